@@ -34,7 +34,6 @@ os.environ |= KEPT | {"XLA_FLAGS": f"{COMPILE} {os.environ.get('XLA_FLAGS', '')}
 
 TESTS = Path(__file__).resolve().parent
 RUN_LONG = (
-    "benchmark_programs/test_loops.py",
     "cli/test_live",
     "cli/test_loops",
     "cli/test_map.py",

@@ -26,10 +26,15 @@ GO_ON = "stopped in time; the same command goes on"
 def main(arguments: list[str] | None = None) -> None:
     """Parse and do it: bad input ends in one line on stderr and exit status 1 (2 where no such option is known)."""
     asked = parser().parse_args(arguments)
+    stopped = time_limit(asked.minutes * (TRAINING_SHARE if asked.work == "train" else 1))
+    from benchmarks.gpu import commands  # brings JAX, which --help does not need
+    from benchmarks.gpu.commands import told
+
     try:
-        asked.work(asked)
+        what, finished = getattr(commands, asked.work)(asked, stopped)
     except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"error: {' '.join(str(error).split())}")
+    print(f"{what}: {'finished' if finished else GO_ON}\n{told(asked.results)}")
 
 
 def time_limit(minutes: float) -> Callable[[], bool]:
@@ -38,60 +43,12 @@ def time_limit(minutes: float) -> Callable[[], bool]:
     return lambda: time.monotonic() > end
 
 
-def simulate(asked: argparse.Namespace) -> None:
-    """Rates of the simulator and of images, and a dataset."""
-    stopped = time_limit(asked.minutes)
-    from benchmarks.gpu.gpu_simulate import TownsConfig, simulate_towns  # these bring JAX, which --help does not need
-    from benchmarks.gpu.simulator_rates import RateConfig
-
-    sensor = asked.sensor, asked.azimuth_steps
-    towns = TownsConfig(asked.out, tuple(asked.seq), asked.scans, asked.layout, *sensor, asked.seed)
-    rates = RateConfig(*sensor, asked.seq[0], asked.batch, asked.points, asked.repeats)
-    finished = simulate_towns(towns, rates, asked.results, stopped)
-    _report(f"{towns.scans_there} of {asked.scans * len(asked.seq)} scans in {asked.out}", finished, asked.results)
-
-
-def train(asked: argparse.Namespace) -> None:
-    """A training, and the scores of its weights so far."""
-    stopped = time_limit(TRAINING_SHARE * asked.minutes)
-    from benchmarks.gpu.gpu_train import TrainJob, train_preset
-
-    names = ("data", "preset", "out", "test", "compute", "chunk", "steps", "packs")
-    job = TrainJob(**{name: getattr(asked, name) for name in names})
-    try:
-        result = train_preset(job, asked.results, stopped)
-    except KeyboardInterrupt:  # how `sglpr_jax.train` stops while it packs recordings
-        if not stopped():
-            raise
-        _report(f"recordings are packed in {asked.packs}", False, asked.results)
-    else:
-        _report(str(result), result.finished, asked.results)
-
-
-def measure(asked: argparse.Namespace) -> None:
-    """Steps and descriptors of presets."""
-    stopped = time_limit(asked.minutes)
-    from benchmarks.gpu.gpu_measure import MeasureConfig, measure_presets
-    from benchmarks.gpu.model_rates import Timing
-
-    timing = Timing(asked.repeats, asked.calls, asked.size, asked.products, asked.peak_tflops)
-    batches = tuple(asked.batch)
-    config = MeasureConfig(tuple(asked.preset), tuple(asked.compute), batches, asked.chunk, timing)
-    _report("presets", measure_presets(config, asked.results, stopped), asked.results)
-
-
-def _report(what: str, finished: bool, results: Path) -> None:
-    from benchmarks.gpu.small_results import told
-
-    print(f"{what}: {'finished' if finished else GO_ON}\n{told(results)}")
-
-
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = made.add_subparsers(required=True)
-    for work, add in ((simulate, _add_simulate), (train, _add_train), (measure, _add_measure)):
-        command = commands.add_parser(work.__name__, description=work.__doc__, help=work.__doc__)
+    for work, (add, about) in WORKS.items():
+        command = commands.add_parser(work, description=about, help=about)
         command.set_defaults(work=work)
         command.add_argument("--minutes", type=_positive, default=9.0, help="it stops by itself after these (9)")
         command.add_argument("--results", type=Path, default=Path("build/gpu"), help="folder of results (build/gpu)")
@@ -136,6 +93,13 @@ def _add_measure(command: argparse.ArgumentParser) -> None:
     add("--size", type=_count, help="rows of the matrices of the peak (8192; on a CPU 2048)")
     add("--products", type=_count, default=20, help="of them in one timing (20)")
     add("--peak-tflops", type=_positive, default=989.0, help="nominal peak in bfloat16 (989, an H100's)")
+
+
+WORKS = {
+    "simulate": (_add_simulate, "Rates of the simulator and of images, and a dataset."),
+    "train": (_add_train, "A training, and the scores of its weights so far."),
+    "measure": (_add_measure, "Steps and descriptors of presets."),
+}
 
 
 def _positive(text: str) -> float:

@@ -1,14 +1,12 @@
 """Time of a descriptor, its size, and the size of the network, for all contenders.
 
-    taskset -c 0 python -m benchmarks.learned.cost sglpr paper-112@random:0 rinet@random:0 bevplace++@random:0 ring
-
 Contenders take turns, so that other programs slow all of them. The time is that from a scan in memory to its
 descriptor, one scan at a time: the image or graph is part of it. A product and a sum are two operations.
 """
 
+import functools
 import json
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,8 @@ import numpy as np
 import tyro
 
 from benchmarks.learned.data import TEST, folders
-from benchmarks.learned.entries import Entry, entry
+from benchmarks.learned.score import Entry, entry
+from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.views import view
@@ -36,7 +35,7 @@ DescribeRecord = Callable[[Record], np.ndarray]
 """Maps a scan to its descriptor."""
 
 
-def main(
+def cost(
     entries: tyro.conf.Positional[tuple[str, ...]],
     *,
     data: Path = Path("build/learned"),
@@ -44,10 +43,10 @@ def main(
     out: Path = Path("build/learned/cost.json"),
     scans: int = 20,
 ) -> None:
-    """Measure, and write one JSON file.
+    """Measure, and write one JSON file. One core: under `taskset -c 0`.
 
     Args:
-        entries: contenders, as in `entries`.
+        entries: contenders, see `score.py`.
         data: folder of the recordings.
         runs: folder of the runs.
         out: file to write.
@@ -55,25 +54,19 @@ def main(
     """
     recording = open_recording(next(one for one in folders(data, TEST) if one.name == TOWN), "00")
     contenders = [entry(name, runs) for name in entries]
-    describers = {one.name: _describer(one, recording) for one in contenders}
-    records = [recording.record(row) for row in range(scans + 1)]
-    times, found = _milliseconds(describers, records), {}
-    for one in contenders:
-        numbers = np.asarray(describers[one.name](records[0])).size
-        found[one.name] = {"ms": times[one.name], "numbers": numbers, "bytes": 4 * numbers, **_network(one)}
+    describers = [_describer(one, recording) for one in contenders]
+    records, found = [recording.record(row) for row in range(scans + 1)], {}
+    jobs = [clocked(functools.partial(_describe_next, of_scan, iter(records))) for of_scan in describers]
+    seconds = np.median(in_turn(jobs, repeats=scans), axis=0).tolist()
+    for one, of_scan, taken in zip(contenders, describers, seconds, strict=True):
+        numbers = np.asarray(of_scan(records[0])).size
+        found[one.name] = {"ms": 1e3 * taken, "numbers": numbers, "bytes": 4 * numbers, **_network(one)}
         print(one.name, json.dumps(found[one.name]), flush=True)
     write_json(out, found)
 
 
-def _milliseconds(describers: Mapping[str, DescribeRecord], records: Sequence[Record]) -> dict[str, float]:
-    """Return the median time of each contender. The first record, for which programs are compiled, does not count."""
-    times: dict[str, list[float]] = {name: [] for name in describers}
-    for record in records:
-        for name, of_scan in describers.items():
-            start = time.perf_counter()
-            of_scan(record)
-            times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: float(np.median(found[1:])) for name, found in times.items()}
+def _describe_next(of_scan: DescribeRecord, records: Iterator[Record]) -> None:
+    of_scan(next(records))
 
 
 def _describer(contender: Entry, recording: Recording) -> DescribeRecord:
@@ -82,12 +75,10 @@ def _describer(contender: Entry, recording: Recording) -> DescribeRecord:
     if isinstance(method, RecordMethod):
         return lambda record: np.asarray(method.describe(method.prepare(record)[None]))
     if isinstance(method, ImageMethod):
-        return lambda record: np.asarray(method.describe(_image(record, method)[None]))
+        return lambda record: np.asarray(
+            method.describe(np.asarray(view(record, method.grid, image=method.image).image)[None])
+        )
     return lambda record: method.describe(record.upright_points, record.classes(20) if method.labels else None)
-
-
-def _image(record: Record, method: ImageMethod) -> np.ndarray:
-    return np.asarray(view(record, method.grid, image=method.image).image)
 
 
 def _network(contender: Entry) -> Mapping[str, Any]:
@@ -97,18 +88,10 @@ def _network(contender: Entry) -> Mapping[str, Any]:
         method = LEARNED[name]
         variables, inputs = random_variables(method, seed=0), example_inputs(method)
         cost = apply_network.lower(variables, inputs, method=method).cost_analysis()
-        return {"weights": weight_count(variables), "gflop": _gflop(cost)}
+        return {"weights": weight_count(variables), "gflop": float(cost["flops"]) / 1e9}
     if name in HANDCRAFTED:
         return {}
     params = load(name) if name in shipped_weights() else init(jax.random.key(0), preset=name)
     grid = params.config.grid
     cost = jax.jit(describe).lower(params, np.zeros((1, grid.height, grid.width), np.float32)).cost_analysis()
-    return {"weights": sum(leaf.size for leaf in jax.tree.leaves(params)), "gflop": _gflop(cost)}
-
-
-def _gflop(cost: Any) -> float:
-    return float(cost["flops"]) / 1e9
-
-
-if __name__ == "__main__":
-    tyro.cli(main)
+    return {"weights": sum(leaf.size for leaf in jax.tree.leaves(params)), "gflop": float(cost["flops"]) / 1e9}

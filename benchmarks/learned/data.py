@@ -1,21 +1,35 @@
 """Simulated recordings on which the networks of other publications are trained, chosen and scored.
 
-    python -m benchmarks.learned.data --out build/learned
-
 `train` has towns of the card of `sglpr` and car parks and garages, whose places repeat. The learning rates are chosen
 on `held-out`. `test` has towns that no weights have seen, with several sensors and sceneries, and one town on two days.
 `train-images` has the images of the scans of `train`, for the presets of `bin/train`, which rotate images.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import tyro
+from jaxtyping import Int
 
+import sglpr_jax
+from sglpr_jax.bev import uncropped
+from sglpr_jax.data.density_grid import SIZE
+from sglpr_jax.data.density_image import values_of_points
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.files import replacing
+from sglpr_jax.labels import to_raw
+from sglpr_jax.retrieval.semantic_maps import semantic_map
 from sglpr_jax.sim.dataset import simulate
 
 TRAIN, TRAIN_IMAGES, HELD_OUT, TEST = "train", "train-images", "held-out", "test"
+BUILDING = 50
+"""The label of all points without labels: raw id of SemanticKITTI."""
+LINKED = ("velodyne", "poses.txt", "times.txt", "calib.txt")
+
+Labels = Callable[[Record], Int[np.ndarray, " n"]]
 
 
 class Dataset(NamedTuple):
@@ -55,11 +69,11 @@ def folders(root: Path, part: str) -> list[Path]:
     """Return the written datasets of a part. Raises FileNotFoundError if there are none."""
     found = [one.folder(root) for one in DATASETS if one.part == part and one.folder(root).is_dir()]
     if not found:
-        raise FileNotFoundError(f"{root / part}: expected datasets of benchmarks.learned.data, found none")
+        raise FileNotFoundError(f"{root / part}: expected datasets of `learned data`, found none")
     return found
 
 
-def main(
+def data(
     *, out: Path = Path("build/learned"), only: Sequence[str] = (), scans: int = 300, azimuth_steps: int = 900
 ) -> None:
     """Write the datasets, unless they exist.
@@ -77,5 +91,66 @@ def main(
             print(simulate(folder, scans=scans, azimuth_steps=azimuth_steps, **one.options), flush=True)
 
 
-if __name__ == "__main__":
-    tyro.cli(main)
+def recordings_of(folder: Path) -> list[Recording]:
+    """All recordings of a dataset."""
+    return [open_recording(folder, name) for name in recording_names(folder)]
+
+
+def labels(
+    kind: tyro.conf.Positional[Literal["predicted", "none"]],
+    *,
+    data: Path = Path("build/learned"),
+    out: Path = Path("build/learned-predicted"),
+    weights: str = "sglpr",
+) -> None:
+    """Write the recordings with other labels, unless they exist.
+
+    Scans, times and poses are links to those of `data`. A predicted label is that of the point's cell in the semantic
+    map, which reaches 25 m; points farther away have none. With "none", all points have one label. Sessions in NCLT's
+    layout are left out: they have no labels.
+
+    Args:
+        kind: labels of `weights`, or none.
+        data: folder of the recordings.
+        out: folder of the recordings with other labels.
+        weights: weights with a segmentation head.
+    """
+    params = sglpr_jax.load(weights)
+    of_points = _unlabelled if kind == "none" else lambda record: _predicted(params, record)
+    for part in (TRAIN, HELD_OUT, TEST):
+        for folder in folders(data, part):
+            if (folder / "sequences").is_dir():
+                _relabel(folder, out / part / folder.name, of_points)
+                print(out / part / folder.name, flush=True)
+
+
+def _relabel(folder: Path, out: Path, labels: Labels) -> None:
+    """Link a dataset, with labels of its own."""
+    out.mkdir(parents=True, exist_ok=True)
+    _link(folder / "simulation.json", out / "simulation.json")
+    for name in recording_names(folder):
+        recording, there = open_recording(folder, name), out / "sequences" / name
+        (there / "labels").mkdir(parents=True, exist_ok=True)
+        for linked in LINKED:
+            _link(folder / "sequences" / name / linked, there / linked)
+        for row, scan in enumerate(recording.ids):
+            path = there / "labels" / f"{scan}.label"
+            if not path.exists():
+                with replacing(path) as temporary:
+                    labels(recording.record(row, labels=False)).astype(np.uint32).tofile(temporary)
+
+
+def _link(to: Path, path: Path) -> None:
+    if to.exists() and not path.exists():
+        path.symlink_to(to.absolute())
+
+
+def _unlabelled(record: Record) -> Int[np.ndarray, " n"]:
+    return np.full(len(record.upright_points), BUILDING)
+
+
+def _predicted(params: sglpr_jax.Params, record: Record) -> Int[np.ndarray, " n"]:
+    """Return the raw label of each point's cell, 0 outside the map."""
+    cells = uncropped(semantic_map(params, record).predicted, shape=(SIZE, SIZE))
+    classes = values_of_points(np.rot90(cells), record.upright_points)  # density_image is rotated by 90 degrees
+    return to_raw(classes, categories=params.config.categories)

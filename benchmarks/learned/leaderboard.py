@@ -1,32 +1,31 @@
-"""Writes the page that compares all contenders.
-
-    python -m benchmarks.learned.leaderboard
-
-Reads the results of `score`, `cost` and the trainings, keeps them in one file, and writes docs/leaderboard.md with its
-figure from it. Without new results, they are those of the kept file. Contenders that were trained and scored with the
-labels of `labels` are called `NAME, predicted labels` and `NAME, no labels`.
-"""
+"""The page that compares all contenders, with its figure."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
-import tyro
+from jinja2 import Template
+from matplotlib.figure import Figure
 
-from benchmarks.learned.clock import stages
-from benchmarks.learned.leaderboard_figure import draw
-from benchmarks.learned.leaderboard_page import page_of
+from benchmarks.learned import tables
+from benchmarks.learned.train import stages
 from sglpr_jax.cli.peers import RATES
-from sglpr_jax.files import write_json, write_text
+from sglpr_jax.files import replacing, write_json, write_text
+from sglpr_jax.methods.learned.weights_file import RANDOM
 from sglpr_jax.training.learned.rate_search import RATES_FILE
 from sglpr_jax.training.learned.run_files import SCORES_FILE
 
 KEPT = Path(__file__).with_name("results.json")
+TEMPLATE = Path(__file__).with_name("leaderboard.md.jinja")
 PAGE, FIGURE = Path("docs/leaderboard.md"), Path("docs/images/leaderboard.svg")
+LABEL = {"rotation": -25, "ha": "left", "va": "top", "rotation_mode": "anchor"}
+"""Labels run downwards, so that those of near points are apart."""
 
 
-def main(
+def leaderboard(
     *,
     build: Path = Path("build/learned"),
     predicted: Path = Path("build/learned-predicted"),
@@ -35,7 +34,10 @@ def main(
     page: Path = PAGE,
     figure: Path = FIGURE,
 ) -> None:
-    """Keep new results, and write the page and its figure.
+    """Keep the results of `score`, `cost` and the trainings in one file, and write the page and its figure from it.
+
+    Without new results, they are those of the kept file. Contenders that were trained and scored with the labels of
+    `labels` are called `NAME, predicted labels` and `NAME, no labels`.
 
     Args:
         build: folder of the results.
@@ -45,7 +47,7 @@ def main(
         page: page to write.
         figure: figure to write.
     """
-    results = json.loads(kept.read_text()) if kept.is_file() else {"scores": {}, "costs": {}, "runs": {}}
+    results = json.loads(kept.read_text())
     for folder, labels in ((build, ""), (predicted, ", predicted labels"), (none, ", no labels")):
         for path in sorted((folder / "scores").glob("*/*.json")):
             one = json.loads(path.read_text())
@@ -55,8 +57,9 @@ def main(
     for path in sorted((build / "runs").glob(f"*/{SCORES_FILE}")):
         results["runs"][path.parent.name] = _run(path.parent)
     write_json(kept, results)
-    write_text(page, page_of(results))
-    draw(results, figure)
+    write_text(page, Template(TEMPLATE.read_text()).render(tables.tables(results)) + "\n")
+    _draw(results, figure)
+    print(f"{page}, {figure}")
 
 
 def _run(folder: Path) -> dict[str, Any]:
@@ -71,5 +74,21 @@ def _run(folder: Path) -> dict[str, Any]:
     return {"curve": curve, "losses": quarters, "rates": found}
 
 
-if __name__ == "__main__":
-    tyro.cli(main)
+def _draw(results: Mapping[str, Any], path: Path) -> None:
+    """Write the figure as SVG. The same results give the same bytes."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    times = {tables.method_of(name): cost["ms"] for name, cost in results["costs"].items()}
+    left, right = figure.subplots(1, 2, sharey=True)
+    for name, run in results["runs"].items():
+        curve = run["curve"]
+        left.plot([one["images"] for one in curve], [one["recall_at_1"] for one in curve], "o-", label=name)
+    left.set(xscale="log", ylim=(0, 1.04), xlabel="images seen", ylabel="Recall@1", title="held-out town")
+    left.legend(fontsize="x-small")
+    for name in (one for one in tables.finals(results["scores"]) if RANDOM not in one):
+        recall = tables.mean(results["scores"][name], tables.TOWN)
+        if tables.method_of(name) in times and recall is not None:
+            right.plot(times[tables.method_of(name)], recall, "o")
+            right.annotate(name, (times[tables.method_of(name)], recall), fontsize="x-small", **LABEL)
+    right.set(xscale="log", xlabel="milliseconds per descriptor", title="unseen town")
+    with matplotlib.rc_context({"svg.hashsalt": "leaderboard", "svg.fonttype": "none"}), replacing(path) as temporary:
+        figure.savefig(temporary, format="svg", metadata={"Date": None})

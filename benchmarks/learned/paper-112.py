@@ -3,7 +3,7 @@
 The paper's own training (the preset `paper-112`) takes 200,000 steps of one tuple, with a fortieth of this learning
 rate. A CPU core does some hundred steps in an hour. Here the other places of a step are the negatives.
 
-    python -m benchmarks.learned.train_presets --preset benchmarks/learned/paper-112.py --seconds 9000 \\
+    python -m benchmarks learned preset --preset benchmarks/learned/paper-112.py --seconds 9000 \\
         --upright-images 6000 --learning-rate 4e-4
 """
 

@@ -1,41 +1,100 @@
-"""Scores contenders on recordings that none of them was trained on.
+"""Contenders of the comparison, and their scores on recordings that none of them was trained on.
 
-    python -m benchmarks.learned.score sglpr rinet-0 rinet-0/weights-4000 rinet@random:0 scan-context --kitti KITTI_BEV
-    python -m benchmarks.learned.score sglpr bevplace++-0 --verify
-
-Every contender (`entries`) describes the test recordings of `data`, raw and with every scan rotated, and the images of
-KITTI if it takes images. A result is a JSON file of one contender and one recording. Existing results are kept.
+A contender is called by a handcrafted method (`scan-context`), shipped weights (`sglpr`), an untrained network
+(`rinet@random:0`), or a folder of weights (`rinet-0`, `rinet-0/weights-4000`) in the folder of the runs.
 """
 
+import dataclasses
 import functools
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import tyro
+from jaxtyping import Float32
 
+import sglpr_jax
 from benchmarks.learned.data import TEST, folders
-from benchmarks.learned.entries import Entry, entry
-from benchmarks.learned.verified import images_of, verified
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.views import view
 from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
 from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
+from sglpr_jax.evaluation.protocols.nearest import nearest_frames
 from sglpr_jax.evaluation.protocols.pairs_f1max import PAIRS_F1MAX
 from sglpr_jax.evaluation.protocols.source import Source, TopK
 from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 from sglpr_jax.files import write_json
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.learned import LEARNED
+from sglpr_jax.methods.learned.weights_file import LAST, RANDOM
+from sglpr_jax.methods.method import Method, Takes
+from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
+from sglpr_jax.models.config import model_preset
+from sglpr_jax.models.sglpr import init
+from sglpr_jax.registration.bev_alignment import align_all
+from sglpr_jax.reproduce.compared import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.revisits import database_end, has_near
+from sglpr_jax.training.learned.run_files import SCORES_FILE
 from sglpr_jax.training.learned.score import FOUND_M
 
+GRID = model_preset("sglpr").grid
+"""Grid of handcrafted methods on images."""
 ROTATION_SEED = 0
+CANDIDATES = 5
+"""Number of places that are verified for each query."""
 SPLIT = ("00", "02", "05", "06")
 """Sequences of KITTI with a published split into map and queries."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A contender."""
+
+    name: str
+    takes: Takes
+    method: Callable[[Recording], Method]
+    """Returns the method for the scans of a recording."""
+    images: int | None = None
+    """Number of images that it was trained with. None: not trained here."""
+    seconds: float | None = None
+    """Training time in seconds."""
+
+
+def entry(name: str, runs: Path) -> Entry:
+    """The contender called `name`. Raises FileNotFoundError if there is no method, weights or run of that name."""
+    if name in HANDCRAFTED:
+        return Entry(name, HANDCRAFTED[name].takes, lambda recording: handcrafted(name, recording, GRID))
+    method, _, weights = name.rpartition("@")
+    if name in sglpr_jax.shipped_weights():
+        takes, made, seen = "images", network(sglpr_jax.load(name)), ()
+    elif weights.startswith(RANDOM) and method in LEARNED:
+        takes, made, seen = LEARNED[method].takes, trained_method(LEARNED[method], weights), (0, 0.0)
+    elif weights.startswith(RANDOM):
+        params = init(jax.random.key(int(weights.removeprefix(RANDOM))), preset=method)
+        takes, made, seen = "images", network(params), (0, 0.0)
+    else:
+        folder = runs / name
+        folder = folder / LAST if (folder / LAST / "config.json").is_file() else folder
+        takes, made, seen = content_of(str(folder)), method_with_weights(str(folder)), _seen(folder)
+    return Entry(name, takes, lambda recording: made, *seen)
+
+
+def _seen(folder: Path) -> tuple[int, float]:
+    """The number of images and the training time of weights, from their file or the scores of the run."""
+    about = json.loads((folder / "config.json").read_text())
+    if "images" in about:
+        return about["images"], about["seconds"]
+    lines = [json.loads(line) for line in (folder.parent / SCORES_FILE).read_text().splitlines()]
+    named = folder.name.removeprefix(f"{LAST}-")
+    line = next((one for one in lines if str(one["images"]) == named), lines[-1])
+    return line["images"], line["seconds"]
 
 
 class Test(NamedTuple):
@@ -47,44 +106,40 @@ class Test(NamedTuple):
     """Earlier session of the same town. None: the recording's own earlier scans."""
     rotated: bool = False
 
-    @property
-    def is_kitti(self) -> bool:
-        """Whether this is a sequence of KITTI's images."""
-        return self.name.startswith("kitti-")
 
-
-def main(
+def score(
     entries: tyro.conf.Positional[tuple[str, ...]],
     *,
     data: Path = Path("build/learned"),
     runs: Path = Path("build/learned/runs"),
     out: Path = Path("build/learned/scores"),
     kitti: Path | None = None,
-    kitti_seqs: Sequence[str] = ("00", "02", "06"),
     part: str = TEST,
     only: str = "",
     verify: bool = False,
 ) -> None:
     """Score contenders and print a line for each recording.
 
+    Every contender describes the test recordings of `data`, raw and with every scan rotated, and the images of KITTI if
+    it takes images. A result is a JSON file of one contender and one recording. Existing results are kept.
+
     Args:
-        entries: contenders, as in `entries`.
+        entries: contenders, see the head of this file.
         data: folder of the recordings.
         runs: folder of the runs.
         out: folder of the results.
         kitti: folder of KITTI's images, NN/imgs/*.png with NN/pose.txt.
-        kitti_seqs: sequences of KITTI to score on.
         part: part of `data` to score on. Scores on "train" distinguish networks that did not learn from those that do
             not generalise.
         only: beginning of the names of the test recordings to score on.
         verify: also score after verification of the nearest places.
     """
-    tests = [one for one in [*_simulated(data, part), *_kitti(kitti, kitti_seqs)] if one.name.startswith(only)]
+    tests = [one for one in [*_simulated(data, part), *_kitti(kitti)] if one.name.startswith(only)]
     for name in entries:
         contender = entry(name, runs)
         for test in tests:
             if _fits(contender, test):
-                found = _result(contender, test, out / contender.file_name, verify=verify)
+                found = _result(contender, test, out / name.replace("/", "_").replace(":", "-"), verify=verify)
                 scores = (f"{key} {value:.3f}" for key, value in found["scores"].items())
                 print(f"{name}, {test.name}: {', '.join(scores)}", flush=True)
 
@@ -102,10 +157,10 @@ def _simulated(data: Path, part: str) -> Iterator[Test]:
             yield Test(f"{folder.name}-{name}-rotated", recording, rotated=True)
 
 
-def _kitti(root: Path | None, seqs: Sequence[str]) -> Iterator[Test]:
+def _kitti(root: Path | None) -> Iterator[Test]:
     if root is None:
         return
-    for seq in seqs:
+    for seq in ("00", "02", "06"):
         recording = open_recording(root, seq)
         yield Test(f"kitti-{seq}", recording)
         yield Test(f"kitti-{seq}-rotated", recording, rotated=True)
@@ -129,10 +184,10 @@ def _result(contender: Entry, test: Test, folder: Path, *, verify: bool) -> Mapp
     if test.database is not None:
         scores = {"recall": bevplace_nclt_recall(_described(contender, test.database), file).score}
     else:
-        scores = _scores(file, split=test.is_kitti and test.name.split("-")[1] in SPLIT)
+        scores = _scores(file, split=test.name.startswith("kitti-") and test.name.split("-")[1] in SPLIT)
     if wanted:
         images = _images(test.recording)
-        scores |= {f"verified {name}": score for name, score in _scores(verified(file, images)).items()}
+        scores |= {f"verified {name}": score for name, score in _scores(_verified(file, images)).items()}
     about = {"images": contender.images, "seconds": contender.seconds, "numbers": file.descriptors.shape[1]}
     found = {"entry": contender.name, "test": test.name, **about, "weights": file.weights_hash, "scores": scores}
     folder.mkdir(parents=True, exist_ok=True)
@@ -146,8 +201,11 @@ def _described(contender: Entry, recording: Recording, *, rotated: bool = False)
 
 
 @functools.lru_cache(maxsize=4)
-def _images(recording: Recording) -> np.ndarray:
-    return images_of(recording, range(len(recording)))
+def _images(recording: Recording) -> Float32[np.ndarray, "n h w"]:
+    """The density images of scans or images of a recording, in the window of `sglpr`."""
+    grid = model_preset("sglpr").grid
+    records = (recording.record(row, labels=False) for row in range(len(recording)))
+    return np.stack([np.asarray(view(one, grid, image="density").image, np.float32) for one in records])
 
 
 def _scores(source: Source, *, split: bool = False) -> dict[str, float]:
@@ -173,5 +231,31 @@ def _recall(source: Source, answers: np.ndarray | None) -> float:
     return float(np.mean((apart <= FOUND_M) & (answers[revisited] >= 0)))
 
 
-if __name__ == "__main__":
-    tyro.cli(main)
+def _verified(file: DescriptorFile, images: Float32[np.ndarray, "n h w"]) -> TopK:
+    """Return the nearest places of each frame, ordered by `align`.
+
+    Arguments:
+      file: Descriptors of a recording.
+      images: Image of each frame.
+    """
+    ends = database_end(len(file), times=file.times)
+    queries = np.flatnonzero(ends)
+    nearest, _ = nearest_frames(file, queries, ends[queries], k=CANDIDATES)
+    correlations = np.stack([_correlations(images, int(q), row) for q, row in zip(queries, nearest, strict=True)])
+    order = np.argsort(-correlations, axis=1, kind="stable")
+    assert file.positions is not None
+    return TopK(
+        sequence=file.sequence,
+        positions=file.positions,
+        times=file.times,
+        pose_source=file.pose_source,
+        queries=queries,
+        nearest=np.take_along_axis(nearest, order, axis=1),
+        scores=np.take_along_axis(correlations, order, axis=1),
+    )
+
+
+def _correlations(images: np.ndarray, query: int, nearest: np.ndarray) -> np.ndarray:
+    """Return the correlation of a frame with each of its nearest places; -1 where there is no further place."""
+    found = align_all(images[query], images[nearest])
+    return np.where(nearest >= 0, np.asarray(found.correlation, np.float64), -1.0)

@@ -1,27 +1,16 @@
-"""Tables of the leaderboard: all scores, the learning curves and the costs."""
+"""Tables of the leaderboard: scores, learning curves, costs, and comparisons of contenders."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
-from benchmarks.learned.cells import (
-    KITTI,
-    LABELLED,
-    SCENERIES,
-    SENSORS,
-    SEQS,
-    SIMULATED,
-    TOWN,
-    Scores,
-    finals,
-    joined,
-    mean,
-    method_of,
-    number,
-    section,
-    text,
-    three,
-)
+from sglpr_jax.evaluation.published import TABLE_1
 
+Scores = Mapping[str, Mapping[str, Any]]
+"""Results of one contender, by test recording."""
+SCORES = ("top1", "pairs", "recall")
+"""Top-1 F1max, pairs F1max and Recall@1."""
 MARKS_S = (225, 450, 900, 1800, 3600)
 PUBLISHED_RECALL = {
     "BEVPlace": (0.997, 0.981, 1.000),
@@ -31,104 +20,214 @@ PUBLISHED_RECALL = {
     "PointNetVLAD": (0.916, 0.623, 0.778),
 }
 """Recall@1 on 00, 02 and 06 as published in the papers of BEVPlace and BEVPlace++."""
+OURS = "sglpr-0"
+"""The run that the peers are compared with."""
+AHEAD = 0.005
+"""Difference of two scores from which a contender is ahead."""
+NEARLY = 1.5
+"""Largest ratio of two numbers of images that are compared."""
+FAR = 0.1
+"""Difference by which a trained network is far above a baseline."""
+REVERSED = 0.02
+"""Difference from which two means are in an order."""
+PUBLISHED_NAMES = {
+    "m2dp": "M2DP",
+    "scan-context": "Scan Context",
+    "lidar-iris": "LiDAR Iris",
+    "ssc": "SSC",
+    "pointnetvlad-0": "PointNetVLAD",
+    "overlap-transformer-0": "OverlapTransformer",
+    "disco-0": "DiSCO",
+    "sgpr-0": "SGPR",
+    "rinet-0": "RINet",
+    "paper-112-0": "SG-LPR",
+}
+"""Contenders that are rows of the paper's table 1."""
+LABELS = {
+    "rinet-0": "true",
+    "rinet-0/weights-1024000": "true",
+    "rinet-0, predicted labels": "predicted",
+    "rinet-0, no labels": "one for all points",
+    "sgpr-0": "true",
+    "sgpr-0, predicted labels": "predicted",
+    "sgpr-0, no labels": "one for all points",
+    "sglpr-0": "true, while training",
+    "sglpr-0/weights-16000": "true, while training",
+    "sglpr-no-labels-0": "none",
+}
+"""Contenders, and the labels that they have."""
 
 
-def summary(scores: Mapping[str, Scores], costs: Mapping[str, Any]) -> str:
-    """Return the table of Recall@1 beside what it costs, the highest mean first."""
-    by_method = {method_of(name): cost for name, cost in costs.items()}
+class Column(NamedTuple):
+    """A mean over test recordings."""
+
+    title: str
+    tests: tuple[str, ...]
+
+    @property
+    def rotated(self) -> "Column":
+        """The same recordings with rotated scans."""
+        return Column(f"{self.title}, rotated", tuple(f"{test}-rotated" for test in self.tests))
+
+
+TOWN = Column("town", ("town-601-00", "town-601-08"))
+TRAINED_TOWN = ("town-10-00", "town-10-08")
+"""Revisits in the same and in the opposite direction in a town of the training."""
+SCENERIES = Column("other sceneries", ("outskirts-602-08", "lanes-602-08", "car_park-602-08"))
+SENSORS = Column("other sensors", ("vlp16-603-08", "os1-64-603-08"))
+DAY = Column("another day", ("days-604",))
+SIMULATED = (TOWN, TOWN.rotated, SCENERIES, SENSORS, DAY)
+LABELLED = SIMULATED[:-1]
+"""The recordings of two days have no labels."""
+SEQS = tuple(Column(seq, (f"kitti-{seq}",)) for seq in ("00", "02", "06"))
+KITTI = Column("KITTI", tuple(test for column in SEQS for test in column.tests))
+
+
+def method_of(name: str) -> str:
+    """The method of a contender: `rinet` of `rinet-0/weights-1000` and of `rinet@random:0`."""
+    return re.sub(r"-\d$", "", name.split("/")[0].split("@")[0])
+
+
+def finals(scores: Mapping[str, Scores]) -> list[str]:
+    """The contenders, without the weights along a training and those with other labels."""
+    return [name for name in scores if "/" not in name and "," not in name]
+
+
+def images_of(found: Scores) -> int:
+    """The number of images that a contender was trained with."""
+    return next(iter(found.values()))["images"] or 0
+
+
+def mean(found: Scores, column: Column, score: str = "recall") -> float | None:
+    """The mean of a score over recordings, or None if one is missing."""
+    values = [found[test]["scores"].get(score) if test in found else None for test in column.tests]
+    return None if None in values else sum(values) / len(values)  # type: ignore[arg-type]
+
+
+def _scores_of(found: Scores, column: Column, *scores: str) -> str:
+    """A cell of several scores, or of none."""
+    texts = [text(mean(found, column, score)) for score in scores]
+    return "-" if set(texts) == {"-"} else ", ".join(texts)
+
+
+def both(a: float | None, b: float | None) -> str:
+    """A cell of two values to compare."""
+    return f"{text(a)} / {text(b)}"
+
+
+def text(value: float | None) -> str:
+    """A score as a cell."""
+    return "-" if value is None else f"{value:.3f}"
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """A number as a cell."""
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
+def tables(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of the page's template: its tables, and facts in its text."""
+    costs, runs = results["costs"], results["runs"]
+    means = {name: sum(mean(one, column) or 0 for column in LABELLED) for name, one in results["scores"].items()}
+    scores = results["scores"]
+    by_recall = {name: scores[name] for name in sorted(scores, key=lambda name: -means[name])}
+    finished = [name for name in finals(scores) if images_of(scores[name]) and not name.startswith("sglpr")]
+    after, ahead_after = _beside_ours(scores, [(name, OURS) for name in finished])
+    equal, ahead_equal = _beside_ours(scores, [pair for name in finished if (pair := _equal_images(scores, name))])
+    beside, near = _baselines(scores)
+    orders, pairs = _published_orders(scores)
+    by_images, by_seconds = _along_trainings(runs)
+    return {
+        "summary": _summary(by_recall, costs),
+        "after_training": after,
+        "ahead_after_training": ahead_after,
+        "equal_images": equal,
+        "ahead_at_equal_images": ahead_equal,
+        "published_recall": _published_recall(by_recall),
+        "baselines": beside,
+        "near_baselines": near,
+        "labels": _labels(scores),
+        "published_orders": orders,
+        "published_pairs": pairs,
+        "costs": _costs(costs),
+        "simulated": _simulated(by_recall),
+        "kitti": _kitti(by_recall),
+        "by_images": by_images,
+        "by_seconds": by_seconds,
+    }
+
+
+def _summary(scores: Mapping[str, Scores], costs: Mapping[str, Any]) -> str:
+    """Recall@1 beside what it costs."""
+    by_method, columns = {method_of(name): cost for name, cost in costs.items()}, (*SIMULATED, KITTI)
     rows = []
-    for name in finals({name: scores[name] for name in _by_recall(scores)}):
-        found = scores[name]
-        cost = by_method.get(method_of(name), {})
-        seen = next(iter(found.values()))
-        training = (number(seen["images"]), number(seen["seconds"]))
-        recalls = (text(mean(found, column, "recall")) for column in (*SIMULATED, KITTI))
-        size = (number(cost.get("ms"), 1), number(cost.get("bytes")))
-        rows.append([f"`{name}`", *recalls, *training, *size])
-    size_titles = ("description (ms)", "descriptor (bytes)")
-    head = ["", *(column.title for column in (*SIMULATED, KITTI)), "images seen", "training (s)", *size_titles]
-    about = """## Summary
-
-Recall@1: the fraction of the revisits whose nearest descriptor, among frames older than 30 s, is within 5 m. Rows are
-ordered by the mean of the columns from *town* to *other sensors*, where a missing cell counts as 0.
-"""
-    return section(about, head, rows)
+    for name in finals(scores):
+        cost, seen = by_method.get(method_of(name), {}), next(iter(scores[name].values()))
+        numbers = (
+            number(seen["images"]),
+            number(seen["seconds"]),
+            number(cost.get("ms"), 1),
+            number(cost.get("bytes")),
+        )
+        rows.append([f"`{name}`", *(text(mean(scores[name], column)) for column in columns), *numbers])
+    more = ("images seen", "training (s)", "description (ms)", "descriptor (bytes)")
+    return markdown(["", *(column.title for column in columns), *more], rows)
 
 
-def simulated(scores: Mapping[str, Scores]) -> str:
-    """Return the table of all scores of simulated recordings."""
+def _simulated(scores: Mapping[str, Scores]) -> str:
+    """All scores of simulated recordings."""
     columns = (TOWN, SCENERIES, SENSORS, TOWN.rotated, SCENERIES.rotated, SENSORS.rotated)
     rows = [
         [
             f"`{name}`",
-            *(three(found, column) for column in columns),
-            joined(mean(found, TOWN, f"verified {score}") for score in ("top1", "recall")),
+            *(_scores_of(found, column, *SCORES) for column in columns),
+            _scores_of(found, TOWN, "verified top1", "verified recall"),
         ]
-        for name in _by_recall(scores)
-        if mean(found := scores[name], TOWN, "recall") is not None
+        for name, found in scores.items()
+        if mean(found, TOWN) is not None
     ]
-    about = """## Simulated recordings
-
-Each cell: top-1 F1max, pairs F1max, Recall@1 ([protocols](concepts/protocols.md)). F1max ignores matches between 3 m
-and 20 m, Recall@1 counts all beyond 5 m as wrong. *Verified*: `align` registers the 5 nearest places, and the one with
-the highest correlation is the answer. This cell has top-1 F1max and Recall@1.
-"""
-    return section(about, ["", *(column.title for column in columns), "town, verified"], rows)
+    return markdown(["", *(column.title for column in columns), "town, verified"], rows)
 
 
-def kitti(scores: Mapping[str, Scores]) -> str:
-    """Return the table of the images of KITTI."""
+def _kitti(scores: Mapping[str, Scores]) -> str:
+    """All scores of the images of KITTI."""
     columns = [each for one in SEQS for each in (one, one.rotated)]
     rows = [
-        [f"`{name}`", *(three(scores[name], column) for column in columns)]
-        for name in _by_recall(scores)
-        if any(test in scores[name] for test in KITTI.tests)
+        [f"`{name}`", *(_scores_of(found, column, *SCORES) for column in columns)]
+        for name, found in scores.items()
+        if any(test in found for test in KITTI.tests)
     ]
-    about = "## Images of KITTI\n\nEach cell: top-1 F1max, pairs F1max, Recall@1.\n"
-    return section(about, ["", *(column.title for column in columns)], rows)
+    return markdown(["", *(column.title for column in columns)], rows)
 
 
-def published_recall(scores: Mapping[str, Scores]) -> str:
-    """Return the table of Recall@1 by the published split into map and queries."""
-    ours = {name: [mean(scores[name], column, "split recall") for column in SEQS] for name in _by_recall(scores)}
+def _published_recall(scores: Mapping[str, Scores]) -> str:
+    """Recall@1 by the published split into map and queries."""
+    ours = {name: [mean(found, column, "split recall") for column in SEQS] for name, found in scores.items()}
     rows = [[f"`{name}`", *map(text, found)] for name, found in ours.items() if any(found)]
-    if rows:
-        rows += [[f"{name}, published", *map(text, found)] for name, found in PUBLISHED_RECALL.items()]
-    about = """## Beside published numbers
-
-Recall@1 on the same images by the protocol of BEVPlace++: the first part of a sequence is the database, a later part
-has the queries. So it differs from Recall@1 in the other tables. The published networks were trained on KITTI 00, and
-those of BEVPlace start from ImageNet. The networks here were trained on simulated recordings.
-"""
-    return section(about, ["", *(column.title for column in SEQS)], rows)
+    rows += [[f"{name}, published", *map(text, found)] for name, found in PUBLISHED_RECALL.items()]
+    return markdown(["", *(column.title for column in SEQS)], rows)
 
 
-def along_trainings(runs: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the tables of Recall@1 on the held-out town along the trainings."""
-    curves = {name: run["curve"] for name, run in runs.items() if run["curve"]}
-    marks = [1000 * 2**k for k in range(8)]
-    rates = {name: (runs[name]["rates"] or {"best": None})["best"] for name in curves}
-    rows = [
-        [f"`{name}`", "-" if rates[name] is None else f"{rates[name]:.2g}", *(_after(curve, mark) for mark in marks)]
-        for name, curve in curves.items()
-    ]
-    about = "## Along the training\n\nRecall@1 on the held-out town after numbers of images.\n"
-    yield section(about, ["", "searched learning rate", *(f"{mark:,}" for mark in marks)], rows)
-    rows = [
-        [
-            f"`{name}`",
-            *(_until(curve, mark) for mark in MARKS_S),
-            text(curve[-1]["recall_at_1"]),
-            number(curve[-1]["images"]),
-            number(curve[-1]["seconds"]),
-            ", ".join(f"{loss:.3g}" for loss in runs[name]["losses"] or ()) or "-",
-        ]
-        for name, curve in curves.items()
-    ]
-    about = """The same after seconds: the score of the last snapshot before. Then the score, the images and the seconds
-at the end, and the mean loss of each quarter of the steps.
-"""
-    yield section(about, ["", *map(str, MARKS_S), "end", "images", "seconds", "loss"], rows)
+def _along_trainings(runs: Mapping[str, Any]) -> tuple[str, str]:
+    """Recall@1 on the held-out town along the trainings, by images and by seconds."""
+    marks, by_images, by_seconds = [1000 * 2**k for k in range(8)], [], []
+    for name, run in runs.items():
+        if curve := run["curve"]:
+            rate, end = (run["rates"] or {"best": None})["best"], curve[-1]
+            searched = "-" if rate is None else f"{rate:.2g}"
+            by_images.append([f"`{name}`", searched, *(_after(curve, mark) for mark in marks)])
+            numbers = (text(end["recall_at_1"]), number(end["images"]), number(end["seconds"]))
+            losses = ", ".join(f"{loss:.3g}" for loss in run["losses"] or ()) or "-"
+            by_seconds.append([f"`{name}`", *(_until(curve, mark) for mark in MARKS_S), *numbers, losses])
+    return (
+        markdown(["", "searched learning rate", *(f"{mark:,}" for mark in marks)], by_images),
+        markdown(["", *map(str, MARKS_S), "end", "images", "seconds", "loss"], by_seconds),
+    )
 
 
 def _after(curve: Sequence[Mapping[str, float]], images: int) -> str:
@@ -142,18 +241,83 @@ def _until(curve: Sequence[Mapping[str, float]], seconds: float) -> str:
     return text(found[-1]["recall_at_1"] if found and finished else None)
 
 
-def costs(costs: Mapping[str, Any]) -> str:
-    """Return the table of times and sizes."""
+def _costs(costs: Mapping[str, Any]) -> str:
+    """Times and sizes."""
     digits = {"ms": 1, "bytes": 0, "weights": 0, "gflop": 3}
     rows = [
         [f"`{method_of(name)}`", *(number(cost.get(key), each) for key, each in digits.items())]
         for name, cost in costs.items()
     ]
-    about = "## Cost\n\nFrom a scan in memory to its descriptor, one scan at a time on one core.\n"
-    return section(about, ["", "ms", "bytes", "weights", "GFLOP"], rows)
+    return markdown(["", "ms", "bytes", "weights", "GFLOP"], rows)
 
 
-def _by_recall(scores: Mapping[str, Scores]) -> list[str]:
-    """Return the contenders, the highest mean Recall@1 first. Missing recordings count as 0."""
-    means = {name: sum(mean(found, one, "recall") or 0 for one in LABELLED) for name, found in scores.items()}
-    return sorted(scores, key=lambda name: -means[name])
+def _equal_images(scores: Mapping[str, Scores], name: str) -> tuple[str, str] | None:
+    """Weights of a run and of ours with nearly the same number of images, the last such pair."""
+    theirs, ours = ([one for one in scores if one == run or one.startswith(f"{run}/")] for run in (name, OURS))
+    pairs = [(images_of(scores[b]), a, b) for a in theirs for b in ours if _near(scores[a], scores[b])]
+    return max(pairs)[1:] if pairs else None
+
+
+def _near(theirs: Scores, ours: Scores) -> bool:
+    return 0 < images_of(ours) <= images_of(theirs) <= NEARLY * images_of(ours)
+
+
+def _beside_ours(scores: Mapping[str, Scores], pairs: Sequence[tuple[str, str]]) -> tuple[str, str]:
+    """Recall@1 of peers beside ours, and those that are ahead."""
+    rows, ahead = [], []
+    for name, own in pairs:
+        cells = [(column, mean(scores[name], column), mean(scores[own], column)) for column in SIMULATED]
+        titles = [column.title for column, a, b in cells if a and b and a >= b + AHEAD]
+        ahead += [f"`{name}` ({'all columns' if len(titles) == len(cells) else '; '.join(titles)})"] if titles else []
+        counts = (f"{images_of(scores[one]):,}" for one in (name, own))
+        rows.append([f"`{name}`", *counts, *(both(a, b) for _, a, b in cells)])
+    head = ["", "its images", f"images of `{OURS}`", *(column.title for column in SIMULATED)]
+    return markdown(head, rows), ", ".join(ahead) or "none"
+
+
+def _baselines(scores: Mapping[str, Scores]) -> tuple[str, str]:
+    """Each network beside its untrained self and the thumbnail, and those that are not far above both."""
+    rows, near = [], []
+    for name in finals(scores):
+        untrained, recall = scores.get(f"{method_of(name)}@random:0", {}), mean(scores[name], TOWN)
+        if not images_of(scores[name]) or recall is None:
+            continue
+        against = [mean(one, TOWN) for one in (untrained, scores.get("thumbnail", {}))]
+        near += [f"`{name}`"] if any(one is not None and recall < one + FAR for one in against) else []
+        directions = [Column("", (test,)) for test in (*TOWN.tests, *TRAINED_TOWN)]
+        cells = (both(*(mean(one, column) for one in (scores[name], untrained))) for column in directions)
+        rows.append([f"`{name}`", text(recall), *map(text, against), *cells])
+    towns = ("same direction", "opposite direction", "training town, same", "training town, opposite")
+    return markdown(["", "trained", "untrained", "thumbnail", *towns], rows), ", ".join(near) or "none"
+
+
+def _labels(scores: Mapping[str, Scores]) -> str:
+    """What labels are worth."""
+    rows = [
+        [
+            f"`{name.split(',')[0].split('/')[0]}`",
+            kind,
+            number(images_of(scores[name])),
+            *(text(mean(scores[name], column)) for column in LABELLED),
+        ]
+        for name, kind in LABELS.items()
+        if name in scores
+    ]
+    return markdown(["", "labels", "images seen", *(column.title for column in LABELLED)], rows)
+
+
+def _published_orders(scores: Mapping[str, Scores]) -> tuple[str, int]:
+    """Published orders of two methods that are reversed here, and the number of pairs that differ."""
+    published = {row.method: row for row in TABLE_1.rows}
+    known = [(name, published[title]) for name, title in PUBLISHED_NAMES.items() if name in scores]
+    pairs, rows = 0, []
+    for (name, row), (other, against) in itertools.permutations(known, 2):
+        score = "pairs" if row.f1max_protocol == "pairs-f1max" else "top1"
+        here, there = mean(scores[name], TOWN, score), mean(scores[other], TOWN, score)
+        if row.f1max_protocol != against.f1max_protocol or here is None or there is None:
+            continue
+        if row.mean >= against.mean + REVERSED:
+            pairs += 1
+            if here <= there - REVERSED:
+                rows.append([f"{row.method}, {against.method}", both(row.mean, against.mean), both(here, there)])
+    return markdown(["", "published", "here"], rows), pairs

@@ -1,29 +1,53 @@
-"""Trains the networks of other publications on the same recordings for the same time, each on one core.
+"""Trainings on the same recordings for the same time: networks of other publications, and presets of `bin/train`.
 
-    python -m benchmarks.learned.train --data build/learned --out build/learned/runs
-    python -m benchmarks.learned.train --methods bevplace++ disco    # beside others on the second core
-
-The recordings are those of `data`. An interrupted training is continued, a finished one is left alone.
+Without --learning-rate, the rate is the best of three short trainings, scored on the held-out town. Weights are kept
+after 1,000, 2,000, 4,000, ... images, an interrupted training is continued, and a finished one is left alone.
 """
 
+import dataclasses
+import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import jax
+import numpy as np
 import tyro
 
-from benchmarks.learned.data import HELD_OUT, TRAIN, folders
+import sglpr_jax
+from benchmarks.learned.data import HELD_OUT, TRAIN, TRAIN_IMAGES, folders, recordings_of
 from sglpr_jax.cli.peers import RATES
+from sglpr_jax.cli.runtime import stop_on_signal
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import write_json
 from sglpr_jax.methods.names import LEARNED_NAMES
+from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.learned.rate_search import RATES_FILE
+from sglpr_jax.training.learned.run import FIRST_SNAPSHOT
+from sglpr_jax.training.learned.run_files import SCORES_FILE
+from sglpr_jax.training.learned.score import recall_at_1
+from sglpr_jax.training.loop import METRICS_FILE
+from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.recipe import WEIGHTS
 
 ONE_CORE = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
+RATE_FACTORS = (1 / 3, 1.0, 3.0)
+"""Learning rates of the search, as multiples of the preset's."""
+OPPOSITE = "08"
+"""Name of the recordings whose revisits are in the opposite direction, that is rotated by half a turn."""
+ENDLESS = 10**9
+SPEED = "steps_per_second"
+UPRIGHT = "upright"
+"""Folder of the first stage, in that of the run."""
 
 
-def main(
+def train(
     *,
     data: Path = Path("build/learned"),
     out: Path = Path("build/learned/runs"),
@@ -34,7 +58,7 @@ def main(
     search_seconds: float = 300.0,
     learning_rate: float | None = None,
 ) -> None:
-    """Train every method with every seed, one after the other.
+    """Train every method with every seed, one after the other. Interrupted trainings are continued.
 
     Args:
         data: folder of the recordings.
@@ -50,11 +74,11 @@ def main(
         for seed in seeds:
             run, first = out / f"{method}-{seed}", out / f"{method}-{seeds[0]}"
             limits = {"seed": seed, "seconds": seconds, "images": images, "search-seconds": search_seconds}
-            rate = learning_rate or (None if run == first else _best_rate(first))
-            _train(method, data, run, limits | ({} if rate is None else {"learning-rate": rate}))
+            rate = learning_rate or (None if run == first else _rate_of(first))
+            _train_method(method, data, run, limits | ({} if rate is None else {"learning-rate": rate}))
 
 
-def _train(method: str, data: Path, run: Path, flags: Mapping[str, float]) -> None:
+def _train_method(method: str, data: Path, run: Path, flags: Mapping[str, float]) -> None:
     """Train one method, or continue its run."""
     (held_out,) = folders(data, HELD_OUT)
     command = ["train", method, *folders(data, TRAIN), "--out", run, "--held-out", held_out, "--cache", data / "cache"]
@@ -65,10 +89,176 @@ def _train(method: str, data: Path, run: Path, flags: Mapping[str, float]) -> No
     subprocess.run(program, check=True, env={**os.environ, **ONE_CORE})
 
 
-def _best_rate(run: Path) -> float:
+def _rate_of(run: Path) -> float:
     """Return the learning rate that the search of a run found."""
     return json.loads((run / RATES / RATES_FILE).read_text())["best"]
 
 
-if __name__ == "__main__":
-    tyro.cli(main)
+def stages(folder: Path) -> Iterator[Path]:
+    """Yield the metrics of a run's stages, in their order."""
+    yield from (path for path in (folder / UPRIGHT / METRICS_FILE, folder / METRICS_FILE) if path.is_file())
+
+
+class Clock(Callback):
+    """Training time of a run, added up over its stages, without scores and compilation.
+
+    The first lines after each start state no speed; their steps count with the mean speed.
+    """
+
+    def __init__(self, folder: Path, *, limit_s: float):
+        """Continue the time of the stages in the folder of a run."""
+        self._limit_s = limit_s
+        self._timed_s, self._timed, self._steps, self._last = 0.0, 0, 0, 0
+        for path in stages(folder):
+            self._last = 0
+            for line in read_metrics(path):
+                self.on_step(int(line["step"]), line)
+
+    @property
+    def seconds(self) -> float:
+        """Training time in seconds."""
+        return self._timed_s * self._steps / max(self._timed, 1)
+
+    @property
+    def over(self) -> bool:
+        """Whether the limit is reached."""
+        return self.seconds >= self._limit_s
+
+    def on_start(self, step: int, steps: int) -> None:
+        self._last = step
+
+    def on_step(self, step: int, values: Mapping[str, float]) -> None:
+        made, self._last = step - self._last, step
+        self._steps += made
+        if SPEED in values:
+            self._timed, self._timed_s = self._timed + made, self._timed_s + made / values[SPEED]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of a run."""
+
+    preset: str = "sglpr"
+    """Name of a file in configs/, or path of your own file."""
+    seed: int = 0
+    data: Path = Path("build/learned")
+    """Folder of the recordings of `data`."""
+    out: Path = Path("build/learned/runs")
+    """Folder of the runs, PRESET-SEED."""
+    seconds: float = 3600.0
+    """Training time, without scores and compilation."""
+    images: int = 0
+    """Number of images after which the run stops, if its time is not over before; 0: no limit."""
+    upright_images: int = 0
+    """Number of images, out of all, of a first stage without rotations, on recordings with revisits in the same
+    direction."""
+    search_seconds: float = 300.0
+    """Training time of each of the three learning rates."""
+    learning_rate: float | None = None
+    """Learning rate. None: the best of the search."""
+    labels: bool = True
+    """Train the semantic branch."""
+    compile_cache: Path = Path("build/learned/compiled")
+    """Folder of compiled programs, which all stages share."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the run."""
+        return self.out / f"{Path(self.preset).stem}{'' if self.labels else '-no-labels'}-{self.seed}"
+
+
+def train_preset(settings: tyro.conf.OmitArgPrefixes[Settings]) -> None:
+    """Train, or continue a run."""
+    jax.config.update("jax_compilation_cache_dir", str(settings.compile_cache.absolute()))
+    recordings = [one for folder in folders(settings.data, TRAIN_IMAGES) for one in recordings_of(folder)]
+    held_out = [one for folder in folders(settings.data, HELD_OUT) for one in recordings_of(folder)]
+    rate = settings.learning_rate or _best_rate(settings, recordings, held_out)
+    _train(_config(settings, rate), recordings, settings.folder, settings, held_out)
+
+
+def _config(settings: Settings, rate: float) -> TrainConfig:
+    """Return the preset with the settings of this comparison."""
+    config = sglpr_jax.preset(settings.preset)
+    optimizer = dataclasses.replace(config.optimizer, learning_rate=rate)
+    changes = {"optimizer": optimizer, "seed": settings.seed, "score_every": ENDLESS}
+    config = dataclasses.replace(config, **changes)
+    if not settings.labels:
+        config = dataclasses.replace(config, model=dataclasses.replace(config.model, categories=0))
+    return without_untrained_head(config)
+
+
+def _best_rate(settings: Settings, recordings: list[Recording], held_out: list[Recording]) -> float:
+    """Return the learning rate of the highest Recall@1 on the held-out town. Finished trainings are not repeated."""
+    folder, scores = settings.folder / RATES, {}
+    preset = sglpr_jax.preset(settings.preset).optimizer.learning_rate
+    for factor in RATE_FACTORS:
+        rate = preset * factor
+        short = dataclasses.replace(settings, seconds=settings.search_seconds)
+        _train(_config(short, rate), recordings, folder / f"rate-{rate:g}", short, held_out)
+        scores[rate] = _scores(folder / f"rate-{rate:g}")[-1]["recall_at_1"]
+    best = max(scores, key=lambda rate: scores[rate])
+    recalls = {f"{rate:g}": found for rate, found in scores.items()}
+    write_json(folder / RATES_FILE, {"seconds": settings.search_seconds, "recall_at_1": recalls, "best": best})
+    return best
+
+
+def _train(
+    config: TrainConfig, recordings: list[Recording], folder: Path, settings: Settings, held_out: list[Recording]
+) -> None:
+    """Train in stages that end where a snapshot is due, until the time or the number of images is reached."""
+    per_step = config.tuples * (1 + config.sampling.positives + config.sampling.negatives)
+    for images in _ends(settings):
+        if any(line["images"] > images - per_step for line in _scores(folder)):
+            continue  # the weights of this end, or later ones, are kept already
+        upright = images <= settings.upright_images
+        run = folder / UPRIGHT if upright else folder
+        done = 0 if upright else settings.upright_images
+        staged = dataclasses.replace(config, steps=(images - done) // per_step, rotate=not upright)
+        clock = Clock(folder, limit_s=settings.seconds)
+        if clock.over:
+            return
+        start_from = folder / UPRIGHT / WEIGHTS if done else None
+        stage = [one for one in recordings if not upright or one.name != OPPOSITE]
+        with stop_on_signal() as stopped:
+            options = {"resume": (run / "config.json").is_file(), "weights": start_from, "callback": clock}
+            result = sglpr_jax.train(staged, stage, out=run, stopped=_any(stopped, clock), **options)
+        seen = done + result.steps * per_step
+        print(f"{run}: {seen} images, {clock.seconds:.0f} s", file=sys.stderr, flush=True)
+        if stopped():
+            sys.exit(stopped.exit_status)
+        _keep(folder, result.params, seen, clock.seconds, held_out)
+
+
+def _any(stopped: Callable[[], bool], clock: Clock) -> Callable[[], bool]:
+    return lambda: stopped() or clock.over
+
+
+def _ends(settings: Settings) -> Iterator[int]:
+    """Yield the numbers of images at which a stage ends."""
+    limit = settings.images or ENDLESS
+    doubled = itertools.takewhile(lambda n: n < limit, (FIRST_SNAPSHOT * 2**k for k in itertools.count()))
+    yield from sorted({*doubled, limit, settings.upright_images} - {0})
+
+
+def _keep(folder: Path, params: sglpr_jax.Params, images: int, seconds: float, held_out: list[Recording]) -> None:
+    """Keep the weights of a snapshot and its score on the held-out town, unless that was done."""
+    if any(line["images"] == images for line in _scores(folder)):
+        return
+    shutil.rmtree(folder / f"weights-{images}", ignore_errors=True)
+    sglpr_jax.save(params, folder / f"weights-{images}")
+    recall = float(np.mean([_recall(params, recording) for recording in held_out]))
+    line = {"images": images, "seconds": round(seconds, 1), "recall_at_1": recall}
+    with (folder / SCORES_FILE).open("a") as file:
+        print(json.dumps(line), file=file)
+    print(f"{folder}: {line}", file=sys.stderr, flush=True)
+
+
+def _recall(params: sglpr_jax.Params, recording: Recording) -> float:
+    file = sglpr_jax.embed(params, recording)
+    assert file.positions is not None
+    return recall_at_1(file.descriptors, file.positions, file.times, distance_function(file.distance))
+
+
+def _scores(folder: Path) -> list[dict[str, float]]:
+    path = folder / SCORES_FILE
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []

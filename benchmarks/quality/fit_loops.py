@@ -1,7 +1,7 @@
-"""Fit the model of loops that ships with the package: how probable it is that two scans show one place.
+"""Fits the model of loops that ships with the package: how probable it is that two scans show one place.
 
-    python -m benchmarks.quality.repeating_scans --seeds 1 --out build/fit
-    python -m benchmarks.quality.fit_loops build/fit
+    python -m benchmarks repeating render --seeds 1 --out build/fit
+    python -m benchmarks repeating fit build/fit
 
 Every drive is searched by the loop detector's finder without odometry, once as it is and once with a break of the
 motion in its middle, and every third drive with odometry that drifts. A pair is a loop if its pose is right within
@@ -12,11 +12,8 @@ the expected calibration error. With `--without-each`, the same follows for mode
 """
 
 import dataclasses
-import functools
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,13 +25,16 @@ from rich.table import Table
 from scipy.special import expit
 
 import sglpr_jax
-from benchmarks.quality.drives import STOREY_M, Odometry, compared, finder_of, pose_errors, read
+from benchmarks.drives import Odometry
+from benchmarks.quality.repeating import compared, finder_of, read
+from benchmarks.quality.scoring import STOREY_M, pose_errors
 from sglpr_jax.files import write_json
 from sglpr_jax.loops.calibration import calibration_error, reliability
 from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.consistency import agree_along
 from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.sequence import neighbour_weights
+from sglpr_jax.models.params import Params
 from sglpr_jax.se3 import transform
 
 PAIRS = 300.0
@@ -64,28 +64,26 @@ class Pairs(NamedTuple):
         return self.neighbours @ model.strength(self.evidence)
 
 
-def main(
+def fit_model(
     drives: tyro.conf.Positional[Path],
     *,
     weights: str = "sglpr",
-    workers: int = 1,
     without_each: bool = False,
     out: Path = DEFAULT,
 ) -> None:
     """Fit and write the model.
 
     Args:
-        drives: folder of `repeating_scans.py`.
+        drives: folder of `repeating render`.
         weights: the model that describes the scans.
-        workers: number of processes.
         without_each: also judge models without each term.
         out: the file to write.
     """
     files = sorted(drives.glob("*.npz"))
-    works = [(path, "none", False) for path in files] + [(path, "none", True) for path in files]
+    works: list[tuple[Path, Odometry, bool]] = [(path, "none", broken) for broken in (False, True) for path in files]
     works += [(path, "drifting", False) for path in files[::DRIFTING]]
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        found = list(pool.map(functools.partial(pairs, weights=weights), *zip(*works, strict=True)))
+    params = sglpr_jax.load(weights)
+    found = [_pairs(*work, params) for work in works]
     sceneries = [path.stem.split("-")[0] for path, _, _ in works]
     kinds = ["-".join([*path.stem.split("-")[:2], odometry]) for path, odometry, _ in works]
     table = Table("scenery", "right", f">= {SURE}", ">= 0.5", "wrong", f">= {SURE}", ">= 0.5", "ECE")
@@ -165,11 +163,10 @@ def fitted(found: Sequence[Pairs], kinds: Sequence[str], *, without: str | None 
     return dataclasses.replace(model, tested=fit(tested, is_loop, weights=weights))
 
 
-def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pairs:
+def _pairs(path: Path, odometry: Odometry, breaks: bool, params: Params) -> Pairs:
     """The candidates of one drive that the motion allows. With `breaks`, the motion is unknown in the middle."""
-    drive, params = read(path), sglpr_jax.load(weights)
-    finder = finder_of(params)
-    frames = compared(drive, params, path.parent / "compared", odometry=odometry, breaks=breaks)
+    drive, finder = read(path), finder_of(params)
+    frames = compared(path, drive, params, odometry=odometry, breaks=breaks)
     poses, found = drive.odometry(odometry), []
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if poses is None else poses[i]
@@ -185,7 +182,3 @@ def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pair
     neighbours = neighbour_weights(way_m, np.arange(len(found))) * np.where(agreeing, 1.0, -1.0)
     wrong = errors.wrong if odometry != "none" else errors.wrong & (errors.storey_m <= STOREY_M)
     return Pairs(Evidence(*evidence.T), neighbours, errors.right, errors.right | wrong)
-
-
-if __name__ == "__main__":
-    tyro.cli(main)

@@ -1,14 +1,4 @@
-"""Say which evidence is missing where places repeat: how well the right place of each revisit fits, and a lookalike.
-
-    python -m benchmarks.quality.repeating_scans --seeds 13 --out build/test
-    python -m benchmarks.quality.missing_evidence build/test
-    python -m benchmarks.quality.missing_evidence build/test --sceneries tunnel walls --out build/missing.png
-
-For each scenery the table has the revisits, the share of them that was compared with the right place, the share for
-which this place fits best, the best wrong fit over the right one (median), and the stated uncertainty of the position
-along the least certain direction. The picture shows a typical revisit of each scenery over its right place and over the
-best lookalike: cells of both are white, those of the query alone are cyan and those of the place red.
-"""
+"""Evidence that is missing where places repeat: how well the right place of each revisit fits, and a lookalike."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -24,8 +14,8 @@ from rich.progress import track
 from rich.table import Table
 
 import sglpr_jax
-from benchmarks.quality.drives import RenderedDrive, compared, pose_errors, read
-from benchmarks.quality.repeating import REVISIT_M, WAY_M, revisits
+from benchmarks.quality.repeating import RenderedDrive, chosen, compared, read
+from benchmarks.quality.scoring import WAY_M, pose_errors
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.overlay import overlaid
 from sglpr_jax.loops.comparison import Fits
@@ -72,7 +62,7 @@ class Revisit(NamedTuple):
         return overlaid(self.image(self.query), self.image(int(self.fits.frames[row])), pose)
 
 
-def main(
+def evidence(
     drives: tyro.conf.Positional[Path],
     *,
     sceneries: tuple[str, ...] = (),
@@ -80,24 +70,27 @@ def main(
     out: Path | None = None,
     weights: str = "sglpr",
 ) -> None:
-    """Print the table, and draw the picture.
+    """Compare revisits of rendered drives with their right place and with the best lookalike.
+
+    For each scenery the table has the revisits, the share of them that was compared with the right place, the share for
+    which this place fits best, the best wrong fit over the right one (median), and the stated uncertainty of the
+    position along the least certain direction. The picture shows a typical revisit of each scenery over its right place
+    and over the best lookalike: cells of both are white, those of the query are cyan and those of the place red.
 
     Args:
-        drives: folder of `repeating_scans.py`.
+        drives: folder of `repeating render`.
         sceneries: those to show; without them all.
         sensor: that of the drives.
         out: picture to write; its suffix is the format (extra viz).
         weights: the model that described the scans.
     """
     params, found, counts = sglpr_jax.load(weights), dict[str, list[Revisit]](), Counter[str]()
-    for path in track(sorted(drives.glob(f"*-{sensor}-*.npz")), description="compare"):
+    for path in track(list(chosen(drives, sceneries, (sensor,))), description="compare"):
         drive = read(path)
-        scenery = drive.about["scenery"]
-        if not sceneries or scenery in sceneries:
-            frames = [one.fits for one in compared(drive, params, drives / "compared")]
-            count, some = _revisits(drive, frames)
-            counts[scenery] += count
-            found.setdefault(scenery, []).extend(some)
+        scenery, frames = drive.about["scenery"], [one.fits for one in compared(path, drive, params)]
+        count, some = _revisits(drive, frames)
+        counts[scenery] += count
+        found.setdefault(scenery, []).extend(some)
     table = Table("scenery", "revisits", "compared", "fits best", "lookalike", "along (m)")
     shown = {}
     for scenery, some in found.items():
@@ -119,7 +112,7 @@ def _revisits(drive: RenderedDrive, frames: Sequence[Fits]) -> tuple[int, list[R
     """Number of revisits of a drive, and those that were compared with their right place."""
     poses, found = drive.world_from_lidar, []
     way_m = travelled(poses)
-    queries = np.flatnonzero(revisits(poses[:, :3, 3], REVISIT_M * drive.scale, WAY_M * drive.scale)).tolist()
+    queries = np.flatnonzero(drive.revisits).tolist()
     for query in queries:
         fits = frames[query]
         peaks = zip(fits.peaks.x, fits.peaks.y, fits.peaks.yaw, strict=True)
@@ -148,7 +141,3 @@ def _draw(shown: dict[str, Revisit], out: Path) -> None:
                 axis.imshow(one.overlay(row), interpolation="nearest")
                 axis.set_title(f"{scenery}, {name} {float(one.fits.peaks.correlation[row]):.2f}", fontsize=8)
     figures.save(figure, out)
-
-
-if __name__ == "__main__":
-    tyro.cli(main)

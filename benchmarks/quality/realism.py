@@ -1,51 +1,60 @@
-"""Real and simulated scans side by side: the same measures of both, as a table and as pictures."""
+"""Real scans beside simulated ones: their histograms, and what weights of the simulator know of real semantics."""
 
-import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
-import tyro
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
 
-from benchmarks.quality.range_images import range_image_paths, read_range_image
-from benchmarks.quality.scan_statistics import (
-    HISTOGRAMS,
-    NUMBERS,
-    Measures,
-    image_measures,
-    scan_measures,
-    total_variation,
-)
-from sglpr_jax.data.density_grid import MAX_COUNT
-from sglpr_jax.data.density_image import density_image
+import sglpr_jax
+from sglpr_jax.bev import rasterize, rasterize_labels
+from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
+from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.evaluation.figures import save
-from sglpr_jax.labels import to_classes
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.evaluation.figures import save, segmentation_panel
+from sglpr_jax.evaluation.segmentation import confusion_matrix, score_confusion
+from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_classes, to_raw
+from sglpr_jax.models.config import model_preset
+from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.semantic_maps import semantic_map
 
-PICTURES_PER_ROW = 8
+GRID = model_preset("sglpr").grid
+
+Measures = Mapping[str, np.ndarray]
+
+_RANGES = (0, 3, 5, 7.5, 10, 15, 20, 30, 40, 60, 80)
+_HEIGHTS = (-np.inf, -2.4, -2, -1.8, -1.6, -1.4, -1.2, -0.8, -0.4, 0, 0.5, 1, 1.5, 2, 3, np.inf)
+_COUNTS = (1, 2, 3, 5, 9, 17, 33, 65, np.inf)
+_DISTANCES = (0, 5, 7.5, 10, 12.5, 15, 17.5, 20, 25, 36)
+_LATERALS = (0, *np.arange(1.8, 20, 2), 25.4)  # five rows of pixels each, but for the first and the last
+_BINS = {
+    "range": ("points by range, m", _RANGES),
+    "height": ("points by height over the sensor, m", _HEIGHTS),
+    "count": ("occupied cells by points in them", _COUNTS),
+    "image_density": ("density image: pixels above 0 by value, tenths", np.arange(0.5, 11)),
+    "image_distance": ("density image: pixels above 0 by distance, m", _DISTANCES),
+    "image_lateral": ("density image: pixels above 0 by distance to the side, m", _LATERALS),
+}
 
 
-@dataclasses.dataclass(frozen=True)
-class Source:
-    """The measures of some scans of one drive, and the density image of one of them."""
-
-    name: str
-    measures: Sequence[Measures]
-    image: np.ndarray
-
-    @property
-    def is_real(self) -> bool:
-        return self.name.startswith("real")
-
-    def mean(self, measure: str) -> np.ndarray | None:
-        """The mean over the scans, or None where this was not measured."""
-        found = [measures[measure] for measures in self.measures if measure in measures]
-        return np.mean(found, axis=0) if found else None
+def _bin_names(edges: Sequence[float]) -> tuple[str, ...]:
+    return tuple(f"{low:g} to {high:g}" for low, high in itertools.pairwise(edges))
 
 
-def main(
+HISTOGRAMS = {name: (title, _bin_names(edges)) for name, (title, edges) in _BINS.items()} | {
+    "class_of_points": ("points by class", CATEGORIES),
+    "class_of_cells": ("occupied cells by class", CATEGORIES),
+    "class_of_pixels": ("density image's window: cells by class", CATEGORIES),
+}
+"""Title and names of the bins of every histogram. A bin holds its lower edge and not its upper one."""
+
+
+def compare(
     *,
     out: Path,
     real: tuple[Path, ...] = (),
@@ -53,142 +62,212 @@ def main(
     simulated: tuple[Path, ...] = (),
     scans: int = 30,
 ) -> None:
-    """Measure real and simulated drives; write table.md, histograms.png and images.png.
-
-    `images.png` shows real scans, which KITTI's licence keeps from being passed on; the other two are numbers only.
+    """Measure real and simulated drives; print how far their histograms are apart, and write histograms.png.
 
     Args:
-        out: folder of the results.
+        out: folder of the picture.
         real: datasets of real scans, or of density images in BEVPlace's layout.
         real_range: folder of labelled range images, NN_FFFFFF.npz with `points` and `label` (learning classes).
         simulated: datasets that bin/simulate made.
         scans: the most scans of a drive that are measured, evenly spread over it.
     """
-    sources = [source for root in real for source in measure_dataset("real", root, scans)]
-    sources += measure_range_images(real_range) if real_range else []
-    sources += [source for root in simulated for source in measure_dataset("simulated", root, scans)]
+    sources = dict(one for root in real for one in _measured("real", root, scans))
+    sources |= dict(_measured_range_images(real_range)) if real_range else {}
+    sources |= dict(one for root in simulated for one in _measured("simulated", root, scans))
     if not sources:
         raise SystemExit("nothing to measure: name datasets with --real, --real-range or --simulated")
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "table.md").write_text(f"{numbers_table(sources)}\n{distances_table(sources)}\n{histogram_table(sources)}")
-    save(draw_histograms(sources), out / "histograms.png")
-    save(draw_images(sources), out / "images.png")
-    print(f"{numbers_table(sources)}\n{distances_table(sources)}\n{out}: table.md, histograms.png, images.png")
+    table = Table("total variation from the real drives, %", *sources)
+    for measure, (title, _) in HISTOGRAMS.items():
+        table.add_row(title, *(_distance_from_real(name, measure, sources) for name in sources))
+    Console(width=200).print(table)
+    save(_draw(sources), out / "histograms.png")
+    print(out / "histograms.png")
 
 
-def measure_dataset(kind: str, root: Path, scans: int) -> Iterator[Source]:
-    """Yield one source for each drive of a dataset."""
+def _measured(kind: str, root: Path, scans: int) -> Iterator[tuple[str, Measures]]:
+    """Mean measures of each drive of a dataset."""
     for name in recording_names(root):
         drive = open_recording(root, name)
-        chosen = np.unique(np.linspace(0, len(drive) - 1, min(scans, len(drive))).astype(int))
+        rows = np.unique(np.linspace(0, len(drive) - 1, min(scans, len(drive))).astype(int)).tolist()
         what = "images" if drive.has_images else "scans"
-        measures = [_measures(drive, i) for i in chosen]
-        yield Source(f"{kind} {what} {name}", measures, _image(drive, chosen[len(chosen) // 2]))
+        yield f"{kind} {what} {name}", _mean([_measures(drive, row) for row in rows])
 
 
-def _measures(drive: Recording, i: int) -> Measures:
+def _measures(drive: Recording, row: int) -> Measures:
     if drive.has_images:
-        return image_measures(_image(drive, i))
-    labels = drive.labels(i)
-    return scan_measures(drive.points(i), None if labels is None else to_classes(labels))
+        return _image_measures(np.rint(drive.image(row) * (255 / MAX_COUNT)).astype(np.uint8))
+    labels = drive.labels(row)
+    return _scan_measures(drive.points(row), None if labels is None else to_classes(labels))
 
 
-def _image(drive: Recording, i: int) -> np.ndarray:
-    """The density image of one scan, in the orientation of eq. 1."""
-    if drive.has_images:
-        return np.rint(drive.image(i) * (255 / MAX_COUNT)).astype(np.uint8)
-    return np.rot90(density_image(drive.points(i)), -1)
+def _measured_range_images(folder: Path) -> Iterator[tuple[str, Measures]]:
+    """Mean measures of each drive of a folder of range images."""
+    for name, of_drive in itertools.groupby(_range_image_paths(folder), key=lambda path: path.stem[:2]):
+        yield f"real range images {name}", _mean([_scan_measures(*_read_range_image(path)) for path in of_drive])
 
 
-def measure_range_images(folder: Path) -> Iterator[Source]:
-    """Yield one source for each drive of a folder of range images."""
-    for name, of_drive in itertools.groupby(range_image_paths(folder), key=lambda path: path.stem[:2]):
-        scans = [read_range_image(path) for path in of_drive]
-        image = np.rot90(density_image(scans[0][0]), -1)
-        yield Source(f"real range images {name}", [scan_measures(*scan) for scan in scans], image)
+def _mean(each: Sequence[Measures]) -> Measures:
+    """Means over the scans; of classes over those with labels."""
+    names = dict.fromkeys(name for measures in each for name in measures)
+    return {name: np.mean([one[name] for one in each if name in one], axis=0) for name in names}
 
 
-def numbers_table(sources: Sequence[Source]) -> str:
-    """Mean over the scans, and the 10 % and 90 % quantiles."""
-    rows = [["scans", *(str(len(source.measures)) for source in sources)]]
-    for measure, title in NUMBERS.items():
-        values = ([m[measure] for m in source.measures if measure in m] for source in sources)
-        rows.append([title, *(_with_spread(found) if found else "" for found in values)])
-    return _markdown(["", *(source.name for source in sources)], rows)
-
-
-def distances_table(sources: Sequence[Source]) -> str:
-    """How far each source's histograms lie from the mean of the real drives (of the others, for a real one)."""
-    rows = [
-        [title, *(_distance_from_real(source, measure, sources) for source in sources)]
-        for measure, (title, _) in HISTOGRAMS.items()
+def _distance_from_real(name: str, measure: str, sources: Mapping[str, Measures]) -> str:
+    """How much of a histogram must move to make the mean of the real drives (of the others, for a real one)."""
+    others = [
+        one[measure] for other, one in sources.items() if other.startswith("real") and other != name if measure in one
     ]
-    return _markdown(["total variation from the real drives, %", *(source.name for source in sources)], rows)
+    if measure not in sources[name] or not others:
+        return ""
+    return f"{50 * np.abs(sources[name][measure] - np.mean(others, axis=0)).sum():.0f}"
 
 
-def _distance_from_real(source: Source, measure: str, sources: Sequence[Source]) -> str:
-    own = source.mean(measure)
-    others = [other.mean(measure) for other in sources if other.is_real and other is not source]
-    known = [mean for mean in others if mean is not None]
-    return f"{total_variation(own, np.mean(known, axis=0)):.0f}" if own is not None and known else ""
-
-
-def histogram_table(sources: Sequence[Source]) -> str:
-    """Every bin of every histogram, in percent."""
-    tables = []
-    for measure, (title, bins) in HISTOGRAMS.items():
-        means = [source.mean(measure) for source in sources]
-        rows = [
-            [name, *("" if mean is None else f"{100 * mean[i]:.2f}" for mean in means)] for i, name in enumerate(bins)
-        ]
-        tables.append(_markdown([f"{title}, %", *(source.name for source in sources)], rows))
-    return "\n".join(tables)
-
-
-def _with_spread(values: Sequence[np.ndarray]) -> str:
-    low, high = np.quantile(values, (0.1, 0.9))
-    return f"{np.mean(values):.4g} ({low:.4g} to {high:.4g})" if high < 1e4 else f"{np.mean(values):,.0f}"
-
-
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def draw_histograms(sources: Sequence[Source]):
+def _draw(sources: Mapping[str, Measures]) -> Figure:
     """One panel for each histogram: real drives in grey, simulated ones in colours."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(15, 12), layout="constrained")
-    real = [source.name for source in sources if source.is_real]
-    dashes = dict(zip(real, itertools.cycle(("-", "--", "-.", ":")), strict=False))
-    styles = {s.name: {"color": "0.4", "linestyle": dashes[s.name]} if s.is_real else {"linewidth": 2} for s in sources}
+    dashes = itertools.cycle(("-", "--", "-.", ":"))
+    styles = {
+        name: {"color": "0.4", "linestyle": next(dashes)} if name.startswith("real") else {"linewidth": 2}
+        for name in sources
+    }
     for axes, (measure, (title, bins)) in zip(figure.subplots(3, 3).flat, HISTOGRAMS.items(), strict=True):
-        for source in sources:
-            mean = source.mean(measure)
-            values = np.full(len(bins), np.nan) if mean is None else 100 * mean
-            axes.plot(values, marker="o", markersize=3, label=source.name, **styles[source.name])
+        for name, measures in sources.items():
+            values = 100 * measures.get(measure, np.full(len(bins), np.nan))
+            axes.plot(values, marker="o", markersize=3, label=name, **styles[name])
         axes.set_title(f"{title}, %", fontsize=10)
         axes.set_xticks(range(len(bins)), bins, rotation=60, ha="right", fontsize=7)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
-def draw_images(sources: Sequence[Source]):
-    """The density image of one scan of each drive: real ones above, simulated ones below."""
-    from matplotlib.figure import Figure
+def _scan_measures(points: np.ndarray, classes: np.ndarray | None) -> Measures:
+    """All measures of a scan (n, 3) in metres; those of classes only where it has them."""
+    padding = (0, (1 << len(points).bit_length()) - len(points))  # few sizes, so few compilations
+    padded, count = jnp.asarray(np.pad(points, (padding, (0, 0)))), jnp.asarray(len(points))
+    counts = np.asarray(rasterize(padded, grid=GRID, count=count))
+    measures = {
+        "range": _histogram("range", np.linalg.norm(points, axis=1)),
+        "height": _histogram("height", points[:, 2]),
+        "count": _histogram("count", counts[counts > 0]),
+        **_image_measures(np.rot90(density_image(points), -1)),
+    }
+    if classes is None:
+        return measures
+    cells = np.asarray(rasterize_labels(padded, jnp.asarray(np.pad(classes, padding)), grid=GRID, count=count))
+    return measures | {
+        "class_of_points": _share_of_classes(classes),
+        "class_of_cells": _share_of_classes(cells[counts > 0]),
+        "class_of_pixels": _share_of_classes(density_label_image(points, classes)),
+    }
 
-    rows = [[s for s in sources if s.is_real][:PICTURES_PER_ROW], [s for s in sources if not s.is_real]]
-    columns = max(len(row) for row in rows)
-    figure = Figure(figsize=(3 * columns, 6.5), layout="constrained")
-    for line, row in zip(figure.subplots(2, columns, squeeze=False), rows, strict=True):
-        for axes in line:
-            axes.axis("off")
-        for axes, source in zip(line, row[:columns], strict=False):
-            axes.imshow(source.image[13:138, 13:138], cmap="magma", vmin=0, vmax=255, interpolation="nearest")
-            axes.set_title(source.name, fontsize=9)
-    return figure
+
+def _image_measures(image: np.ndarray) -> Measures:
+    """The measures of a density image (151, 151) of grey values, in the orientation of eq. 1."""
+    half = image.shape[0] // 2
+    down, right = np.nonzero(image)
+    x, y = (right - half) * RESOLUTION_M, (half - down) * RESOLUTION_M
+    values = image[down, right]
+    return {
+        "image_density": _histogram("image_density", values / 25.5),
+        "image_distance": _histogram("image_distance", np.hypot(x, y)),
+        "image_lateral": _histogram("image_lateral", np.abs(y)),
+    }
 
 
-if __name__ == "__main__":
-    tyro.cli(main)
+def _histogram(name: str, values: np.ndarray) -> np.ndarray:
+    _, edges = _BINS[name]
+    counts = np.histogram(values, bins=edges)[0]
+    return counts / max(counts.sum(), 1)
+
+
+def _share_of_classes(classes: np.ndarray) -> np.ndarray:
+    """The shares of the classes; class 0, which is no class, has none."""
+    counts = np.bincount(classes.ravel(), minlength=len(CATEGORIES))
+    counts[0] = 0
+    return counts / max(counts.sum(), 1)
+
+
+def _range_image_paths(folder: Path) -> list[Path]:
+    """The files of a folder, in order; ends the program where there are none."""
+    paths = sorted(folder.glob("*.npz"))
+    if not paths:
+        raise SystemExit(f"{folder}: expected range images (*.npz), found none")
+    return paths
+
+
+def _read_range_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) in metres and the class of each (n,)."""
+    with np.load(path, allow_pickle=False) as file:
+        return np.ascontiguousarray(file["points"][:, :3]), file["label"].astype(np.int32)
+
+
+def semantics(
+    *,
+    weights: str,
+    out: Path,
+    prior: Path,
+    scans: tuple[Path, ...] = (),
+    range_images: Path | None = None,
+    prior_scans: int = 30,
+) -> None:
+    """Score semantics of real labelled scans: mean IoU beside that of the commonest class of each simulated cell.
+
+    Args:
+        weights: weights that were trained in the simulator.
+        out: folder of pictures of real scans, which KITTI's licence keeps private.
+        prior: simulated dataset from which each cell's commonest class is taken.
+        scans: datasets in KITTI's layout; their labelled scans are scored.
+        range_images: folder of labelled range images.
+        prior_scans: scans of each simulated recording that make the prior.
+    """
+    params = sglpr_jax.load(weights)
+    by_cell, classes = _commonest_by_cell(params, prior, prior_scans), params.config.classes
+    totals: dict[str, np.ndarray] = {}
+    for source, scan in _labelled_scans(scans, range_images):
+        found = semantic_map(params, scan)
+        if source not in totals:
+            resolution_m = params.config.grid.resolution_m
+            panel = segmentation_panel(found.counts, found.truth, found.predicted, resolution_m=resolution_m)
+            save(panel, out / f"{source.replace(' ', '-')}.png")
+        each = [
+            confusion_matrix(found.truth, one, counted=found.seen, classes=classes)
+            for one in (found.predicted, by_cell)
+        ]
+        totals[source] = totals.get(source, 0) + np.stack(each)
+    totals["all"] = np.sum(list(totals.values()), axis=0)
+    for source, matrices in totals.items():
+        ours, guess = map(score_confusion, matrices)
+        table = Table("class", "share of the cells", "IoU", "IoU of each cell's commonest class", title=source)
+        for i in np.flatnonzero(ours.shares).tolist():
+            table.add_row(CATEGORIES[i], f"{ours.shares[i]:.2%}", f"{ours.iou[i]:.3f}", f"{guess.iou[i]:.3f}")
+        table.add_row(f"mean of {ours.present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
+        table.add_row(f"{CATEGORIES[ours.majority]} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
+        Console(width=120).print(table)
+
+
+def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Iterator[tuple[str, Record]]:
+    """Source and record of every scan that has labels."""
+    for root in roots:
+        for name in recording_names(root):
+            recording = open_recording(root, name)
+            for row, labelled in enumerate(recording.labelled):
+                if labelled and not recording.has_images:
+                    yield f"scans of {name}", recording.record(row)
+    for path in _range_image_paths(range_images) if range_images else ():
+        points, classes = _read_range_image(path)
+        yield f"range images of {path.stem[:2]}", Record(points=points, labels=to_raw(classes))
+
+
+def _commonest_by_cell(params: Params, root: Path, scans: int) -> np.ndarray:
+    """The commonest class of each cell (h, w) over simulated scans; road where none ever saw a point."""
+    grid = params.config.grid
+    votes = np.zeros((grid.height, grid.width, params.config.classes), np.int64)
+    rows, columns = np.indices(votes.shape[:2])
+    for name in recording_names(root):
+        recording = open_recording(root, name)
+        for row in np.linspace(0, len(recording) - 1, scans).astype(int):
+            found = semantic_map(params, recording.record(row))
+            votes[rows, columns, found.truth] += 1
+    votes[..., UNLABELLED] = 0
+    votes[..., CATEGORIES.index("road")] += 1
+    return votes.argmax(-1)

@@ -1,25 +1,24 @@
-"""Find loops where places repeat: wrong loops, recall and reliability by scenery, without and with odometry.
+"""Drives where places repeat: rendered, read, compared and searched.
 
-    python -m benchmarks.quality.repeating_scans --seeds 13 14 --out build/test
-    python -m benchmarks.quality.repeating build/test
-    python -m benchmarks.quality.repeating build/test --odometry drifting --sensors vlp16
-    python -m benchmarks.quality.repeating build/test --odometry exact --sceneries rooms corridor car_park --optimized
+Each drive is a file SCENERY-REVISIT-SENSOR-SEED.npz with these arrays, n scans each:
 
-Reads the drives that `repeating_scans.py` has rendered. A loop is wrong if its pose is wrong (`drives.PoseErrors`).
-Revisits are scans within 3 m of one on the same storey from which at least 30 m were travelled. Odometry is the true
-poses, exact or with drift (`loops.drifted`). Results are kept beside the drives, in `found-ODOMETRY.jsonl`; with the
-same model and settings, a drive is searched once.
+    descriptors (n, 256) float32, images (n, h, w) uint8, world_from_lidar (n, 4, 4), times (n,)
+    scenery, sensor, revisit: names; seed
+    scale: factor for lengths of the images; poses are in real metres
+
+Comparisons of a scan with those that may show its place take most of the time of a search, and do not depend on the
+model of the probability. They are kept beside the drives, in `compared/`, for the same settings of the finder; delete
+the folder after a change of its code.
 """
 
 import dataclasses
-import functools
 import hashlib
+import itertools
 import json
+import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import tyro
@@ -28,146 +27,222 @@ from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from benchmarks.quality.drives import STOREY_M, Odometry, compared, pose_errors, read
+from benchmarks.drives import Case, Odometry, odometry_of, revisited
+from benchmarks.quality.scoring import REPEATING_M, STOREY_M, WAY_M, pose_errors
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.scaled import scaled, scaled_poses
+from sglpr_jax.files import replacing
 from sglpr_jax.loops.acceptance import accepted
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.checkpoint import columns, compared_of
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.pose_graph import optimize
-from sglpr_jax.pose_graph.optimize import trajectory_error
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.models.params import Params
+from sglpr_jax.se3 import travelled
+from sglpr_jax.sim.routes import REVISITS, Revisit
+from sglpr_jax.sim.sceneries import REPEATING
+from sglpr_jax.sim.scenery import SCENERIES
 
-REVISIT_M, WAY_M = 3.0, 30.0
+CARS, WALKERS = ("hdl64e", "vlp16"), ("os0-32+backpack", "os0-32-140+handheld")
+OF_SCENERY: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("hall", "yard"), WALKERS),
+    **dict.fromkeys(("campus", "warehouse"), (*CARS, "os0-32+cart")),
+    "forest": (*CARS, "os0-32+backpack"),
+    "storeys": ("hdl32e", "vlp16"),
+}
+"""Sensors of a scenery, if they are not `CARS`."""
 
 
-def main(
-    drives: tyro.conf.Positional[Path],
+def render(
     *,
-    odometry: Odometry = "none",
-    optimized: bool = False,
-    sceneries: tuple[str, ...] = (),
+    sceneries: tuple[str, ...] = (*REPEATING, *SCENERIES),
+    seeds: tuple[int, ...] = (1,),
     sensors: tuple[str, ...] = (),
-    seeds: tuple[int, ...] = (),
+    revisits: tuple[Revisit, ...] = REVISITS,
+    scans: int = 300,
+    azimuth_steps: int = 900,
+    scale: Scale = 1,
     weights: str = "sglpr",
-    workers: int = 1,
+    out: Path = Path("build/repeating"),
 ) -> None:
-    """Search the drives and print the tables.
+    """Render drives, and store what the loop detector keeps of each scan. Files that exist are skipped.
 
     Args:
-        drives: folder of `repeating_scans.py`.
-        odometry: what the detector is given.
-        optimized: correct the odometry by the loops, and print how far that moved it and its error before and after
-            (extra gtsam).
-        sceneries: those to search; without them all.
-        sensors: likewise.
-        seeds: likewise.
-        weights: the model that described the scans.
-        workers: number of processes.
+        sceneries: names of sceneries that repeat, and of towns.
+        seeds: one drive for each.
+        sensors: names in `drives.LIDARS`, with +CARRIER if it is not a vehicle. By default those of the scenery.
+        revisits: whether and how the vehicle returns.
+        scans: number of scans of each drive.
+        azimuth_steps: firings of the sensor per turn.
+        scale: factor for all lengths before a scan is described; another scale needs another folder.
+        weights: the model that describes the scans.
+        out: the folder.
     """
-    found = drives / f"found-{odometry}{'-optimized' * optimized}.jsonl"
-    settings = _settings(weights)
-    files = [path for path in sorted(drives.glob("*.npz")) if _chosen(path, sceneries, sensors, seeds)]
-    done = {row["drive"]: row for row in _rows(found) if row["settings"] == settings}
-    left = [path for path in files if path.stem not in done]
-    search = functools.partial(searched, odometry=odometry, optimized=optimized, weights=weights)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool, found.open("a") as lines:
-        for number, row in enumerate(pool.map(search, left), 1):
-            done[row["drive"]] = row | {"settings": settings}
-            lines.write(json.dumps(done[row["drive"]]) + "\n")
-            lines.flush()
-            print(f"{number}/{len(left)} {row['drive']}: {row['loops']} loops, {row['wrong']} wrong", flush=True)
-    report([done[path.stem] for path in files])
+    drives = [
+        Case(scenery, revisit, seed, sensor)
+        for seed, revisit, scenery in itertools.product(seeds, revisits, sceneries)
+        for sensor in sensors or OF_SCENERY.get(scenery, CARS)
+    ]
+    drives = [drive for drive in drives if not (out / _name(drive)).exists()]
+    params = sglpr_jax.load(weights)
+    for number, drive in enumerate(drives, 1):
+        line = _render(drive, params, scans=scans, azimuth_steps=azimuth_steps, scale=scale, out=out)
+        print(f"{number}/{len(drives)} {line}", flush=True)
 
 
-def _chosen(path: Path, sceneries: Sequence[str], sensors: Sequence[str], seeds: Sequence[int]) -> bool:
-    scenery, _, rest = path.stem.split("-", 2)
-    sensor, seed = rest.rsplit("-", 1)
-    wanted = ((scenery, sceneries), (sensor, sensors), (int(seed), seeds))
-    return all(not some or one in some for one, some in wanted)
+def _name(case: Case) -> str:
+    return f"{case.world}-{case.route}-{case.sensor}-{case.seed}.npz"
 
 
-def _settings(weights: str) -> str:
-    """Names the model of the probabilities and all settings of the detector."""
-    detector = LoopDetector(sglpr_jax.load(weights))
-    about = json.dumps([detector.model.to_json(), dataclasses.asdict(detector.config)])
+def _render(case: Case, params: Params, *, scans: int, azimuth_steps: int, scale: Scale, out: Path) -> str:
+    """Render a drive, write its file, and return a line about it."""
+    begin = time.perf_counter()
+    simulated = case.simulate(scans=scans, azimuth_steps=azimuth_steps)
+    recording, finder = scaled(simulated, scale), CandidateFinder(params)
+    seen = [finder.seen(recording.record(i, labels=False)) for i in range(len(recording))]
+    with replacing(out / _name(case)) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            descriptors=np.stack([one.descriptor for one in seen]),
+            images=np.stack([one.image for one in seen]),
+            world_from_lidar=simulated.poses.world_from_lidar,
+            times=simulated.poses.times,
+            scale=np.array(scale),
+            scenery=case.world,
+            revisit=case.route,
+            sensor=case.sensor,
+            seed=case.seed,
+        )
+    seconds, empty = time.perf_counter() - begin, np.mean([finder.is_empty(one.image) for one in seen])
+    return f"{_name(case)}: {len(seen)} scans in {seconds:.1f} s, {empty:.0%} nearly empty"
+
+
+class RenderedDrive(NamedTuple):
+    """A drive as its file holds it."""
+
+    seen: Sequence[Seen]
+    world_from_lidar: Float[np.ndarray, "n 4 4"]
+    times: Float[np.ndarray, " n"]
+    about: dict[str, str]
+    """Scenery, revisit, sensor and seed."""
+    scale: int = 1
+    """Factor that all lengths, also those of the poses, were multiplied by."""
+
+    def odometry(self, kind: Odometry) -> Float[np.ndarray, "n 4 4"] | None:
+        """The true poses, the same with drift, or None."""
+        real = odometry_of(kind, scaled_poses(self.world_from_lidar, 1 / self.scale), seed=int(self.about["seed"]))
+        return None if real is None else scaled_poses(real, self.scale)
+
+    @property
+    def revisits(self) -> Bool[np.ndarray, " n"]:
+        """Which scans come within 3 m of one from which at least 30 m were travelled."""
+        poses, scale = self.world_from_lidar, self.scale
+        return revisited(poses[:, :3, 3], travelled(poses), near_m=REPEATING_M * scale, apart=WAY_M * scale)
+
+
+def read(path: Path) -> RenderedDrive:
+    """Read a drive."""
+    with np.load(path) as file:
+        scale = int(file["scale"]) if "scale" in file else 1
+        about = {name: str(file[name]) for name in ("scenery", "revisit", "sensor", "seed")}
+        seen = [Seen(*each, None) for each in zip(file["descriptors"], file["images"], strict=True)]
+        return RenderedDrive(seen, scaled_poses(file["world_from_lidar"], scale), file["times"], about, scale)
+
+
+def chosen(folder: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> Iterator[Path]:
+    """Files of some sceneries and sensors; of all, if none is named."""
+    for path in sorted(folder.glob("*.npz")):
+        scenery, _, rest = path.stem.split("-", 2)
+        if (not sceneries or scenery in sceneries) and (not sensors or rest.rsplit("-", 1)[0] in sensors):
+            yield path
+
+
+def finder_of(params: Params) -> CandidateFinder:
+    """An empty finder with the settings of the loop detector. It needs no model of the probability."""
+    return CandidateFinder(params, keyframe_m=DetectorConfig.keyframe_m)
+
+
+def compared(
+    path: Path, drive: RenderedDrive, params: Params, *, odometry: Odometry = "none", breaks: bool = False
+) -> list[Compared]:
+    """Comparisons of each scan; read from the folder where they are kept.
+
+    With `breaks`, the motion is unknown in the middle of the drive.
+    """
+    finder = finder_of(params)
+    name = f"{path.stem}-{_settings(finder, odometry)}{'-broken' * breaks}.npz"
+    path = path.parent / "compared" / name
+    if path.exists():
+        with np.load(path) as file:
+            return compared_of(dict(file))
+    poses = drive.odometry(odometry)
+    found = []
+    for i, (seen, stamp) in enumerate(zip(drive.seen, drive.times.tolist(), strict=True)):
+        pose = None if poses is None else poses[i]
+        finder.add_seen(seen, time=stamp, odometry=pose, continues=not (breaks and i == len(drive.seen) // 2))
+        found.append(finder.compared)
+    kept = columns(found)
+    path.parent.mkdir(exist_ok=True, parents=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **kept)
+    return compared_of(kept)
+
+
+def _settings(finder: CandidateFinder, odometry: Odometry) -> str:
+    """Hash of all that decides the comparisons."""
+    parts = [finder.config, finder.verification, finder.motion_drift if odometry == "none" else finder.drift]
+    about = json.dumps([finder.index.weights_hash, odometry, *map(dataclasses.asdict, parts)])
     return hashlib.sha256(about.encode()).hexdigest()[:16]
 
 
-def _rows(path: Path) -> Iterator[dict[str, Any]]:
-    if path.exists():
-        yield from map(json.loads, path.read_text().splitlines())
+def search(
+    drives: tyro.conf.Positional[Path],
+    *,
+    odometry: Odometry = "none",
+    sceneries: tuple[str, ...] = (),
+    sensors: tuple[str, ...] = (),
+    weights: str = "sglpr",
+) -> None:
+    """Search rendered drives: wrong loops and recall by scenery, without or with odometry.
+
+    A loop is wrong if its pose is (`scoring.PoseErrors`). Revisits are scans within 3 m of one on the same storey from
+    which at least 30 m were travelled.
+
+    Args:
+        drives: folder of `render`.
+        odometry: poses that the detector is given.
+        sceneries: those to search; without them all.
+        sensors: likewise.
+        weights: the model that described the scans.
+    """
+    params, found = sglpr_jax.load(weights), dict[str, dict[str, list[np.ndarray]]]()
+    for path in chosen(drives, sceneries, sensors):
+        drive = read(path)
+        counts = _counts(path, drive, params, odometry)
+        found.setdefault(drive.about["revisit"], {}).setdefault(drive.about["scenery"], []).append(counts)
+        print(f"{path.stem}: {counts[1]} loops, {counts[2]} wrong", flush=True)
+    for revisit, of_sceneries in found.items():
+        table = Table("scenery", "scans", "loops", "wrong", "of these in the plane", "recall", title=revisit)
+        everything = [one for some in of_sceneries.values() for one in some]
+        for scenery, some in (*of_sceneries.items(), ("all", everything)):
+            *numbers, again, right = np.sum(some, axis=0).tolist()
+            table.add_row(scenery, *map(str, numbers), f"{right / again:.3f}" if again else "")
+        Console().print(table)
 
 
-def searched(path: Path, *, odometry: Odometry, optimized: bool, weights: str) -> dict[str, Any]:
-    """The loops of one drive, judged by the true poses."""
-    params, drive = sglpr_jax.load(weights), read(path)
-    poses, times = drive.world_from_lidar, drive.times
-    given = drive.odometry(odometry)
-    detector = LoopDetector(params)
-    frames = compared(drive, params, path.parent / "compared", odometry=odometry)
+def _counts(path: Path, drive: RenderedDrive, params: Params, odometry: Odometry) -> np.ndarray:
+    """Scans, loops, wrong ones, those of them in the plane, revisits, and revisits with a right loop."""
+    given, detector = drive.odometry(odometry), LoopDetector(params)
+    frames = compared(path, drive, params, odometry=odometry)
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if given is None else given[i]
-        detector.add_seen(seen, time=float(times[i]), odometry=pose, compared=frame)
+        detector.add_seen(seen, time=float(drive.times[i]), odometry=pose, compared=frame)
     drift = detector.finder.present_drift
     loops = detector.loops if given is None else accepted(detector.loops, given, drift=drift)[0]
-    revisited = revisits(poses[:, :3, 3], REVISIT_M * drive.scale, WAY_M * drive.scale)
-    errors = pose_errors(
-        [(one.query, one.match) for one in loops], np.array([one.match_from_query for one in loops]), poses
-    )
+    fits = np.array([one.match_from_query for one in loops])
+    errors = pose_errors([(one.query, one.match) for one in loops], fits, drive.world_from_lidar)
     right = {loop.query for loop, ok in zip(loops, errors.right, strict=True) if ok}
-    moved = _moved(given, loops, poses) if optimized and given is not None else {}
-    return {
-        "drive": path.stem,
-        **drive.about,
-        "scans": len(poses),
-        "loops": len(loops),
-        "wrong": int(errors.wrong.sum()),
-        "in_plane": int((errors.wrong & (errors.storey_m <= STOREY_M)).sum()),
-        "sure_of_wrong": _surest(loops, errors.wrong),
-        "revisits": int(revisited.sum()),
-        "found": int(sum(frame in right for frame in np.flatnonzero(revisited))),
-        **moved,
-    }
-
-
-def _moved(
-    odometry: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], poses: Float[np.ndarray, "n 4 4"]
-) -> dict[str, float]:
-    """How far the optimisation moves the odometry at most, and its RMS error before and after, in metres."""
-    corrected = optimize.optimized(odometry, tuple(loops))
-    before, after = (trajectory_error(each, poses[:, :3, 3]) for each in (odometry, corrected.poses))
-    return {"moved_m": corrected.moved_m, "before_m": before, "after_m": after}
-
-
-def _surest(loops: Sequence[Loop], wrong: Bool[np.ndarray, " n"]) -> float:
-    return max((loop.probability for loop, is_wrong in zip(loops, wrong, strict=True) if is_wrong), default=0.0)
-
-
-def revisits(positions: Float[np.ndarray, "n 3"], near_m: float, way_m: float) -> Bool[np.ndarray, " n"]:
-    """Which scans come near an earlier one after at least `way_m` metres of travelled distance."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
-    found = np.zeros(len(positions), bool)
-    for i, position in enumerate(positions):
-        old = positions[way <= way[i] - way_m]
-        found[i] = len(old) > 0 and np.linalg.norm(old - position, axis=1).min() < near_m
-    return found
-
-
-def report(rows: Sequence[dict[str, Any]]) -> None:
-    """Print a table by scenery for each kind of drive, and what it comes to."""
-    for revisit in dict.fromkeys(row["revisit"] for row in rows):
-        table = Table("scenery", "scans", "loops", "wrong", "of these in the plane", "recall", title=revisit)
-        chosen = [row for row in rows if row["revisit"] == revisit]
-        for scenery in (*dict.fromkeys(row["scenery"] for row in chosen), "all"):
-            some = [row for row in chosen if scenery in ("all", row["scenery"])]
-            total = {name: sum(row[name] for row in some) for name in some[0] if isinstance(some[0][name], int)}
-            recall = f"{total['found'] / total['revisits']:.3f}" if total["revisits"] else ""
-            counts = (total["scans"], total["loops"], total["wrong"], total["in_plane"], recall)
-            table.add_row(scenery, *map(str, counts))
-        Console().print(table)
-    for row in rows:
-        if "moved_m" in row:
-            moved = "moved by {moved_m:.2f} m, error {before_m:.2f} m before, {after_m:.2f} m after".format(**row)
-            print(f"{row['drive']}: {row['loops']} loops, {moved}")
-
-
-if __name__ == "__main__":
-    tyro.cli(main)
+    again, in_plane = drive.revisits, errors.wrong & (errors.storey_m <= STOREY_M)
+    found = sum(frame in right for frame in np.flatnonzero(again).tolist())
+    return np.array([len(drive.seen), len(loops), errors.wrong.sum(), in_plane.sum(), again.sum(), found])

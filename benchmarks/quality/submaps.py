@@ -1,32 +1,22 @@
-"""Recall@1 of single scans and of submaps: one street driven five times, in both directions and a lane aside.
-
-    python -m benchmarks.quality.submaps --sensors vlp16 hdl64e --seeds 601 602 --out build/submaps
-
-The first pass is the map. A query is a scan of another pass. It is right if the nearest descriptor of the map is within
-5 m. The odometry is 1 % too long and turns by one degree every 100 m, with noise. The scans are rendered once and kept
-in the folder `--out`; delete it after a change of the simulator.
-"""
+"""Single scans and submaps on a street that is driven five times, in both directions and a lane aside."""
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
-import tyro
 from jaxtyping import Float, Int
 from numpy.lib.format import open_memmap
 
 import sglpr_jax
-from benchmarks.quality.loops import drifted
+from benchmarks.drives import drifted, lidar
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.files import replacing
 from sglpr_jax.se3 import distances
 from sglpr_jax.sim.drive import PlanarPath, plan_path, timed
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
-from sglpr_jax.sim.sensor import SENSORS
 from sglpr_jax.sim.world import build_world
 
 PASSES = {"map": 0.0, "opposite": 2.4, "same": 0.4, "opposite, aside": 3.5, "same, aside": 3.5}
@@ -48,7 +38,7 @@ class Drive(NamedTuple):
     passes: Int[np.ndarray, " n"]
 
 
-def main(
+def recall(
     *,
     sensors: tuple[str, ...] = ("vlp16", "os1-64", "hdl64e"),
     seeds: tuple[int, ...] = (601, 602),
@@ -57,41 +47,38 @@ def main(
     spacing_m: float = 2.0,
     azimuth_steps: int = 900,
     weights: str = "sglpr",
-    render_only: bool = False,
     out: Path = Path("build/submaps"),
 ) -> None:
-    """Print the recall of each sensor and length.
+    """Measure Recall@1 of single scans and of submaps. Prints a row for each sensor and length.
+
+    The first pass is the map. A query is a scan of another pass. It is right if the nearest descriptor of the map is
+    within 5 m. The odometry is 1 % too long and turns by one degree every 100 m. The scans are rendered once and kept
+    in `out`; delete the folder after a change of the simulator.
 
     Args:
-        sensors: names of `sim.SENSORS`.
+        sensors: names of sensors.
         seeds: one town for each.
         lengths_m: lengths of the submaps; 0 is a single scan.
         metres: length of the street; a scan every metre.
         spacing_m: distance between the scored scans.
         azimuth_steps: firings of the sensor per turn, at most.
         weights: the model that describes the scans.
-        render_only: render the scans and score nothing.
         out: folder of the scans.
     """
-    if not render_only:
-        print(f"| sensor | submap m | {' | '.join(list(PASSES)[1:])} | ms a submap |\n|---|---|" + "---|" * len(PASSES))
+    print(f"| sensor | submap m | {' | '.join(list(PASSES)[1:])} |\n|---|---|" + "---|" * (len(PASSES) - 1))
     params = sglpr_jax.load(weights)
     for sensor in sensors:
         drives = [rendered(sensor, seed, metres, azimuth_steps, out) for seed in seeds]
-        for length_m in () if render_only else lengths_m:
-            print(row(sensor, drives, params, length_m, max(1, round(spacing_m))), flush=True)
+        for length_m in lengths_m:
+            print(_row(sensor, drives, params, length_m, max(1, round(spacing_m))), flush=True)
 
 
-def row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: float, every: int) -> str:
+def _row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: float, every: int) -> str:
     """One row of the table."""
-    described, seconds = [], 0.0
+    described = []
     for town, drive in enumerate(drives):
         recording = submaps_of_passes(drive, length_m, seed=town)
         rows = [i for i in scored(drive) if i % every == 0]
-        begin = time.perf_counter()
-        for i in rows[: len(rows) // 4]:
-            recording.points(i)
-        seconds += (time.perf_counter() - begin) / (len(rows) // 4) / len(drives)
         file = sglpr_jax.embed(params, only(recording, rows), on_bad_scan=lambda scan, error: None)
         descriptors = np.full((len(rows), file.descriptors.shape[1]), np.inf)  # of a scan that shows nothing
         descriptors[np.isin([recording.ids[i] for i in rows], file.ids)] = file.descriptors
@@ -105,7 +92,7 @@ def row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: fl
     right = (apart[np.arange(len(apart)), nearest] <= RIGHT_M) & seen
     answerable = apart.min(axis=1) <= RIGHT_M
     recalls = [right[answerable & (passes == number)].mean() for number in range(1, len(PASSES))]
-    return f"| {sensor} | {length_m:g} | {' | '.join(f'{value:.3f}' for value in recalls)} | {1e3 * seconds:.0f} |"
+    return f"| {sensor} | {length_m:g} | {' | '.join(f'{value:.3f}' for value in recalls)} |"
 
 
 def scored(drive: Drive) -> list[int]:
@@ -125,15 +112,14 @@ def submaps_of_passes(drive: Drive, length_m: float, *, seed: int) -> Recording:
 def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Path) -> Drive:
     """The drive with its scans in a file, which is written if it does not exist."""
     path = folder / f"{sensor}-{seed}-{metres}-{azimuth_steps}.npy"
-    recording, passes = drive(sensor, seed, metres, azimuth_steps)
+    recording, passes = _drive(sensor, seed, metres, azimuth_steps)
     ends_file = path.with_suffix(".ends.npy")
     if not ends_file.exists():
-        begin, clouds = time.perf_counter(), [recording.points(i) for i in range(len(recording))]
+        clouds = [recording.points(i) for i in range(len(recording))]
         folder.mkdir(parents=True, exist_ok=True)
         for target, values in ((path, np.concatenate(clouds)), (ends_file, np.cumsum([len(one) for one in clouds]))):
             with replacing(target) as temporary, temporary.open("wb") as file:
                 np.save(file, values)
-        print(f"<!-- {path.name}: {len(clouds)} scans in {time.perf_counter() - begin:.0f} s -->", flush=True)
     points, ends = open_memmap(path, mode="r"), np.load(ends_file)
     row_of = {name: i for i, name in enumerate(recording.paths)}
 
@@ -145,9 +131,9 @@ def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Pa
     return Drive(dataclasses.replace(recording, read=read, label_paths=()), poses, passes)
 
 
-def drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[SimulatedRecording, Int[np.ndarray, " n"]]:
+def _drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[SimulatedRecording, Int[np.ndarray, " n"]]:
     """The simulated drive, and the number of the pass of each scan."""
-    line, left = street(seed, metres)
+    line, left = _street(seed, metres)
     rng, paths, clock = np.random.default_rng((seed, 6)), [], 0.0
     for number, aside in enumerate(PASSES.values()):
         way = line + aside * left
@@ -158,9 +144,6 @@ def drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[Simu
     starts = np.cumsum([0, *(len(path.times) for path in paths[:-1])])
     every = [len(path.times) // metres for path in paths]
     rows = np.concatenate([start + np.arange(metres) * step for start, step in zip(starts, every, strict=True)])
-    lidar = SENSORS[sensor]
-    if lidar.azimuth_steps > azimuth_steps and lidar.pattern == "rings":
-        lidar = dataclasses.replace(lidar, azimuth_steps=azimuth_steps)
     recording = drive_through(
         build_world((seed, 7), whole.xy, whole.times),
         whole,
@@ -168,14 +151,14 @@ def drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[Simu
         name=f"{sensor}-{seed}",
         ids=tuple(f"{i:06d}" for i in range(len(rows))),
         times=whole.times[rows],
-        sensor=lidar,
+        sensor=lidar(sensor, azimuth_steps),
         key=jax.random.key(seed),
         rng=np.random.default_rng((seed, 8)),
     )
     return recording, np.repeat(np.arange(len(PASSES)), metres)
 
 
-def street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+def _street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """A line of points every half metre, and the unit vectors to its left."""
     xy = plan_path(np.random.default_rng((seed, 5)), ROUTE, scans=600, rate_hz=10.0).xy
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1).cumsum()])
@@ -184,7 +167,3 @@ def street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.n
     ahead = np.gradient(line, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return line, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-
-
-if __name__ == "__main__":
-    tyro.cli(main)

@@ -1,29 +1,89 @@
-"""One command of `writers`, disturbed: killed, run twice at once, without room or rights, its input changed."""
+"""Commands that write files, disturbed: killed, run twice at once, without room or rights, their input changed."""
 
 import contextlib
+import functools
 import os
 import random
 import shutil
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
 
 from benchmarks.robustness.writers import (
     ERRORS,
     INPUTS,
     OUT,
+    WRITERS,
     Process,
     Writer,
-    begin,
-    differing,
     ended,
-    left_behind,
-    missing,
+    make_inputs,
     said,
     written,
 )
+from benchmarks.timing import about
+from sglpr_jax.files import half_written
+
+Row = dict[str, Any]
+"""Titles of columns and their values."""
+
+
+def kills(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 20, seed: int = 0) -> None:
+    """Kill each command with signal 9 again and again; see what lies there, and how its next run ends.
+
+    Every second kill comes at any time of the run, the others within 5 ms of a change in its folder. Counts kills,
+    those in the middle of writing, files that are half there under their own names, next runs that fail, and other
+    bytes.
+
+    Args:
+        commands: names in `writers.WRITERS`.
+        times: how often each is killed.
+        seed: seed of the moments.
+    """
+    _run("killed", commands, functools.partial(_killed, times=times, seed=seed))
+
+
+def together(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 5) -> None:
+    """Start each command twice at once on one folder: both end well, or one is refused in one line.
+
+    Args:
+        commands: names in `writers.WRITERS`.
+        times: how often each is started twice.
+    """
+    _run("two at once", commands, functools.partial(_together, times=times))
+
+
+def disk(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 4, seed: int = 0) -> None:
+    """No room, no right to write, files that are read vanish or are half there: one line, and nothing half-written.
+
+    Args:
+        commands: names in `writers.WRITERS`.
+        times: how often each trouble is made.
+        seed: seed of sizes and moments.
+    """
+    _run("troubles", commands, functools.partial(_troubled, times=times, seed=seed))
+
+
+def _run(title: str, commands: Sequence[str], rows_of: Callable[[Writer, Path], Iterator[Row]]) -> None:
+    """Disturb commands. Prints a row as soon as it is known, and a table."""
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        make_inputs(Path(folder))
+        for name in commands:
+            for row in rows_of(WRITERS[name], Path(folder)):
+                rows.append({"command": name, **row})
+                print(rows[-1], flush=True)
+    table = Table(*rows[0], title=title)
+    for row in rows:
+        table.add_row(*(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row.values()))
+    Console(width=140).print(table)
+    print("\n".join(about().values()))
 
 
 class Whole(NamedTuple):
@@ -35,21 +95,21 @@ class Whole(NamedTuple):
     """How often something changed in its folder."""
 
 
-def undisturbed(writer: Writer, folder: Path) -> Whole:
+def _undisturbed(writer: Writer, folder: Path) -> Whole:
     """Run twice: the first run compiles, and the second has to end with the same bytes."""
     runs = []
     for _ in range(2):
         place, start = _fresh(folder, writer), time.perf_counter()
-        process = begin(writer, place)
-        changes = sum(1 for _ in changing(process, place))
+        process = writer.begin(place)
+        changes = sum(1 for _ in _changing(process, place))
         assert ended(process) == 0, f"{writer.name}: {said(place)}"
         runs.append(Whole(written(place), time.perf_counter() - start, changes))
-    unlike = differing(writer, runs[1].files, runs[0].files)
+    unlike = writer.differing(runs[1].files, runs[0].files)
     assert not unlike and runs[1].files, f"{writer.name}: two runs differ in {', '.join(unlike)}"
     return runs[1]
 
 
-def changing(process: Process, folder: Path) -> Iterator[None]:
+def _changing(process: Process, folder: Path) -> Iterator[None]:
     """Yield each time that something has changed in what a process writes, until it ends; looks 1000 times a second."""
     before: list[tuple[str, int]] = []
     while process.is_alive():
@@ -70,20 +130,15 @@ def _seen(folder: Path) -> list[tuple[str, int]]:
     return sorted(found)
 
 
-def killed(writer: Writer, folder: Path, *, kills: int, seed: int) -> tuple[Whole, dict[str, int]]:
-    """Kill it so often, each time in a fresh folder, and let it run again.
-
-    Every second kill comes at any time of the run, the others within 5 ms of any of the changes in its folder. Counts
-    kills, those in the middle of writing, files that are half there under their own names, next runs that fail, and
-    other bytes after them.
-    """
-    draw, whole = random.Random(f"{seed} {writer.name}"), undisturbed(writer, folder)
+def _killed(writer: Writer, folder: Path, *, times: int, seed: int) -> Iterator[Row]:
+    """Kill a command so often, each time in a fresh folder, and let it run again."""
+    draw, whole = random.Random(f"{seed} {writer.name}"), _undisturbed(writer, folder)
     counts = dict.fromkeys(("kills", "in the middle", "half-written", "next run fails", "other bytes"), 0)
-    for attempt in range(3 * kills):
-        if counts["kills"] == kills:
+    for attempt in range(3 * times):
+        if counts["kills"] == times:
             break
         place = _fresh(folder, writer)
-        process = begin(writer, place)
+        process = writer.begin(place)
         if attempt % 2:
             _wait_for_changes(process, place, draw.randint(1, whole.changes))
             time.sleep(draw.uniform(0, 5e-3))
@@ -94,73 +149,69 @@ def killed(writer: Writer, folder: Path, *, kills: int, seed: int) -> tuple[Whol
             continue  # it was faster
         found = written(place)
         counts["kills"] += 1
-        counts["in the middle"] += bool(left_behind(place)) or 0 < len(found) < len(whole.files)
-        counts["half-written"] += _told(writer, "is not whole", differing(writer, found, whole.files))
+        counts["in the middle"] += bool(half_written(place / OUT)) or 0 < len(found) < len(whole.files)
+        counts["half-written"] += _told(writer, "is not whole", writer.differing(found, whole.files))
         if not _finishes(writer, place):
             counts["next run fails"] += 1
         else:
-            counts["other bytes"] += _told(writer, "is another one after the next run", _unlike(writer, place, whole))
-    return whole, counts
+            counts["other bytes"] += _told(
+                writer, "is another one after the next run", writer.unlike(place, whole.files)
+            )
+    yield {"seconds": whole.seconds, "files": len(whole.files), **counts}
 
 
-def together(writer: Writer, folder: Path, *, times: int) -> dict[str, int]:
-    """Start it twice at once, so often. Counts how often both ended well, one was refused in one line, one or both
-    failed, and other bytes.
-    """
-    whole = undisturbed(writer, folder)
+def _together(writer: Writer, folder: Path, *, times: int) -> Iterator[Row]:
+    """Start a command twice at once, so often."""
+    whole = _undisturbed(writer, folder)
     counts = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
     for _ in range(times):
         place = _fresh(folder, writer)
         errors = (f"{ERRORS}-0", f"{ERRORS}-1")
-        processes = [begin(writer, place, errors=name) for name in errors]
+        processes = [writer.begin(place, errors=name) for name in errors]
         statuses = [ended(process) for process in processes]
         bad = [said(place, name) for name, status in zip(errors, statuses, strict=True) if status]
-        refused = len(bad) == 1 and is_one_line(bad[0])
+        refused = len(bad) == 1 and _is_one_line(bad[0])
         counts["both end well" if not bad else "one is refused" if refused else "fail"] += 1
         for error in bad:
             print(f"{writer.name}: one of two ended with: {error[-2000:]}", file=sys.stderr)
-        counts["other bytes"] += _told(writer, "is another one after two at once", _unlike(writer, place, whole))
-    return counts
+        counts["other bytes"] += _told(writer, "is another one after two at once", writer.unlike(place, whole.files))
+    yield dict(counts)
 
 
-def troubled(writer: Writer, folder: Path, *, times: int, seed: int) -> dict[str, dict[str, int]]:
-    """Let it run with each of `TROUBLES`, so often. Counts how often it was refused in one line, ended well, ended in
-    anything else, and files that are half there under their own names, or others than in a good run.
-    """
-    draw, whole, found = random.Random(f"{seed} {writer.name}"), undisturbed(writer, folder), {}
+def _troubled(writer: Writer, folder: Path, *, times: int, seed: int) -> Iterator[Row]:
+    """Let a command run with each of `TROUBLES`, so often."""
+    draw, whole = random.Random(f"{seed} {writer.name}"), _undisturbed(writer, folder)
     for name, trouble in TROUBLES.items():
-        counts = found[name] = dict.fromkeys(("refused in one line", "ends well", "anything else", "half-written"), 0)
+        counts = dict.fromkeys(("refused in one line", "ends well", "anything else", "half-written"), 0)
         for _ in range(times):
             place = _fresh(folder, writer)
             status = trouble(writer, place, whole, draw)
-            refused = status == 1 and is_one_line(said(place))
+            refused = status == 1 and _is_one_line(said(place))
             kind = "ends well" if status == 0 else "refused in one line" if refused else "anything else"
             if kind == "anything else":
                 print(f"{writer.name}, {name}: status {status}: {said(place)[-2000:]}", file=sys.stderr)
             counts[kind] += 1
-            unlike = differing(writer, written(place), whole.files)
+            unlike = writer.differing(written(place), whole.files)
             counts["half-written"] += _told(writer, f"is not whole: {name}", unlike)
-    return found
+        yield {"trouble": name, **counts}
 
 
-def is_one_line(error: str) -> bool:
-    """Whether a command ended as it should where something is wrong."""
-    return error.rstrip("\n").splitlines()[-1:] != [] and (
-        error.rstrip("\n").splitlines()[-1].startswith("error: ") and "Traceback" not in error
-    )
+def _is_one_line(error: str) -> bool:
+    """Whether a command ended as it should if something is wrong."""
+    return "Traceback" not in error and error.rstrip("\n").split("\n")[-1].startswith("error: ")
 
 
 def _full(writer: Writer, place: Path, whole: Whole, draw: random.Random) -> int:
     """No file may grow beyond a part of the largest one: to a program that is a full disk, and it takes no rights."""
     largest = max(len(content) for content in whole.files.values())
-    return ended(begin(writer, place, file_bytes=draw.randrange(largest)))
+    return ended(writer.begin(place, file_bytes=draw.randrange(largest)))
 
 
 def _read_only(writer: Writer, place: Path, whole: Whole, draw: random.Random) -> int:
     """Nobody may write into the folder."""
     (place / OUT).mkdir(parents=True)
     (place / OUT).chmod(0o555)
-    status = ended(begin(writer, place, humble=True))
+    status = ended(writer.begin(place, humble=True))
     (place / OUT).chmod(0o755)
     return status
 
@@ -189,8 +240,8 @@ def _meanwhile(writer: Writer, place: Path, whole: Whole, draw: random.Random, c
     shutil.copytree(inputs, before)
     try:
         scans = sorted((inputs / "town/sequences/08/velodyne").iterdir())
-        named = [place / word for word in writer.arguments if word.startswith(f"../{INPUTS}/")]
-        process = begin(writer, place)
+        named = [place / word for word in writer.line.split() if word.startswith(f"../{INPUTS}/")]
+        process = writer.begin(place)
         time.sleep(draw.uniform(0, whole.seconds))
         change(draw.choice([*scans[-len(named) :], *(one for one in named if one.is_file())]))
         return ended(process)
@@ -208,23 +259,18 @@ def _fresh(folder: Path, writer: Writer) -> Path:
 
 
 def _wait_for_changes(process: Process, place: Path, count: int) -> None:
-    for done, _ in enumerate(changing(process, place), 1):
+    for done, _ in enumerate(_changing(process, place), 1):
         if done == count:
             return
 
 
 def _finishes(writer: Writer, place: Path) -> bool:
     """Run to the end; whether that went well, or the work had been done before."""
-    status = ended(begin(writer, place))
+    status = ended(writer.begin(place))
     good = status == 0 or bool(writer.refuses and writer.refuses in said(place))
     if not good:
         print(f"{writer.name}: the next run ended with {status}: {said(place)[-2000:]}", file=sys.stderr)
     return good
-
-
-def _unlike(writer: Writer, place: Path, whole: Whole) -> list[str]:
-    found = written(place)
-    return [*differing(writer, found, whole.files), *missing(writer, found, whole.files)]
 
 
 def _told(writer: Writer, what: str, files: list[str]) -> int:

@@ -1,4 +1,4 @@
-"""The commands that write files, on inputs so small that each takes a second: for programs that kill or starve them.
+"""The commands that write files, on inputs so small that each takes a second, for `disturbed`.
 
 A command runs in a process forked from this one, which has imported its module but never started JAX: so it starts in
 no time, and whoever kills it meets it at its work.
@@ -17,8 +17,6 @@ import sys
 from collections.abc import Iterable
 from multiprocessing.context import ForkProcess as Process
 from pathlib import Path
-
-from sglpr_jax.files import half_written
 
 INPUTS = "inputs"
 """The folder of what the commands read, beside the folders in which they write."""
@@ -49,14 +47,24 @@ class Writer:
     refuses: str = ""
     """What the error says where the command has done its work before and never does it twice."""
 
-    @property
-    def command(self) -> str:
-        """Which of `bin/` it is."""
-        return self.name.split()[0]
+    def begin(self, folder: Path, **options) -> Process:
+        """Start it in its folder, or have it go on with what lies there. The options are those of `start`."""
+        (folder / OUT).mkdir(parents=True, exist_ok=True)
+        resume = self.resumed_by and (folder / OUT / self.resumed_by).exists()
+        return start(self.name.split()[0], (*self.line.split(), *["--resume"] * bool(resume)), folder, **options)
 
-    @property
-    def arguments(self) -> tuple[str, ...]:
-        return tuple(self.line.split())
+    def differing(self, found: dict[str, bytes], whole: dict[str, bytes]) -> list[str]:
+        """The files that are not as in an undisturbed run, those apart that never are."""
+        return [name for name, content in found.items() if not self._varies(name) and content != whole.get(name)]
+
+    def unlike(self, folder: Path, whole: dict[str, bytes]) -> list[str]:
+        """The same, with the files of an undisturbed run that are not there."""
+        found = written(folder)
+        return self.differing(found, whole) + [one for one in whole if one not in found and not self._varies(one)]
+
+    def _varies(self, name: str) -> bool:
+        """Whether a file is another one each time."""
+        return any(fnmatch.fnmatch(name, pattern) for pattern in self.varies)
 
 
 RUN_FILES = ("*/checkpoints/*", "*/environment.json", "*/metrics.jsonl", "*/learning-curves.png", "*/mining/*")
@@ -68,15 +76,17 @@ WRITERS = {
         Writer("evaluate", f"../{INPUTS}/08.npz --data {TOWN} --seq 08 --out {OUT}/08"),
         Writer("simulate", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12"),
         Writer("simulate images", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12 --images"),
-        Writer("export", f"--weights circular --out {OUT}/mine", refuses="does not exist yet"),
-        Writer(
-            "export stablehlo",
-            f"--weights circular --format stablehlo --out {OUT}/mine",
-            refuses="does not exist yet",
-        ),
+        Writer("export", f"--weights circular --out {OUT}/mine", refuses="not exist yet"),
+        Writer("export stablehlo", f"--weights circular --format stablehlo --out {OUT}/mine", refuses="not exist yet"),
         Writer(
             "map",
             f"{TOWN} --seq 08 --poses {POSES} --pose-format kitti --out {OUT}/town.safetensors",
+            varies=("town.unfinished/*",),
+        ),
+        Writer(
+            "map more",
+            f"{TOWN} --seq 05 --poses {POSES.replace('08', '05')} --pose-format kitti "
+            f"--add-to ../{INPUTS}/town.safetensors --out {OUT}/town.safetensors",
             varies=("town.unfinished/*",),
         ),
         Writer("relocalize", f"{TOWN}/{SCANS}/000003.bin --map ../{INPUTS}/town.safetensors --out {OUT}/pose.json"),
@@ -112,13 +122,6 @@ def make_inputs(folder: Path) -> None:
         command, *arguments = line.split()
         assert ended(start(command, arguments, inputs)) == 0, said(inputs)
     (inputs / ERRORS).unlink()
-
-
-def begin(writer: Writer, folder: Path, **options) -> Process:
-    """Start a writer in its folder, or have it go on with what lies there. The options are those of `start`."""
-    (folder / OUT).mkdir(parents=True, exist_ok=True)
-    resume = writer.resumed_by and (folder / OUT / writer.resumed_by).exists()
-    return start(writer.command, (*writer.arguments, *["--resume"] * bool(resume)), folder, **options)
 
 
 def start(
@@ -181,23 +184,3 @@ def written(folder: Path) -> dict[str, bytes]:
         if path.is_file() and not any(part.startswith(".") for part in path.relative_to(out).parts):
             found[name] = path.read_bytes()
     return found
-
-
-def differing(writer: Writer, found: dict[str, bytes], whole: dict[str, bytes]) -> list[str]:
-    """The files that are not as in an undisturbed run, those apart that never are."""
-    return [name for name, content in found.items() if not varies(writer, name) and content != whole.get(name)]
-
-
-def missing(writer: Writer, found: dict[str, bytes], whole: dict[str, bytes]) -> list[str]:
-    """The files of an undisturbed run that are not there."""
-    return [name for name in whole if name not in found and not varies(writer, name)]
-
-
-def varies(writer: Writer, name: str) -> bool:
-    """Whether a file is another one each time."""
-    return any(fnmatch.fnmatch(name, pattern) for pattern in writer.varies)
-
-
-def left_behind(folder: Path) -> list[Path]:
-    """What a killed process had not finished."""
-    return half_written(folder / OUT)

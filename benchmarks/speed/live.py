@@ -4,8 +4,6 @@ A process publishes a simulated drive at a fixed rate, there and back again and 
 The latency of a scan is the time from before it is published to the line of bin/live that reports it or its loop.
 """
 
-import dataclasses
-import importlib
 import json
 import multiprocessing
 import os
@@ -15,95 +13,179 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
-import tyro
 
+from benchmarks.timing import resident_mb
+from sglpr_jax.live.report import Reports
+from sglpr_jax.live.ros_messages import CLOUD, TRANSFORMS, encode, transform_message, typestore
+from sglpr_jax.live.ros_wire import Wire, domain_of
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.se3 import quaternions
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 
 
-class Publisher(Protocol):
-    """Publishes scans for a source. The function `publisher(where)` of `benchmarks.speed.live_SOURCE` makes one."""
+class FolderPublisher:
+    """Writes scans, which are renamed when they are whole, and a growing tum file."""
 
-    flags: tuple[str, ...]
-    """Flags of bin/live for this source, beside its name."""
+    def __init__(self, where: str):
+        self._folder = Path(where)
+        self._folder.mkdir(exist_ok=True)
+        self._poses = self._folder.parent / "poses.tum"
+        self._poses.touch()
+        self.flags = ("--poses", str(self._poses))
 
     def put(self, points: np.ndarray, world_from_lidar: np.ndarray, stamp: float) -> None:
         """Publish a scan with its odometry at a time in seconds since 1970."""
-        ...
+        numbers = [stamp, *world_from_lidar[:3, 3], *quaternions(world_from_lidar[None])[0]]
+        with self._poses.open("a") as file:
+            file.write(" ".join(f"{number:.9f}" for number in numbers) + "\n")
+        hidden = self._folder / f".{stamp:.6f}.bin"
+        np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(hidden)
+        hidden.rename(self._folder / f"{stamp:.6f}.bin")
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Flags of the program."""
+class RosPublisher:
+    """Publishes clouds with 16 bytes a point, as common drivers do, and the odometry as a transform before each."""
 
-    source: str = "folder"
-    """Source of bin/live, without `:WHERE` for a folder, which is temporary."""
-    rates: tuple[float, ...] = (10.0, 20.0)
-    """Scans a second."""
-    seconds: float = 60.0
-    """Duration at each rate, without the start."""
-    warm_s: float = 10.0
-    """Time before memory is measured for the first time."""
-    scans: int = 240
-    """Scans of the simulated drive."""
-    sensor: str = "vlp16"
-    weights: str = DEFAULT_WEIGHTS
-    flags: tuple[str, ...] = ()
-    """More flags of bin/live, such as `max-places=500`."""
+    flags = ("--topic", "/points", "--odometry-topic", "/odometry")
 
+    def __init__(self, connect: Callable[[], Wire]):
+        """`connect` opens the connection with the first scan. Scans before the subscription finds it are lost."""
+        self._connect = connect
+        self._wire: Wire | None = None
 
-def publisher_of(name: str, where: str) -> Publisher:
-    """Publisher for a source."""
-    return importlib.import_module(f"benchmarks.speed.live_{name}").publisher(where)
+    def put(self, points: np.ndarray, world_from_lidar: np.ndarray, stamp: float) -> None:
+        """Publish a scan with its odometry at a time in seconds since 1970."""
+        if self._wire is None:
+            self._wire = self._connect()
+            self._clouds = self._wire.advertise("/points", CLOUD, depth=1, latched=False)
+            self._poses = self._wire.advertise("/odometry", TRANSFORMS, depth=100, latched=False)
+        self._poses(encode(transform_message(world_from_lidar, time=stamp, frame="odom", child="lidar")))
+        self._clouds(_cloud(points, stamp))
 
 
-def measured(options: Options, rate: float) -> dict[str, float]:
+def _cloud(points: np.ndarray, stamp: float) -> bytes:
+    """PointCloud2 with the fields x, y and z."""
+    types = typestore().types
+    padded = np.zeros((len(points), 4), np.float32)
+    padded[:, :3] = points
+    seconds, nanoseconds = divmod(round(stamp * 1e9), 10**9)
+    time_of = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+    field = types["sensor_msgs/msg/PointField"]
+    found = types[CLOUD](
+        header=types["std_msgs/msg/Header"](stamp=time_of, frame_id="lidar"),
+        height=1,
+        width=len(points),
+        fields=[field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate("xyz")],
+        is_bigendian=False,
+        point_step=16,
+        row_step=padded.nbytes,
+        data=padded.view(np.uint8).reshape(-1),
+        is_dense=True,
+    )
+    return encode(found)
+
+
+def _dds(where: str) -> Wire:
+    """Connection in a domain."""
+    from sglpr_jax.live.dds_wire import DdsWire
+
+    return DdsWire(domain_of(where, source="dds"), Reports())
+
+
+def _zenoh(endpoint: str) -> Wire:
+    """Connection that listens at an endpoint, such as tcp/127.0.0.1:7450."""
+    from sglpr_jax.live.zenoh_wire import ZenohWire
+
+    config = {"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+    with tempfile.NamedTemporaryFile("w", suffix=".json5") as file:
+        json.dump(config, file)
+        file.flush()
+        os.environ["ZENOH_SESSION_CONFIG_URI"] = file.name
+        return ZenohWire("", domain_of("", source="zenoh"), Reports())
+
+
+PUBLISHERS: dict[str, Callable[[str], Any]] = {
+    "folder": FolderPublisher,
+    "dds": lambda where: RosPublisher(lambda: _dds(where)),
+    "zenoh": lambda where: RosPublisher(lambda: _zenoh(where)),
+}
+"""By the name of the source."""
+
+
+def live(
+    *,
+    source: str = "folder",
+    rates: tuple[float, ...] = (10.0, 20.0),
+    seconds: float = 60.0,
+    warm_s: float = 10.0,
+    scans: int = 240,
+    weights: str = DEFAULT_WEIGHTS,
+) -> None:
+    """Measure the latency of bin/live for a source, dropped scans and memory. Prints a row for each rate.
+
+    Args:
+        source: source of bin/live, without `:WHERE` for a folder, which is temporary.
+        rates: scans a second.
+        seconds: duration at each rate, without the start.
+        warm_s: time before memory is measured for the first time.
+        scans: scans of the simulated drive.
+        weights: weights of bin/live.
+    """
+    for at, rate in enumerate(rates):
+        count = int(rate * (seconds + warm_s))
+        row = _measured(source, rate, count, warm_s, scans, weights)
+        if not at:
+            print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
+        print("| " + " | ".join(f"{value:.4g}" for value in row.values()) + " |", flush=True)
+
+
+def _measured(source: str, rate: float, count: int, warm_s: float, scans: int, weights: str) -> dict[str, float]:
     """Run both processes at one rate. Returns a row of the table."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        name, _, where = options.source.partition(":")
+        name, _, where = source.partition(":")
         where = str(folder / "scans") if name == "folder" else where
         text = f"{name}:{where}" if where else name
-        publisher = publisher_of(name, where)
-        more = [part for flag in options.flags for part in f"--{flag}".split("=", 1)]
-        command = ["-m", "sglpr_jax.cli.live", text, "--out", str(folder / "map"), "--weights", options.weights]
+        publisher = PUBLISHERS[name](where)
+        command = ["-m", "sglpr_jax.cli.live", text, "--out", str(folder / "map"), "--weights", weights]
         with (folder / "errors.txt").open("w") as errors:
             node = subprocess.Popen(
-                [sys.executable, *command, *publisher.flags, *more], stdout=subprocess.PIPE, stderr=errors, text=True
+                [sys.executable, *command, *publisher.flags], stdout=subprocess.PIPE, stderr=errors, text=True
             )
         results = Results(node)
-        ready = wait_for(folder / "errors.txt", "ready:", node)
+        ready = _wait_for(folder / "errors.txt", "ready:", node)
         context = multiprocessing.get_context("spawn")
-        process = context.Process(target=publish, args=(name, where, rate, options))
+        process = context.Process(target=_publish, args=(name, where, rate, count, scans))
         process.start()
-        wait_until(lambda: results.frames, node)
-        time.sleep(options.warm_s)
+        _wait_until(lambda: results.frames, node)
+        time.sleep(warm_s)
         before = results.memory()
         process.join()
         time.sleep(1.0)
         after = results.memory()
         node.send_signal(signal.SIGTERM)
         results.close()
-        published = int(rate * (options.seconds + options.warm_s))
-        return {"Hz": rate, "start [s]": ready, **results.row(published), **growth(before, after)}
+        memory = {"resident [MB]": after[0], "grown [MB]": after[0] - before[0], "map grown [MB]": after[1] - before[1]}
+        return {"Hz": rate, "start [s]": ready, **results.row(count), **memory}
 
 
-def publish(name: str, where: str, rate: float, options: Options) -> None:
+def _publish(name: str, where: str, rate: float, count: int, scans: int) -> None:
     """Publish scans at a rate, in a process of its own."""
-    drive = simulate_recording("08", scans=options.scans, sensor=SENSORS[options.sensor], seed=3)
-    clouds = [drive.points(i) for i in range(len(drive))]
-    poses = drive.poses.world_from_lidar
-    there_and_back = [*range(len(drive)), *range(len(drive) - 2, 0, -1)]
-    publisher = publisher_of(name, where)
+    recording = simulate_recording("08", scans=scans, sensor=SENSORS["vlp16"], seed=3)
+    clouds = [recording.points(i) for i in range(len(recording))]
+    poses = recording.poses.world_from_lidar
+    there_and_back = [*range(len(recording)), *range(len(recording) - 2, 0, -1)]
+    publisher = PUBLISHERS[name](where)
     begin = time.monotonic()
-    for count in range(int(rate * (options.seconds + options.warm_s))):
-        time.sleep(max(0.0, begin + count / rate - time.monotonic()))
-        row = there_and_back[count % len(there_and_back)]
+    for number in range(count):
+        time.sleep(max(0.0, begin + number / rate - time.monotonic()))
+        row = there_and_back[number % len(there_and_back)]
         publisher.put(clouds[row], poses[row], time.time())
 
 
@@ -128,8 +210,7 @@ class Results:
 
     def memory(self) -> tuple[float, float]:
         """Resident memory of the node in MB, and its count of the map's bytes in MB."""
-        pages = int(Path(f"/proc/{self._node.pid}/statm").read_text().split()[1])
-        return pages * os.sysconf("SC_PAGESIZE") / 1e6, self.frames[-1]["nbytes"] / 1e6
+        return resident_mb(self._node.pid), self.frames[-1]["nbytes"] / 1e6
 
     def row(self, published: int) -> dict[str, float]:
         """Numbers of the table."""
@@ -155,34 +236,16 @@ class Results:
             looped = None
 
 
-def growth(before: tuple[float, float], after: tuple[float, float]) -> dict[str, float]:
-    """Memory at the end and its growth, beside that of the map."""
-    return {"resident [MB]": after[0], "grown [MB]": after[0] - before[0], "map grown [MB]": after[1] - before[1]}
-
-
-def wait_for(path: Path, text: str, node: subprocess.Popen) -> float:
+def _wait_for(path: Path, text: str, node: subprocess.Popen) -> float:
     """Seconds until a file contains a text."""
     begin = time.monotonic()
-    wait_until(lambda: text in path.read_text(), node)
+    _wait_until(lambda: text in path.read_text(), node)
     return time.monotonic() - begin
 
 
-def wait_until(condition, node: subprocess.Popen) -> None:
+def _wait_until(condition, node: subprocess.Popen) -> None:
     """Wait for a condition while the node runs."""
     while not condition():
         if node.poll() is not None:
             raise RuntimeError(f"bin/live ended with {node.returncode}")
         time.sleep(0.05)
-
-
-def main(options: Options) -> None:
-    """Print a row for each rate."""
-    for at, rate in enumerate(options.rates):
-        row = measured(options, rate)
-        if not at:
-            print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
-        print("| " + " | ".join(f"{value:.4g}" for value in row.values()) + " |", flush=True)
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))

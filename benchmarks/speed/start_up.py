@@ -1,26 +1,17 @@
-"""How long programs take to start: the help of each command, random weights of each preset, loading of shipped weights,
-and the descriptor of one scan, cold (nothing compiled yet, timed once) and warm.
-
-    taskset -c 1 python -m benchmarks.speed.start_up
-
-Seconds, and processor seconds, which are nearer the truth on a machine that is busy: the least and the median.
-"""
+"""Time until commands start, networks are made, weights are loaded and the first scan is described."""
 
 import dataclasses
 import os
-import resource
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.timing import run_command
 from sglpr_jax.models.config import MODELS
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
@@ -34,14 +25,17 @@ COMMANDS = tuple(
 )
 
 
-def main(
+def start_up(
     *,
     commands: tuple[str, ...] = COMMANDS,
     presets: tuple[str, ...] = tuple(MODELS),
     weights: str = "sglpr",
     repeats: int = 9,
 ) -> None:
-    """Time commands in processes of their own, one after another.
+    """Time commands in processes of their own, one after another: under `taskset -c 1`.
+
+    The descriptor of one scan is timed cold (nothing compiled yet, once) and warm. Processor seconds are nearer the
+    truth on a machine that is busy.
 
     Args:
         commands: whose help is timed.
@@ -50,8 +44,9 @@ def main(
         repeats: how often each is timed.
     """
     lines = {f"{command} --help": _command(command, "--help") for command in commands}
-    lines |= {f"init, {preset}": ("-c", INIT.format(preset)) for preset in presets}
-    lines |= {"import jax": ("-c", "import jax"), f"load, {weights}": ("-c", LOAD.format(weights))}
+    programs = {f"init, {preset}": INIT.format(preset) for preset in presets}
+    programs |= {"import jax": "import jax", f"load, {weights}": LOAD.format(weights)}
+    lines |= {title: (sys.executable, "-c", program) for title, program in programs.items()}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scan = simulate_recording("08", scans=1, sensor=dataclasses.replace(SENSORS["hdl64e"], azimuth_steps=900))
@@ -63,36 +58,19 @@ def main(
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         table = Table("", "seconds, least", "median", "processor seconds, least", "median")
         for title, line in (  # the second describes a batch of one, another program
-            (f"load and describe one image, {weights}", ("-c", DESCRIBE.format(weights))),
+            (f"load and describe one image, {weights}", (sys.executable, "-c", DESCRIBE.format(weights))),
             (f"embed one scan, {weights}", embed),
         ):
-            wall, processor = seconds(line, environment)
+            wall, processor = run_command(line, environment)
             table.add_row(f"{title}, cold", f"{wall:.2f}", "", f"{processor:.2f}", "")
             lines[f"{title}, warm"] = line
         for title, line in lines.items():
-            wall, processor = zip(*(seconds(line, environment) for _ in range(repeats)), strict=True)
+            wall, processor = zip(*(run_command(line, environment) for _ in range(repeats)), strict=True)
             found = (min(wall), statistics.median(wall), min(processor), statistics.median(processor))
             table.add_row(title, *(f"{value:.2f}" for value in found))
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    Console(width=140).print(table)
     print(f"{repeats} times each; {os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
 
 
-def seconds(line: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float]:
-    """How long Python takes for a command line, and how long processors work for it."""
-    start, before = time.perf_counter(), _processor_s()
-    subprocess.run((sys.executable, *line), env=environment, check=True, capture_output=True)
-    return time.perf_counter() - start, _processor_s() - before
-
-
 def _command(command: str, *arguments: str) -> tuple[str, ...]:
-    return "-m", f"sglpr_jax.cli.{command}", *arguments
-
-
-def _processor_s() -> float:
-    """Of all processes that were started here and have ended."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-if __name__ == "__main__":
-    tyro.cli(main)
+    return sys.executable, "-m", f"sglpr_jax.cli.{command}", *arguments

@@ -1,10 +1,11 @@
-"""The circular CNN and its decoder as plain PyTorch modules, with the layers and names of ours."""
+"""The circular CNN, its decoder and the heads as plain PyTorch modules, with the layers and names of ours."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from benchmarks.torch_peer.torch_layers import Convolution, means, repeated
-from sglpr_jax.models.config import CircularConfig
+from sglpr_jax.models.config import CircularConfig, HeadConfig
 
 
 class CircularBlock(nn.Module):
@@ -69,3 +70,69 @@ def map_channels(inputs: int, config: CircularConfig) -> list[int]:
     """Of the averaged image and the map of each block, with what joins it."""
     joining = (*config.fine, *(0,) * (len(config.widths) + 1 - len(config.fine)))
     return [own + more for own, more in zip((inputs, *config.widths), joining, strict=True)]
+
+
+class Place(nn.Module):
+    """The place head: CBAM, circular blocks, NetVLAD."""
+
+    def __init__(self, channels: int, config: HeadConfig):
+        super().__init__()
+        self.cbam = Cbam(channels, config.cbam_reduction) if config.cbam else nn.Identity()
+        self.means = config.means
+        shapes = zip((channels, *config.channels), config.channels, config.strides, strict=False)
+        for i, (inputs, outputs, stride) in enumerate(shapes):
+            self.add_module(f"block_{i}", CircularBlock(inputs, outputs, stride))
+        self.netvlad = NetVlad((channels, *config.channels)[-1], config.clusters, config.descriptor_size)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.cbam(x)
+        for i, sectors in enumerate(self.means):
+            x = means(self.get_submodule(f"block_{i}")(x), 1, sectors)
+        return F.normalize(self.netvlad(x.flatten(1, 2)), dim=-1)
+
+
+class Cbam(nn.Module):
+    """The channel gate, then the spatial gate."""
+
+    def __init__(self, channels: int, reduction: int):
+        super().__init__()
+        hidden = max(1, channels // reduction)
+        layers = {"mlp_in": nn.Linear(channels, hidden), "mlp_out": nn.Linear(hidden, channels)}
+        self.channel = nn.ModuleDict(layers)
+        self.spatial = nn.ModuleDict({"convolution": Convolution(2, 1, 7, circular=True)})
+
+    def forward(self, x: Tensor) -> Tensor:
+        pooled = torch.stack([x.mean((1, 2)), x.amax((1, 2))])
+        logits = self.channel["mlp_out"](self.channel["mlp_in"](pooled).relu()).sum(0)
+        x = x * logits.sigmoid()[:, None, None]
+        return x * self.spatial["convolution"](torch.stack([x.amax(-1), x.mean(-1)], dim=-1)).sigmoid()
+
+
+class NetVlad(nn.Module):
+    """Soft assignment to clusters, sums of residuals, a linear layer, context gating."""
+
+    def __init__(self, channels: int, clusters: int, output: int):
+        super().__init__()
+        self.assignment = nn.Linear(channels, clusters)
+        self.centres = nn.Parameter(torch.zeros(channels, clusters))
+        self.hidden, self.gate = nn.Linear(channels * clusters, output), nn.Linear(output, output)
+
+    def forward(self, features: Tensor) -> Tensor:
+        assignment = self.assignment(features).softmax(-1)
+        vlad = features.transpose(1, 2) @ assignment - assignment.sum(1)[:, None] * self.centres
+        y = self.hidden(F.normalize(F.normalize(vlad, dim=1).flatten(1), dim=-1))
+        return y * self.gate(y).sigmoid()
+
+
+class Detail(nn.Module):
+    """Two convolutions on the image, mixed with the features of every cell."""
+
+    def __init__(self, inputs: int, width: int):
+        super().__init__()
+        self.local0 = Convolution(inputs, 16, 5, circular=False)
+        self.local1 = Convolution(16, 16, 3, circular=False)
+        self.mix = nn.Linear(width + 16, width)
+
+    def forward(self, features: Tensor, image: Tensor) -> Tensor:
+        local = self.local1(self.local0(image).relu()).relu()
+        return F.gelu(self.mix(torch.cat([features, local], dim=-1)))

@@ -1,32 +1,14 @@
 """The Swin-Unet as plain PyTorch modules, with the layers and names of ours."""
 
 from collections import OrderedDict
-from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sglpr_jax.models.config import SglprConfig, SwinConfig
-from sglpr_jax.models.swin import BLOCKED, MLP_RATIO, relative_position_index, shift_mask
-
-
-class Windows(NamedTuple):
-    """What the blocks of a Swin-Unet have in common, as `swin_unet.SwinUnet` names it."""
-
-    window: int
-    mlp_ratio: int = MLP_RATIO
-    circular: bool = False
-    shift_each_way: bool = False
-
-    def shift(self, size: tuple[int, int]) -> tuple[int, int]:
-        """By how many rows and columns a shifted block rolls a map of that size."""
-        if min(size) <= self.window and not self.shift_each_way:
-            return 0, 0
-        window = min(self.window, *size)
-        down, right = (window // 2 if edge > window else 0 for edge in size)
-        return down, right
+from sglpr_jax.models.config import SglprConfig
+from sglpr_jax.models.swin import BLOCKED, relative_position_index, shift_mask
 
 
 class WindowAttention(nn.Module):
@@ -55,12 +37,13 @@ class WindowAttention(nn.Module):
 class Block(nn.Module):
     """A Swin block on maps of `size`."""
 
-    def __init__(self, size: tuple[int, int], channels: int, heads: int, windows: Windows, *, shifted: bool):
+    def __init__(self, size: tuple[int, int], channels: int, heads: int, config: SglprConfig, *, shifted: bool):
         super().__init__()
-        self.window = min(windows.window, *size)
-        self.shift = down, right = windows.shift(size) if shifted else (0, 0)
-        blocked = shift_mask(*size, self.window, (down, right), circular=windows.circular)
-        hidden = windows.mlp_ratio * channels
+        self.window = min(config.window, *size)
+        down, right = (self.window // 2 if shifted and edge > self.window else 0 for edge in size)
+        self.shift = down, right
+        blocked = shift_mask(*size, self.window, (down, right), circular=True)
+        hidden = config.mlp_ratio * channels
         self.attention_norm, self.mlp_norm = nn.LayerNorm(channels), nn.LayerNorm(channels)
         self.mlp_in, self.mlp_out = nn.Linear(channels, hidden), nn.Linear(hidden, channels)
         self.attention = WindowAttention(channels, heads, self.window, blocked if blocked.any() else None)
@@ -123,21 +106,19 @@ class PatchExpand(nn.Module):
 class SwinUnet(nn.ModuleDict):
     """Image to tokens, `size` of them; the encoder's stages, then the decoder's."""
 
-    def __init__(
-        self, inputs: int, size: tuple[int, int], config: SwinConfig | SglprConfig, windows: Windows, *, patch: int
-    ):
+    def __init__(self, inputs: int, size: tuple[int, int], config: SglprConfig):
         super().__init__()
         widths = [config.embed_dim * 2**level for level in range(len(config.depths))]
         self.coarsest = coarsest = len(widths) - 1
-        self["patch_embed"] = PatchEmbed(inputs, widths[0], patch)
+        self["patch_embed"] = PatchEmbed(inputs, widths[0], 1)
         self["norm"], self["norm_up"] = nn.LayerNorm(widths[-1]), nn.LayerNorm(widths[0])
         for level, width in enumerate(widths):
             mirrored = coarsest - level
-            self[f"encoder_{level}"] = _stage(level, size, config, windows)
+            self[f"encoder_{level}"] = _stage(level, size, config)
             if mirrored:
                 self[f"encoder_{level}_merge"] = PatchMerging(width)
                 self[f"decoder_{mirrored}_fuse"] = nn.Linear(2 * width, width)
-                self[f"decoder_{mirrored}"] = _stage(level, size, config, windows)
+                self[f"decoder_{mirrored}"] = _stage(level, size, config)
             if level:
                 self[f"decoder_{mirrored}_expand"] = PatchExpand(width, 2, width // 2)
 
@@ -153,9 +134,9 @@ class SwinUnet(nn.ModuleDict):
         return self["norm_up"](x)
 
 
-def _stage(level: int, size: tuple[int, int], config: SwinConfig | SglprConfig, windows: Windows) -> nn.Sequential:
+def _stage(level: int, size: tuple[int, int], config: SglprConfig) -> nn.Sequential:
     """The blocks of one level of the U."""
     height, width = (edge // 2**level for edge in size)
     channels, heads = config.embed_dim * 2**level, config.heads[level]
-    blocks = (Block((height, width), channels, heads, windows, shifted=i % 2 == 1) for i in range(config.depths[level]))
+    blocks = (Block((height, width), channels, heads, config, shifted=i % 2 == 1) for i in range(config.depths[level]))
     return nn.Sequential(OrderedDict((f"block_{i}", block) for i, block in enumerate(blocks)))

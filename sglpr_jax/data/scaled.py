@@ -25,7 +25,7 @@ SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0
 """Minimum range of scans that are not scaled, in metres (`typical_range_m`). Simulated corridors and rooms
-have 5 to 6 m, warehouses 9 to 13 m, and garages and streets 12 m or more (`benchmarks/quality/ranges.py`)."""
+have 5 to 6 m, warehouses 9 to 13 m, and garages and streets 12 m or more (`benchmarks/quality/sensors.py`)."""
 NEAR_SCALE: Scale = 4
 """Scale of recordings with shorter ranges."""
 

@@ -1,7 +1,7 @@
 """Covariance of a pose from the shape of the correlation peak: small at a corner, long along a wall.
 
 It is the sum of three parts: least squares at the peak (curvature and image noise), the extent of the ridge under the
-peak, and small fixed errors. The constants were fitted on simulated drives (`benchmarks/quality/covariance.py`).
+peak, and small fixed errors. The constants were fitted on simulated drives (`benchmarks/quality/poses.py`).
 """
 
 import functools

@@ -2,7 +2,7 @@
 
 Errors of neighbouring points are correlated: the points lie on one surface, one ring of the sensor or one vehicle that
 has moved. Their contributions are summed in blocks of space, and the scatter of the blocks gives the noise (a sandwich
-estimator). The constants were fitted on simulated drives with 64, 32 and 16 beams (`benchmarks/quality/covariance.py`).
+estimator). The constants were fitted on simulated drives with 64, 32 and 16 beams (`benchmarks/quality/poses.py`).
 """
 
 from typing import Any, NamedTuple

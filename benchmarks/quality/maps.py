@@ -1,0 +1,291 @@
+"""Relocalisation in maps of another sensor: maps that are point clouds, and maps of scans."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy.spatial.transform import Rotation
+
+import sglpr_jax
+from benchmarks.drives import lidar
+from benchmarks.quality.submaps import APART_M, PASSES, RIGHT_M, rendered, scored, submaps_of_passes
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.readers import cloud_map
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scan_stream import only
+from sglpr_jax.files import replacing
+from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.odometry.kiss_icp import scan_odometry
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.se3 import distances, inverse, yaw_of
+from sglpr_jax.sim.sensor import SENSORS
+from sglpr_jax.sim.sessions import plan_sessions
+
+WELL_M, WELL_DEG, SURE = 0.5, 2.0, 0.99
+"""Largest errors of a right pose, and the probability of an answer that should not be wrong."""
+DAYS, ROUTES = ("2012-01-15", "2012-02-04"), ("00", "05", "08")
+NOISE_M, NOISE_DEG = 0.05, 0.1
+"""Standard deviation of a registered front end's poses, in metres and degrees along and about each axis."""
+DRIVE_S = 60.0
+"""Duration of a drive, in seconds."""
+FAR_M, VOXEL_M = 60.0, 0.15
+"""Maximum range of the points in the cloud, and edge of its voxels, in metres."""
+
+
+def is_right(found: Float[np.ndarray, "4 4"], true: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether a pose is within `WELL_M` (horizontally) and `WELL_DEG` of the true one."""
+    error = inverse(true) @ found
+    return bool(np.hypot(*error[:2, 3]) < WELL_M and abs(np.degrees(yaw_of(error))) < WELL_DEG)
+
+
+class Drive(NamedTuple):
+    """Scans of one sensor in a folder, and their true poses."""
+
+    folder: Path
+    world_from_lidar: Float[np.ndarray, "n 4 4"]
+    sensor: str
+
+    def points(self, row: int) -> Float32[np.ndarray, "n 3"]:
+        """Points of a scan."""
+        return np.fromfile(self.folder / f"{row:06d}.bin", "<f4").reshape(-1, 4)[:, :3]
+
+    def recording(self) -> Recording:
+        """The recording of the folder, with the sensor's height."""
+        return sglpr_jax.open_recording(self.folder, format="kitti", sensor_height=SENSORS[self.sensor].height_m)
+
+
+def _driven(root: Path, *, seed: int, sensor: str, day: int, scans: int, azimuth_steps: int) -> Drive:
+    """A drive through a town on a day. Its scans are rendered unless they exist."""
+    folder = root / f"{seed}-{sensor}-day{day}-{scans}x{azimuth_steps}"
+    poses_file = folder / "poses.npy"
+    if not poses_file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        options = {"scans": scans, "rate_hz": scans / DRIVE_S, "seed": seed, "sensor": lidar(sensor, azimuth_steps)}
+        recording = plan_sessions(DAYS, route=ROUTES[seed % len(ROUTES)], **options)[day].simulate()
+        for row in range(len(recording)):
+            rows = np.pad(recording.points(row), ((0, 0), (0, 1)), constant_values=1)
+            rows.astype("<f4").tofile(folder / f"{row:06d}.bin")
+        with replacing(poses_file) as temporary, temporary.open("wb") as file:
+            np.save(file, recording.poses.world_from_lidar)
+    return Drive(folder, np.load(poses_file), sensor)
+
+
+def cloud(
+    *,
+    seeds: tuple[int, ...] = (201, 202),
+    queries: tuple[str, ...] = ("vlp16", "os1-64"),
+    maps: tuple[str, ...] = ("cloud", "all points", "scans"),
+    scans: int = 180,
+    map_scans: int | None = None,
+    map_azimuth_steps: int = 1800,
+    every: int = 2,
+    spacing_m: float = 4.0,
+    kiss_icp: bool = False,
+    weights: str = "sglpr",
+    out: Path = Path("build/cloud_map"),
+) -> None:
+    """Locate scans of other sensors in a map that is a point cloud with its trajectory.
+
+    hdl64e drives through a simulated town. Its scans at noisy poses are one cloud in voxels. On another day, other
+    sensors drive the same streets, partly in the opposite direction. Each of their scans within 5 m of the first drive
+    is located. It is right within 0.5 m (horizontally) and 2 degrees of the true pose relative to the nearest pose of
+    the first drive, so that drift of the trajectory is not counted.
+
+    Args:
+        seeds: one town for each.
+        queries: sensors that are located.
+        maps: cloud; all points (without removing hidden points); scans (those of hdl64e).
+        scans: scans of each drive, which takes a minute.
+        map_scans: scans of the first drive, if another number.
+        map_azimuth_steps: firings of the first drive's sensor per turn.
+        every: every k-th scan is a query.
+        spacing_m: distance between the places of a map, in metres.
+        kiss_icp: poses that kiss-icp computes, of which it needs 10 a second, instead of noisy ones (extra odometry).
+        weights: the model that describes the scans.
+        out: folder of the scans and clouds.
+    """
+    params, total = sglpr_jax.load(weights), dict[tuple[str, str], np.ndarray]()
+    print("| seed | map | query | right | of them probability >= .9 | queries |\n|---|---|---|---|---|---|")
+    for seed in seeds:
+        steps = {"scans": map_scans or scans, "azimuth_steps": map_azimuth_steps}
+        first = _driven(out, seed=seed, sensor="hdl64e", day=0, **steps)
+        trajectory = _trajectory(first, seed, kiss_icp=kiss_icp)
+        poses = sglpr_jax.read_odometry(trajectory, format="tum")
+        opened = _openers(first, trajectory, poses)
+        for name in maps:
+            recording, map_poses = opened[name]()
+            places = sglpr_jax.PlaceMap.of(recording, params, map_poses, spacing_m=spacing_m)
+            for sensor in queries:
+                query = _driven(out, seed=seed, sensor=sensor, day=1, scans=scans, azimuth_steps=900)
+                found = np.array(_located_in(places, params, query, first, poses, every))
+                total[name, sensor] = total.get((name, sensor), 0) + found
+                print(f"| {seed} | {name} | {sensor} | {found[0]} | {found[1]} | {found[2]} |", flush=True)
+        jax.clear_caches()
+    for (name, sensor), (right, sure, count) in total.items():
+        print(f"| all | {name} | {sensor} | {right / count:.3f} | {sure / count:.3f} | {count} |")
+
+
+def _trajectory(drive: Drive, seed: int, *, kiss_icp: bool) -> Path:
+    """File of the poses of the map, written unless it exists."""
+    path = drive.folder.with_name(f"{drive.folder.name}-{'kiss' if kiss_icp else 'noisy'}.tum")
+    if not path.exists():
+        found = scan_odometry(drive.recording()) if kiss_icp else _noisy(drive.world_from_lidar, seed=seed)
+        write_tum(path, found, 0.5 + np.arange(len(found)) * DRIVE_S / len(found))
+    return path
+
+
+def _noisy(poses: Float[np.ndarray, "n 4 4"], *, seed: int) -> Float[np.ndarray, "n 4 4"]:
+    """Poses with independent errors of `NOISE_M` and `NOISE_DEG`."""
+    rng, found = np.random.default_rng((seed, 39)), poses.copy()
+    turned = Rotation.from_rotvec(np.radians(rng.normal(0, NOISE_DEG, (len(poses), 3)))).as_matrix()
+    found[:, :3, :3] = poses[:, :3, :3] @ turned
+    found[:, :3, 3] += rng.normal(0, NOISE_M, (len(poses), 3))
+    return found
+
+
+def _openers(
+    drive: Drive, trajectory: Path, poses: Float[np.ndarray, "n 4 4"]
+) -> dict[str, Callable[[], tuple[Recording, np.ndarray]]]:
+    """For each map a function that opens its recording and poses."""
+    path = trajectory.with_name(f"{trajectory.stem}.pcd")
+    if not path.exists():
+        _write_pcd(path, _cloud_of(drive, poses))
+
+    def of_cloud() -> tuple[Recording, np.ndarray]:
+        recording = sglpr_jax.open_recording(path, poses=trajectory)
+        print("; ".join(recording.description), flush=True)
+        assert recording.world_from_lidar is not None
+        return recording, recording.world_from_lidar
+
+    def of_all() -> tuple[Recording, np.ndarray]:
+        recording, found = of_cloud()
+        return _unhidden(recording), found
+
+    return {"cloud": of_cloud, "all points": of_all, "scans": lambda: (drive.recording(), poses)}
+
+
+def _cloud_of(drive: Drive, poses: Float[np.ndarray, "n 4 4"]) -> Float32[np.ndarray, "m 3"]:
+    """Centroids of the voxels of all scans, in the frame of the poses."""
+    parts = []
+    for row, pose in enumerate(poses):
+        points = drive.points(row)
+        points = points[np.linalg.norm(points, axis=1) < FAR_M]
+        parts.append((points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
+    points = np.concatenate(parts)
+    voxels = np.floor(points / VOXEL_M).astype(np.int64) + (1 << 20)
+    _, voxel, counts = np.unique(voxels @ (1 << np.array([42, 21, 0])), return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(voxel, weights=axis) / counts for axis in points.T], axis=1).astype(np.float32)
+
+
+def _write_pcd(path: Path, points: Float32[np.ndarray, "n 3"]) -> None:
+    """Write a file in the Point Cloud Library's format."""
+    count = len(points)
+    header = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
+    path.write_bytes((header + "DATA binary\n").encode() + points.astype("<f4").tobytes())
+
+
+def _unhidden(recording: Recording) -> Recording:
+    """The recording of a cloud whose scans have all points around a pose."""
+    options = recording.read.keywords  # type: ignore[attr-defined]
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        points = cloud_map._points_at(options["cloud"], options["world_from_lidar"][int(path.name)])
+        return Record(points=points)
+
+    return dataclasses.replace(recording, read=read)
+
+
+def _located_in(
+    places: sglpr_jax.PlaceMap, params: sglpr_jax.Params, query: Drive, first: Drive, poses: np.ndarray, every: int
+) -> tuple[int, int, int]:
+    """Numbers of right answers, of right answers with a probability of .9 or more, and of queries."""
+    apart = distances(query.world_from_lidar[:, :2, 3], first.world_from_lidar[:, :2, 3])
+    mounting, right, sure, count = Mounting(SENSORS[query.sensor].height_m), 0, 0, 0
+    for row in np.flatnonzero(apart.min(axis=1) < APART_M)[::every].tolist():
+        near = int(apart[row].argmin())
+        expected = poses[near] @ inverse(first.world_from_lidar[near]) @ query.world_from_lidar[row]
+        best = places.relocate(params, Record(points=query.points(row), mounting=mounting))[0]
+        fits = is_right(best.world_from_query, expected)
+        right, sure, count = right + fits, sure + (fits and best.probability >= 0.9), count + 1
+    return right, sure, count
+
+
+class Driven(NamedTuple):
+    """A map of the first pass, and the described scans of the other passes."""
+
+    places: sglpr_jax.PlaceMap
+    seen: list[Seen]
+    poses: Float[np.ndarray, "n 4 4"]
+    """True pose of each query."""
+
+
+def sensors(
+    *,
+    sensors: tuple[str, ...] = ("vlp16", "os0-32", "os1-64", "hdl64e", "mid360", "avia"),
+    seeds: tuple[int, ...] = (609, 610),
+    length_m: float = 0.0,
+    metres: int = 110,
+    spacing_m: float = 4.0,
+    azimuth_steps: int = 900,
+    weights: str = "sglpr",
+    out: Path = Path("build/submaps"),
+) -> None:
+    """Locate scans of one sensor in a map of another, for all pairs.
+
+    Each sensor drives the same street (`submaps`): once for the map, then once in the opposite and once in the same
+    direction. A query within 5 m of the map is found if the nearest descriptor is within 5 m. It is relocated right
+    within 0.5 m (horizontally) and 2 degrees, and wrong if its probability is at least 0.99 and its position is more
+    than 5 m off.
+
+    Args:
+        sensors: names of sensors.
+        seeds: one town for each.
+        length_m: length of the submaps; 0 is a single scan.
+        metres: length of the street.
+        spacing_m: distance between two places of a map, and between two queries.
+        azimuth_steps: firings of the sensor per turn, at most.
+        weights: the model that describes the scans.
+        out: folder of the scans.
+    """
+    params, found = sglpr_jax.load(weights), dict[str, list[Driven]]()
+    finder = CandidateFinder(params)
+    for sensor in sensors:
+        for seed in seeds:
+            drive = rendered(sensor, seed, metres, azimuth_steps, out)
+            recording = submaps_of_passes(drive, length_m, seed=seed)
+            rows = np.array(scored(drive))
+            mapped = rows[drive.passes[rows] == 0]
+            some = only(recording, mapped.tolist())
+            places = sglpr_jax.PlaceMap.of(some, params, drive.poses[mapped], spacing_m=spacing_m)
+            numbers = [list(PASSES).index(name) for name in ("opposite", "same")]
+            asked = rows[np.isin(drive.passes[rows], numbers)][:: max(1, round(spacing_m))]
+            seen = [finder.seen(recording.record(row)) for row in asked.tolist()]
+            found.setdefault(sensor, []).append(Driven(places, seen, drive.poses[asked]))
+    print("| map | query | recall@1 | right | wrong at .99 | queries |\n|---|---|---|---|---|---|")
+    for mapped in sensors:
+        for asked in sensors:
+            pairs = [_located(*both) for both in zip(found[mapped], found[asked], strict=True)]
+            near, right, wrong = np.concatenate(pairs, axis=1)
+            shares = f"{near.mean():.3f} | {right.mean():.3f} | {wrong.sum()}"
+            print(f"| {mapped} | {asked} | {shares} | {len(near)} |", flush=True)
+
+
+def _located(mapped: Driven, asked: Driven) -> Bool[np.ndarray, "3 n"]:
+    """For each query near the map: found by its descriptor, relocated right, and relocated wrong but sure."""
+    apart = distances(asked.poses[:, :2, 3], mapped.places.world_from_place[:, :2, 3])
+    rows = np.flatnonzero(apart.min(axis=1) < APART_M)
+    found = np.zeros((3, len(rows)), bool)
+    for i, row in enumerate(rows.tolist()):
+        nearest = mapped.places.index.query(asked.seen[row].descriptor).rows[0]
+        found[0, i] = apart[row, nearest] <= RIGHT_M
+        answers = mapped.places.relocate_seen(asked.seen[row], weights_hash=mapped.places.index.weights_hash)
+        if answers:
+            pose, true = answers[0].world_from_query, asked.poses[row]
+            found[1, i] = is_right(pose, true)
+            found[2, i] = np.hypot(*(pose - true)[:2, 3]) > RIGHT_M and answers[0].probability >= SURE
+    return found

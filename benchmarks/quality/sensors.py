@@ -1,0 +1,300 @@
+"""What a sensor sees: gravity of a walk by IMU and ground, deskewing of fast turns, ranges, rotations of a scan."""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation, RotationSpline
+
+import sglpr_jax
+from benchmarks.drives import Case, in_memory, lidar, recording_of
+from benchmarks.quality.poses import WALKS, simulated
+from sglpr_jax.data.deskew import deskew as deskew_points
+from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
+from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scaled import chosen_scale, typical_range_m
+from sglpr_jax.data.views import view
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.se3 import distances, inverse, transformed
+from sglpr_jax.sim.drive import TimedPoses, plan_path, poses_on
+from sglpr_jax.sim.recording import SimulatedRecording
+from sglpr_jax.sim.sceneries import REPEATING
+from sglpr_jax.sim.sensor import Sensor, scan
+from sglpr_jax.sim.world import World, build_world
+
+WALK = 0.2
+"""Speed of a person as a share of that of the simulated drive."""
+RATE_HZ = 200.0
+GYRO_NOISE, GYRO_BIAS = 0.003, 0.005
+"""Standard deviations of a sample and of the bias of the gyroscope, in radians per second."""
+ACCELERATION_NOISE, ACCELERATION_BIAS = 0.05, 0.03
+"""Standard deviations of a sample and of the bias of the accelerometer, in m/s^2."""
+TURN_S, SECTORS = 0.1, 36
+SWING_S = 2.0
+"""Period of the yaw rate. Its maximum is in the middle of the scan, and it is 0 after half a second."""
+MOTIONS = {"car": (10.0, 25.0), "robot": (1.0, 90.0), "hand": (1.4, 180.0)}
+"""Speed in m/s and maximum yaw rate in degrees per second."""
+AZIMUTHS = 900
+OTHER_PLACE_M = 20.0
+BATCH = 64
+
+
+def imu(
+    *,
+    drives: tuple[str, ...] = WALKS,
+    sensor: str = "vlp16",
+    scans: int = 360,
+    blind: float = 0.0,
+) -> None:
+    """Compare roll and pitch of a sensor in a hand by its IMU and by the ground of its scans.
+
+    The motion is a smooth curve through the poses of a simulated drive, at a fifth of its horizontal size, because
+    people walk. The IMU has 200 Hz, noise and biases. Prints the error of roll and pitch against gravity, and the share
+    of errors within 2 standard deviations. The constants of the library were fitted on seeds 500 and 503.
+
+    Args:
+        drives: WORLD:ROUTE:SEED.
+        sensor: name of the sensor.
+        scans: scans of a drive.
+        blind: share of the scans that do not see the ground.
+    """
+    print("| drive | gravity | roll, pitch [deg] | 95 % | within 2 sigma |\n|---|---|---|---|---|")
+    for name in drives:
+        recording = simulated(name, f"{sensor}+handheld", scans)
+        measured = _measured_imu(recording.poses, np.random.default_rng(int(name.split(":")[-1])))
+        ups = measured.ups(recording.poses.times)[0]
+        print(_row_of_gravity(name, "IMU alone", ups, np.full(len(ups), IMU_TILT_DEG), recording.poses), flush=True)
+        rendered = dataclasses.replace(_without_ground(recording, blind), mounting=None)
+        for how, read in (("ground", None), ("IMU and ground", lambda ups=ups: (ups, "an IMU"))):
+            opened = mounted(dataclasses.replace(rendered, read_ups=read), "auto", gravity="scan", known=False)
+            each = opened.mountings or ()
+            found, sigmas = [one.up for one in each], [one.tilt_deviation_deg for one in each]
+            print(_row_of_gravity(name, how, np.array(found), np.array(sigmas, float), recording.poses), flush=True)
+
+
+def _without_ground(recording: SimulatedRecording, share: float) -> Recording:
+    """The recording in memory. A share of its scans has no points below the sensor."""
+    rendered = in_memory(recording)
+    hidden = {path for path in rendered.paths if np.random.default_rng(int(path.name)).random() < share}
+    turned = dict(zip(rendered.paths, recording.poses.world_from_lidar[:, :3, :3], strict=True))
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        points = rendered.read(path, None, False).points
+        assert points is not None
+        return Record(points=points if path not in hidden else points[points @ turned[path][2] > 0])
+
+    return dataclasses.replace(rendered, read=read)
+
+
+def _row_of_gravity(
+    name: str, how: str, ups: Float[np.ndarray, "n 3"], sigma_deg: Float[np.ndarray, " n"], poses: TimedPoses
+) -> str:
+    """One row of the table. The errors are those about the two horizontal axes."""
+    in_world = np.einsum("nij,nj->ni", poses.world_from_lidar[:, :3, :3], ups)
+    sizes = np.abs(np.degrees(in_world[:, :2]))
+    within = (sizes <= 2 * sigma_deg[:, None]).mean()
+    return f"| {name} | {how} | {np.median(sizes):.2f} | {np.quantile(sizes, 0.95):.2f} | {within:.3f} |"
+
+
+def _measured_imu(poses: TimedPoses, rng: np.random.Generator) -> Imu:
+    """Samples of an IMU in the frame of the LiDAR, along a smooth curve through the poses."""
+    stamps = np.arange(poses.times[0], poses.times[-1], 1 / RATE_HZ)
+    turned = RotationSpline(poses.times, Rotation.from_matrix(poses.world_from_lidar[:, :3, :3]))
+    path = CubicSpline(poses.times, poses.world_from_lidar[:, :3, 3] * [WALK, WALK, 1.0])
+    accelerations = turned(stamps).inv().apply(path(stamps, 2) + np.array([0, 0, STANDARD_GRAVITY]))
+    noisy = []
+    for values, noise, bias in (
+        (turned(stamps, 1), GYRO_NOISE, GYRO_BIAS),
+        (accelerations, ACCELERATION_NOISE, ACCELERATION_BIAS),
+    ):
+        noisy.append(values + rng.normal(scale=bias, size=3) + rng.normal(scale=noise, size=values.shape))
+    return Imu(stamps, *noisy)
+
+
+class _Place(NamedTuple):
+    """A place of a town and the time when a scan begins there."""
+
+    world: World
+    xy: Float[np.ndarray, "2"]
+    yaw: float
+    clock: float
+    sensor: Sensor
+
+    def poses(self, times: Float[np.ndarray, " n"], speed_mps: float, turn_deg: float) -> Float[np.ndarray, "n 4 4"]:
+        """Poses of the LiDAR at times since the begin of the scan."""
+        steps = np.linspace(-2 * TURN_S, 2 * TURN_S, 401)
+        angle = 2 * np.pi / SWING_S
+        yaw = self.yaw + np.radians(turn_deg) / angle * np.sin(angle * (steps - TURN_S / 2))
+        forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        xy = np.cumsum(forward, axis=0) * speed_mps * (steps[1] - steps[0])
+        xy += self.xy - xy[len(steps) // 2]
+        x, y, yaw = (np.interp(times, steps, values) for values in (*xy.T, yaw))
+        at = np.stack([x, y], axis=1)
+        return poses_on(self.world.ground.relief, at, yaw, height_m=self.sensor.height_m)
+
+    def scan(self, pose: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "n 3"]:
+        """A scan without motion."""
+        return scan(jax.random.key(seed), self.world, pose, sensor=self.sensor, time=self.clock)[0][:, :3]
+
+    def moving_scan(self, poses: Float[np.ndarray, "sectors 4 4"], seed: int) -> tuple[list[np.ndarray], np.ndarray]:
+        """The points of each sector in the frame of its pose, and the times of all points."""
+        sectors = []
+        for number, pose in enumerate(poses):
+            points = self.scan(pose, seed)
+            azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+            sectors.append(points[np.floor(azimuth / (2 * np.pi) * SECTORS).astype(int) == number])
+        return sectors, np.repeat(_middles(), [len(points) for points in sectors]).astype(np.float32)
+
+
+def _middles() -> Float[np.ndarray, " sectors"]:
+    """Time of each sector since the begin of the scan."""
+    return (np.arange(SECTORS) + 0.5) * TURN_S / SECTORS
+
+
+def deskew(
+    *,
+    sensors: tuple[str, ...] = ("vlp16",),
+    seeds: tuple[int, ...] = (611, 612),
+    places: int = 12,
+    weights: str = "sglpr",
+) -> None:
+    """Measure points and descriptors of scans on a fast turn, before and after deskewing.
+
+    A scan of 0.1 s is put together from sectors, each rendered at the pose of its time. Points are deskewed with the
+    true poses of this scan and of its neighbours. The descriptors are compared with that of a scan rendered at the pose
+    of the scan, with other noise. Beside them is the distance of two such scans, and of the nearest other place.
+
+    Args:
+        sensors: names of sensors.
+        seeds: one town for each.
+        places: scans of each town.
+        weights: the model that describes the scans.
+    """
+    columns = ("sensor", "motion", "points skewed", "deskewed [m]", "descriptors skewed", "deskewed", "no motion")
+    print(f"| {' | '.join((*columns, 'elsewhere'))} |\n{'|---' * 8}|")
+    params = sglpr_jax.load(weights)
+    for name in sensors:
+        towns = [_town(seed, places, lidar(name, AZIMUTHS)) for seed in seeds]
+        for motion in MOTIONS:
+            print(_row_of_motion(name, motion, towns, params), flush=True)
+
+
+def _town(seed: int, places: int, sensor: Sensor) -> list[_Place]:
+    """Places along a route of a town."""
+    path = plan_path(np.random.default_rng((seed, 1)), "00", scans=600)
+    world = build_world((seed, 2), path.xy, path.times)
+    rows = np.linspace(20, len(path.times) - 20, places).astype(int)
+    return [_Place(world, path.xy[i], float(path.yaw[i]), float(path.times[i]), sensor) for i in rows]
+
+
+def _row_of_motion(name: str, motion: str, towns: list[list[_Place]], params: Params) -> str:
+    """One row of the table: medians, and 95 % quantiles of the points."""
+    speed_mps, turn_deg = MOTIONS[motion]
+    errors: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": []}
+    apart: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": [], "again": [], "other": []}
+    for places in towns:
+        clouds: dict[str, list[np.ndarray]] = {"still": [], "again": [], "skewed": [], "deskewed": []}
+        for number, place in enumerate(places):
+            stamps = TURN_S * np.array([-1.0, 0.0, 1.0])
+            trajectory, within = (place.poses(times, speed_mps, turn_deg) for times in (stamps, _middles()))
+            sectors, times = place.moving_scan(within, 3 * number)
+            true = [
+                transformed(inverse(trajectory[1]) @ pose, points) for pose, points in zip(within, sectors, strict=True)
+            ]
+            skewed = np.concatenate(sectors)
+            found = deskew_points(skewed, times, time=0.0, pose_times=stamps, world_from_lidar=trajectory)
+            for how, cloud in (("skewed", skewed), ("deskewed", found)):
+                clouds[how].append(cloud)
+                errors[how].append(np.linalg.norm(cloud - np.concatenate(true), axis=1))
+            for how, seed in (("still", 3 * number + 1), ("again", 3 * number + 2)):
+                clouds[how].append(place.scan(trajectory[1], seed))
+        described = {how: _descriptors(params, scans) for how, scans in clouds.items()}
+        for how in ("skewed", "deskewed", "again"):
+            apart[how].append(np.linalg.norm(described[how] - described["still"], axis=1))
+        at = np.array([place.xy for place in places])
+        others = distances(described["still"], described["still"])
+        others[distances(at, at) < OTHER_PLACE_M] = np.inf
+        apart["other"].append(others.min(axis=1))
+    metres = [np.concatenate(values) for values in errors.values()]
+    cells = [f"{np.median(values):.3f}, 95 % {np.quantile(values, 0.95):.3f}" for values in metres]
+    cells += [f"{np.median(np.concatenate(values)):.3f}" for values in apart.values()]
+    return f"| {name} | {motion}, {speed_mps:g} m/s, {turn_deg:g} deg/s | {' | '.join(cells)} |"
+
+
+def _descriptors(params: Params, clouds: list[np.ndarray]) -> Float[np.ndarray, "n d"]:
+    records = [Record(points=np.ascontiguousarray(cloud, np.float32)) for cloud in clouds]
+    return sglpr_jax.embed(params, recording_of("scans", records)).descriptors
+
+
+def ranges(*, sensors: tuple[str, ...] = ("vlp16", "hdl64e"), seeds: tuple[int, ...] = (11, 12)) -> None:
+    """Measure how far sensors see in each scenery, and the scale that `--scale auto` chooses.
+
+    Args:
+        sensors: names of simulated sensors.
+        seeds: one drive of 40 scans for each.
+    """
+    for name in sensors:
+        for world in (*REPEATING, "town"):
+            route = "00" if world == "town" else "none"
+            cases = [Case(world, route, seed, name) for seed in seeds]
+            drives = [case.simulate(scans=40, azimuth_steps=300) for case in cases]
+            said = ", ".join(f"{typical_range_m(drive):.1f} m, scale {chosen_scale(drive)}" for drive in drives)
+            print(f"{name} {world}: {said}", flush=True)
+
+
+def rotation(
+    *,
+    data: Path,
+    seq: str | None = None,
+    weights: tuple[str, ...] = (DEFAULT_WEIGHTS,),
+    scans: int = 20,
+    step_deg: int = 1,
+    among: int = 1000,
+) -> None:
+    """Measure how far descriptors move when a scan rotates, as a share of the distance to the nearest other place.
+
+    Args:
+        data: a dataset with poses.
+        seq: which recording of it.
+        weights: names of shipped weights, or folders.
+        scans: scans that are rotated, evenly spaced over the recording.
+        step_deg: degrees between two rotations.
+        among: scans, evenly spaced, among which the nearest other place is searched, more than 20 m away.
+    """
+    recording = sglpr_jax.open_recording(data, seq)
+    rows, others = (np.unique(np.linspace(0, len(recording) - 1, n).astype(int)) for n in (scans, among))
+    angles = np.radians(np.arange(step_deg, 360, step_deg))
+    for name in weights:
+        params = sglpr_jax.load(name)
+        unrotated = _rotated(params, recording, [(row, None) for row in rows])
+        elsewhere = cdist(unrotated, _rotated(params, recording, [(row, None) for row in others]))
+        apart = cdist(recording.positions[rows, :2], recording.positions[others, :2])
+        nearest = np.where(apart > OTHER_PLACE_M, elsewhere, np.inf).min(axis=1)
+        turned = _rotated(params, recording, [(row, angle) for row in rows for angle in angles])
+        moved = np.linalg.norm(turned.reshape(len(rows), len(angles), -1) - unrotated[:, None], axis=2)
+        share = moved / nearest[:, None]
+        print(
+            f"{name}: {moved.size} rotations of {len(moved)} scans: moved by {np.median(moved):.3f} (median), "
+            f"{np.quantile(moved, 0.95):.3f} (95 %), {moved.max():.3f} (most); the nearest other place at "
+            f"{np.median(nearest):.3f} (median), {nearest.min():.3f} (least); share {np.median(share):.3f} (median), "
+            f"{np.quantile(share, 0.95):.3f} (95 %)"
+        )
+
+
+def _rotated(params: Params, recording: Recording, views: list) -> Float[np.ndarray, "n d"]:
+    """Descriptors of rows of the recording, each rotated by its angle."""
+    describe, config, found = jax.jit(sglpr_jax.describe), params.config, []
+    for start in range(0, len(views), BATCH):
+        part = views[start : start + BATCH]
+        seen = [view(recording.record(row), config.grid, image=config.image, angle=angle) for row, angle in part]
+        images = [np.asarray(one.image) for one in seen]
+        images += images[-1:] * (BATCH - len(images))  # one program for all batches
+        found.append(np.asarray(describe(params, np.stack(images)))[: len(part)])
+    return np.concatenate(found)

@@ -1,0 +1,91 @@
+"""Memory and time of the loop detector on a long drive."""
+
+import dataclasses
+import gc
+import sys
+import time
+from collections.abc import Callable, Sequence
+from types import FunctionType, ModuleType
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import sglpr_jax
+from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.comparison import NO_FITS
+from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.sim.recording import simulate_recording
+from sglpr_jax.sim.sensor import HDL64E
+
+STEP_S, STEP_M, LAP = 0.1, 1.0, 2000
+"""Time and distance between two frames, and frames of a lap."""
+SCANS = 20
+"""Number of different simulated scans."""
+
+
+def loops(
+    *,
+    frames: Sequence[int] = (1000, 4541, 20_000),
+    repeats: int = 20,
+    azimuth_steps: int = 900,
+    weights: str = "sglpr",
+) -> None:
+    """Print bytes a frame, and processor milliseconds of a further scan, after some numbers of frames.
+
+    The vehicle drives the same circle again and again. Descriptors are random, images are those of a few simulated
+    scans, and no images are compared but for the timed scans. One core: under `taskset -c 0`.
+
+    Args:
+        frames: numbers of frames at which memory and time are measured.
+        repeats: scans that are timed.
+        azimuth_steps: firings of the simulated sensor per turn.
+        weights: the model that describes the timed scans.
+    """
+    detector, rng = LoopDetector(sglpr_jax.load(weights)), np.random.default_rng(0)
+    finder, sensor = detector.finder, dataclasses.replace(HDL64E, azimuth_steps=azimuth_steps)
+    drive = simulate_recording("08", scans=60, sensor=sensor, seed=101)
+    records = [drive.record(i, labels=False) for i in range(SCANS)]
+    seen = [finder.seen(record) for record in records]
+    table = Table("frames", "MB", "bytes a frame", "ms to describe a scan", "ms a scan")
+    before = held_bytes(detector)
+    for end in frames:
+        while len(detector) < end:
+            frame = len(detector)
+            drawn = rng.normal(size=finder.index.width).astype(np.float32)
+            own = Seen(drawn / np.linalg.norm(drawn), seen[frame % SCANS].image.copy(), seen[0].mounting)
+            link = Link(*map(np.asarray, (STEP_M, 0.0, 2 * np.pi / LAP, 0.9, 0.3, 0.1))) if frame else None
+            detector.add_seen(own, time=STEP_S * frame, compared=Compared(NO_FITS, link))
+        held = held_bytes(detector) - before
+        describing = _mean_s(lambda record: finder.seen(record), records, repeats)
+        adding = _mean_s(lambda record: detector.add(record, time=STEP_S * len(detector)), records, repeats)
+        milliseconds = (f"{1e3 * one:.1f}" for one in (describing, adding))
+        values = (f"{end:,}", f"{held / 1e6:.0f}", f"{held / end:,.0f}", *milliseconds)
+        table.add_row(*values)
+        print(*values, flush=True)
+    Console(width=100).print(table)
+
+
+def _mean_s(job: Callable[[sglpr_jax.Record], object], records: list[sglpr_jax.Record], repeats: int) -> float:
+    """Mean processor seconds of a job. The first runs, which compile, do not count."""
+    for i in range(2 * repeats):
+        if i == repeats:
+            start = time.process_time()
+        job(records[i % SCANS])
+    return (time.process_time() - start) / repeats
+
+
+def held_bytes(root: object) -> int:
+    """Bytes of an object and of all that it refers to, without functions, modules and classes."""
+    seen, left, total = {id(root)}, [root], 0
+    while left:
+        one = left.pop()
+        total += sys.getsizeof(one)
+        others = [one.base] if isinstance(one, np.ndarray) else gc.get_referents(one)
+        for other in others:
+            if id(other) not in seen and not isinstance(other, type | ModuleType | FunctionType):
+                seen.add(id(other))
+                left.append(other)
+    return total

@@ -1,0 +1,134 @@
+"""How fast this device makes scans of a simulated town, and images of clouds: one row each."""
+
+import concurrent.futures
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.drives import lidar
+from benchmarks.speed.inputs import random_scans
+from benchmarks.timing import about, median_seconds
+from sglpr_jax.bev import rasterize
+from sglpr_jax.data.density_image import density_bev
+from sglpr_jax.grid import Grid
+from sglpr_jax.sim.drive import plan_scan_path, poses_on
+from sglpr_jax.sim.sensor import Sensor, cast_turn, first_surface, returned_points, scan, view_of
+from sglpr_jax.sim.world import build_world
+
+GRID = Grid(height=224, width=224)
+"""The paper's, onto which clouds are rasterised."""
+Row = dict[str, Any]
+
+
+class Along:
+    """A drive through its town, and the sensor that makes it."""
+
+    def __init__(self, seq: str, scans: int, sensor: Sensor):
+        xy, yaw, self.times = plan_scan_path(np.random.default_rng(0), seq, scans=scans)
+        self.world = build_world(0, xy, self.times)
+        self.poses = poses_on(self.world.ground.relief, xy, yaw, height_m=sensor.height_m)
+        self.sensor, self.key = sensor, jax.random.key(0)
+
+    def view(self, i: int) -> Any:
+        """What the rays of a scan may meet."""
+        return view_of(self.world, self.poses[i], sensor=self.sensor, time=float(self.times[i]))
+
+    def scan(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """A scan from the town to the host's memory."""
+        return scan(self.key, self.world, self.poses[i], sensor=self.sensor, time=float(self.times[i]))
+
+    def scans_in(self, threads: int) -> None:
+        """All scans, in some threads."""
+        with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+            list(pool.map(self.scan, range(len(self.poses))))
+
+
+def measurements(
+    sensor: str, azimuth_steps: int | None, *, route: str, scans: int, batch: int, points: int, repeats: int
+) -> Iterator[tuple[Row, Callable[[], Row]]]:
+    """The key of each row, and a function that measures its rest."""
+    one = lidar(sensor, azimuth_steps)
+    drive = functools.cache(lambda: Along(route, scans, one))
+    rays = {"sensor": sensor, "rays": [len(one.elevations_deg), one.azimuth_steps]}
+    yield {"what": "scan", **rays}, lambda: _whole_scans(drive(), repeats)
+    for number in (1, batch):
+        key = {"what": "cast", "batch": number, **rays}
+        yield key, functools.partial(_casts, drive, number, repeats)
+    for number in (1, batch):
+        key = {"what": "rasterize", "batch": number, "points": points}
+        yield key, functools.partial(_rasterized, number, points, repeats)
+    yield {"what": "density_bev on the host", "points": points}, functools.partial(_densities, points, repeats)
+
+
+def _whole_scans(drive: Along, repeats: int) -> Row:
+    """Scans from the town to the host's memory: stages, and the rate in one and two threads.
+
+    The cast is done twice to tell it from the returns, which follow it.
+    """
+    view = drive.view(0)
+    turn = jax.block_until_ready(cast_turn(drive.key, view, sensor=drive.sensor))
+    stages = {
+        "cull": lambda: drive.view(0),
+        "cast": lambda: jax.block_until_ready(first_surface(drive.key, view, sensor=drive.sensor)),
+        "cast and returns": lambda: jax.block_until_ready(cast_turn(drive.key, view, sensor=drive.sensor)),
+        "copy": lambda: returned_points(turn),
+    }
+    row = {f"{name}_s": median_seconds(job, repeats=repeats) for name, job in stages.items()}
+    row["returns_s"] = row.pop("cast and returns_s") - row["cast_s"]
+    one, two = (median_seconds(lambda n=n: drive.scans_in(n), repeats=repeats) for n in (1, 2))
+    count = len(drive.poses)
+    return {**row, "scans_per_second": count / one, "scans_per_second_in_2_threads": count / two}
+
+
+def _casts(drive: Callable[[], Along], batch: int, repeats: int) -> Row:
+    """The device's part alone: the rays of so many scans in one call, all they may meet on the device already."""
+    along, keys = drive(), jax.random.split(jax.random.key(0), batch)
+    views = [along.view(i % len(along.poses)) for i in range(batch)]
+    stacked = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *views))
+    cast = jax.jit(jax.vmap(functools.partial(cast_turn, sensor=along.sensor)))
+    seconds = median_seconds(lambda: jax.block_until_ready(cast(keys, stacked)), repeats=repeats)
+    return {"seconds": seconds, "scans_per_second": batch / seconds}
+
+
+def _rasterized(batch: int, points: int, repeats: int) -> Row:
+    clouds = jax.device_put(random_scans(batch, points, grid=GRID)[0])
+    seconds = median_seconds(lambda: jax.block_until_ready(rasterize(clouds, grid=GRID)), repeats=repeats)
+    return {"seconds": seconds, "points_per_second": batch * points / seconds}
+
+
+def _densities(points: int, repeats: int) -> Row:
+    """The density image, which numpy makes: no device takes part."""
+    cloud = random_scans(points, grid=GRID)[0]
+    seconds = median_seconds(lambda: density_bev(cloud), repeats=repeats)
+    return {"seconds": seconds, "points_per_second": points / seconds}
+
+
+def simulate(
+    *,
+    sensor: str = "hdl64e",
+    azimuth_steps: int = 1800,
+    seq: str = "00",
+    scans: int = 100,
+    batch: int = 16,
+    points: int = 120_000,
+    repeats: int = 5,
+) -> None:
+    """Time the simulator and images of clouds: scans a second in one and two threads, and where the time goes.
+
+    Args:
+        sensor: one of the sensor presets.
+        azimuth_steps: rays of a laser in one turn.
+        seq: the drive.
+        scans: scans of the drive, all of which are made in every repeat.
+        batch: scans and clouds in one call, beside one.
+        points: points of a cloud.
+        repeats: how often everything is timed.
+    """
+    sizes = {"route": seq, "scans": scans, "batch": batch, "points": points, "repeats": repeats}
+    for key, measure in measurements(sensor, azimuth_steps, **sizes):
+        row = measure()
+        print(f"{key}: {', '.join(f'{name} {value:.4g}' for name, value in row.items())}", flush=True)
+    print("\n".join(about("jax").values()))

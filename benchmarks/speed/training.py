@@ -1,0 +1,261 @@
+"""Training steps: tuples a second, their operations, and their share of the device's peak."""
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.interpreters.partial_eval import dce_jaxpr
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.speed.inputs import random_batch, random_images
+from benchmarks.timing import SPREAD, Job, about, clocked, in_turn, peak_mb
+from sglpr_jax.data.sampling.batch import Batch
+from sglpr_jax.files import in_short
+from sglpr_jax.models.sglpr import describe, init
+from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.presets import load_preset
+from sglpr_jax.training.state import new_state
+from sglpr_jax.training.step import train_step
+
+PRODUCTS = 4
+"""Matrix products in one timing."""
+NOMINAL_TYPE = "bfloat16"
+"""The type that nominal peaks are given for here."""
+
+
+def count_flops(program: ClosedJaxpr) -> int:
+    """Operations of the matrix products and convolutions of a traced program, less what no output needs.
+
+    Two for each product of two numbers that are added up, on every device. Of a branch the dearer side counts. XLA's
+    own cost analysis counts the body of a loop once, knows nothing of library calls on a GPU, and adds up operations
+    of all kinds. Raises ValueError for a product in a loop whose turns depend on values.
+    """
+    needed, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars))
+    return _count(needed)
+
+
+def _count(program: Jaxpr) -> int:
+    return sum(map(_of_equation, program.eqns))
+
+
+def _of_equation(equation: Any) -> int:
+    name = equation.primitive.name
+    if name == "dot_general":
+        return _of_product(equation)
+    if name == "conv_general_dilated":
+        return _of_convolution(equation)
+    values = [each for one in equation.params.values() for each in (one if isinstance(one, tuple) else (one,))]
+    opened = [each.jaxpr if isinstance(each, ClosedJaxpr) else each for each in values]
+    inner = [_count(each) for each in opened if isinstance(each, Jaxpr)]
+    if name == "cond":
+        return max(inner)
+    if name == "while" and any(inner):
+        raise ValueError("a matrix product in a loop whose number of turns is not known cannot be counted")
+    return (equation.params["length"] if name == "scan" else 1) * sum(inner)
+
+
+def _of_product(equation: Any) -> int:
+    (summed, _), _ = equation.params["dimension_numbers"]
+    left, out = equation.invars[0].aval.shape, equation.outvars[0].aval.shape
+    return 2 * math.prod(out) * math.prod(left[axis] for axis in summed)
+
+
+def _of_convolution(equation: Any) -> int:
+    """Every output adds up a kernel's worth of products; zeros between the inputs (`lhs_dilation`) are no work.
+
+    Such zeros are in the gradient of a convolution with strides. Padding counts, as it does everywhere.
+    """
+    _, _, *spatial = equation.params["dimension_numbers"].rhs_spec
+    kernel, out = equation.invars[1].aval.shape, equation.outvars[0].aval.shape
+    inputs = kernel[equation.params["dimension_numbers"].rhs_spec[1]]
+    taps = math.prod(kernel[axis] for axis in spatial)
+    return 2 * math.prod(out) * inputs * taps // math.prod(equation.params["lhs_dilation"])
+
+
+def step_flops(config: TrainConfig, batch: Batch) -> int:
+    """Operations of a step in one piece: a step in chunks goes forward twice, which is no work of the model's."""
+    whole = dataclasses.replace(config, chunk=0)
+    return count_flops(train_step.trace(jax.eval_shape(lambda: new_state(whole)), batch, config=whole).jaxpr)
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """How often everything is timed, and against what."""
+
+    repeats: int
+    calls: int
+    """Steps, or calls of `describe`, in one timing."""
+    size: int | None
+    """Rows and columns of the matrices whose product is the measured peak. None: 2048 on a CPU, 8192 elsewhere."""
+    products: int
+    """Of them in one timing."""
+    peak_tflops: float | None = None
+    """The nominal peak of products in bfloat16, 10^12 operations a second."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """A job, and what is known of one of its calls."""
+
+    job: Job
+    flops: int
+    images: int
+    program: Callable[[], jax.stages.Compiled]
+    """The compiled program; after the job has run nothing is compiled for it."""
+
+
+class StepJob:
+    """A job: training steps, one after another."""
+
+    def __init__(self, config: TrainConfig, batch: Batch, steps: int):
+        self._config, self._batch, self._steps = config, batch, steps
+        self._state = new_state(config)
+
+    def __call__(self) -> None:
+        """Make the steps. Raises FloatingPointError if the loss is no longer finite."""
+        for _ in range(self._steps):
+            self._state, metrics = train_step(self._state, self._batch, config=self._config)
+        if not np.isfinite(metrics["loss"]):
+            raise FloatingPointError(f"the loss is {metrics['loss']}: what was timed is no training")
+
+    def program(self) -> jax.stages.Compiled:
+        """The compiled step."""
+        return train_step.lower(self._state, self._batch, config=self._config).compile()
+
+
+def step_work(config: TrainConfig, calls: int, *, labels: bool = True) -> Work:
+    """Training steps on a random batch that is on the device: all but reading."""
+    batch = jax.device_put(random_batch(config, config.max_points, labels=labels))
+    job = StepJob(config, batch, calls)
+    return Work(job, step_flops(config, batch), config.images, job.program)
+
+
+def describe_work(config: TrainConfig, batch: int, calls: int) -> Work:
+    """Descriptors of so many random images that are on the device; each call waits for its own."""
+    params = jax.jit(init, static_argnames="config")(jax.random.key(0), config=config.model)
+    images = jax.device_put(random_images(batch, config.model.grid, image="points")[0])
+    described = jax.jit(describe)
+
+    def job() -> None:
+        for _ in range(calls):
+            jax.block_until_ready(described(params, images))
+
+    flops = count_flops(described.trace(params, images).jaxpr)
+    return Work(job, flops, batch, lambda: described.lower(params, images).compile())
+
+
+def product_job(type_: str, size: int, products: int) -> Job:
+    """Products of two square matrices."""
+    keys = jax.random.split(jax.random.key(0))
+    a, b = (jax.random.normal(key, (size, size), jnp.dtype(type_)) for key in keys)
+    multiply = jax.jit(jnp.matmul)
+
+    def job() -> None:
+        for _ in range(products):
+            product = multiply(a, b)
+        jax.block_until_ready(product)
+
+    return job
+
+
+def configured(config: TrainConfig, compute: str) -> TrainConfig:
+    """The preset with another type."""
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, compute=compute))
+
+
+def measured(make: Callable[[], Work], compute: str, timing: Timing) -> dict[str, Any]:
+    """Time work against matrix products in turn. If the device refuses it, for want of memory say, the reason."""
+    peak_before = _peak_bytes()
+    try:
+        work = make()
+        size = timing.size or (2048 if jax.devices()[0].platform == "cpu" else 8192)
+        jobs = [clocked(work.job), clocked(product_job(compute, size, timing.products))]
+        seconds = in_turn(jobs, repeats=timing.repeats)
+        needed = _program_bytes(work.program())
+    except (jax.errors.JaxRuntimeError, FloatingPointError) as error:
+        return {"error": in_short(error)}
+    rates, peaks = (np.array([timing.calls * work.flops, timing.products * 2.0 * size**3]) / seconds).T
+    peak_after, nominal = _peak_bytes(), timing.peak_tflops if compute == NOMINAL_TYPE else None
+    rate = float(np.median(rates))
+    low, middle, high = map(float, np.quantile(rates / peaks, (SPREAD[0], 0.5, SPREAD[1])))
+    return {
+        "seconds": work.flops / rate,
+        "images_per_second": work.images * rate / work.flops,
+        "flop": work.flops,
+        "flop_per_second": rate,
+        "peak_flop_per_second": float(np.median(peaks)),
+        "share_of_peak": middle,
+        "share_of_peak_spread": (low, high),
+        "nominal_tflops": nominal,
+        "share_of_nominal": None if nominal is None else rate / (nominal * 1e12),
+        "program_bytes": needed,
+        "peak_bytes": None if peak_after == peak_before else peak_after,
+    }
+
+
+def _peak_bytes() -> int | None:
+    """The most of the device's memory that this process has used so far; None if the device does not tell."""
+    return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+
+
+def _program_bytes(program: jax.stages.Compiled) -> int | None:
+    """Bytes of inputs, outputs and intermediate values; None if the compiler does not tell."""
+    needs = program.memory_analysis()
+    if needs is None:
+        return None
+    buffers = needs.argument_size_in_bytes + needs.output_size_in_bytes + needs.temp_size_in_bytes
+    return buffers - needs.alias_size_in_bytes
+
+
+def about_device() -> dict[str, str]:
+    """The device, and what is needed to repeat a measurement."""
+    return {"device": jax.devices()[0].device_kind, **about("jax", "jaxlib", "optax")}
+
+
+def training(
+    *,
+    preset: tuple[str, ...] = ("sglpr",),
+    compute: tuple[str, ...] = (),
+    labels: bool = True,
+    repeats: int = 10,
+    steps: int = 2,
+    size: int | None = None,
+) -> None:
+    """Time training steps and matrix products in turn: tuples a second, and the share of the device's peak.
+
+    The step is all but reading, on a random batch that is on the device. Its operations are those of matrix products
+    and convolutions, forward and backward. The peak is the rate of large square products of the same type, at the
+    precision JAX has by default.
+
+    Args:
+        preset: files of configs/ by name, or paths.
+        compute: float32, bfloat16; none named: float32, and on other devices than a CPU bfloat16 too.
+        labels: whether the clouds have them; without them the segmentation head is not computed.
+        repeats: how often steps and products are timed in turn.
+        steps: steps in one timing.
+        size: rows and columns of the matrices; none: 2048 on a CPU, 8192 elsewhere.
+    """
+    types = compute or (("float32",) if jax.devices()[0].platform == "cpu" else ("float32", "bfloat16"))
+    columns = ("tuples/s", "images/s", "GFLOP/step", "GFLOP/s", "peak GFLOP/s", "share", "spread")
+    table = Table("preset", "compute", "tuples/step", *columns)
+    for name in preset:
+        for type_ in types:
+            config = configured(load_preset(name), type_)
+            timing = Timing(repeats, steps, size, PRODUCTS)
+            row = measured(lambda config=config: step_work(config, steps, labels=labels), type_, timing)
+            tuples_per_second = config.tuples / row["seconds"]
+            giga = (f"{row[key] / 1e9:.4g}" for key in ("flop", "flop_per_second", "peak_flop_per_second"))
+            spread = " to ".join(f"{share:.3f}" for share in row["share_of_peak_spread"])
+            numbers = (f"{tuples_per_second:.4g}", f"{row['images_per_second']:.4g}", *giga)
+            table.add_row(name, type_, str(config.tuples), *numbers, f"{row['share_of_peak']:.3f}", spread)
+    Console(width=140, highlight=False).print(table)
+    print("Share: of the peak, medians of what was measured in turn. Spread: its 10 % and 90 % quantiles.")
+    print("\n".join(f"{name}: {value}" for name, value in about_device().items()))
+    print(f"peak of memory: {peak_mb():.0f} MB, with GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")

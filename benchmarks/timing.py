@@ -1,0 +1,187 @@
+"""Timing of jobs against each other on a machine that is never quiet.
+
+Jobs run in turn, in the opposite order at every other repeat. Ratios are formed within each repeat, so that load from
+outside meets all jobs alike. Reported are the median of those ratios and their spread.
+"""
+
+import importlib.metadata
+import multiprocessing
+import os
+import platform
+import resource
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
+
+Job = Callable[[], Any]
+SPREAD = (0.1, 0.9)
+BUSY_ALLOWANCE = 0.5
+"""Load average beyond the CPUs that does not matter yet."""
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+def clocked(job: Job) -> Callable[[], float]:
+    """A job that returns its seconds."""
+
+    def run() -> float:
+        start = time.perf_counter()
+        job()
+        return time.perf_counter() - start
+
+    return run
+
+
+def in_turn(jobs: Sequence[Callable[[], float]], *, repeats: int) -> Float[np.ndarray, "repeats jobs"]:
+    """Seconds of jobs that return them. A first run of each, which compiles, does not count."""
+    for job in jobs:
+        job()
+    seconds = np.zeros((repeats, len(jobs)))
+    for repeat in range(repeats):
+        for i in range(len(jobs))[:: -1 if repeat % 2 else 1]:
+            seconds[repeat, i] = jobs[i]()
+    return seconds
+
+
+def median_seconds(job: Job, *, repeats: int) -> float:
+    """Median seconds of one job."""
+    return float(np.median(in_turn([clocked(job)], repeats=repeats)))
+
+
+def run_command(command: Sequence[str | Path], environment: Mapping[str, str] = os.environ) -> tuple[float, float]:
+    """Seconds and processor seconds of a command. Raises SystemExit if it fails."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
+    seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if ended.returncode:
+        raise SystemExit(f"{command[:3]} failed: {ended.stderr[-2000:]}")
+    return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+class Contender:
+    """A job in a process of its own. A call runs it once and returns its seconds.
+
+    `make_job(*arguments)` is called in that process. A framework that it imports or uses first there gets `threads`
+    threads.
+    """
+
+    def __init__(self, name: str, make_job: Callable[..., Job], *arguments: Any, threads: int):
+        self.name = name
+        self._pipe, far_end = _SPAWN.Pipe()
+        process = _SPAWN.Process(target=_serve, args=(far_end, threads, make_job, arguments), daemon=True)
+        process.start()
+        far_end.close()
+
+    def run(self) -> tuple[Any, float]:
+        """What the job returns, and its seconds. Raises SystemExit if the process has ended."""
+        return self._ask("run")
+
+    def __call__(self) -> float:
+        return self.run()[1]
+
+    def forget_peak(self) -> None:
+        """Let `peak_mb` and `processor_s` begin anew: compiling needs memory, too."""
+        self._ask("forget peak")
+
+    def processor_s(self) -> float:
+        """Median of the processor seconds, over all threads, of the runs since `forget_peak` or its start."""
+        return self._ask("processor")
+
+    def peak_mb(self) -> float:
+        """The most resident memory of the process, in 10^6 bytes, since `forget_peak` or its start."""
+        return self._ask("peak")
+
+    def _ask(self, question: str) -> Any:
+        try:
+            self._pipe.send(question)
+            return self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise SystemExit(f"{self.name}: its process ended, for the reason above or for want of memory") from error
+
+
+def _serve(pipe, threads: int, make_job: Callable[..., Job], arguments: tuple) -> None:
+    os.environ["NPROC"] = os.environ["OMP_NUM_THREADS"] = str(threads)  # XLA's and PyTorch's
+    job, processor_s = make_job(*arguments), []
+    while True:
+        try:
+            asked = pipe.recv()
+        except EOFError:
+            return
+        if asked == "run":
+            start, used = time.perf_counter(), time.process_time()
+            value = job()
+            pipe.send((value, time.perf_counter() - start))
+            processor_s.append(time.process_time() - used)
+        elif asked == "forget peak":
+            processor_s.clear()
+            pipe.send(Path("/proc/self/clear_refs").write_text("5"))  # of all that it can clear: VmHWM
+        else:
+            pipe.send({"peak": peak_mb, "processor": lambda: float(np.median(processor_s))}[asked]())
+
+
+def peak_mb() -> float:
+    """The most memory that this process has held, in 10^6 bytes."""
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status["VmHWM"].split()[0]) * 1024 / 1e6
+
+
+def resident_mb(process: int | str = "self") -> float:
+    """Memory that a process holds, in 10^6 bytes."""
+    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def warn_if_busy(threads: int) -> None:
+    """Print a warning if other programs leave too few CPUs for `threads`."""
+    busy, cpus = os.getloadavg()[0], os.cpu_count() or 1
+    if busy + threads > cpus + BUSY_ALLOWANCE:
+        print(
+            f"warning: other programs keep {busy:.1f} of {cpus} CPUs busy. Two threads that share a CPU cost PyTorch's "
+            "OpenMP far more than JAX: take --threads 1, or wait"
+        )
+
+
+def check_equal(name: str, ours: np.ndarray, theirs: np.ndarray, *, tolerance: float) -> None:
+    """Print the largest difference; raises SystemExit if it is above `tolerance` times the largest value."""
+    difference, scale = np.abs(np.subtract(ours, theirs)).max(), np.abs(theirs).max()
+    print(f"{name}: largest difference {difference:.2g}, largest value {scale:.3g}")
+    if not difference <= tolerance * scale:
+        raise SystemExit(f"{name}: the two do not agree, so there is nothing to time")
+
+
+def report(
+    title: str,
+    ours: tuple[str, Float[np.ndarray, " n"]],
+    other: tuple[str, Float[np.ndarray, " n"]],
+    *,
+    packages: Sequence[str],
+    threads: int,
+) -> None:
+    """Print names and seconds of two contenders, the ratios, and what is needed to repeat them."""
+    (name, seconds), (against, others) = ours, other
+    low, middle, high = np.quantile(seconds / others, (SPREAD[0], 0.5, SPREAD[1]))
+    table = Table("", f"{against}, ms", f"{name}, ms", f"{name} / {against}", "spread")
+    milliseconds = (f"{1e3 * np.median(each):.4g}" for each in (others, seconds))
+    table.add_row(title, *milliseconds, f"{middle:.3f}", f"{low:.3f} to {high:.3f}")
+    Console(width=120).print(table)
+    print(f"Medians of {len(seconds)} repeats. Below 1 {name} is faster. Spread: the 10 % and 90 % quantiles.")
+    print(f"{threads} threads each; GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")
+    print("\n".join(about(*packages).values()))
+
+
+def about(*packages: str) -> dict[str, str]:
+    """What is needed to repeat a measurement."""
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in packages]
+    load = ", ".join(f"{average:.1f}" for average in os.getloadavg())
+    return {
+        "command": shlex.join(["python", *sys.argv]),
+        "versions": ", ".join([f"Python {platform.python_version()}", *versions]),
+        "machine": f"{os.cpu_count()} CPUs, load average {load} at the end",
+    }
