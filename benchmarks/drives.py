@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.se3 import inverse, transform
-from sglpr_jax.sim.carriers import CARRIERS
+from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.scenery import SCENERIES
+from sglpr_jax.sim.styles import SCENERIES
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
 
 Odometry = Literal["none", "exact", "drifting"]

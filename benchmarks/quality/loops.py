@@ -36,7 +36,7 @@ from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import SimulatedRecording
-from sglpr_jax.sim.scenery import SCENERIES
+from sglpr_jax.sim.styles import SCENERIES
 
 PEERS = Path(__file__).resolve().parent / "peers"
 KEPT, NO_LOOP = 1000.0, -100.0

@@ -32,7 +32,7 @@ from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import distances, moved_covariance
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.scenery import SCENERIES
+from sglpr_jax.sim.styles import SCENERIES
 
 APART_M, APART_S = 10.0, 30.0
 """The scans of a pair are at most so many metres and at least so many seconds apart."""

@@ -42,7 +42,7 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.se3 import travelled
 from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.scenery import SCENERIES
+from sglpr_jax.sim.styles import SCENERIES
 
 CARS, WALKERS = ("hdl64e", "vlp16"), ("os0-32+backpack", "os0-32-140+handheld")
 OF_SCENERY: dict[str, tuple[str, ...]] = {

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,8 +77,8 @@ PARSED = (
 def folder(tmp_path_factory) -> Path:
     """A folder with small datasets."""
     made = tmp_path_factory.mktemp("benchmarks")
-    write_dataset(made / "town", names=("00",), scans=60, sensor=SENSOR)
-    write_dataset(made / "images", names=("08",), scans=60, sensor=SENSOR, layout="images")
+    simulate(made / "town", routes=("00",), scans=60, sensor=SENSOR)
+    simulate(made / "images", routes=("08",), scans=60, sensor=SENSOR, images=True)
     np.savez(made / "drawn.npz", a=np.random.default_rng(0).normal(size=(40, 16)).astype(np.float32))
     (made / "kept.json").write_text((ROOT / "benchmarks/learned/results.json").read_text())
     return made
