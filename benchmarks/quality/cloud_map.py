@@ -149,7 +149,7 @@ def main() -> None:
         poses = maps["scans"]()[1]
         for name in command.maps:
             recording, map_poses = maps[name]()
-            places = sglpr_jax.PlaceMap.of(recording, params, map_poses, spacing_m=command.spacing_m)
+            places = sglpr_jax.map_recording(recording, params, map_poses, spacing_m=command.spacing_m).places
             for sensor in command.queries:
                 query = driven(command.out, seed=seed, sensor=sensor, day=1, scans=command.scans, azimuth_steps=900)
                 found = np.array(located(places, params, query, first, poses, command.every))

@@ -36,7 +36,7 @@ from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.models.params import Params
-from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
+from sglpr_jax.pose_graph.optimize import PoseGraph, trajectory_error
 from sglpr_jax.registration.bev_alignment import refined
 from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.same_place import EXCLUDED_FRAMES
@@ -83,7 +83,7 @@ class Simulated:
             rejected = [*detector.rejected, *rejected]
             sure[f"town {town}"] = report(f"town {town}", drive, poses, detector, kept, rejected, seconds)
             if self.optimized and odometry is not None:
-                found = optimized(odometry, tuple(kept))
+                found = PoseGraph({0: odometry}, kept).solve()
                 before, after = (trajectory_error(each, drive.positions) for each in (odometry, found.poses))
                 print(f"  trajectory: off by {before:.2f} m before, {after:.2f} m after, ", end="")
                 print(found)

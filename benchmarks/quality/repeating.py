@@ -132,7 +132,7 @@ def _moved(
     odometry: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], poses: Float[np.ndarray, "n 4 4"]
 ) -> dict[str, float]:
     """How far the optimisation moves the odometry at most, and its RMS error before and after, in metres."""
-    corrected = optimize.optimized(odometry, tuple(loops))
+    corrected = optimize.PoseGraph({0: odometry}, loops).solve()
     before, after = (trajectory_error(each, poses[:, :3, 3]) for each in (odometry, corrected.poses))
     return {"moved_m": corrected.moved_m, "before_m": before, "after_m": after}
 

@@ -21,6 +21,7 @@ from benchmarks.quality.submaps import APART_M, PASSES, RIGHT_M, Drive, rendered
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.se3 import distances, inverse, yaw_of
 
@@ -84,7 +85,7 @@ def prepared(params: sglpr_jax.Params, drive: Drive, length_m: float, spacing_m:
     recording = submaps_of_passes(drive, length_m, seed=seed)
     rows, every = np.array(scored(drive)), max(1, round(spacing_m))
     mapped = rows[drive.passes[rows] == 0]
-    places = PlaceMap.of(only(recording, mapped.tolist()), params, drive.poses[mapped], spacing_m=spacing_m)
+    places = map_recording(only(recording, mapped.tolist()), params, drive.poses[mapped], spacing_m=spacing_m).places
     numbers = [list(PASSES).index(name) for name in QUERIES]
     asked = rows[np.isin(drive.passes[rows], numbers)][::every]
     finder = CandidateFinder(params)

@@ -17,12 +17,11 @@ import tyro
 from jaxtyping import Float
 
 import sglpr_jax
-from benchmarks.quality.two_recordings import Poses, Search, judged, report
+from benchmarks.quality.two_recordings import Poses, judged, report
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.search import prepared, searched
-from sglpr_jax.loops.search_between import between_searches
+from sglpr_jax.loops.search import Searched, prepared, search_pair, search_session
 from sglpr_jax.models.params import Params
 from sglpr_jax.se3 import inverse, travelled
 
@@ -64,7 +63,7 @@ def main(
         if a[0] == b[0] and b[1] - a[1] > scans * step and _common_m(true[a], true[b]) >= COMMON_M
     ]
     apart = [(a, b) for a, b in both if a[0] != b[0]]
-    done: dict[tuple[str, int], Search] = {}
+    done: dict[tuple[str, int], Searched] = {}
     rows, invented = [], 0
     for kind, chosen, count in (("common", common, pairs), ("strangers", apart, strangers)):
         for k in rng.permutation(len(chosen))[:count]:
@@ -72,13 +71,13 @@ def main(
                 if window not in done:
                     done[window] = _search(params, data, window, true[window], step)
             searches = done[chosen[k][0]], done[chosen[k][1]]
-            found = between_searches(0, 1, searches)
-            row: dict[str, Any] = {"first": chosen[k][0], "second": chosen[k][1], "loops": len(found.loops)}
+            loops, _, transforms = search_pair(0, 1, searches)
+            row: dict[str, Any] = {"first": chosen[k][0], "second": chosen[k][1], "loops": len(loops)}
             if kind == "common":
-                rows.append(row | judged(found, searches, [true[window] for window in chosen[k]]))
+                rows.append(row | judged(loops, transforms, searches, [true[window] for window in chosen[k]]))
                 row = rows[-1]
             else:
-                invented += bool(found.aligned)
+                invented += bool(transforms)
             print(kind, json.dumps(row), flush=True)
     report(rows, invented, min(strangers, len(apart)))
 
@@ -97,21 +96,14 @@ def _common_m(first: Poses, second: Poses) -> float:
     return float(np.diff(travelled(second), prepend=0.0)[apart <= NEAR_M].sum())
 
 
-def _search(params: Params, data: Path, window: tuple[str, int], true: Float[np.ndarray, "n 4 4"], step: int) -> Search:
+def _search(
+    params: Params, data: Path, window: tuple[str, int], true: Float[np.ndarray, "n 4 4"], step: int
+) -> Searched:
     """Search one recording, with its poses in the frame of its first scan."""
     whole = sglpr_jax.open_recording(data, window[0])
     recording = only(whole, list(range(window[1], window[1] + step * len(true), step)))
-    return searched(
-        prepared(recording, inverse(true[0]) @ true, DetectorConfig(), registered=False),
-        params,
-        model=None,
-        registered=False,
-        scale=1,
-        on_bad_scan=None,
-        kept_in=None,
-        should_stop=lambda: False,
-        on_progress=lambda done: None,
-    )
+    given = prepared(recording, inverse(true[0]) @ true, DetectorConfig(), registered=False)
+    return search_session(given, params)
 
 
 if __name__ == "__main__":

@@ -26,11 +26,11 @@ from benchmarks.quality.drives import Odometry
 from benchmarks.quality.loops import drifted
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.loops.acceptance import settled
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.frame_alignment import AlignedParts
 from sglpr_jax.loops.keyframes import Seen
-from sglpr_jax.loops.search import FoundLoops
-from sglpr_jax.loops.search_between import FoundBetween, between_searches
+from sglpr_jax.loops.search import Input, Searched, search_pair
 from sglpr_jax.models.params import Params
 from sglpr_jax.se3 import inverse, yaw_of
 
@@ -38,7 +38,6 @@ OTHER_M = 20.0
 """A loop whose scans are farther apart is wrong."""
 LIMIT_M, LIMIT_DEG = 0.2, 0.5
 
-Search = tuple[FoundLoops, CandidateFinder]
 Poses = Float[np.ndarray, "n 4 4"]
 
 
@@ -69,17 +68,18 @@ def main(
         first, second = (searched(params, content, name, odometry) for name in ("first", "second"))
         true = [content[f"{name}_world_from_lidar"] for name in ("first", "second")]
         row = {"pair": path.stem, "common_m": float(content["common_m"]), "turned_deg": float(content["turned_deg"])}
-        rows.append(row | judged(between_searches(0, 1, (first, second)), (first, second), true))
+        loops, _, transforms = search_pair(0, 1, (first, second))
+        rows.append(row | judged(loops, transforms, (first, second), true))
         print(json.dumps(rows[-1]), flush=True)
         if before is not None and done < strangers:
-            found = between_searches(0, 1, (first, before))
-            done, invented = done + 1, invented + bool(found.aligned)
-            print(f"  strangers: {len(found.loops)} loops, {len(found.aligned)} transforms", flush=True)
+            loops, _, transforms = search_pair(0, 1, (first, before))
+            done, invented = done + 1, invented + bool(transforms)
+            print(f"  strangers: {len(loops)} loops, {len(transforms)} transforms", flush=True)
         before = second
     report(rows, invented, done)
 
 
-def searched(params: Params, content: dict[str, np.ndarray], name: str, odometry: Odometry) -> Search:
+def searched(params: Params, content: dict[str, np.ndarray], name: str, odometry: Odometry) -> Searched:
     """Search one recording of a pair. Its frame is that of its first scan."""
     poses, times = content[f"{name}_world_from_lidar"], content[f"{name}_times"]
     drifting = drifted(poses, seed=int(1e3 * times[-1]))
@@ -99,28 +99,29 @@ def searched(params: Params, content: dict[str, np.ndarray], name: str, odometry
         read=lambda path, labels, lasers: Record(),
     )
     loops, rejected = settled(recording, detector.loops, given, detector.config, registered=False)
-    found = FoundLoops(recording, len(times), tuple(loops), tuple(rejected), given, model=detector.model)
-    return found, detector.finder
+    return Searched(Input(recording, given, detector.config), detector, loops, rejected)
 
 
-def judged(found: FoundBetween, searches: tuple[Search, Search], true: list[Poses]) -> dict[str, Any]:
+def judged(
+    loops: list[Loop], transforms: list[AlignedParts], searches: tuple[Searched, Searched], true: list[Poses]
+) -> dict[str, Any]:
     """Number of loops, wrong ones and transforms, and the errors of the first transform."""
-    seen = [inverse(true[0][loop.match]) @ true[1][loop.query] for loop in found.loops]
+    seen = [inverse(true[0][loop.match]) @ true[1][loop.query] for loop in loops]
     wrong = sum(bool(np.linalg.norm(pose[:3, 3]) > OTHER_M) for pose in seen)
-    row: dict[str, Any] = {"loops": len(found.loops), "wrong": wrong, "transforms": len(found.aligned)}
-    if not found.aligned:
+    row: dict[str, Any] = {"loops": len(loops), "wrong": wrong, "transforms": len(transforms)}
+    if not transforms:
         return row
-    aligned = found.aligned[0]
+    aligned = transforms[0]
     parts, given = (aligned.match, aligned.query), []
-    for part, (one, finder) in zip(parts, searches, strict=True):
-        poses = finder.motion.poses if one.odometry is None else one.odometry
+    for part, one in zip(parts, searches, strict=True):
+        poses = one.detector.finder.motion.poses if one.given.odometry is None else one.given.odometry
         given.append(poses if part.is_odometry else inverse(poses[part.first]) @ poses)
     frames = [poses[0 if part.is_odometry else part.first] for poses, part in zip(true, parts, strict=True)]
     match_from_query = aligned.alignment.match_from_query
     error = inverse(inverse(frames[0]) @ frames[1]) @ match_from_query
     here = [
         inverse(given[0][loop.match] @ pose) @ match_from_query @ given[1][loop.query]
-        for loop, pose in zip(found.loops, seen, strict=True)
+        for loop, pose in zip(loops, seen, strict=True)
         if parts[1].first <= loop.query <= parts[1].last and parts[0].first <= loop.match <= parts[0].last
     ]
     sigma = np.sqrt(np.diag(aligned.alignment.covariance))

@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 from recordings import with_points
 
-import sglpr_jax
 from sglpr_jax.loops.calibration import calibrated, certain_pairs
 from sglpr_jax.loops.probability import default_model
 
 FRAMES = 50
-
-
-@pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
 
 
 @pytest.fixture(scope="module")

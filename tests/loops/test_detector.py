@@ -24,11 +24,6 @@ NOW = CandidateConfig(recent_m=1e-9)
 
 
 @pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
-
-
-@pytest.fixture(scope="module")
 def streamed(drive, params):
     """The detector after the whole drive, with odometry, and what it returned frame by frame."""
     detector = LoopDetector(params)

@@ -7,7 +7,6 @@ import pytest
 from recordings import reading_scans
 from scipy.spatial.transform import Rotation
 
-import sglpr_jax
 from sglpr_jax.data.levelling import Mountings, lidar_pose, upright_from_lidar, upright_odometry, upright_poses
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Record
@@ -17,17 +16,14 @@ from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.search import find_loops
+from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import inverse, moved_covariance, transform, transformed
 
 TILTS = {"forward": (0.0, 25.0, 0.0), "sideways": (20.0, 10.0, 0.0), "upside down": (170.0, 5.0, 0.0)}
-
-
-@pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
 
 
 def tilted_from_level(degrees) -> np.ndarray:
@@ -97,7 +93,7 @@ def test_the_loops_of_a_tilted_recording_are_registered_and_agree_with_odometry_
 def test_scans_of_a_tilted_and_of_an_upright_sensor_find_themselves_in_one_map(drive, params, tmp_path):
     recording, poses = tilted_drive(drive, TILTS["upside down"])
     few = {name: getattr(recording, name)[:8] for name in ("ids", "paths", "times", "positions")}
-    PlaceMap.of(dataclasses.replace(recording, **few), params, poses[:8]).save(tmp_path / "map.safetensors")
+    map_recording(dataclasses.replace(recording, **few), params, poses[:8]).places.save(tmp_path / "map.safetensors")
     places = PlaceMap.load(tmp_path / "map.safetensors")
     assert places.mounting() == recording.mounting
     for record, world_from_lidar in (
@@ -159,11 +155,13 @@ def test_loops_of_a_tilted_sensor_agree_as_those_of_an_upright_one():
     def loop_of(loop, pose):
         return dataclasses.replace(loop, match_from_query=loop.match_from_query @ pose)
 
-    expected = agree(loops(None), level)
+    expected = agree(loops(None), DrivenPath.of(level))
     assert expected[:5, :5].all() and not expected[5, :5].any()
     of_lidar = level @ inverse(tilted)
     for odometry in (of_lidar, inverse(of_lidar[0]) @ of_lidar):
-        np.testing.assert_array_equal(agree(loops(mounting), odometry, mounting=mounting), expected)
+        np.testing.assert_array_equal(
+            agree(loops(mounting), DrivenPath.of(odometry, mounting=mounting), mounting=mounting), expected
+        )
 
 
 def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
@@ -207,9 +205,10 @@ def test_loops_of_frames_with_different_tilts_agree_with_their_odometry():
         alignment = Alignment(pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0]), spread, 1.0, 0.0)
         options = {"query_mounting": mountings[query], "match_mounting": mountings[match]}
         loops.append(planar_loop(query, match, alignment, probability=1.0, **options))
-    assert agree(loops, odometry, mounting=mountings).all()
-    np.testing.assert_allclose(deviations(loops, odometry, mounting=mountings), 0, atol=1e-3)
-    assert (deviations(loops, odometry) > 0.3).any()  # with the mean mounting
+    path = DrivenPath.of(odometry, mounting=mountings)
+    assert agree(loops, path, mounting=mountings).all()
+    np.testing.assert_allclose(deviations(loops, path, mounting=mountings), 0, atol=1e-3)
+    assert (deviations(loops, DrivenPath.of(odometry)) > 0.3).any()  # with the mean mounting
 
 
 def test_frames_with_one_mounting_are_stored_once():

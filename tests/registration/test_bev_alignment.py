@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import difference, place, relative, seen_from
 from scipy import ndimage, signal
 
 from sglpr_jax.data.levelling import upright_poses
@@ -16,8 +17,6 @@ from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.registration.bev_alignment import DEFAULT, _parabola, align, align_all
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import inverse, yaw_of
-
-from .scenes import difference, place, relative, seen_from
 
 SMALL = VerificationConfig(reach_m=12.8, max_shift_m=4.0)
 YAWS = st.floats(-3.1, 3.1)

@@ -40,7 +40,7 @@ def first(drive):
 @pytest.fixture(scope="module")
 def places(first, params) -> PlaceMap:
     recording, poses = first
-    return PlaceMap.of(recording, params, poses)
+    return map_recording(recording, params, poses).places
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, fir
     sunday = dataclasses.replace(recording, name="sunday")
     shifted = poses.copy()
     shifted[:, 2, 3] += 1.0
-    other = PlaceMap.of(sunday, params, shifted)
+    other = map_recording(sunday, params, shifted).places
     both = places.merged(other)
     assert both.index.ids == places.index.ids + other.index.ids
     np.testing.assert_array_equal(both.index.positions, both.world_from_place[:, :3, 3])
@@ -116,7 +116,9 @@ def synthetic(scans: Sequence[int], *, drive: int) -> PlaceMap:
     poses[:, 0, 3], poses[:, 1, 3] = scans, drive
     index = Index.empty(2)
     index.add(poses[:, :2, 3], ids=[f"08/{scan}" for scan in scans], positions=poses[:, :3, 3])
-    return PlaceMap(index, np.zeros((len(scans), 2, 2), np.uint8), poses, np.ones((len(scans), 4)))
+    return PlaceMap(
+        index, np.zeros((len(scans), 2, 2), np.uint8), poses, np.ones((len(scans), 4)), np.full((len(scans), 2), np.nan)
+    )
 
 
 @pytest.mark.parametrize(
@@ -179,7 +181,7 @@ def test_scans_that_cannot_be_read_are_left_out_of_a_map(first, places, params, 
 
     bad, said = with_points(recording, points_of), []
     with pytest.raises(ValueError, match="found half of one"):
-        PlaceMap.of(bad, params, poses)
+        map_recording(bad, params, poses)
     options = {"on_bad_scan": lambda scan, error: said.append(scan), "kept_in": tmp_path / "kept"}
     for _ in range(2):  # the second one reads nothing
         made = map_recording(bad, params, poses, **options)
@@ -193,16 +195,16 @@ def test_scans_that_cannot_be_read_are_left_out_of_a_map(first, places, params, 
 @pytest.mark.slow
 def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(first, places, params, tmp_path):
     recording, poses = first
-    assert len(PlaceMap.of(recording, params, np.tile(poses[:1], (len(poses), 1, 1)))) == 1
+    assert len(map_recording(recording, params, np.tile(poses[:1], (len(poses), 1, 1))).places) == 1
     with pytest.raises(ValueError, match="08: expected a pose for each of 30 scans, found 3"):
-        PlaceMap.of(recording, params, poses[:3])
+        map_recording(recording, params, poses[:3])
     assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
     empty = with_points(recording, lambda path: np.full((1, 3), 5, np.float32))
     with pytest.raises(ValueError, match="08: expected at least one scan that is not empty, found 30 empty ones"):
-        PlaceMap.of(dataclasses.replace(empty, label_paths=()), params, poses)
+        map_recording(dataclasses.replace(empty, label_paths=()), params, poses)
     at_origin = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
     with pytest.raises(ValueError, match=r"scan 000000 of sequence 08: expected points around the sensor"):
-        PlaceMap.of(dataclasses.replace(at_origin, label_paths=()), params, poses)
+        map_recording(dataclasses.replace(at_origin, label_paths=()), params, poses)
     places.index.save(tmp_path / "index.safetensors")
     with pytest.raises(ValueError, match="expected a map of places, found an index without images"):
         PlaceMap.load(tmp_path / "index.safetensors")

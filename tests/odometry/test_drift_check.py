@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from drives import along, drifted
 
 from sglpr_jax.odometry.bev_odometry import Link
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.se3 import inverse, transform, yaw_of
-
-from .drives import along, drifted
 
 TRUE = along([(0, 0), (150, 0), (150, 150)], 3.0)
 

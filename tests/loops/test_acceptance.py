@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drives import along, drifted, rooms, town, true_loops, wrong_loops
 from recordings import of_scans
 
 from sglpr_jax.data.warning import DataWarning
@@ -15,11 +16,10 @@ from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
+from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.pose_graph.optimize import PoseGraph, trajectory_error
 from sglpr_jax.registration.gicp import Registration
 from sglpr_jax.se3 import transform
-
-from .drives import along, drifted, rooms, town, true_loops, wrong_loops
 
 SERPENTINE = along([(0, 0), (150, 0), (150, 26), (0, 26), (0, 52), (150, 52), (150, 78), (0, 78)], 2.0)
 
@@ -45,10 +45,10 @@ def of_a_car_park() -> tuple[np.ndarray, list[Loop]]:
 @pytest.mark.parametrize("scene", [of_rooms, of_a_corridor, of_a_car_park])
 def test_of_places_that_repeat_no_loop_is_accepted_and_the_odometry_stays(scene):
     odometry, wrong = scene()
-    assert len(wrong) >= 50 and deviations(wrong, odometry).min() > 8
+    assert len(wrong) >= 50 and deviations(wrong, DrivenPath.of(odometry)).min() > 8
     kept, rejected = accepted(wrong, odometry)
     assert not kept and {one.reason for one in rejected} == {"contradicts the odometry"}
-    found = optimized(odometry, tuple(wrong))
+    found = PoseGraph({0: odometry}, wrong).solve()
     np.testing.assert_array_equal(found.poses, odometry)
     assert not found.inliers.any() and str(found).startswith(f"trajectory not corrected: {len(wrong)} loops need")
 
@@ -59,10 +59,10 @@ def test_true_loops_are_kept_and_correct_the_drift(seed):
     true = town()
     odometry = drifted(true, percent=1, deg_per_100m=0.5, noise=1.0, seed=seed)
     loops = true_loops(true, every=6)
-    assert len(loops) >= 52 and deviations(loops, odometry).max() < 1.7
+    assert len(loops) >= 52 and deviations(loops, DrivenPath.of(odometry)).max() < 1.7
     kept, rejected = accepted(loops, odometry)
     assert kept == loops and not rejected
-    found = optimized(odometry, tuple(kept))
+    found = PoseGraph({0: odometry}, kept).solve()
     assert found.inliers.all() and found.deviation < 2
     before, after = (trajectory_error(poses, true[:, :3, 3]) for poses in (odometry, found.poses))
     assert after < 0.5 * before
@@ -101,7 +101,7 @@ def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_ca
     drift = DriftModel(percent / 100, degrees / 100)
     kept, _ = accepted(loops, odometry, drift=drift)
     assert len(kept) > 0.98 * len(loops)
-    found = optimized(odometry, tuple(kept), drift=drift)
+    found = PoseGraph({0: odometry}, kept, drift).solve()
     assert trajectory_error(found.poses, true[:, :3, 3]) < 0.3 * trajectory_error(odometry, true[:, :3, 3])
 
 
@@ -133,8 +133,8 @@ def test_a_solution_beyond_the_drift_loses_the_loops_that_bend_it_or_is_not_take
         dataclasses.replace(one, match_from_query=one.match_from_query @ transform(0.0, 8.0, 0.0))
         for one in loops[-wrong:]
     ]
-    assert deviations(aside, true).max() < 1
-    found = optimized(true, (*loops[:-wrong], *aside))
+    assert deviations(aside, DrivenPath.of(true)).max() < 1
+    found = PoseGraph({0: true}, (*loops[:-wrong], *aside)).solve()
     assert found.inliers.sum() == right and not found.inliers[-wrong:].any()
     assert found.deviation < 1 and found.moved_m < 1
     if not right:

@@ -39,7 +39,7 @@ def loops(poses) -> list[Loop]:
 
 
 def test_a_graph_comes_back_from_g2o(tmp_path, poses, loops):
-    write_g2o(tmp_path / "loops.g2o", loops, poses)
+    write_g2o(tmp_path / "loops.g2o", loops, [(np.arange(6), poses)])
     graph = read_g2o(tmp_path / "loops.g2o")
     np.testing.assert_allclose(np.stack([graph.poses[i] for i in range(6)]), poses, atol=1e-6)
     assert [(i, j) for i, j, *_ in graph.edges] == [(i, i + 1) for i in range(5)] + [(0, 5), (1, 4)]
@@ -142,7 +142,7 @@ def test_coordinates_of_a_country_come_back_with_all_digits(tmp_path, poses, loo
     poses[:, :3, 3] += (412345.678912345, 5654321.123456789, 0.0)
     write_tum(tmp_path / "t.tum", poses, times)
     write_kitti(tmp_path / "t.kitti", poses)
-    write_g2o(tmp_path / "t.g2o", [], poses)
+    write_g2o(tmp_path / "t.g2o", [], [(np.arange(6), poses)])
     again, clock = read_tum(tmp_path / "t.tum")
     np.testing.assert_array_equal(clock, times)
     np.testing.assert_array_equal(again[:, :3, 3], poses[:, :3, 3])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drives import along, town
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -9,8 +10,6 @@ from hypothesis.extra.numpy import arrays
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import travelled
-
-from .drives import along, town
 
 
 def test_one_by_one_is_at_once():

@@ -33,11 +33,6 @@ EMPTY = Index.empty(4, weights_hash="w")
 
 
 @pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
-
-
-@pytest.fixture(scope="module")
 def twice(drive):
     """The recording, and its odometry."""
     parts = {name: tuple(getattr(drive, name)[i] for i in ROWS) for name in ("ids", "paths")}
@@ -154,7 +149,7 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
     assert first.frames == 9
     found = find_loops(bad, params, **options)
     ids = tuple(recording.ids[row] for row in (0, 6, 17))
-    assert found.skipped == ids and [scan for scan, _ in said] == list(ids)
+    assert found.sessions[0].skipped == ids and [scan for scan, _ in said] == list(ids)
     assert str(found).endswith("3 scans skipped")
     frames = {frame for loop in found.loops for frame in (loop.query, loop.match)}
     assert len(found.loops) >= 5 and not frames & {0, 6, 17}
@@ -221,7 +216,7 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
     stopped = find_loops(recording, params, **options, should_stop=lambda: len(done) >= 2)
     overlaps = [loop.overlap for loop in stopped.loops]
     assert overlaps == [0.9] * 2 + [None] * (len(overlaps) - 2) and len(overlaps) >= 8
-    assert stopped.frames == 24 and not stopped.whole and stopped.unregistered == len(overlaps) - 2
+    assert stopped.frames == 24 and not stopped.whole and stopped.sessions[0].unregistered == len(overlaps) - 2
     assert str(stopped).endswith(f", {len(overlaps) - 2} not registered")
     read = with_points(recording, lambda path: asked.append(path) or recording.read(path, None, False).points)
     found = find_loops(read, params, **options)

@@ -8,6 +8,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
+from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
@@ -23,7 +24,7 @@ def maps(drive, revisit):
     def map_around(frame: int, name: str) -> PlaceMap:
         rows = list(range(max(frame - SCANS // 2, 0), min(frame + SCANS // 2, len(drive))))
         recording = dataclasses.replace(only(drive, rows), name=name)
-        return PlaceMap.of(recording, params, drive.poses.world_from_lidar[rows], spacing_m=0.0)
+        return map_recording(recording, params, drive.poses.world_from_lidar[rows], spacing_m=0.0).places
 
     query, match = revisit
     return map_around(match, "first"), map_around(query, "second")

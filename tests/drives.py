@@ -1,14 +1,46 @@
-"""Synthetic drives and the loops, true or wrong, that a detector might find on them."""
+"""Drives for the tests: one that is simulated, and synthetic ones with loops that a detector might find on them."""
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from sglpr_jax.loops.closure import Loop, planar_loop
 from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.se3 import inverse, transform, yaw_of
+from sglpr_jax.sim import recording
+from sglpr_jax.sim.recording import SimulatedRecording
+from sglpr_jax.sim.sensor import Sensor
+
+SCANS = 240
+SENSOR = Sensor(elevations_deg=tuple(np.linspace(2, -24, 32)), azimuth_steps=600)
 
 LOOP_COVARIANCE = np.diag([0.1, 0.1, np.radians(0.3)]) ** 2
+
+
+@functools.cache
+def simulated_drive() -> SimulatedRecording:
+    """240 scans, about 1.8 m apart; the drive comes back the other way. Each scan is rendered once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "KEPT_SCANS", SCANS)
+        return recording.simulate_recording("08", scans=SCANS, sensor=SENSOR, seed=3)
+
+
+@pytest.fixture(scope="session")
+def drive() -> SimulatedRecording:
+    """`simulated_drive`."""
+    return simulated_drive()
+
+
+@pytest.fixture(scope="session")
+def revisit(drive) -> tuple[int, int]:
+    """A query and a match within 3 m of each other, half a minute apart or more."""
+    apart = np.linalg.norm(drive.positions[:, None] - drive.positions[None], axis=2)
+    apart[np.abs(np.subtract.outer(drive.times, drive.times)) < 30] = np.inf
+    query, match = np.unravel_index(apart.argmin(), apart.shape)
+    assert apart[query, match] < 3
+    return int(max(query, match)), int(min(query, match))
 
 
 def along(corners: Sequence[Sequence[float]], step_m: float = 1.0) -> np.ndarray:

@@ -1,21 +1,36 @@
 """A drifted drive of known truth is corrected by its loops; wrong loops do not bend it; gtsam reads our g2o."""
 
+import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from drives import drifted
 from recordings import of_images
 from scipy.spatial.transform import Rotation
+from session_pairs import found_pair, two_drives
 
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.loops.search import FoundLoops, Session
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o
-from sglpr_jax.pose_graph.optimize import MOST_RISEN_M, optimize_trajectory, optimized, trajectory_error
+from sglpr_jax.pose_graph.optimize import (
+    MOST_RISEN_M,
+    OptimizedTrajectory,
+    PoseGraph,
+    optimize_trajectory,
+    placements,
+    trajectory_error,
+)
 from sglpr_jax.se3 import from_quaternions, inverse, transform
 
 from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
+
+
+def optimized(odometry: np.ndarray, loops: Sequence[Loop]) -> OptimizedTrajectory:
+    return PoseGraph({0: odometry}, loops).solve()
 
 
 def test_the_error_of_a_drifted_drive_falls(two_laps, two_laps_odometry, second_lap_loops):
@@ -40,19 +55,17 @@ def test_wrong_loops_do_not_bend_it(two_laps, two_laps_odometry, second_lap_loop
     )
 
 
-def test_of_a_recording_the_frames_that_were_looked_at(two_laps_odometry, second_lap_loops, tmp_path, monkeypatch):
+def test_of_a_recording_the_searched_frames_are_corrected(two_laps_odometry, second_lap_loops, tmp_path, monkeypatch):
     images = {tmp_path / f"{i:06d}.png": np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
     early = tuple(loop for loop in second_lap_loops if loop.query < 90)
-    found = FoundLoops(of_images(images), 90, early, (), two_laps_odometry)
+    session = Session(of_images(images), 90, two_laps_odometry)
+    found = FoundLoops((session,), early)
     corrected = optimize_trajectory(found)
     assert corrected.poses.shape == (90, 4, 4)
-    np.testing.assert_array_equal(corrected.poses, optimized(two_laps_odometry[:90], early).poses)
-    with pytest.raises(
-        ValueError,
-        match="08: expected loops found with odometry, found loops without it",
-    ):
-        optimize_trajectory(FoundLoops(of_images(images), 90, early, (), None))
-    none = optimize_trajectory(FoundLoops(of_images(images), 90, (), (), two_laps_odometry))
+    np.testing.assert_allclose(corrected.poses, optimized(two_laps_odometry[:90], early).poses, atol=1e-9)
+    with pytest.raises(ValueError, match="08: expected loops found with odometry, found loops without it"):
+        optimize_trajectory(FoundLoops((dataclasses.replace(session, odometry=None),), early))
+    none = optimize_trajectory(FoundLoops((session,)))
     np.testing.assert_array_equal(none.poses, two_laps_odometry[:90])
     assert none.inliers.shape == (0,)
     monkeypatch.setitem(sys.modules, "gtsam", None)
@@ -60,11 +73,45 @@ def test_of_a_recording_the_frames_that_were_looked_at(two_laps_odometry, second
         optimize_trajectory(found)
 
 
+def test_sessions_fit_together_better_than_by_one_transform():
+    first, second, true = two_drives()
+    odometry = drifted(first, percent=1, deg_per_100m=0.5), drifted(second, percent=-1, deg_per_100m=-0.5)
+    found = found_pair(odometry=odometry)
+    corrected = optimize_trajectory(found)
+    assert corrected.inliers.all() and len(found.split(corrected.poses)[1]) == len(second)
+    np.testing.assert_allclose(corrected.poses[0], odometry[0][0], atol=1e-5)
+    truth = np.concatenate([first, true @ second])[:, :3, 3]
+    (_, own), (group, placed) = placements(found)
+    assert group == 0 and np.array_equal(own, np.eye(4))
+    before = trajectory_error(np.concatenate([odometry[0], placed @ odometry[1]]), truth)
+    assert trajectory_error(corrected.poses, truth) < 0.8 * before
+
+
+def test_sessions_without_a_common_place_stay_as_they_are():
+    found = dataclasses.replace(found_pair(), loops=(), transforms=())
+    assert [group for group, _ in placements(found)] == [0, 1]
+    expected = np.concatenate([one.odometry for one in found.sessions])
+    np.testing.assert_allclose(optimize_trajectory(found).poses, expected, atol=1e-9)
+
+
+def test_a_third_session_is_placed_through_the_second():
+    pair = found_pair()
+    (first,) = pair.transforms
+    second = first._replace(match=first.match._replace(session=1), query=first.query._replace(session=2))
+    step = first.alignment.match_from_query
+    chain = dataclasses.replace(pair, sessions=(*pair.sessions, pair.sessions[1]), transforms=(first, second))
+    np.testing.assert_allclose([to for _, to in placements(chain)], [np.eye(4), step, step @ step], atol=1e-9)
+    around = second._replace(match=first.match)
+    found = placements(dataclasses.replace(chain, transforms=(around, second)))
+    assert [group for group, _ in found] == [0, 0, 0]
+    np.testing.assert_allclose(found[1][1], step @ inverse(step), atol=1e-9)
+
+
 def test_gtsam_reads_the_graph_that_we_write(two_laps_odometry, second_lap_loops, tmp_path):
     import gtsam
 
     path = tmp_path / "loops.g2o"
-    write_g2o(path, second_lap_loops, two_laps_odometry)
+    write_g2o(path, second_lap_loops, [(np.arange(LAPS_FRAMES), two_laps_odometry)])
     graph, start = gtsam.readG2o(str(path), True)
     assert start.size() == LAPS_FRAMES and graph.size() == LAPS_FRAMES - 1 + len(second_lap_loops)
     read = np.stack([start.atPose3(frame).matrix() for frame in range(LAPS_FRAMES)])
@@ -94,7 +141,7 @@ def test_heights_that_move_by_metres_are_told(two_laps, two_laps_odometry, secon
     images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
     low = two_laps_odometry.copy()
     low[:, 2, 3] -= 0.06 * np.arange(LAPS_FRAMES)  # odometry that sinks, which loops of known heights correct
-    moved = FoundLoops(of_images(images), LAPS_FRAMES, second_lap_loops, (), low)
+    moved = FoundLoops((Session(of_images(images), LAPS_FRAMES, low),), second_lap_loops)
     with pytest.warns(DataWarning, match="08: expected heights near those of the odometry, found them moved by"):
         corrected = optimize_trajectory(moved)
     assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MOST_RISEN_M

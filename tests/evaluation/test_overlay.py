@@ -1,11 +1,10 @@
 """The moved query covers the match where the pose is right, and not where it is wrong."""
 
 import numpy as np
+from scenes import place, relative, seen_from
 
 from sglpr_jax.evaluation.overlay import overlaid
 from sglpr_jax.se3 import transform
-
-from .scenes import place, relative, seen_from
 
 
 def test_a_right_pose_makes_the_picture_white_and_a_wrong_one_coloured():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.odometry.bev_odometry import UNKNOWN_M, Link, Motion
+from sglpr_jax.odometry.bev_odometry import GAP_M, UNKNOWN_M, Link, Motion
 from sglpr_jax.odometry.config import MotionConfig
 from sglpr_jax.se3 import transform
 
@@ -102,3 +102,18 @@ def test_after_an_unknown_motion_nothing_is_known_about_the_way():
     assert motion.segments.tolist() == [0, 0, 0, 1, 1] and motion.keyframe == 3
     assert motion.path.travelled[3] - motion.path.travelled[2] >= UNKNOWN_M
     np.testing.assert_allclose(np.diff(motion.path.travelled)[[0, 1, 3]], 1.0, rtol=1e-6)
+
+
+def straight(frames: int) -> Motion:
+    motion = Motion()
+    for frame in range(frames):
+        motion.add(float(frame), pose=transform(4.0 * frame, 0.0, 0.0))
+    return motion
+
+
+def test_joined_motions_keep_their_poses_and_are_apart():
+    first, second = straight(5), straight(3)
+    joined = Motion.joined([first, second], [np.eye(3)] * 2)
+    assert joined.segments.tolist() == [0] * 5 + [1] * 3 and len(joined) == 8
+    np.testing.assert_array_equal(joined.poses[5:], second.poses)
+    np.testing.assert_allclose(np.diff(joined.travelled), [4, 4, 4, 4, GAP_M, 4, 4])

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from scenes import place, seen_from
 
 from sglpr_jax.loops import keyframes
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.registration.bev_spectra import match_spectra
 from sglpr_jax.retrieval.index import Index
-
-from .scenes import place, seen_from
 
 
 def images(count: int) -> list[np.ndarray]:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import place, relative, seen_from
 
 from sglpr_jax.registration.bev_search import search, search_near, search_spectra
 from sglpr_jax.registration.bev_spectra import (
@@ -17,8 +18,6 @@ from sglpr_jax.registration.bev_spectra import (
     spectrum,
 )
 from sglpr_jax.registration.config import VerificationConfig
-
-from .scenes import place, relative, seen_from
 
 SMALL = VerificationConfig(reach_m=12.8, max_shift_m=4.0)
 

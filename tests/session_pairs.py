@@ -1,19 +1,18 @@
 """Two recordings of one town without a common frame, whose loops and transform are known without a search."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
+from drives import along, loop_at
 from recordings import of_images
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.frame_alignment import aligned_frames
-from sglpr_jax.loops.search import FoundLoops
-from sglpr_jax.loops.search_between import AlignedParts, FoundBetween, FoundRecordings, Part
+from sglpr_jax.loops.frame_alignment import AlignedParts, Part, aligned_frames
+from sglpr_jax.loops.search import FoundLoops, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse, transform, travelled
-
-from .drives import along, loop_at
 
 MATCH_FROM_QUERY = transform(40.0, -25.0, 2.0)
 """Pose of the second frame in the first one."""
@@ -39,20 +38,20 @@ def loops_between(first: np.ndarray, second: np.ndarray, true: np.ndarray, *, se
     return found
 
 
-def found_pair(*, odometry: tuple[np.ndarray, np.ndarray] | None = None) -> FoundRecordings:
+def found_pair(*, odometry: tuple[np.ndarray, np.ndarray] | None = None) -> FoundLoops:
     """Result of a search in both recordings, with true odometry unless other `odometry` is given."""
     first, second, true = two_drives()
     loops = loops_between(first, second, true)
     given = (first, second) if odometry is None else odometry
-    parts = [Part(0, len(poses) - 1, True) for poses in given]
+    parts = [Part(session, 0, len(poses) - 1, True) for session, poses in enumerate(given)]
     ways = {"match_way": travelled(given[0]), "query_way": travelled(given[1])}
     alignment = aligned_frames(loops, *given, **ways, drift=DriftModel())
-    recordings = tuple(
-        FoundLoops(_recording(len(poses), name), len(poses), (), (), poses)
+    sessions = tuple(
+        Session(_recording(len(poses), name), len(poses), poses)
         for name, poses in zip(("monday", "tuesday"), given, strict=True)
     )
-    aligned = AlignedParts(parts[0], parts[1], alignment, len(loops))
-    return FoundRecordings(recordings, (FoundBetween(0, 1, tuple(loops), (), (aligned,), len(second)),))
+    between = tuple(dataclasses.replace(loop, query_session=1) for loop in loops)
+    return FoundLoops(sessions, between, transforms=(AlignedParts(*parts, alignment, len(loops)),))
 
 
 def _recording(scans: int, name: str) -> Recording:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
-import sglpr_jax
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record
@@ -28,11 +27,6 @@ from sglpr_jax.se3 import transform
 POSES = [np.eye(4).tolist(), transform(1.0, 0.0, 0.5)]
 FLAT = np.zeros((2, 4, 4))
 EMPTY = Seen(np.ones(256, np.float32), np.zeros((152, 152), np.uint8), None)
-
-
-@pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
 
 
 @pytest.fixture
@@ -80,9 +74,9 @@ def test_the_functions_ask_so(recording, params):
         with pytest.raises((TypeError, ValueError), match=rf"expected odometry \(n, 4, 4\), {found}"):
             find_loops(recording, params, odometry=given)
     with pytest.raises(ValueError, match=r"expected poses \(n, 4, 4\), found an array of shape \(2, 3\)"):
-        PlaceMap.of(recording, params, np.zeros((2, 3)))
+        map_recording(recording, params, np.zeros((2, 3)))
     with pytest.raises(ValueError, match="08: expected a pose for each of 2 scans, found 1"):
-        PlaceMap.of(recording, params, POSES[:1])
+        map_recording(recording, params, POSES[:1])
     with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
         LoopDetector(params).add("0.bin")
     with pytest.raises(ValueError, match=r"expected a density image, floats from 0 to 10, found floats from 0 to 255"):
@@ -100,7 +94,9 @@ def test_what_is_no_recording_is_named(function, params):
 def test_points_are_looked_for_in_a_map_as_those_of_its_sensor(params, monkeypatch):
     index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
     index.add(np.ones(index.width), positions=np.zeros(3))
-    places = PlaceMap(index, np.zeros((1, 152, 152), np.uint8), np.eye(4)[None], np.array([[2.5, 0, 0, 1.0]]))
+    places = PlaceMap(
+        index, np.zeros((1, 152, 152), np.uint8), np.eye(4)[None], np.array([[2.5, 0, 0, 1.0]]), np.full((1, 2), np.nan)
+    )
     seen = []
     monkeypatch.setattr(CandidateFinder, "seen", lambda self, record: seen.append(record) or EMPTY)
     assert places.relocate(params, [[5, 3, 1]]) == [] and places.relocate(params, np.zeros((9, 9))) == []

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scenes import place, seen_from
 
 import sglpr_jax
 from sglpr_jax.loops.candidates import CandidateFinder
@@ -13,8 +14,6 @@ from sglpr_jax.registration.bev_search import coarse_correlations, search
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import transform
-
-from .scenes import place, seen_from
 
 PLACES, TRUE = 12, 7
 
