@@ -8,6 +8,8 @@ from drives import drive, revisit  # noqa: F401
 
 import sglpr_jax
 from sglpr_jax.loops.comparison import Candidate, Comparer
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import described as describe_scan
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.models.params import Params
 from sglpr_jax.registration.bev_alignment import Alignment
@@ -17,6 +19,12 @@ from sglpr_jax.se3 import yaw_of
 @pytest.fixture(scope="session")
 def params() -> Params:
     return sglpr_jax.load("circular")
+
+
+@pytest.fixture(scope="session")
+def described(drive, params) -> list[Seen]:  # noqa: F811
+    """Description of each scan of the drive."""
+    return [describe_scan(params, drive.record(i, labels=False)) for i in range(len(drive))]
 
 
 @pytest.fixture

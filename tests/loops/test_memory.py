@@ -16,12 +16,6 @@ from sglpr_jax.se3 import inverse, transform
 LIMIT = 150
 
 
-@pytest.fixture(scope="module")
-def described(drive, params) -> list[Seen]:
-    finder = CandidateFinder(params)
-    return [finder.seen(drive.record(i, labels=False)) for i in range(len(drive))]
-
-
 def searched(params, drive, described, *, odometry: bool, **limits) -> LoopDetector:
     """The detector after the drive. It never stores more scans than its limit."""
     detector, poses = LoopDetector(params, config=DetectorConfig(**limits)), drive.poses.world_from_lidar

@@ -16,7 +16,6 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import search
-from sglpr_jax.loops.acceptance import check_odometry
 from sglpr_jax.loops.candidates import Compared
 from sglpr_jax.loops.closure import MEANING, Loop, Reason, Rejected, counted, listed, why_rejected
 from sglpr_jax.loops.comparison import NO_FITS
@@ -95,12 +94,6 @@ def test_odometry_in_the_cameras_axes_is_told_by_its_way_too(there_and_back):
     forward = Mounting(1.0, (1.0, 0.0, 0.0))
     with pytest.warns(DataWarning, match=words):
         check_level(there_and_back, forward, name="08")
-
-
-def test_a_few_loops_tell_nothing():
-    few = [Rejected(Loop(query, 0, np.eye(4), np.eye(6), 1.0), "contradicts the odometry") for query in range(1, 5)]
-    for rejected in (few, []):  # a warning is an error
-        check_odometry("08", [], rejected, np.tile(np.eye(4), (5, 1, 1)), CONFIG)
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.levelling import Mountings, lidar_pose, upright_from_lidar, upright_odometry, upright_poses
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.recording import Record
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.config import CandidateConfig
@@ -56,9 +55,8 @@ def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("degrees", TILTS.values(), ids=TILTS)
-def test_the_pose_of_a_revisit_is_that_of_the_raw_points_and_is_registered(drive, revisit, params, degrees):
-    recording, poses = tilted_drive(drive, degrees)
+def test_the_pose_of_a_revisit_is_that_of_the_raw_points_and_is_registered(drive, revisit, params):
+    recording, poses = tilted_drive(drive, TILTS["upside down"])
     finder = CandidateFinder(params, config=CandidateConfig(recent_m=1e-9))
     query, match = revisit
     finder.add(recording.record(match))
@@ -176,21 +174,6 @@ def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
     seen = np.concatenate([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()], axis=1)
     expected = moved_covariance(root @ root.T, lidar)
     np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.05 * expected.diagonal().max())
-
-
-@pytest.mark.slow
-def test_each_frame_of_a_stream_has_its_own_mounting(drive, revisit, params):
-    query, match = revisit
-    finder = CandidateFinder(params, config=CandidateConfig(recent_m=1e-9))
-    tilts = [tilted_from_level(TILTS[name]) for name in ("sideways", "forward")]
-    for frame, tilted in zip((match, query), tilts, strict=True):
-        points = transformed(tilted, drive.points(frame)).astype(np.float32)
-        candidates = finder.add(Record(points=points, mounting=mounting_of(tilted)))
-    mountings = {"query_mounting": finder.mountings[1], "match_mounting": finder.mountings[0]}
-    loop = planar_loop(1, 0, candidates[0].alignment, probability=1.0, **mountings)
-    poses = drive.poses.world_from_lidar[[match, query]] @ inverse(np.stack(tilts))
-    metres, degrees = error_of(loop.match_from_query, inverse(poses[0]) @ poses[1])
-    assert metres < 1.0 and degrees < 4
 
 
 def test_loops_of_frames_with_different_tilts_agree_with_their_odometry():

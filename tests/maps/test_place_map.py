@@ -81,12 +81,6 @@ def test_a_map_comes_back_from_its_file(places, tmp_path):
 
 
 @pytest.mark.slow
-def test_more_answers_than_places_that_can_be_compared_are_refused(places, params, drive):
-    with pytest.raises(ValueError, match="candidates: expected a number from 1 up to 1000, found 1000000000"):
-        places.relocate(params, drive.record(20), candidates=10**9)
-
-
-@pytest.mark.slow
 def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, first, places, params):
     recording, poses = first
     sunday = dataclasses.replace(recording, name="sunday")
@@ -240,18 +234,11 @@ LEVEL = np.tile([1.73, 0, 0, 1], (3, 1))
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"world_from_place": changed(POSES, (1, 0, 3), np.nan)}, "expected finite world_from_place"),
         ({"world_from_place": 2 * POSES}, r"expected world_from_place \(n, 4, 4\), with rotations"),
-        ({"world_from_place": changed(POSES, (2, 3, 0), 5)}, r"expected world_from_place .* in row 2"),
-        ({"world_from_place": POSES.astype(np.float32)}, "expected world_from_place as float64"),
         ({"world_from_place": POSES[:2]}, "expected world_from_place as float64"),
-        ({"images": np.zeros((3, 8, 6), np.uint8)}, r"expected images as uint8 \(3, 8, 8\), found uint8 \(3, 8, 6\)"),
         ({"images": np.zeros((3, 7, 7), np.uint8)}, "expected images of an even number of cells"),
-        ({"images": np.zeros((2, 8, 8), np.uint8)}, "expected images as uint8"),
-        ({"images": np.zeros((3, 8, 8))}, "expected images as uint8"),
         ({"mountings": changed(LEVEL, (0, 0), 1000)}, "expected the sensor's height above the ground"),
         ({"mountings": changed(LEVEL, (0, 3), 2)}, "expected up directions of length 1"),
-        ({"mountings": LEVEL[:, :3]}, "expected mountings as float64"),
         ({"distance": "cosine"}, "expected descriptors compared by l2, found cosine"),
     ],
 )

@@ -107,14 +107,6 @@ def test_loops_come_back_from_json_lines_and_csv(tmp_path, loops):
         np.testing.assert_allclose(row[2], loop.match_from_query, atol=1e-6)
 
 
-def test_no_loops_are_files_too(tmp_path, poses):
-    write_loops_jsonl(tmp_path / "a.jsonl", [])
-    write_loops_csv(tmp_path / "a.csv", [])
-    write_g2o(tmp_path / "a.g2o", [])
-    assert read_loops_jsonl(tmp_path / "a.jsonl") == [] and read_loops_csv(tmp_path / "a.csv") == []
-    assert read_g2o(tmp_path / "a.g2o") == ({}, [])
-
-
 @pytest.mark.parametrize(
     ("read", "text", "message"),
     [

@@ -90,19 +90,6 @@ def test_scans_without_times_get_those_of_a_tum_file(tmp_path, poses):
 
 
 @pytest.mark.parametrize(
-    ("name", "format", "times", "why"),
-    [("kitti.txt", "kitti", np.arange(6.0), "the file"), ("odometry.tum", "auto", None, "the scans")],
-)
-def test_as_many_other_poses_without_times_name_their_file_and_the_recording(tmp_path, poses, name, format, times, why):
-    write_kitti(tmp_path / "kitti.txt", poses)
-    write_tum(tmp_path / "odometry.tum", poses, np.arange(5.0) / 10)
-    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(6)}, times=times)
-    message = f"{name}: expected 6 poses, one for each scan of 08, found 5, and {why} ha.* no times to interpolate at"
-    with pytest.raises(ValueError, match=message):
-        at_scans(recording, poses, tmp_path / name, format=format)
-
-
-@pytest.mark.parametrize(
     ("text", "format", "message"),
     [
         ("", "auto", "found an empty file"),

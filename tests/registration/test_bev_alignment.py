@@ -109,14 +109,6 @@ def test_between_two_plain_walls_the_place_along_them_is_unknown(yaw):
 
 
 @pytest.mark.slow
-def test_in_a_town_the_place_is_known(drive, revisit):
-    query, match = (square_image(drive.record(frame)) for frame in revisit)
-    found = align(query, match)
-    assert position_deviation(found.covariance) <= 0.15 and not is_degenerate(found.covariance)
-    assert np.sqrt(found.covariance[2, 2]) <= np.radians(0.5)
-
-
-@pytest.mark.slow
 def test_errors_in_a_town_are_as_large_as_the_covariance_says(drive):
     poses = upright_poses(drive.poses.world_from_lidar, drive.mounting)
     apart = np.linalg.norm(drive.positions[:, None] - drive.positions[None], axis=2)
@@ -132,16 +124,6 @@ def test_errors_in_a_town_are_as_large_as_the_covariance_says(drive):
     assert len(squares) >= 20
     assert 0.5 < np.median(squares) / 2.37 < 2  # the median of a chi-square of 3 degrees of freedom
     assert np.quantile(squares, 0.95) / 7.81 < 2
-
-
-def test_along_a_wall_the_place_is_less_sure_than_across():
-    wall = np.stack([np.linspace(-20, 20, 4000), np.full(4000, 3.0)], axis=1)
-    poles = place(0)[-480:]
-    images = [seen_from(np.concatenate([wall, wall - [0, 7], poles[:80]]), (x, 0.0, 0.0)) for x in (0.0, 0.4)]
-    found = align(*images, config=SMALL)
-    assert found.covariance[0, 0] > 2 * found.covariance[1, 1]
-    np.testing.assert_allclose(found.covariance, found.covariance.T, rtol=1e-4)
-    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
 
 
 def test_other_places_correlate_less_and_another_pose_fits_as_well():

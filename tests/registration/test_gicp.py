@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.formats.pose_files import read_poses
-from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.loops.acceptance import MIN_OVERLAP
 from sglpr_jax.loops.closure import is_degenerate, position_deviation
 from sglpr_jax.registration.gicp import coarse_pose, overlap, register
 from sglpr_jax.se3 import inverse, transform, transformed
@@ -78,33 +75,6 @@ def test_other_places_do_not_overlap(drive, revisit):
     query = drive.points(revisit[0])
     far = np.argsort(-np.linalg.norm(drive.positions - drive.positions[revisit[0]], axis=1))[:2]
     assert all(register(query, drive.points(int(other))).overlap < 0.5 for other in far)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "query", "match"), [("00", 4501, 52), ("08", 1500, 720)])
-def test_a_real_revisit_is_found_from_nothing(shared, name, query, match):
-    scans, poses = real_sequence(shared, name)
-    found = register(scans(query), scans(match))
-    metres, degrees = error_of(found.match_from_query, inverse(poses[match]) @ poses[query])
-    assert metres <= 0.06 and degrees <= 0.2 and found.overlap >= MIN_OVERLAP
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("query", "match"), [(4501, 88), (850, 88), (4501, 0), (198, 52)])
-def test_other_real_places_do_not_overlap(shared, query, match):
-    scans, _ = real_sequence(shared, "00")
-    assert register(scans(query), scans(match)).overlap < MIN_OVERLAP
-
-
-def real_sequence(shared, name: str):
-    """How its scans are read, and its poses world_from_lidar, of which the camera's file and calib.txt tell."""
-    folder = shared / "data/kitti_odometry/sequences" / name
-    calibration = next(line for line in (folder / "calib.txt").read_text().splitlines() if line.startswith("Tr"))
-    camera_from_lidar = np.vstack([np.array(calibration.split()[1:], float).reshape(3, 4), [0, 0, 0, 1]])
-    camera = np.tile(np.eye(4), (len(read_poses(folder / "poses.txt")), 1, 1))
-    camera[:, :3] = read_poses(folder / "poses.txt")
-    poses = inverse(camera_from_lidar) @ camera @ camera_from_lidar
-    return lambda frame: read_scan(folder / f"velodyne/{frame:06d}.bin"), poses
 
 
 def test_the_overlap_of_a_scan_with_itself_is_whole_and_counts_voxels():
