@@ -93,12 +93,9 @@ def map_recording(
       params: Weights of the model that describes them.
       poses: Pose of the LiDAR in the world at each scan.
       spacing_m: Minimum distance of consecutive places, in metres. Scans nearer to the last place are not read.
-      scale: Factor for all lengths before scans are described, 1, 2 or 4, for places that are small in an image, such
-        as rooms. Poses of the map are in metres.
-      on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped. Without it the error is
-        raised.
-      kept_in: Checkpoint directory. With the same recording, poses, weights and spacing, the run resumes from it. The
-        directory is not removed.
+      scale: Factor for all lengths before scans are described, as in `find_loops`. Poses of the map are in metres.
+      on_bad_scan: See `find_loops`. Skipped scans do not become places.
+      kept_in: Checkpoint directory of these poses and this spacing, as in `find_loops`.
       should_stop: If it returns True, the run ends and returns the map of the processed scans.
       on_progress: Called with the number of processed scans.
 
