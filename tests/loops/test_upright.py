@@ -131,37 +131,6 @@ def test_odometry_of_a_tilted_sensor_is_laid_level_whatever_its_world():
     assert upright_odometry(of_lidar, Mounting(2.5)) is of_lidar and upright_odometry(of_lidar, None) is of_lidar
 
 
-def test_loops_of_a_tilted_sensor_agree_as_those_of_an_upright_one():
-    rng = np.random.default_rng(0)
-    level = np.stack([transform(20 * np.cos(a), 20 * np.sin(a), a) for a in np.linspace(0, 12, 120)])
-    tilted = tilted_from_level(TILTS["sideways"])
-    mounting = mounting_of(tilted)
-    pairs = [(70, 7), (75, 12), (90, 27), (100, 5), (110, 47)]
-
-    def loops(sensor):
-        spread = np.diag([0.05, 0.05, 0.002]).astype(np.float32)
-        found = []
-        for query, match in pairs:
-            pose = inverse(level[match]) @ level[query] @ transform(*rng.normal(scale=0.05, size=2), 0.0)
-            yaw = np.arctan2(pose[1, 0], pose[0, 0])
-            alignment = Alignment(pose[0, 3], pose[1, 3], yaw, spread, 1.0, 0.0)
-            options = {"query_mounting": sensor, "match_mounting": sensor}
-            found.append(planar_loop(query, match, alignment, probability=1.0, **options))
-        wrong = loop_of(found[0], transform(9.0, 4.0, 1.0))
-        return [*found, wrong]
-
-    def loop_of(loop, pose):
-        return dataclasses.replace(loop, match_from_query=loop.match_from_query @ pose)
-
-    expected = agree(loops(None), DrivenPath.of(level))
-    assert expected[:5, :5].all() and not expected[5, :5].any()
-    of_lidar = level @ inverse(tilted)
-    for odometry in (of_lidar, inverse(of_lidar[0]) @ of_lidar):
-        np.testing.assert_array_equal(
-            agree(loops(mounting), DrivenPath.of(odometry, mounting=mounting), mounting=mounting), expected
-        )
-
-
 def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
     rng = np.random.default_rng(0)
     mounting = mounting_of(tilted_from_level(TILTS["sideways"]), height_m=3.0)
