@@ -9,8 +9,9 @@
   `estimate_mounting`, `GroundFilter`; `deskewed`, `deskew`, `submaps`, `SubmapBuilder`, `scaled`
 - find places again: `embed`, `DescriptorFile`, `nearest`; incrementally `Index`, for a fleet `FleetIndex`
 - score retrieval: `evaluate`
-- find loops: `find_loops` of a recording, `LoopDetector` for a stream of scans; `read_odometry`, `optimize_trajectory`,
-  `IncrementalTrajectory`; `scan_odometry`, and `slam` for all of it; `PlaceMap` for scans of another day
+- find loops: `find_loops` of recordings, `LoopDetector` for a stream of scans; `read_odometry`, `optimize_trajectory`,
+  `IncrementalTrajectory`; `scan_odometry`, and `slam` for all of it; `map_recording`, `PlaceMap` for scans of another
+  day
 - train: `preset`, `train`; initialise with `init`, store with `save`, publish with `for_places`, `average`,
   `save_program`
 - simulate recordings with labels: `simulate`, `simulate_recording`, `simulate_repeating`; `SENSORS`, `CARRIERS`

@@ -38,7 +38,7 @@ from .labels import to_classes as to_classes
 from .loops.closure import Loop as Loop
 from .loops.detector import LoopDetector as LoopDetector
 from .loops.search import find_loops as find_loops
-from .loops.search_between import find_loops_between as find_loops_between
+from .maps.build import map_recording as map_recording
 from .maps.place_map import PlaceMap as PlaceMap
 from .models.config import MODELS as MODELS
 from .models.config import CircularConfig as CircularConfig

@@ -43,6 +43,10 @@ RUN_LONG = (
     "docs/test_blocks.py::test_python_runs[docs/guides/sessions.md]",
     "live/test_live_map.py",
     "loops/",
+    "maps/",
+    "odometry/",
+    "pose_graph/",
+    "registration/",
     "sim/",
 )
 """Tests whose programs run for longer than they compile: XLA optimizes them. It compiles the other programs without

@@ -20,7 +20,7 @@ import tyro
 import sglpr_jax
 from sglpr_jax.files import replacing
 from sglpr_jax.methods.registry import network
-from sglpr_jax.pose_graph.folder import write_several
+from sglpr_jax.pose_graph.folder import write_found
 from sglpr_jax.retrieval.fleet_index import FleetIndex
 from sglpr_jax.retrieval.overlaps import overlaps
 from sglpr_jax.retrieval.parquet import embed_to_store, read_places, stored_places
@@ -144,7 +144,7 @@ class PairSearch:
         """Search the loops within and between two recordings, and write the files of `bin/loops`."""
         with local_copy(row["first"]) as first, local_copy(row["second"]) as second:
             recordings = [sglpr_jax.open_recording(path) for path in (first, second)]
-            found = sglpr_jax.find_loops_between(recordings, self.params)
+            found = sglpr_jax.find_loops(recordings, self.params)
             with replacing(Path(self.out) / row["pair"]) as folder:
-                write_several(found, folder)
+                write_found(found, folder)
         return row | {"said": str(found).splitlines()[-1]}

@@ -18,9 +18,9 @@ from sglpr_jax.data.training_recordings import leave_one_out
 from sglpr_jax.evaluation.final_test import final_test
 from sglpr_jax.files import read_json, write_json
 from sglpr_jax.models.weights_file import save
-from sglpr_jax.sim.layouts import LAYOUTS
 from sglpr_jax.sim.dataset import Simulated
 from sglpr_jax.sim.dataset import simulate as simulate_dataset
+from sglpr_jax.sim.layouts import LAYOUTS
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.loop import METRICS_FILE
 from sglpr_jax.training.metrics_log import read_metrics

@@ -31,7 +31,7 @@ from benchmarks.quality.scoring import STOREY_M, pose_errors
 from sglpr_jax.files import write_json
 from sglpr_jax.loops.calibration import calibration_error, reliability
 from sglpr_jax.loops.closure import planar_loop
-from sglpr_jax.loops.consistency import agree_along
+from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.sequence import neighbour_weights
 from sglpr_jax.models.params import Params
@@ -178,7 +178,7 @@ def _pairs(path: Path, odometry: Odometry, breaks: bool, params: Params) -> Pair
     evidence = np.array([one.evidence for one in found], np.float64).reshape(-1, len(ALL))
     loops = [planar_loop(one.query, one.match, one.alignment, probability=0.5) for one in found]
     way_m = np.maximum.accumulate([float(finder.motion.travelled[one.query]) for one in found])
-    agreeing = agree_along(finder.motion.path, loops, loops, drift=finder.present_drift)
+    agreeing = agree(loops, finder.motion.path, drift=finder.present_drift)
     neighbours = neighbour_weights(way_m, np.arange(len(found))) * np.where(agreeing, 1.0, -1.0)
     wrong = errors.wrong if odometry != "none" else errors.wrong & (errors.storey_m <= STOREY_M)
     return Pairs(Evidence(*evidence.T), neighbours, errors.right, errors.right | wrong)

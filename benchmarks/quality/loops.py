@@ -32,7 +32,7 @@ from sglpr_jax.loops.search import FoundLoops
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
 from sglpr_jax.models.params import Params
 from sglpr_jax.pose_graph.files import read_loops_jsonl
-from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
+from sglpr_jax.pose_graph.optimize import PoseGraph, trajectory_error
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import SimulatedRecording
@@ -79,7 +79,9 @@ def _ours(drive: Drive, *, drifting: bool, weights: str, **_: Any) -> Found:
     start = time.perf_counter(), time.process_time()
     loops = sglpr_jax.find_loops(drive.recording, params, odometry=odometry, registered=False).loops
     taken = time.perf_counter() - start[0], time.process_time() - start[1]
-    return Found(closures_of(loops), None if odometry is None else optimized(odometry, loops).poses, *taken, loops)
+    return Found(
+        closures_of(loops), None if odometry is None else PoseGraph({0: odometry}, loops).solve().poses, *taken, loops
+    )
 
 
 class _ByScanContext(StoredScans):

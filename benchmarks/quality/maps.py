@@ -119,7 +119,7 @@ def cloud(
         opened = _openers(first, trajectory, poses)
         for name in maps:
             recording, map_poses = opened[name]()
-            places = sglpr_jax.PlaceMap.of(recording, params, map_poses, spacing_m=spacing_m)
+            places = sglpr_jax.map_recording(recording, params, map_poses, spacing_m=spacing_m).places
             for sensor in queries:
                 query = _driven(out, seed=seed, sensor=sensor, day=1, scans=scans, azimuth_steps=900)
                 found = np.array(_located_in(places, params, query, first, poses, every))
@@ -261,7 +261,7 @@ def sensors(
             rows = np.array(scored(drive))
             mapped = rows[drive.passes[rows] == 0]
             some = only(recording, mapped.tolist())
-            places = sglpr_jax.PlaceMap.of(some, params, drive.poses[mapped], spacing_m=spacing_m)
+            places = sglpr_jax.map_recording(some, params, drive.poses[mapped], spacing_m=spacing_m).places
             numbers = [list(PASSES).index(name) for name in ("opposite", "same")]
             asked = rows[np.isin(drive.passes[rows], numbers)][:: max(1, round(spacing_m))]
             seen = [finder.seen(recording.record(row)) for row in asked.tolist()]

@@ -173,8 +173,8 @@ def search(
         print(json.dumps(rows[-1]), flush=True)
         if before is not None and done < strangers:
             found = _found(params, first, before)
-            done, invented = done + 1, invented + bool(found.aligned)
-            print(f"  strangers: {len(found.loops)} loops, {len(found.aligned)} transforms", flush=True)
+            done, invented = done + 1, invented + bool(found.transforms)
+            print(f"  strangers: {len(found.loops)} loops, {len(found.transforms)} transforms", flush=True)
         before = second
     _report(rows, invented, done)
 
@@ -188,17 +188,17 @@ def _drive(content: dict[str, np.ndarray], name: str, *, drifting: bool) -> Driv
 def _found(params: sglpr_jax.Params, first: Drive, second: Drive) -> Any:
     """Loops and transforms between two drives."""
     recordings, odometry = (first.recording, second.recording), (first.given, second.given)
-    return sglpr_jax.find_loops_between(recordings, params, odometry=odometry, registered=False).between[0]
+    return sglpr_jax.find_loops(recordings, params, odometry=odometry, registered=False).between(0, 1)
 
 
 def _judged(found: Any, first: Drive, second: Drive) -> dict[str, Any]:
     """Number of loops, wrong ones and transforms, and the errors of the transform."""
     seen = [inverse(first.true[loop.match]) @ second.true[loop.query] for loop in found.loops]
     wrong = sum(bool(np.linalg.norm(pose[:3, 3]) > OTHER_M) for pose in seen)
-    row: dict[str, Any] = {"loops": len(found.loops), "wrong": wrong, "transforms": len(found.aligned)}
-    if not found.aligned:
+    row: dict[str, Any] = {"loops": len(found.loops), "wrong": wrong, "transforms": len(found.transforms)}
+    if not found.transforms:
         return row
-    alignment = found.aligned[0].alignment
+    alignment = found.transforms[0].alignment
     error = inverse(inverse(first.true[0]) @ second.true[0]) @ alignment.match_from_query
     here = [
         inverse(first.given[loop.match] @ pose) @ alignment.match_from_query @ second.given[loop.query]

@@ -10,7 +10,7 @@ GROUPS = {
     ],
     "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "Index", "FleetIndex"],
     "Scores": ["evaluate", "Evaluation"],
-    "Loops": ["find_loops", "find_loops_between", "LoopDetector", "Loop"],
+    "Loops": ["find_loops", "LoopDetector", "Loop"],
     "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],
     "Simulation": ["simulate"],
     "Weights and presets": ["Params", "shipped_weights", "MODELS", "model_preset"],

@@ -18,7 +18,6 @@ from sglpr_jax.cli.recording import (
 )
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.cli.scan_odometry import AUTO, check_auto, open_with_scan_odometry, remove_odometry
-from sglpr_jax.cli.several_loops import search_several
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.loops.config import (
     MIN_PROBABILITY,
@@ -40,6 +39,9 @@ from sglpr_jax.odometry.config import (
 from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
     from sglpr_jax.data.recording import Recording
 
 UNFINISHED = "unfinished"
@@ -141,11 +143,8 @@ def loops_of_recording(command: LoopsCommand) -> int:
     from sglpr_jax.loops.checkpoint import alone  # slow import, not needed for --help
 
     _check(command)
-    config = detector_config(command)
     with alone(command.out / UNFINISHED):
-        if len(command.recordings) > 1:
-            return search_several(command, config, unfinished=command.out / UNFINISHED)
-        return _search(command, config)
+        return _search(command, detector_config(command))
 
 
 def _check(command: LoopsCommand) -> None:
@@ -186,7 +185,8 @@ def _is_trajectory(path: Path, out: Path) -> bool:
 
 
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
-    from sglpr_jax.evaluation.page.of_loops import PAGE, loops_page
+    from sglpr_jax.evaluation.page.of_loops import PAGE
+    from sglpr_jax.evaluation.page.of_recordings import recordings_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.loops.closure import why_rejected
@@ -195,23 +195,21 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.pose_graph.folder import write_found
     from sglpr_jax.pose_graph.optimize import optimize_trajectory
 
-    source, (root,) = command.source, command.recordings
     params = load(command.weights)
     if command.odometry == AUTO:
-        command, (recording,), (odometry,) = open_with_scan_odometry(command)
-    elif not command.odometry_files:
-        recording, odometry = command.submap.prepared(source.open(root), None), None
+        command, recordings, odometry = open_with_scan_odometry(command)
     else:
-        (path,) = command.odometry_files
-        recording, odometry = open_with_poses(source, root, path, format=command.odometry_format)
-        recording = command.submap.prepared(recording, odometry)
-    scale = resolved_scale(command.scale, recording)
-    register = command.register and can_register(recording)
+        recordings, odometry = _opened(command)
+    scale = resolved_scale(command.scale, *recordings)
+    register = command.register and all(map(can_register, recordings))
     if command.register and not register:
-        print(f"{recording.name}: loops are not registered, {_why_not(recording)}", file=sys.stderr)
-    with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
+        left_out = next(one for one in recordings if not can_register(one))
+        print(f"{left_out.name}: loops are not registered, {_why_not(left_out)}", file=sys.stderr)
+    name = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"
+    steps = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
+    with stop_on_signal() as stop, progress_bar(f"loops {name}", steps) as show:
         found = find_loops(
-            recording,
+            recordings,
             params,
             odometry=odometry,
             config=config,
@@ -225,8 +223,8 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     if command.degenerate == "drop":
         found = found.without_degenerate()
     corrected = optimize_trajectory(found) if command.optimize else None
-    page = {PAGE: loops_page(found, optimized=corrected)}
-    paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses, texts=page)
+    page = {PAGE: recordings_page(found, optimized=corrected)}
+    paths = write_found(found, command.out, optimized=corrected, texts=page)
     paths.append(record_command(dataclasses.replace(command, scale=scale), command.out))
     if command.rerun is not None:
         write_rerun(found, command.rerun, optimized=corrected)
@@ -237,9 +235,22 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     if not found.whole:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
+    for number in range(len(recordings) if len(recordings) > 1 else 0):
+        remove(command.out / UNFINISHED / f"{number}")
     remove(command.out / UNFINISHED)
     remove_odometry(command)
     return 0
+
+
+def _opened(command: LoopsCommand) -> "tuple[list[Recording], list[Float[np.ndarray, 'n 4 4']] | None]":
+    """Open the recordings, with their odometry if there is one."""
+    if not command.odometry_files:
+        return [command.submap.prepared(command.source.open(path), None) for path in command.recordings], None
+    opened = [
+        open_with_poses(command.source, path, file, format=command.odometry_format)
+        for path, file in zip(command.recordings, command.odometry_files, strict=True)
+    ]
+    return [command.submap.prepared(*one) for one in opened], [poses for _, poses in opened]
 
 
 def _why_not(recording: "Recording") -> str:

@@ -104,7 +104,7 @@ def _log_map(
     for frame, pose in enumerate(poses):
         stream.set_time(TIMELINE, sequence=frame)
         stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[AFTER]))
-        if frame in keyframes and found.recording.ids[frame] not in found.skipped:
+        if frame in keyframes and found.recording.ids[frame] not in found.sessions[0].skipped:
             points = found.recording.record(frame, labels=False).points
             if points is not None and len(points):
                 placed = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)

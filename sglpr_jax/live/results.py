@@ -7,7 +7,7 @@ import numpy as np
 from sglpr_jax.files import write_all
 from sglpr_jax.live.corrected import CorrectedTrajectory
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.pose_graph.files import write_joint_g2o, write_loops_csv, write_rejected_jsonl, write_tum
+from sglpr_jax.pose_graph.files import write_g2o, write_loops_csv, write_rejected_jsonl, write_tum
 
 GRAPH, TABLE, REJECTED = "loops.g2o", "loops.csv", "rejected.jsonl"
 TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
@@ -25,7 +25,7 @@ def write_results(live: LiveMap, folder: Path, *, corrected: CorrectedTrajectory
     segments = detector.finder.motion.segments
     parts = np.split(np.arange(len(odometry)), np.flatnonzero(np.diff(segments)) + 1) if len(odometry) else []
     files = {
-        GRAPH: lambda path: write_joint_g2o(
+        GRAPH: lambda path: write_g2o(
             path, loops, [(rows, odometry[rows]) for rows in parts], drift=detector.config.drift
         ),
         TABLE: lambda path: write_loops_csv(path, loops),

@@ -17,6 +17,7 @@ from sglpr_jax.loops.config import ConsistencyConfig, DetectorConfig
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import inverse, travelled
 
@@ -48,9 +49,10 @@ def accepted(
     Returns:
       The accepted and the rejected loops, each in the given order.
     """
-    fits = deviations(loops, odometry, drift=drift, mounting=mounting) <= drift.max_deviation
+    path = DrivenPath.of(odometry, mounting=mounting)
+    fits = deviations(loops, path, drift=drift, mounting=mounting) <= drift.max_deviation
     left = np.flatnonzero(fits).tolist()
-    pairs = agree([loops[i] for i in left], odometry, mounting=mounting, drift=drift, config=config)
+    pairs = agree([loops[i] for i in left], path, mounting=mounting, drift=drift, config=config)
     members = {left[i] for i in largest_consistent_set(pairs)}
     reasons: tuple[Reason, Reason] = ("contradicts the odometry", "contradicts other loops")
     rejected = [Rejected(loop, reasons[int(fits[i])]) for i, loop in enumerate(loops) if i not in members]
@@ -108,9 +110,10 @@ def _readings(
     scale: Scale,
 ) -> str:
     """Both explanations of loops that contradict the odometry, with the drift that would explain them."""
-    found = deviations(against, odometry, drift=config.drift, mounting=mounting)
+    path = DrivenPath.of(odometry, mounting=mounting)
+    found = deviations(against, path, drift=config.drift, mounting=mounting)
     drift = config.drift.scaled(float(f"{np.median(found):.2g}"))
-    pairs = agree(against, odometry, mounting=mounting, drift=drift, config=config.consistency)
+    pairs = agree(against, path, mounting=mounting, drift=drift, config=config.consistency)
     members = [against[i] for i in largest_consistent_set(pairs)]
     stated, drift = (scaled_drift(one, 1 / scale) for one in (config.drift, drift))
     percent, degrees = 100 * drift.metres_per_metre, 100 * drift.degrees_per_metre

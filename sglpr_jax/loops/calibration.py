@@ -1,13 +1,12 @@
 """Reliability of loop probabilities: pairs in bins of probability, and the share of loops in each bin."""
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Complex64, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float
 
 from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.levelling import mountings_of, upright_odometry
@@ -165,29 +164,6 @@ def certain_pairs(
     return Evidence.stack(evidence), np.array(is_loop)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Some:
-    """Stored scans without the ignored ones."""
-
-    stored: StoredScans
-    kept: Bool[np.ndarray, " n"]
-
-    @property
-    def frames(self) -> Int[np.ndarray, " n"]:
-        return self.stored.frames
-
-    def nearest(
-        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
-    ) -> Int[np.ndarray, " j"]:
-        return self.stored.nearest(descriptor, k, among & self.kept)
-
-    def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
-        return self.stored.image(row)
-
-    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        return self.stored.spectra(rows)
-
-
 class _Drive:
     """Stored scans of a drive, and its odometry with a last frame of unknown pose for queries."""
 
@@ -212,7 +188,7 @@ class _Drive:
         near = (apart >= NEAR_M[0]) & (apart <= NEAR_M[1])
         near &= np.abs(way_m - self.motion.travelled[frame]) <= SAME_PASS_M
         query = self.rotated(frame, angle)
-        scans = _Some(self.stored, far | near if positive else far)
+        scans = self.stored.some(far | near if positive else far)
         fits = self.comparer.compare(query, scans, possible=near if positive else far)
         matches = np.isin(fits.frames, frames[near if positive else far])
         found = self.comparer.candidates(query, fits, self.stored.image_of, possible=matches)

@@ -12,9 +12,7 @@ from jaxtyping import Float, Int
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.levelling import AnyMounting, lidar_pose, upright_from_lidar, upright_poses, uprights
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scaled import scaled, scaled_poses
-from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.se3 import inverse, moved_covariance, transform, yaw_of
@@ -43,13 +41,20 @@ DEGENERATE_M = 1.0
 """Maximum standard deviation of the position of a pose that is not degenerate, in metres."""
 
 
+class FrameId(NamedTuple):
+    """A frame of a session, both counted from 0: a node of a pose graph."""
+
+    session: int
+    frame: int
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loop:
     """Two frames of one place, with the pose between them."""
 
     query: int
     match: int
-    """Frame numbers, counted from 0. The match is the earlier frame."""
+    """Frames, counted from 0 in each session. Of one session, the match is the earlier frame."""
     match_from_query: Float[np.ndarray, "4 4"]
     """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. The points of the scans are in these
     frames, which are tilted if the sensor is tilted."""
@@ -60,6 +65,14 @@ class Loop:
     """Probability that both frames show one place."""
     overlap: float | None = None
     """Overlap of the scans, from 0 to 1, if they were registered in 6 degrees of freedom."""
+    query_session: int = 0
+    match_session: int = 0
+    """Sessions of the two frames, counted from 0. The match is in the same session or in an earlier one."""
+
+    @property
+    def nodes(self) -> tuple[FrameId, FrameId]:
+        """The match and the query."""
+        return FrameId(self.match_session, self.match), FrameId(self.query_session, self.query)
 
     @property
     def yaw(self) -> float:
@@ -240,51 +253,27 @@ def wrapped(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-class Search(NamedTuple):
-    """Input of a search: a recording, the pose of the LiDAR at each of its scans, and the settings."""
-
-    recording: Recording
-    odometry: Float[np.ndarray, "n 4 4"] | None
-    config: DetectorConfig
-
-    def scaled(self, scale: Scale) -> "Search":
-        """The same input with all lengths multiplied by `scale`."""
-        odometry = None if self.odometry is None else scaled_poses(self.odometry, float(scale))
-        return Search(scaled(self.recording, scale), odometry, scaled_config(self.config, scale))
-
-
-def scaled_config(config: DetectorConfig, scale: Scale) -> DetectorConfig:
-    """Settings for scaled scans. Settings that do not belong to the images are in real metres, and are scaled."""
-    return dataclasses.replace(
-        config,
-        keyframe_m=config.keyframe_m * scale,
-        drift=scaled_drift(config.drift, float(scale)),
-    )
-
-
 def scaled_drift(drift: DriftModel, factor: float) -> DriftModel:
     """Drift of odometry whose translations were multiplied by `factor`. Shares of the distance do not change."""
     return dataclasses.replace(drift, degrees_per_metre=drift.degrees_per_metre / factor)
 
 
-def divided_loop(loop: Loop, scale: Scale) -> Loop:
-    """Loop of scans before they were multiplied by `scale`."""
-    return dataclasses.replace(
-        loop,
-        match_from_query=scaled_poses(loop.match_from_query, 1 / scale),
-        covariance=divided_covariance(loop.covariance, scale),
-    )
+def in_metres(loop: Loop, scale: Scale) -> Loop:
+    """Loop of scans before all lengths were multiplied by `scale`."""
+    pose = scaled_poses(loop.match_from_query, 1 / scale)
+    return dataclasses.replace(loop, match_from_query=pose, covariance=covariance_in_metres(loop.covariance, scale))
 
 
-def divided_rejected(rejected: Rejected, scale: Scale) -> Rejected:
-    """Rejected pair of scans before they were multiplied by `scale`."""
-    return dataclasses.replace(rejected, loop=divided_loop(rejected.loop, scale))
-
-
-def divided_covariance(covariance: Float[np.ndarray, "6 6"], scale: Scale) -> Float[np.ndarray, "6 6"]:
-    """Covariance of a pose (x, y, z, rotations) before its lengths were multiplied by `scale`."""
+def covariance_in_metres(covariance: Float[np.ndarray, "6 6"], scale: Scale) -> Float[np.ndarray, "6 6"]:
+    """Covariance of a pose (x, y, z, rotations) before all lengths were multiplied by `scale`."""
     units = np.repeat([1 / scale, 1.0], 3)
     return covariance * np.outer(units, units)
+
+
+def renumbered(loop: Loop, numbers: Sequence[Int[np.ndarray, " _"]]) -> Loop:
+    """The loop with other numbers of its frames: those of the frames of each session."""
+    query, match = numbers[loop.query_session][loop.query], numbers[loop.match_session][loop.match]
+    return dataclasses.replace(loop, query=int(query), match=int(match))
 
 
 MEANING: dict[Reason, str] = {

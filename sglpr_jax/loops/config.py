@@ -25,11 +25,6 @@ CANDIDATES = 5
 """Number of nearest places of a map that a query is compared with."""
 
 
-def _check_probability(name: str, value: float) -> None:
-    if not 0 <= value <= 1:
-        raise ValueError(f"expected {name} from 0 to 1, found {value}")
-
-
 @dataclasses.dataclass(frozen=True)
 class CandidateConfig:
     """Selection of the scans that a query is compared with: possible matches, and scans that show other places."""
@@ -116,7 +111,8 @@ class DetectorConfig:
 
     def __post_init__(self):
         """Raises ValueError if the probability is outside [0, 1], or if a limit of the stored scans is invalid."""
-        _check_probability("min_probability", self.min_probability)
+        if not 0 <= self.min_probability <= 1:
+            raise ValueError(f"expected min_probability from 0 to 1, found {self.min_probability}")
         if not 0 <= self.keyframe_m < math.inf:
             raise ValueError(f"expected keyframe_m of 0 or more, found {self.keyframe_m}")
         if self.max_places is not None and self.max_places < 1:

@@ -6,7 +6,6 @@ Maximization (ICRA 2018), in the plane.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax.data.levelling import AnyMounting
 from sglpr_jax.loops.closure import Loop, Reason, Rejected, compose, frames_of, inverted, planar, planar_loops, relative
 from sglpr_jax.loops.config import ConsistencyConfig
+from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 
@@ -23,7 +23,7 @@ BLOCK = 64
 
 def agree(
     loops: Sequence[Loop],
-    odometry: Float[np.ndarray, "n 4 4"],
+    path: DrivenPath,
     others: Sequence[Loop] | None = None,
     *,
     way: Float[np.ndarray, " n"] | None = None,
@@ -31,38 +31,22 @@ def agree(
     drift: DriftModel = DriftModel(),
     config: ConsistencyConfig = ConsistencyConfig(),
 ) -> Bool[np.ndarray, "a b"]:
-    """Pairs of loops that are consistent, given the odometry of all frames.
+    """Pairs of loops that are consistent, given the path of all frames. The length of the path does not cost time.
 
     Arguments:
       loops: Loops between LiDAR frames.
-      odometry: Pose of the LiDAR at each frame.
+      path: Path of all frames.
       others: Loops to compare with, by default `loops`.
-      way: Travelled distance at each frame in metres, by default computed from the odometry.
+      way: Travelled distance at each frame in metres, by default that of the path.
       mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
-      drift: Drift model of the odometry.
+      drift: Drift model of the path.
       config: Thresholds.
 
     Returns:
       Whether loop i of `loops` is consistent with loop j of `others`.
     """
-    path = DrivenPath.of(odometry, mounting=mounting)
-    others = loops if others is None else others
-    return agree_along(path, loops, others, way=way, mounting=mounting, drift=drift, config=config)
-
-
-def agree_along(
-    path: DrivenPath,
-    loops: Sequence[Loop],
-    others: Sequence[Loop],
-    *,
-    way: Float[np.ndarray, " n"] | None = None,
-    mounting: AnyMounting = None,
-    drift: DriftModel = DriftModel(),
-    config: ConsistencyConfig = ConsistencyConfig(),
-) -> Bool[np.ndarray, "a b"]:
-    """Return `agree` for two sets of loops and a path. The time is independent of the length of the path."""
     way = path.travelled if way is None else way
-    a, b = (_columns(each, path, way, mounting) for each in (loops, others))
+    a, b = (_columns(each, path, way, mounting) for each in (loops, loops if others is None else others))
     pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)
     for start in range(0, len(pairs), BLOCK):
         rows = slice(start, start + BLOCK)
@@ -141,51 +125,41 @@ def _closes(
 
 
 MIN_LOOPS = 5
-"""Minimum number of consistent loops between two recordings."""
+"""Minimum number of consistent loops between two sessions."""
 MIN_TRAVELLED_M = 15.0
-"""Minimum travelled distance between the first and the last of these loops, in each recording, in metres."""
+"""Minimum travelled distance between the first and the last of these loops, in each session, in metres."""
 MAX_RIVAL = 0.5
 """Maximum size of the second largest consistent set, as a fraction of the largest one."""
 
 
-class Joined(NamedTuple):
-    """Poses of the frames of both recordings, one after the other. Poses of different parts are not comparable."""
-
-    poses: Float[np.ndarray, "n 4 4"]
-    """Pose of the gravity-aligned frame of the sensor at each frame."""
-    travelled: Float[np.ndarray, " n"]
-    """Travelled distance at each frame, in metres."""
-    parts: Int[np.ndarray, " n"]
-    """Part of each frame. Parts are separated where the motion is unknown, and between the recordings."""
-
-
 def accepted_between(
-    loops: Sequence[Loop], joined: Joined, *, drift: DriftModel, config: ConsistencyConfig
+    loops: Sequence[Loop], motion: Motion, *, mounting: AnyMounting, drift: DriftModel, config: ConsistencyConfig
 ) -> tuple[list[list[Loop]], list[Rejected]]:
-    """Accept sets of consistent loops, at most one for each part of one recording and each part of the other.
+    """Accept sets of consistent loops between two sessions, at most one for each segment of each session.
 
     Arguments:
-      loops: Loops in gravity-aligned frames, in the order of their queries.
-      joined: Poses of both recordings.
-      drift: Drift model of the poses.
+      loops: Loops in the order of their queries. Their frames are rows of the motion.
+      motion: Motion of both sessions (`Motion.joined`). Poses of different segments are not comparable.
+      mounting: Mounting of the LiDAR at each row.
+      drift: Drift model of the motion.
       config: Thresholds of the consistency of two loops.
 
     Returns:
       The accepted sets, the largest one first, and the rejected loops.
     """
     query, match = frames_of(loops)
-    pairs_of_parts = np.stack([joined.parts[match], joined.parts[query]], axis=1)
+    segments = np.stack([motion.segments[match], motion.segments[query]], axis=1)
     found, rejected = [], []
-    for parts in np.unique(pairs_of_parts, axis=0):
-        rows = np.flatnonzero((pairs_of_parts == parts).all(axis=1)).tolist()
-        some = [loops[row] for row in rows]
-        pairs = agree(some, joined.poses, way=joined.travelled, drift=drift, config=config)
+    for pair in np.unique(segments, axis=0):
+        some = [loops[row] for row in np.flatnonzero((segments == pair).all(axis=1)).tolist()]
+        rules = {"way": motion.travelled, "mounting": mounting, "drift": drift, "config": config}
+        pairs = agree(some, motion.path, **rules)
         members = largest_consistent_set(pairs).tolist()
         others = np.setdiff1d(np.arange(len(some)), members)
         rival = largest_consistent_set(pairs[np.ix_(others, others)])
         chosen = [some[k] for k in members]
         reason: Reason = "contradicts other loops"
-        if not _is_enough(chosen, joined):
+        if not _is_enough(chosen, motion.travelled):
             reason, others = "too few neighbours", np.arange(len(some))
         elif len(rival) > MAX_RIVAL * len(members):
             others = np.arange(len(some))
@@ -195,8 +169,6 @@ def accepted_between(
     return sorted(found, key=len, reverse=True), rejected
 
 
-def _is_enough(loops: Sequence[Loop], joined: Joined) -> bool:
-    """Whether there are enough loops, over enough travelled distance in both recordings."""
-    if len(loops) < MIN_LOOPS:
-        return False
-    return all(np.ptp(joined.travelled[frames]) >= MIN_TRAVELLED_M for frames in frames_of(loops))
+def _is_enough(loops: Sequence[Loop], way: Float[np.ndarray, " n"]) -> bool:
+    """Whether there are enough loops, over enough travelled distance in both sessions."""
+    return len(loops) >= MIN_LOOPS and all(np.ptp(way[frames]) >= MIN_TRAVELLED_M for frames in frames_of(loops))

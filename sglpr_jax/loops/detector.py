@@ -1,23 +1,21 @@
 """Loop detector for a stream of scans."""
 
-import dataclasses
 import datetime
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.special import expit, logit
 
 from sglpr_jax.data.recording import Record
 from sglpr_jax.loops.arguments import given_pose, given_record, given_time
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.closure import Loop, Reason, Rejected, planar_loop
+from sglpr_jax.loops.closure import Loop, Reason, Rejected
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.loops.sequence import Pair, tested_log_odds, verdict
+from sglpr_jax.loops.sequence import Pair, pair_of, probable_loops, verdict
 from sglpr_jax.models.params import Params
 
 MAX_WAITING = 240
@@ -134,7 +132,8 @@ class LoopDetector:
         self.candidates += candidates
         if self.config.max_places is not None:
             del self.candidates[: -self.config.max_places]
-        self._waiting += [self._pair(one) for one in candidates]
+        about = self.model, self.finder.motion, self.finder.mountings
+        self._waiting += [pair_of(one, *about, knows_height=self.finder.knows_height) for one in candidates]
         oldest_m = self.finder.motion.travelled[len(self) - 1] - self.config.sequence.window_m
         old = [one.way_m < oldest_m for one in self._waiting]
         count = max(sum(old), len(self._waiting) - MAX_WAITING)
@@ -150,19 +149,6 @@ class LoopDetector:
         """Verdicts about the pairs of the last frames, if no further frame follows."""
         return self._verdicts(self._waiting)
 
-    def _pair(self, one: Candidate) -> Pair:
-        each, evidence = self.finder.mountings, one.evidence
-        loop = planar_loop(
-            one.query,
-            one.match,
-            one.alignment,
-            probability=float(self.model.probability(evidence)),
-            knows_height=self.finder.knows_height,
-            query_mounting=each[one.query],
-            match_mounting=each[one.match],
-        )
-        return Pair(loop, evidence, float(self.finder.motion.travelled[one.query]))
-
     def _confirmed(self) -> list[Loop]:
         """New loops of the last frames that pass the sequential test."""
         allowed = [one for one in self._waiting if self._is_allowed(one)]
@@ -173,17 +159,12 @@ class LoopDetector:
 
     def _probable(self, pairs: Sequence[Pair], done: set[int]) -> list[Loop]:
         """Pairs that are probable enough given their neighbours. Queries that are `done` are left out, and noted."""
-        finder, config = self.finder, self.config
-        rules = {"drift": finder.present_drift, "mounting": finder.mountings}
-        rules |= {"consistency": config.consistency, "config": config.sequence}
-        log_odds = tested_log_odds(pairs, self.model, finder.motion.path, **rules)
-        found = [
-            dataclasses.replace(one.loop, probability=float(expit(value)))
-            for one, value in zip(pairs, log_odds, strict=True)
-            if value >= logit(config.min_probability) and one.loop.query not in done
-        ]
-        done |= {loop.query for loop in found}
-        return found
+        finder = self.finder
+        rules = {"mounting": finder.mountings, "drift": finder.present_drift, "config": self.config}
+        found = probable_loops(pairs, self.model, finder.motion.path, **rules)
+        new = [loop for loop in found if loop is not None and loop.query not in done]
+        done |= {loop.query for loop in new}
+        return new
 
     def _is_allowed(self, one: Pair) -> bool:
         """Whether the motion allows the pose of a pair."""

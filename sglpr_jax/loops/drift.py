@@ -18,12 +18,7 @@ STEP_M, STEP_DEG = 0.005, 0.005
 
 
 def deviations(
-    loops: Sequence[Loop],
-    odometry: Float[np.ndarray, "n 4 4"],
-    *,
-    drift: DriftModel = DriftModel(),
-    mounting: AnyMounting = None,
-    guessed_m: Float[np.ndarray, " n"] | None = None,
+    loops: Sequence[Loop], path: DrivenPath, *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
 ) -> Float[np.ndarray, " k"]:
     """Mahalanobis distance of each loop from the odometry between its frames.
 
@@ -38,20 +33,11 @@ def deviations(
     alike, so a difference in height must not be outweighed by a good fit in the plane.
 
     Arguments:
-      loops: Loops between frames of the odometry.
-      odometry: Pose of the LiDAR at each frame.
+      loops: Loops between frames of the path. The time is independent of the length of the path.
+      path: Path of the sensor by odometry.
       drift: Drift model.
       mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
-      guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
     """
-    path = DrivenPath.of(odometry, mounting=mounting, guessed_m=guessed_m)
-    return deviations_along(path, loops, drift=drift, mounting=mounting)
-
-
-def deviations_along(
-    path: DrivenPath, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
-) -> Float[np.ndarray, " k"]:
-    """Return `deviations` of each loop from a path. The time is independent of the length of the path."""
     poses, covariances = planar_loops(loops, mounting)
     query, match = frames_of(loops)
     options = {"drift": drift, "level": path.level(mounting), "covariances": covariances}
@@ -126,8 +112,7 @@ def floor_deviations(
 def height_deviations(
     path: DrivenPath, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
 ) -> Float[np.ndarray, " k"]:
-    """Deviation of each loop from a path in height, in standard deviations. The arguments are those of
-    `deviations_along`."""
+    """Deviation of each loop from a path in height, in standard deviations. Arguments as in `deviations`."""
     query, match = frames_of(loops)
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
     by_loop = path.poses[match] @ upright_poses(poses, mounting, query=query, match=match)

@@ -1,4 +1,4 @@
-"""Transform between the frames of two recordings, estimated from the loops between them."""
+"""Transform between the frames of two sessions, estimated from the loops between them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,10 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.loops.closure import Loop, frames_of
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.scaled import scaled_poses
+from sglpr_jax.loops.closure import Loop, covariance_in_metres, frames_of
 from sglpr_jax.loops.config import SequenceConfig
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.se3 import adjoint, inverse, moved_covariance
+from sglpr_jax.se3 import adjoint, inverse, moved_covariance, yaw_of
 
 ROUNDS = 20
 """Maximum number of Gauss-Newton steps."""
@@ -19,13 +21,49 @@ SMALL = 1e-9
 
 
 class FrameAlignment(NamedTuple):
-    """Transform between the frames of two recordings."""
+    """Transform between the frames of two sessions."""
 
     match_from_query: Float[np.ndarray, "4 4"]
     """Pose of the query recording's frame in the match recording's frame, in metres."""
     covariance: Float[np.ndarray, "6 6"]
     """Covariance of a small motion of the query recording's frame in itself: x, y, z in metres, then rotations about x,
     y, z in radians."""
+
+
+class Part(NamedTuple):
+    """Frames of a session whose poses are known in one frame: all of them if there is odometry."""
+
+    session: int
+    first: int
+    last: int
+    """First and last row of the part."""
+    is_odometry: bool
+    """Whether the frame is that of the odometry. Otherwise it is the LiDAR's frame at the first row."""
+
+
+class AlignedParts(NamedTuple):
+    """Transform between a part of one session and a part of a later one."""
+
+    match: Part
+    query: Part
+    alignment: FrameAlignment
+    loops: int
+    """Number of loops from which the transform was estimated."""
+
+    def in_metres(self, scale: Scale) -> "AlignedParts":
+        """The transform before all lengths were multiplied by `scale`."""
+        pose = scaled_poses(self.alignment.match_from_query, 1 / scale)
+        return self._replace(alignment=FrameAlignment(pose, covariance_in_metres(self.alignment.covariance, scale)))
+
+    def __str__(self) -> str:
+        (x, y, z), sigma = self.alignment.match_from_query[:3, 3], np.sqrt(np.diag(self.alignment.covariance))
+        yaw, parts = np.degrees(yaw_of(self.alignment.match_from_query)), ""
+        if not self.match.is_odometry:
+            parts = f" of scans {self.match.first}-{self.match.last} and {self.query.first}-{self.query.last}"
+        return (
+            f"transform{parts} x {x:.2f}, y {y:.2f}, z {z:.2f} m, yaw {yaw:.2f} degrees "
+            f"(+- {np.hypot(*sigma[:2]):.2f} m, {np.degrees(sigma[5]):.2f} degrees)"
+        )
 
 
 def aligned_frames(

@@ -82,6 +82,7 @@ class StoredScans:
         """Start with an index without places. The limits are those of `DetectorConfig`."""
         self.index, self.verification, self.keyframe_m, self.max_places = index, verification, keyframe_m, max_places
         self._first = 0
+        self._kept: Bool[np.ndarray, " n"] | None = None
         self._frames = GrowingArray(np.empty(0, np.int64))
         self._repeated = GrowingArray(np.empty(0, bool))
         """Whether each scan has a loop to a newer stored scan."""
@@ -104,12 +105,19 @@ class StoredScans:
         found._first = first
         return found
 
+    def some(self, kept: Bool[np.ndarray, " n"]) -> "StoredScans":
+        """The same scans, of which only those with a flag are the nearest ones of a descriptor. They are shared."""
+        found = copy.copy(self)
+        found._kept = kept
+        return found
+
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
         """Up to k (0 or more) scans with the nearest descriptors among those with a flag, nearest first."""
         if not k:
             return np.zeros(0, np.int64)
+        among = among if self._kept is None else among & self._kept
         rows = self.index.query(descriptor, k, exclude=~among).rows
         return rows[rows >= 0]
 

@@ -1,10 +1,16 @@
-"""Search for the loops of a recording: detector over all scans, then joint acceptance over the whole drive."""
+"""Search for the loops within and between sessions: a detector over the scans of each one, then joint acceptance.
+
+Loops between two sessions: each stored scan of the later one is compared with the stored scans of the earlier one.
+Comparison, probability and sequential test are the same as within a session. Scans of both show other places.
+"""
 
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -12,109 +18,206 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
-from sglpr_jax.data.levelling import check_level, mountings_of
+from sglpr_jax.data.levelling import Mountings, check_level, mountings_of
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.acceptance import AXES, check_odometry, settled
+from sglpr_jax.loops.acceptance import AXES, check_odometry, registered_loops, settled
 from sglpr_jax.loops.arguments import check_is, given_poses
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import (
-    MEANING,
-    Loop,
-    Rejected,
-    Search,
-    counted,
-    divided_loop,
-    divided_rejected,
-    listed,
-    scaled_drift,
-)
-from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, in_metres, listed, scaled_drift
+from sglpr_jax.loops.comparison import Candidate, Comparer, Query
 from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.frame_alignment import AlignedParts, Part, aligned_frames
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import LoopModel
+from sglpr_jax.loops.sequence import pair_of, probable_loops, verdict
 from sglpr_jax.models.params import Params
+from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.registration.gicp import check_installed, is_installed
+from sglpr_jax.se3 import inverse
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FoundLoops:
-    """Loops of a recording, with the trajectory and the settings of the search."""
+class Session:
+    """A searched recording."""
 
     recording: Recording
     frames: int
     """Number of scans that were searched: all, unless the search was stopped."""
-    loops: tuple[Loop, ...]
-    rejected: tuple[Rejected, ...]
-    """All other compared pairs, each with the reason for its rejection."""
-    odometry: Float[np.ndarray, "n 4 4"] | None
+    odometry: Float[np.ndarray, "n 4 4"] | None = None
     """Pose of the LiDAR at every scan of the recording."""
+    drift: DriftModel = DriftModel()
+    """Drift of the odometry, estimated from the drive."""
     skipped: tuple[str, ...] = ()
     """Ids of scans that cannot be read."""
-    candidates: tuple[Candidate, ...] = ()
-    """All compared pairs or, with `max_places`, that many of the last ones."""
-    model: LoopModel | None = None
-    """Model of the probabilities."""
-    unregistered: int = 0
-    """Number of loops that were not registered because the search was stopped."""
-    config: DetectorConfig = DetectorConfig()
-    """Settings of the search. The drift is that of the odometry, estimated from the drive."""
     empty: int = 0
     """Number of searched scans that are almost empty."""
+    unregistered: int = 0
+    """Number of loops within the session that were not registered because the search was stopped."""
+    candidates: tuple[Candidate, ...] = ()
+    """All compared pairs or, with `max_places`, that many of the last ones. Their lengths have the search's scale."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FoundLoops:
+    """Loops within and between sessions."""
+
+    sessions: tuple[Session, ...]
+    loops: tuple[Loop, ...] = ()
+    """Loops within each session, then those between each pair of sessions."""
+    rejected: tuple[Rejected, ...] = ()
+    """All other compared pairs, each with the reason for its rejection."""
+    transforms: tuple[AlignedParts, ...] = ()
+    """Transforms between the frames of sessions. For each pair, the one with most loops is first; none if no common
+    place was found. With odometry there is at most one."""
+    model: LoopModel | None = None
+    """Model of the probabilities."""
+    config: DetectorConfig = DetectorConfig()
+    """Settings of the search."""
     scale: Scale = 1
-    """Factor for all lengths during the search. Loops, odometry and settings are in metres; candidates are scaled."""
+    """Factor for all lengths during the search. The results are in metres."""
+    stopped: bool = False
+    """Whether the search between sessions was stopped before its end."""
 
     @property
-    def drift(self) -> DriftModel:
-        """Drift model of the odometry."""
-        return self.config.drift
+    def recording(self) -> Recording:
+        """Recording of the first session."""
+        return self.sessions[0].recording
+
+    @property
+    def frames(self) -> int:
+        """Number of scans of the first session that were searched."""
+        return self.sessions[0].frames
+
+    @property
+    def odometry(self) -> Float[np.ndarray, "n 4 4"] | None:
+        """Pose of the LiDAR at every scan of the first session."""
+        return self.sessions[0].odometry
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Compared pairs of the first session."""
+        return self.sessions[0].candidates
 
     @property
     def whole(self) -> bool:
         """Whether the search was completed."""
-        return self.frames == len(self.recording) and not self.unregistered
+        ended = (one.frames == len(one.recording) and not one.unregistered for one in self.sessions)
+        return not self.stopped and all(ended)
 
-    def __str__(self) -> str:
-        degenerate = sum(loop.is_degenerate for loop in self.loops)
-        loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
-        found = f"{loops} in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
-        why = f" ({listed(counted(self.rejected))})" if self.rejected else ""
-        skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
-        left = f", {self.unregistered} not registered" if self.unregistered else ""
-        scale = f", scale {self.scale}" if self.scale != 1 else ""
-        return f"{found}, {len(self.rejected)} rejected{why}{left}{skipped}{scale}"
+    def split(self, poses: Float[np.ndarray, "n 4 4"]) -> list[Float[np.ndarray, "_ 4 4"]]:
+        """Divide the poses of all searched frames by session."""
+        return np.split(poses, np.cumsum([one.frames for one in self.sessions])[:-1])
 
-    def divided(self, given: Search, scale: Scale) -> "FoundLoops":
-        """Results in metres of a search whose input `given` was multiplied by `scale`."""
-        drift = scaled_drift(self.config.drift, 1 / scale)
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Numbers of the two sessions of each pair: first that of the matches, then that of the queries."""
+        return list(itertools.combinations(range(len(self.sessions)), 2))
+
+    def between(self, match: int, query: int) -> "FoundLoops":
+        """The results whose queries and matches are in these sessions, which may be the same."""
+        ends = match, query
         return dataclasses.replace(
             self,
-            recording=given.recording,
-            odometry=None if self.odometry is None else given.odometry,
-            config=dataclasses.replace(given.config, drift=drift),
-            loops=tuple(divided_loop(loop, scale) for loop in self.loops),
-            rejected=tuple(divided_rejected(one, scale) for one in self.rejected),
-            scale=scale,
+            loops=tuple(one for one in self.loops if _ends(one) == ends),
+            rejected=tuple(one for one in self.rejected if _ends(one.loop) == ends),
+            transforms=tuple(one for one in self.transforms if (one.match.session, one.query.session) == ends),
+        )
+
+    def within(self, session: int) -> "FoundLoops":
+        """The results of one session, as if it had been searched alone."""
+        found, alone = self.between(session, session), {"match_session": 0, "query_session": 0}
+        loops = (dataclasses.replace(loop, **alone) for loop in found.loops)
+        others = (dataclasses.replace(one, loop=dataclasses.replace(one.loop, **alone)) for one in found.rejected)
+        return dataclasses.replace(
+            found, sessions=(self.sessions[session],), loops=tuple(loops), rejected=tuple(others)
         )
 
     def without_degenerate(self) -> "FoundLoops":
         """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction
-        (`is_degenerate`).
+        (`is_degenerate`). Transforms stay, because their weights contain this uncertainty.
         """
         kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
         others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
         return dataclasses.replace(self, loops=kept, rejected=_in_order([*self.rejected, *others]))
 
+    def __str__(self) -> str:
+        within = (self.within(number)._session_in_words() for number in range(len(self.sessions)))
+        return "\n".join([*within, *(self.between(*pair)._pair_in_words(*pair) for pair in self.pairs)])
+
+    def _session_in_words(self) -> str:
+        one = self.sessions[0]
+        degenerate = sum(loop.is_degenerate for loop in self.loops)
+        loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
+        found = f"{loops} in {one.frames} of {len(one.recording)} frames of {one.recording.name}"
+        skipped = f", {len(one.skipped)} scans skipped" if one.skipped else ""
+        left = f", {one.unregistered} not registered" if one.unregistered else ""
+        scale = f", scale {self.scale}" if self.scale != 1 else ""
+        return f"{found}, {len(self.rejected)} rejected{self._reasons()}{left}{skipped}{scale}"
+
+    def _pair_in_words(self, match: int, query: int) -> str:
+        names = f"{self.sessions[match].recording.name} and {self.sessions[query].recording.name}"
+        if not self.transforms:
+            return f"{names}: no common place found{self._reasons()}"
+        transforms = "; ".join(map(str, self.transforms))
+        return f"{names}: {len(self.loops)} loops, {len(self.rejected)} rejected{self._reasons()}; {transforms}"
+
+    def _reasons(self) -> str:
+        return f" ({listed(counted(self.rejected))})" if self.rejected else ""
+
+
+def _ends(loop: Loop) -> tuple[int, int]:
+    """Sessions of match and query."""
+    return loop.match_session, loop.query_session
+
+
+def _in_order(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
+    """Pairs within the sessions, then those between them, in the order of their frames."""
+
+    def order(one: Rejected) -> tuple[bool, tuple[int, int], int, int]:
+        match, query = _ends(one.loop)
+        return match != query, (match, query), one.loop.query, one.loop.match
+
+    return tuple(sorted(rejected, key=order))
+
+
+class Input(NamedTuple):
+    """Input of a search: a recording, the pose of the LiDAR at each of its scans, and the settings."""
+
+    recording: Recording
+    odometry: Float[np.ndarray, "n 4 4"] | None
+    config: DetectorConfig
+
+    def scaled(self, scale: Scale) -> "Input":
+        """The same input with all lengths multiplied by `scale`. Lengths of the images' settings stay as they are."""
+        odometry = None if self.odometry is None else scaled_poses(self.odometry, float(scale))
+        keyframe_m, drift = self.config.keyframe_m * scale, scaled_drift(self.config.drift, float(scale))
+        config = dataclasses.replace(self.config, keyframe_m=keyframe_m, drift=drift)
+        return Input(scaled(self.recording, scale), odometry, config)
+
+
+class Searched(NamedTuple):
+    """A session after the search within it. Lengths are multiplied by the scale of the search."""
+
+    given: Input
+    """The drift is that of the odometry, estimated from the drive. Without usable odometry there is none."""
+    detector: LoopDetector
+    loops: list[Loop]
+    rejected: list[Rejected]
+
 
 def find_loops(
-    recording: Recording,
+    recordings: Recording | Sequence[Recording],
     params: Params,
     *,
-    odometry: ArrayLike | None = None,
+    odometry: ArrayLike | Sequence[ArrayLike | None] | None = None,
     model: LoopModel | None = None,
     config: DetectorConfig = DetectorConfig(),
     registered: bool | None = None,
@@ -124,16 +227,22 @@ def find_loops(
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> FoundLoops:
-    """Find the loops of a recording.
+    """Find the loops of a recording, or those within and between several recordings.
 
     Poses are between LiDAR frames, the frames of the points, whatever the mounting of the sensor. Scans that are almost
     empty have no loops. A warning says if the odometry contradicts most of the loops.
 
+    Several recordings need no common frame. Loops between two of them are accepted if at least five, over at least 15 m
+    of both recordings, fit one transform between the frames and no other transform fits half as many. Otherwise none is
+    accepted and there is no transform. Without odometry, the motion estimated from the images is used. Where it is
+    unknown, a recording consists of several parts, and each part is aligned by its own loops.
+
     Arguments:
-      recording: The scans.
+      recordings: The scans of one recording, or several recordings.
       params: Weights of the model that describes them.
       odometry: Pose of the LiDAR at each scan, with drift (`config.drift`). Candidates and loops beyond the drift are
-        rejected. Of the remaining loops the largest consistent set is kept.
+        rejected. Of the remaining loops the largest consistent set is kept. For a sequence of recordings, a sequence
+        with the odometry of each one.
       model: Model of the probabilities, by default the one shipped for the weights.
       config: Settings of the detector.
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap
@@ -143,53 +252,107 @@ def find_loops(
         of the scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
-      kept_in: Checkpoint directory. If recording, odometry, weights and settings are the same, the search resumes from
-        it. The directory is not removed.
+      kept_in: Checkpoint directory. If recordings, odometry, weights and settings are the same, the search resumes from
+        it. The directory is not removed. With several recordings it gets a folder for each one.
       should_stop: If it returns True, the search ends with the loops that were found. Loops that were not registered by
         then have no overlap.
-      on_progress: Called with the number of searched scans.
+      on_progress: Called with the number of finished steps. A search takes one step for each scan. The comparison of
+        two recordings takes one step for each scan of the second one.
 
     Raises:
-      ValueError: If the odometry has another length or shape, if no scan can be read, or if all scans are empty.
+      ValueError: If there is no recording, if the odometry has another length or shape, if no scan can be read, or if
+        all scans of a recording are empty.
       TypeError: If an argument is not a recording, parameters or an array.
       ImportError: If `registered` is True and small-gicp is not installed.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
-    check_is(recording, Recording, by="open_recording")
-    registered = can_register(recording) if registered is None else registered
-    given = prepared(recording, odometry, config, registered=registered)
-    found, _ = searched(
-        given.scaled(scale),
-        params,
-        model=model,
-        registered=registered,
+    given, registered = _inputs(recordings, odometry, config, registered=registered)
+    steps, searches = 0, list[Searched]()
+    for number, one in enumerate(given):
+        folder = None if kept_in is None else Path(kept_in) / f"{number}" if len(given) > 1 else Path(kept_in)
+        found = search_session(
+            one.scaled(scale),
+            params,
+            model=model,
+            registered=registered,
+            scale=scale,
+            on_bad_scan=on_bad_scan,
+            kept_in=folder,
+            should_stop=should_stop,
+            on_progress=lambda done, before=steps: on_progress(before + done),
+        )
+        searches.append(found)
+        steps += len(one.recording)
+    loops, rejected, transforms = [], [], []
+    for number, one in enumerate(searches):
+        own = {"match_session": number, "query_session": number}
+        loops += [dataclasses.replace(loop, **own) for loop in one.loops]
+        rejected += [dataclasses.replace(other, loop=dataclasses.replace(other.loop, **own)) for other in one.rejected]
+    for match, query in itertools.combinations(range(len(given)), 2):
+        options = {"registered": registered, "should_stop": should_stop}
+        options["on_progress"] = lambda done, before=steps: on_progress(before + done)
+        for all_found, some in zip(
+            (loops, rejected, transforms), search_pair(match, query, searches, **options), strict=True
+        ):
+            all_found += some
+        steps += len(given[query].recording)
+    return FoundLoops(
+        tuple(_session(one, found, scale, registered) for one, found in zip(given, searches, strict=True)),
+        tuple(in_metres(loop, scale) for loop in loops),
+        tuple(dataclasses.replace(one, loop=in_metres(one.loop, scale)) for one in rejected),
+        tuple(one.in_metres(scale) for one in transforms),
+        model=searches[0].detector.model,
+        config=config,
         scale=scale,
-        on_bad_scan=on_bad_scan,
-        kept_in=kept_in,
-        should_stop=should_stop,
-        on_progress=on_progress,
+        stopped=len(given) > 1 and should_stop(),
     )
-    return found.divided(given, scale)
 
 
-def searched(
-    given: Search,
+def _inputs(
+    recordings: Any, odometry: Any, config: DetectorConfig, *, registered: bool | None
+) -> tuple[list[Input], bool]:
+    """Checked input of each session, and whether loops are registered."""
+    several = isinstance(recordings, list | tuple)
+    some, poses = (recordings, odometry) if several else ([recordings], [odometry])
+    poses = [None] * len(some) if poses is None else list(poses)
+    if not some or len(poses) != len(some):
+        raise ValueError(f"expected recordings with odometry of each, found {len(some)} with odometry of {len(poses)}")
+    for one in some:
+        check_is(one, Recording, by="open_recording")
+    registered = all(map(can_register, some)) if registered is None else registered
+    return [prepared(*pair, config, registered=registered) for pair in zip(some, poses, strict=True)], registered
+
+
+def _session(given: Input, found: Searched, scale: Scale, registered: bool) -> Session:
+    """The searched recording, in metres."""
+    finder = found.detector.finder
+    return Session(
+        given.recording,
+        len(finder),
+        odometry=None if found.given.odometry is None else given.odometry,
+        drift=scaled_drift(found.given.config.drift, 1 / scale),
+        skipped=tuple(given.recording.ids[row] for row in finder.missing),
+        empty=int(finder.empty.sum()) - len(finder.missing),
+        unregistered=sum(loop.overlap is None for loop in found.loops) if registered else 0,
+        candidates=tuple(found.detector.candidates),
+    )
+
+
+def search_session(
+    given: Input,
     params: Params,
     *,
-    model: LoopModel | None,
-    registered: bool,
-    scale: Scale,
-    on_bad_scan: OnBadScan | None,
-    kept_in: Path | str | None,
-    should_stop: Callable[[], bool],
-    on_progress: Callable[[int], None],
-) -> tuple[FoundLoops, CandidateFinder]:
-    """Do the same as `find_loops` with checked and scaled arguments, and also return the finder with images and motion.
-
-    The results are scaled, too.
-    """
+    model: LoopModel | None = None,
+    registered: bool = False,
+    scale: Scale = 1,
+    on_bad_scan: OnBadScan | None = None,
+    kept_in: Path | str | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Searched:
+    """Search one session. The arguments are those of `find_loops`; the input is already checked and scaled."""
     recording, odometry, config = given
     detector = LoopDetector(params, model=model, config=config)
     add_scans(
@@ -205,42 +368,126 @@ def searched(
         max_places=config.max_places,
         acceptance=_acceptance(detector),
     )
-    _check_scans(detector.finder, recording)
-    if odometry is not None and detector.finder.odometry_check.is_unusable:
+    finder = detector.finder
+    _check_scans(finder, recording)
+    if odometry is not None and finder.odometry_check.is_unusable:
         warn(
             f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored; check "
             f"that the poses belong to these scans and use these axes: {AXES}"
         )
-        return searched(
-            given._replace(odometry=None),
-            params,
-            model=model,
-            registered=registered,
-            scale=scale,
-            on_bad_scan=on_bad_scan,
-            kept_in=None,
-            should_stop=should_stop,
-            on_progress=on_progress,
-        )
+        options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
+        given = given._replace(odometry=None)
+        return search_session(given, params, model=model, registered=registered, scale=scale, **options)
     if odometry is not None:
-        config = dataclasses.replace(config, drift=detector.finder.present_drift)
-    options = {"registered": registered, "scale": scale, "should_stop": should_stop}
-    loops, rejected = _accepted(detector, recording, odometry, config, **options)
-    missing = detector.finder.missing
-    found = FoundLoops(
-        recording,
-        len(detector),
-        loops,
-        rejected,
-        odometry,
-        skipped=tuple(recording.ids[i] for i in missing),
-        candidates=tuple(detector.candidates),
-        model=detector.model,
-        unregistered=sum(loop.overlap is None for loop in loops) if registered else 0,
-        config=config,
-        empty=int(detector.finder.empty.sum()) - len(missing),
-    )
-    return found, detector.finder
+        config = dataclasses.replace(config, drift=finder.present_drift)
+    options = {"registered": registered, "knows_height": finder.knows_height, "should_stop": should_stop}
+    loops, rejected = settled(recording, detector.loops, odometry, config, **options)
+    rejected = list(_in_order([*rejected, *detector.rejected, *detector.undecided()]))
+    if odometry is not None:
+        sensors = mountings_of(recording)
+        check_odometry(recording.name, loops, rejected, odometry, config, mounting=sensors, scale=scale)
+    return Searched(given._replace(config=config), detector, loops, rejected)
+
+
+def search_pair(
+    match: int,
+    query: int,
+    searches: Sequence[Searched],
+    *,
+    registered: bool = False,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> tuple[list[Loop], list[Rejected], list[AlignedParts]]:
+    """Loops, rejected pairs and transforms between two sessions, numbers `match` and `query` of the searched ones."""
+    both = searches[match], searches[query]
+    finders = both[0].detector.finder, both[1].detector.finder
+    levels = [finder.motion.path.level(finder.mountings) for finder in finders]
+    motion = Motion.joined([finder.motion for finder in finders], levels)
+    mountings = Mountings(finder.mountings[row] for finder in finders for row in range(len(finder)))
+    knows_height = all(finder.knows_height for finder in finders)
+    model, config = both[0].detector.model, both[0].given.config
+    candidates = _candidates_between(*finders, motion, should_stop=should_stop, on_progress=on_progress)
+    pairs = [pair_of(one, model, motion, mountings, knows_height=knows_height) for one in candidates]
+    rules = {"mounting": mountings, "drift": finders[1].present_drift}
+    probable = probable_loops(pairs, model, motion.path, config=config, **rules)
+    rejected = [
+        Rejected(pair.loop, verdict(pair, model, config.min_probability))
+        for pair, loop in zip(pairs, probable, strict=True)
+        if loop is None
+    ]
+    likely = [loop for loop in probable if loop is not None]
+    sets, contradicting = accepted_between(likely, motion, config=config.consistency, **rules)
+    offset, ends = len(finders[0]), {"match_session": match, "query_session": query}
+
+    def of_sessions(loop: Loop) -> Loop:
+        return dataclasses.replace(loop, query=loop.query - offset, **ends)
+
+    rejected = [Rejected(of_sessions(one.loop), one.reason) for one in [*rejected, *contradicting]]
+    loops, transforms = [], []
+    for some in sets:
+        some = list(map(of_sessions, some))
+        if registered:
+            recordings = both[1].given.recording, both[0].given.recording
+            options = {"knows_height": knows_height, "should_stop": should_stop}
+            some, little = registered_loops(*recordings, some, **options)
+            rejected += little
+        if some:
+            transforms.append(_aligned(some, both, motion, rules["drift"]))
+            loops += some
+    return sorted(loops, key=lambda loop: (loop.query, loop.match)), list(_in_order(rejected)), transforms
+
+
+def _candidates_between(
+    matches: CandidateFinder,
+    queries: CandidateFinder,
+    motion: Motion,
+    *,
+    should_stop: Callable[[], bool],
+    on_progress: Callable[[int], None],
+) -> list[Candidate]:
+    """Best match of each stored scan of a session in another one, by their joined motion.
+
+    Raises:
+      ValueError: If the images of the two sessions have other sizes.
+    """
+    found, offset = list[Candidate](), len(matches)
+    if not len(queries.stored) or not len(matches.stored):
+        return found
+    ours, theirs = (finder.stored.image(0).shape for finder in (queries, matches))
+    if ours != theirs:
+        raise ValueError(f"expected images of one size in both recordings, found {theirs} and {ours} cells")
+    joined = np.concatenate([matches.joined, queries.joined + offset])
+    comparer = Comparer(motion, queries.present_drift, np.eye(3), matches.config, matches.verification, joined)
+    own = queries.stored.shifted(offset)
+    for row, frame in enumerate(own.frames.tolist()):
+        if should_stop():
+            break
+        image = own.image(row)
+        spectra = query_spectra(image, config=matches.verification)
+        query = Query(frame, own.index.descriptors[row], image, spectra)
+        fits = comparer.compare(query, matches.stored, own)
+        found += comparer.candidates(query, fits, matches.stored.image_of, possible=fits.frames < offset)
+        on_progress(row + 1)
+    return found
+
+
+def _aligned(loops: Sequence[Loop], both: Sequence[Searched], motion: Motion, drift: DriftModel) -> AlignedParts:
+    """Transform between the parts of two sessions to which some loops belong."""
+    first = loops[0]
+    ends = (first.match_session, first.match), (first.query_session, first.query)
+    parts, poses = [], []
+    for (session, frame), one in zip(ends, both, strict=True):
+        finder, odometry = one.detector.finder, one.given.odometry
+        rows = np.flatnonzero(finder.motion.segments == finder.motion.segments[frame])
+        parts.append(Part(session, int(rows[0]), int(rows[-1]), odometry is not None))
+        if odometry is None:
+            seen = finder.motion.poses @ finder.mountings.uprights(np.arange(len(finder)))
+            poses.append(inverse(seen[rows[0]]) @ seen)
+        else:
+            poses.append(odometry[: len(finder)])
+    match_way, query_way = np.split(motion.travelled, [len(poses[0])])
+    alignment = aligned_frames(loops, *poses, match_way=match_way, query_way=query_way, drift=drift)
+    return AlignedParts(parts[0], parts[1], alignment, len(loops))
 
 
 def can_register(recording: Recording) -> bool:
@@ -255,7 +502,7 @@ def _acceptance(detector: LoopDetector) -> str | None:
     return hashlib.sha256(repr((detector.config, detector.model)).encode()).hexdigest()[:16]
 
 
-def prepared(recording: Recording, odometry: ArrayLike | None, config: DetectorConfig, *, registered: bool) -> Search:
+def prepared(recording: Recording, odometry: ArrayLike | None, config: DetectorConfig, *, registered: bool) -> Input:
     """Check recording and odometry before any work. Return the odometry as an array, and gravity of scans by it."""
     poses = None if odometry is None else given_poses(odometry, of="odometry")
     if poses is not None and len(poses) != len(recording):
@@ -269,7 +516,7 @@ def prepared(recording: Recording, odometry: ArrayLike | None, config: DetectorC
     if poses is not None:
         check_level(poses, mountings_of(recording), name=recording.name)
         recording = with_odometry(recording, poses)
-    return Search(recording, poses, config)
+    return Input(recording, poses, config)
 
 
 def _add(
@@ -294,57 +541,33 @@ def _check_scans(finder: CandidateFinder, recording: Recording) -> None:
         )
 
 
-def _accepted(
-    detector: LoopDetector,
-    recording: Recording,
-    odometry: Float[np.ndarray, "n 4 4"] | None,
-    config: DetectorConfig,
-    *,
-    registered: bool,
-    scale: Scale,
-    should_stop: Callable[[], bool],
-) -> tuple[tuple[Loop, ...], tuple[Rejected, ...]]:
-    """Joint acceptance of the loops of a detector. Returns accepted and rejected loops, and warns of wrong odometry."""
-    options = {"registered": registered, "knows_height": detector.finder.knows_height, "should_stop": should_stop}
-    loops, rejected = settled(recording, detector.loops, odometry, config, **options)
-    rejected = _in_order([*rejected, *detector.rejected, *detector.undecided()])
-    if odometry is not None:
-        name, mounting = recording.name, mountings_of(recording)
-        check_odometry(name, loops, rejected, odometry, config, mounting=mounting, scale=scale)
-    return tuple(loops), rejected
-
-
-def _in_order(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
-    return tuple(sorted(rejected, key=lambda one: (one.loop.query, one.loop.match)))
-
-
 def why_none(found: FoundLoops) -> list[str]:
-    """Reasons why a recording has no loops, one sentence each. Empty if there are loops."""
+    """Reasons why sessions have no loops of their own, one sentence each. With several, names begin the sentences."""
+    if len(found.sessions) != 1:
+        each = ((one.recording.name, why_none(found.within(k))) for k, one in enumerate(found.sessions))
+        return [f"{name}: {line}" for name, lines in each for line in lines]
     if found.loops:
         return []
-    if not found.frames:
+    session = found.sessions[0]
+    if not session.frames:
         return ["The search was stopped before the first scan."]
-    reasons = []
-    if found.frames < len(found.recording):
-        reasons.append(f"The search was stopped after {found.frames} of {len(found.recording)} frames.")
-    if 2 * found.empty > found.frames:
+    reasons, scans = [], len(session.recording)
+    if session.frames < scans:
+        reasons.append(f"The search was stopped after {session.frames} of {scans} frames.")
+    if 2 * session.empty > session.frames:
         cells = found.config.candidates.min_cells
         reasons.append(
-            f"{found.empty} of {found.frames} scans are almost empty (fewer than {cells} occupied cells of the image): "
-            "check the format and the range of the points, and whether the sensor was covered."
+            f"{session.empty} of {session.frames} scans are almost empty (fewer than {cells} occupied cells of the "
+            "image): check the format and the range of the points, and whether the sensor was covered."
         )
-    if 2 * len(found.skipped) > found.frames:
-        reasons.append(f"{len(found.skipped)} of {found.frames} scans cannot be read.")
-    return [*reasons, _of_pairs(found)]
-
-
-def _of_pairs(found: FoundLoops) -> str:
-    """Most frequent reason why the compared pairs are not loops."""
-    if not found.rejected:
-        source = "images" if found.odometry is None else "odometry"
-        return (
-            f"No pair was compared: according to the {source}, no scan came back to a place after at least "
-            f"{found.config.candidates.recent_m:g} m of travelled distance."
-        )
-    reason, count = next(iter(counted(found.rejected).items()))
-    return f"{len(found.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"
+    if 2 * len(session.skipped) > session.frames:
+        reasons.append(f"{len(session.skipped)} of {session.frames} scans cannot be read.")
+    if found.rejected:
+        reason, count = next(iter(counted(found.rejected).items()))
+        return [*reasons, f"{len(found.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]
+    source = "images" if session.odometry is None else "odometry"
+    return [
+        *reasons,
+        f"No pair was compared: according to the {source}, no scan came back to a place after at least "
+        f"{found.config.candidates.recent_m:g} m of travelled distance.",
+    ]

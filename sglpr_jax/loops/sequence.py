@@ -5,18 +5,21 @@ elsewhere. Neighbours that see the same walls are not independent, so the weight
 travelled since the previous one. Only what their images say counts: the motion between the two passes is common to all.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import logit
+from scipy.special import expit, logit
 
-from sglpr_jax.data.levelling import AnyMounting
-from sglpr_jax.loops.closure import Loop, Reason
-from sglpr_jax.loops.config import ConsistencyConfig, SequenceConfig
-from sglpr_jax.loops.consistency import agree_along
+from sglpr_jax.data.levelling import AnyMounting, Mountings
+from sglpr_jax.loops.closure import Loop, Reason, planar_loop
+from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.config import DetectorConfig, SequenceConfig
+from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 
@@ -34,17 +37,34 @@ class Pair(NamedTuple):
     """Travelled distance at the query, in metres."""
 
 
-def tested_log_odds(
+def pair_of(one: Candidate, model: LoopModel, motion: Motion, mountings: Mountings, *, knows_height: bool) -> Pair:
+    """The pair of a candidate with its probability alone.
+
+    Arguments:
+      one: Candidate between two rows of the motion.
+      model: Model of the probabilities.
+      motion: Motion of all frames.
+      mountings: Mounting of the sensor at each frame.
+      knows_height: Whether the odometry measures height.
+    """
+    probability = float(model.probability(one.evidence))
+    sensors = {"query_mounting": mountings[one.query], "match_mounting": mountings[one.match]}
+    loop = planar_loop(
+        one.query, one.match, one.alignment, probability=probability, knows_height=knows_height, **sensors
+    )
+    return Pair(loop, one.evidence, float(motion.travelled[one.query]))
+
+
+def probable_loops(
     pairs: Sequence[Pair],
     model: LoopModel,
     path: DrivenPath,
     *,
     mounting: AnyMounting,
     drift: DriftModel,
-    consistency: ConsistencyConfig = ConsistencyConfig(),
-    config: SequenceConfig = SequenceConfig(),
-) -> Float[np.ndarray, " n"]:
-    """Log odds of pairs, given their neighbours and the motion.
+    config: DetectorConfig,
+) -> list[Loop | None]:
+    """For each pair, the loop with its probability given the neighbours, or None below `config.min_probability`.
 
     Arguments:
       pairs: Pairs in the order of their queries.
@@ -52,21 +72,39 @@ def tested_log_odds(
       path: Path of all frames.
       mounting: Mounting of the sensor, or that at each frame.
       drift: Drift model of the path.
-      consistency: Thresholds of the agreement of two pairs.
-      config: Selection and weights of neighbours.
+      config: Thresholds.
     """
+    found = tested_log_odds(pairs, model, path, mounting=mounting, drift=drift, config=config)
+    least = logit(config.min_probability)
+    return [
+        dataclasses.replace(one.loop, probability=float(expit(value))) if value >= least else None
+        for one, value in zip(pairs, found, strict=True)
+    ]
+
+
+def tested_log_odds(
+    pairs: Sequence[Pair],
+    model: LoopModel,
+    path: DrivenPath,
+    *,
+    mounting: AnyMounting,
+    drift: DriftModel,
+    config: DetectorConfig = DetectorConfig(),
+) -> Float[np.ndarray, " n"]:
+    """Log odds of pairs, given their neighbours and the motion. The arguments are those of `probable_loops`."""
     if not pairs:
         return np.zeros(0)
     evidence = Evidence.stack([one.evidence for one in pairs])
     strength, support = model.strength(evidence), np.empty(len(pairs))
     loops, way_m = [one.loop for one in pairs], np.maximum.accumulate([one.way_m for one in pairs])
+    window_m = config.sequence.window_m
     for start in range(0, len(pairs), BLOCK):
         end = min(start + BLOCK, len(pairs))
-        first = int(np.searchsorted(way_m, way_m[start] - config.window_m))
-        last = int(np.searchsorted(way_m, way_m[end - 1] + config.window_m, side="right"))
-        options = {"mounting": mounting, "drift": drift, "config": consistency}
-        agreeing = agree_along(path, loops[start:end], loops[first:last], **options)
-        weights = neighbour_weights(way_m[first:last], np.arange(start, end) - first, config=config)
+        first = int(np.searchsorted(way_m, way_m[start] - window_m))
+        last = int(np.searchsorted(way_m, way_m[end - 1] + window_m, side="right"))
+        options = {"mounting": mounting, "drift": drift, "config": config.consistency}
+        agreeing = agree(loops[start:end], path, loops[first:last], **options)
+        weights = neighbour_weights(way_m[first:last], np.arange(start, end) - first, config=config.sequence)
         support[start:end] = (np.where(agreeing, 1.0, -1.0) * weights) @ strength[first:last]
     return model.tested_log_odds(evidence, support)
 

@@ -4,14 +4,14 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.config import ConsistencyConfig
-from sglpr_jax.loops.consistency import Joined, accepted_between
+from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.frame_alignment import FrameAlignment, aligned_frames
 from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse, moved_covariance, travelled
 
@@ -60,16 +60,12 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     loops = _located(before, new)
     if not loops:
         return None
-    upright = [_upright_loop(loop, before, new) for loop in loops]
-    joined = Joined(
-        np.concatenate([_upright_poses(before), _upright_poses(new)]),
-        np.concatenate([travelled(before.world_from_place), travelled(new.world_from_place)]),
-        np.repeat([0, 1], [len(before), len(new)]),
-    )
-    sets, _ = accepted_between(upright, joined, drift=DriftModel(), config=ConsistencyConfig())
+    upright, offset = [_upright_loop(loop, before, new) for loop in loops], len(before)
+    motion = Motion.joined([Motion.of(one.upright_poses()) for one in (before, new)], [np.eye(3)] * 2)
+    sets, _ = accepted_between(upright, motion, mounting=None, drift=DriftModel(), config=ConsistencyConfig())
     if not sets:
         return None
-    accepted = {loop.query - len(before) for loop in sets[0]}
+    accepted = {loop.query - offset for loop in sets[0]}
     common = [loop for loop in loops if loop.query in accepted]
     frames = aligned_frames(
         common,
@@ -114,12 +110,6 @@ def _located(before: PlaceMap, new: PlaceMap) -> list[Loop]:
         if answers and answers[0].probability >= MIN_PROBABILITY:
             loops.append(dataclasses.replace(answers[0].loop, query=row))
     return loops
-
-
-def _upright_poses(places: PlaceMap) -> Float[np.ndarray, "n 4 4"]:
-    """Pose of the gravity-aligned frame of the sensor at each place."""
-    uprights = [upright_from_lidar(places.mounting(row)) for row in range(len(places))]
-    return places.world_from_place @ inverse(np.array(uprights).reshape(-1, 4, 4))
 
 
 def _upright_loop(loop: Loop, before: PlaceMap, new: PlaceMap) -> Loop:

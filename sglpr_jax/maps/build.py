@@ -1,19 +1,65 @@
 """Creation of the map of a recording with known poses. It can skip unreadable scans, stop and resume."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.gravity import with_odometry
+from sglpr_jax.data.levelling import check_level, mountings_of
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
-from sglpr_jax.loops.arguments import check_is
+from sglpr_jax.loops.arguments import check_is, given_poses
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.checkpoint import add_scans
+from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import SPACING_M
-from sglpr_jax.maps.mapped_scans import map_scans
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.maps.place_names import place_names
 from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.index import Index
+
+
+class _PlaceScans:
+    """Scans at least `spacing_m` from the last place. Bad and almost empty scans do not become places."""
+
+    def __init__(self, finder: CandidateFinder, positions: Float[np.ndarray, "n 3"], spacing_m: float):
+        self._finder, self._positions, self._spacing_m = finder, positions, spacing_m
+        self.looked_at: list[int] = []
+        """Rows of the recording that are frames of the finder."""
+        self.frames: list[int] = []
+        """Frames of the finder that are places."""
+        self.rows: list[int] = []
+        """Rows of the recording that are places."""
+        self.done = 0
+        """Number of processed rows."""
+
+    def unseen(self) -> Iterator[int]:
+        """Yields the rows that have to be read. The caller adds each to the finder before it takes the next one."""
+        for row in range(len(self._positions)):
+            self.done = row
+            if self._is_far(row):
+                frame = len(self.looked_at)
+                if frame == len(self._finder):  # not seen by an earlier run
+                    yield row
+                if not self._finder.empty[frame]:
+                    self.frames.append(frame)
+                    self.rows.append(row)
+                self.looked_at.append(row)
+        self.done = len(self._positions)
+
+    def _is_far(self, row: int) -> bool:
+        """Whether a scan is far enough from the last place."""
+        if not self.rows:
+            return True
+        return bool(np.linalg.norm(self._positions[row] - self._positions[self.rows[-1]]) >= self._spacing_m)
 
 
 class Mapped(NamedTuple):
@@ -47,12 +93,9 @@ def map_recording(
       params: Weights of the model that describes them.
       poses: Pose of the LiDAR in the world at each scan.
       spacing_m: Minimum distance of consecutive places, in metres. Scans nearer to the last place are not read.
-      scale: Factor for all lengths before scans are described, 1, 2 or 4, for places that are small in an image, such
-        as rooms. Poses of the map are in metres.
-      on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped. Without it the error is
-        raised.
-      kept_in: Checkpoint directory. With the same recording, poses, weights and spacing, the run resumes from it. The
-        directory is not removed.
+      scale: Factor for all lengths before scans are described, as in `find_loops`. Poses of the map are in metres.
+      on_bad_scan: See `find_loops`. Skipped scans do not become places.
+      kept_in: Checkpoint directory of these poses and this spacing, as in `find_loops`.
       should_stop: If it returns True, the run ends and returns the map of the processed scans.
       on_progress: Called with the number of processed scans.
 
@@ -61,15 +104,59 @@ def map_recording(
       TypeError: If an argument is not a recording, parameters or an array.
     """
     check_is(recording, Recording, by="open_recording")
-    mapped = map_scans(
-        recording,
-        params,
-        poses,
-        spacing_m=spacing_m,
-        scale=scale,
-        on_bad_scan=on_bad_scan,
+    poses = given_poses(poses, of="poses")
+    if len(poses) != len(recording) or not len(recording):
+        raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
+    check_level(poses, mountings_of(recording), name=recording.name)
+    recording = with_odometry(recording, poses)
+    finder = CandidateFinder(params)
+    chosen = _PlaceScans(finder, poses[:, :3, 3], spacing_m)
+    seen_scans: list[Seen | None] = []
+
+    def add(seen: Seen | None, compared: Compared | None) -> None:
+        seen_scans.append(seen)
+        finder.add_seen(seen, compared=Compared(NO_FITS, None))
+
+    add_scans(
+        scaled(recording, scale),
+        finder,
+        add,
+        rows=chosen.unseen(),
         kept_in=kept_in,
+        on_bad_scan=on_bad_scan,
         should_stop=should_stop,
         on_progress=on_progress,
+        poses=poses,
+        spacing_m=spacing_m,
     )
-    return Mapped(PlaceMap(*mapped.places), mapped.scans, mapped.skipped)
+    on_progress(chosen.done)
+    if not chosen.rows and chosen.done == len(recording):
+        raise ValueError(
+            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
+        )
+    skipped = tuple(recording.ids[chosen.looked_at[frame]] for frame in finder.missing)
+    index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
+    seen = [one for one in (seen_scans[frame] for frame in chosen.frames) if one is not None]
+    return Mapped(_places(index, recording, poses, chosen.rows, seen), chosen.done, skipped)
+
+
+def _places(
+    index: Index,
+    recording: Recording,
+    poses: Float[np.ndarray, "n 4 4"],
+    rows: Sequence[int],
+    seen: Sequence[Seen],
+) -> PlaceMap:
+    """Map of some scans of a recording, added to an index without places."""
+    names = place_names(recording)
+    descriptors = np.array([one.descriptor for one in seen], np.float32).reshape(-1, index.width)
+    index.add(descriptors, ids=[names[row] for row in rows], positions=poses[rows, :3, 3])
+    sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
+    deviations = [[sensor.height_deviation_m, sensor.tilt_deviation_deg] for sensor in sensors]
+    return PlaceMap(
+        index,
+        np.stack([one.image for one in seen]) if seen else np.zeros((0, 0, 0), np.uint8),
+        poses[rows],
+        np.array([[sensor.height_m, *sensor.up] for sensor in sensors], np.float64).reshape(-1, 4),
+        np.array(deviations, np.float64).reshape(-1, 2),  # None becomes NaN
+    )

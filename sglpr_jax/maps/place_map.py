@@ -1,8 +1,8 @@
-"""Poses of a scan in a map of places, the answers of `PlaceMap.relocate`."""
+"""Map of places with known poses, in which scans are located."""
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,18 +14,18 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.recording import Record
 from sglpr_jax.data.scaled import scaled_poses, scaled_record
 from sglpr_jax.fields import check_value
-from sglpr_jax.loops.arguments import check_is, given_record
+from sglpr_jax.files import naming, replacing
+from sglpr_jax.loops.arguments import given_poses, given_record
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.closure import Loop, divided_loop, planar_loop
+from sglpr_jax.loops.closure import Loop, in_metres, planar_loop
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
-from sglpr_jax.loops.config import CANDIDATES, SPACING_M, CandidateConfig, PlaceCount
+from sglpr_jax.loops.config import CANDIDATES, CandidateConfig, PlaceCount
 from sglpr_jax.loops.keyframes import Seen, image_spectrum
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.maps.mapped_scans import map_scans
-from sglpr_jax.maps.place_file import REQUIRED, Content, free_names, read_places, write_places
+from sglpr_jax.maps.place_names import Content, free_names
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
@@ -34,7 +34,8 @@ from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.index_rows import check_scale, check_weights
 from sglpr_jax.same_place import NEGATIVE_M
-from sglpr_jax.se3 import inverse
+from sglpr_jax.schema import Column, check_columns
+from sglpr_jax.se3 import ROTATION_TOLERANCE, inverse
 
 
 class Relocated(NamedTuple):
@@ -52,18 +53,13 @@ class Relocated(NamedTuple):
         """Probability that the scan shows the place."""
         return self.loop.probability
 
-    def divided(self, scale: Scale) -> "Relocated":
-        """The same pose in metres, of scans that were multiplied by `scale`."""
-        pose = scaled_poses(self.world_from_query, 1 / scale)
-        return self._replace(world_from_query=pose, loop=divided_loop(self.loop, scale))
 
-
-def with_shared_probability(answers: Sequence[Relocated]) -> list[Relocated]:
-    """Sort answers by probability, scaled so that those of answers more than `NEGATIVE_M` apart add up to at most 1."""
+def with_shared_probability(answers: Sequence[Relocated], *, apart_m: float = NEGATIVE_M) -> list[Relocated]:
+    """Sort answers by probability, scaled so that those of answers more than `apart_m` apart add up to at most 1."""
     groups: list[list[Relocated]] = []
     for one in _most_probable_first(answers):
         position = one.world_from_query[:3, 3]
-        near = (group for group in groups if np.linalg.norm(group[0].world_from_query[:3, 3] - position) <= NEGATIVE_M)
+        near = (group for group in groups if np.linalg.norm(group[0].world_from_query[:3, 3] - position) <= apart_m)
         group = next(near, None)
         if group is None:
             groups.append([one])
@@ -82,14 +78,21 @@ def _most_probable_first(answers: Sequence[Relocated]) -> list[Relocated]:
 NO_DRIFT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=1e-3)
 """Drift of the poses of a map. It is small, but large over the unknown motion of a query (`motion.UNKNOWN_M`)."""
 NO_LOOPS = np.zeros((0, 2), np.int64)
+ARRAYS = {
+    "images": Column("uint8", ("n", "h", "h")),
+    "world_from_place": Column("float64", ("n", 4, 4)),
+    "mountings": Column("float64", ("n", 4)),
+    "mounting_deviations": Column("float64", ("n", 2), finite=False, optional=True),
+}
+"""Arrays of a map's file in addition to the index. Without the optional one, no sensor tilts."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PlaceMap:
-    """Places in one world frame, from one or more drives.
+    """Places in one world frame, from one or more drives: the keyframes of sessions with known poses.
 
     Example:
-      places = PlaceMap.of(recording, params, poses)
+      places = map_recording(recording, params, poses).places
       places.save("town.safetensors")
       best = PlaceMap.load("town.safetensors").relocate(params, record)[0]
     """
@@ -101,45 +104,16 @@ class PlaceMap:
     """Pose of the LiDAR at each place."""
     mountings: Float[np.ndarray, "n 4"]
     """Mounting of the sensor: height above the ground, in metres, and the up direction in its frame."""
-    mounting_deviations: Float[np.ndarray, "n 2"] | None = None
-    """Standard deviations of height (metres) and tilt (degrees), NaN for a sensor fixed to a vehicle. None stands for
-    NaN everywhere."""
+    mounting_deviations: Float[np.ndarray, "n 2"]
+    """Standard deviations of height (metres) and tilt (degrees), NaN for a sensor fixed to a vehicle."""
 
     def __len__(self) -> int:
         return len(self.index)
 
-    @classmethod
-    def of(
-        cls,
-        recording: Recording,
-        params: Params,
-        poses: ArrayLike,
-        *,
-        spacing_m: float = SPACING_M,
-        scale: Scale = 1,
-        on_progress: Callable[[int], None] = lambda done: None,
-    ) -> "PlaceMap":
-        """Create the map of a recording with known poses.
-
-        `map_recording` does the same and can also skip unreadable scans and resume. Raises the errors of
-        `map_recording`.
-
-        Arguments:
-          recording: The scans.
-          params: Weights of the model that describes them.
-          poses: Pose of the LiDAR in the world at each scan.
-          spacing_m: Minimum distance of consecutive places, in metres.
-          scale: Factor for all lengths before scans are described, 1, 2 or 4.
-          on_progress: Called with the number of scans done.
-        """
-        check_is(recording, Recording, by="open_recording")
-        scans = map_scans(recording, params, poses, spacing_m=spacing_m, scale=scale, on_progress=on_progress)
-        return cls(*scans.places)
-
     def mounting(self, row: int = -1) -> Mounting:
         """Mounting of the sensor at a place, by default the last one."""
         height, *up = self.mountings[row].tolist()
-        deviations = self._deviations[row]
+        deviations = self.mounting_deviations[row]
         return Mounting(height, tuple(up), *(() if np.isnan(deviations).any() else deviations.tolist()))
 
     def query_mounting(self, points: Float[np.ndarray, "n 3"]) -> Mounting:
@@ -159,12 +133,7 @@ class PlaceMap:
     @property
     def tilts(self) -> bool:
         """Whether the mounting of some place was estimated from its scan, because the sensor tilts."""
-        return bool(np.isfinite(self._deviations).all(axis=1).any())
-
-    @property
-    def _deviations(self) -> Float[np.ndarray, "n 2"]:
-        given = self.mounting_deviations
-        return np.full((len(self), 2), np.nan) if given is None else given
+        return bool(np.isfinite(self.mounting_deviations).all(axis=1).any())
 
     def merged(self, other: "PlaceMap", *, drive: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> "PlaceMap":
         """Merge two maps in one world frame. Places that are in both are stored once.
@@ -192,9 +161,7 @@ class PlaceMap:
         for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
             places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
             index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
-        both = (np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in REQUIRED)
-        deviations = np.concatenate([self._deviations, other._deviations[new]])
-        return PlaceMap(index, *both, mounting_deviations=deviations)
+        return PlaceMap(index, *(np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in ARRAYS))
 
     def relocate(
         self,
@@ -247,17 +214,17 @@ class PlaceMap:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
         if not len(self) or np.count_nonzero(image) < CandidateConfig().min_cells:
             return []
-        model, scaled_map = default_model() if model is None else model, self._scaled()
+        model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
         query = Query(len(self), seen.descriptor, image, query_spectra(image))
-        comparer = Comparer(scaled_map._motion, NO_DRIFT, np.eye(3), config, VerificationConfig(), NO_LOOPS)
-        fits = comparer.compare(query, scaled_map)
+        comparer = Comparer(self._motion, NO_DRIFT, np.eye(3), config, VerificationConfig(), NO_LOOPS)
+        fits = comparer.compare(query, self)
         order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
         best = order[np.sort(first)][:candidates].tolist()
         found = [comparer.candidate(query, fits, row, self.image) for row in best]
-        answers = [scaled_map._answer(one, seen, float(model.probability(one.evidence))) for one in found]
-        return [one.divided(self.scale) for one in with_shared_probability(answers)]
+        answers = [self._answer(one, seen, float(model.probability(one.evidence))) for one in found]
+        return with_shared_probability(answers, apart_m=NEGATIVE_M / self.scale)
 
     @property
     def frames(self) -> Int[np.ndarray, " n"]:
@@ -281,11 +248,15 @@ class PlaceMap:
 
     @functools.cached_property
     def _motion(self) -> Motion:
-        """Poses of the places, and a last frame of unknown pose for queries. The world is level."""
-        uprights = np.array([upright_from_lidar(self.mounting(row)) for row in range(len(self))]).reshape(-1, 4, 4)
-        found = Motion.of(self.world_from_place @ inverse(uprights))
+        """Poses of the scaled places, and a last frame of unknown pose for queries. The world is level."""
+        found = Motion.of(self.upright_poses(self.scale))
         found.add(0.0, continues=False)
         return found
+
+    def upright_poses(self, scale: Scale = 1) -> Float[np.ndarray, "n 4 4"]:
+        """Pose of the gravity-aligned frame of the sensor at each place. All lengths are multiplied by `scale`."""
+        uprights = [upright_from_lidar(self.mounting(row).scaled(scale)) for row in range(len(self))]
+        return scaled_poses(self.world_from_place, float(scale)) @ inverse(np.array(uprights).reshape(-1, 4, 4))
 
     def seen(self, row: int) -> Seen:
         """Description of the scaled scan at a place."""
@@ -300,8 +271,7 @@ class PlaceMap:
         index = self.index.without_places()
         ids, positions = [self.index.ids[row] for row in rows], self.world_from_place[rows, :3, 3]
         index.add(self.index.descriptors[rows], ids=ids, positions=positions)
-        arrays = {name: getattr(self, name)[rows] for name in REQUIRED}
-        return PlaceMap(index, **arrays, mounting_deviations=self._deviations[rows])
+        return PlaceMap(index, *(getattr(self, name)[rows] for name in ARRAYS))
 
     def moved(self, world_from_old: Float[np.ndarray, "4 4"]) -> "PlaceMap":
         """Return the map in another world frame.
@@ -315,27 +285,22 @@ class PlaceMap:
         return dataclasses.replace(self, index=index, world_from_place=poses)
 
     def save(self, path: Path | str) -> None:
-        """Write the map atomically to one file: an index file with additional arrays (`place_file.ARRAYS`)."""
-        deviations = {"mounting_deviations": self._deviations} if self.tilts else {}
-        write_places(Path(path), self.index, {name: getattr(self, name) for name in REQUIRED} | deviations)
+        """Write the map atomically to one file: an index file with additional arrays (`ARRAYS`)."""
+        arrays = {name: getattr(self, name) for name in ARRAYS if self.tilts or not ARRAYS[name].optional}
+        content = self.index.to_bytes(arrays)
+        with replacing(Path(path)) as temporary:
+            temporary.write_bytes(content)
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
         """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
-        index, arrays = read_places(path, weights_hash=weights_hash)
-        return cls(index, **arrays)
-
-    def _scaled(self) -> "PlaceMap":
-        """The same map with poses and mountings of its scaled scans."""
-        if self.scale == 1:
-            return self
-        deviations = self.mounting_deviations
-        return dataclasses.replace(
-            self,
-            world_from_place=scaled_poses(self.world_from_place, float(self.scale)),
-            mountings=self.mountings * np.array([self.scale, 1, 1, 1]),
-            mounting_deviations=None if deviations is None else deviations * np.array([self.scale, 1]),
-        )
+        index, more = Index.load_with(path, weights_hash=weights_hash)
+        left_out = [name for name, column in ARRAYS.items() if name not in more and not column.optional]
+        if left_out:
+            raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
+        with naming(path):
+            _check(index, more)
+        return cls(index, **{name: more.get(name, np.full((len(index), 2), np.nan)) for name in ARRAYS})
 
     def _contents(self) -> Iterator[tuple[bytes, bytes]]:
         """Descriptor and pose of each place, as bytes."""
@@ -344,6 +309,22 @@ class PlaceMap:
 
     def _answer(self, one: Candidate, seen: Seen, probability: float) -> Relocated:
         """Pose of a query by a place."""
-        mountings = {"query_mounting": seen.mounting, "match_mounting": self.mounting(one.match)}
+        match_mounting = self.mounting(one.match).scaled(self.scale)
+        mountings = {"query_mounting": seen.mounting, "match_mounting": match_mounting}
         loop = planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
+        loop = in_metres(loop, self.scale)
         return Relocated(self.index.ids[one.match], self.world_from_place[one.match] @ loop.match_from_query, loop)
+
+
+def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError if the content of a file is not that of a map."""
+    if index.distance != "l2":
+        raise ValueError(f"expected descriptors compared by l2, found {index.distance}")
+    check_columns(arrays, ARRAYS, n=len(index))
+    if arrays["images"].shape[1] % 2:
+        raise ValueError(f"expected images of an even number of cells, found {arrays['images'].shape[1:]}")
+    given_poses(arrays["world_from_place"], of="world_from_place")
+    for height, *up in np.unique(arrays["mountings"], axis=0).tolist():
+        Mounting(height, tuple(up))
+        if abs(np.linalg.norm(up) - 1) > ROTATION_TOLERANCE:
+            raise ValueError(f"expected up directions of length 1 in mountings, found {up}")

@@ -9,16 +9,10 @@ from sglpr_jax.fields import NotNegative, Positive, check_fields
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
 """Format of odometry. "kitti" and "lidar" have 12 numbers a line, in KITTI's camera axes or with z up. "tum" has time,
 position and quaternion. "g2o" has the vertices of a graph."""
-
-
 DRIFT_PERCENT = 1.0
 """Position drift of odometry: one standard deviation, in percent of the travelled distance."""
-
-
 DRIFT_DEG_PER_100M = 0.5
 """Heading drift of odometry: one standard deviation, in degrees per 100 m of travelled distance."""
-
-
 DRIFT_HEIGHT_PERCENT = 0.3
 """Height drift of odometry: one standard deviation, in percent of the travelled distance."""
 

@@ -126,28 +126,13 @@ class DrivenPath:
         return Between(length[:, 0], first, directions[:, WHOLE], squares[:, WHOLE])
 
     def position_deviations(
-        self,
-        rows: Int[np.ndarray, " k"],
-        frame: int,
-        position: Float[np.ndarray, " 3"] | None = None,
-        *,
-        drift: DriftModel = DriftModel(),
+        self, rows: Int[np.ndarray, " k"], frame: int, *, drift: DriftModel = DriftModel()
     ) -> Float[np.ndarray, " k"]:
-        """Standard deviation of the positions of some frames, in metres, over all directions.
-
-        Arguments:
-          rows: The frames.
-          frame: Frame to which the deviations are relative.
-          position: Position straight on from `frame` to which they are relative instead.
-          drift: Drift model.
-        """
-        here = self.poses[frame, :3, 3] if position is None else position
-        step = float(np.linalg.norm(here - self.poses[frame, :3, 3]))
-        here, sums = here - self.poses[0, :3, 3], self._sums.rows[rows] - self._sums.rows[frame]
+        """Standard deviation of the positions of some frames relative to a frame, in metres, over all directions."""
+        here, sums = self.poses[frame, :3, 3] - self.poses[0, :3, 3], self._sums.rows[rows] - self._sums.rows[frame]
         weights = np.zeros(SUMS)  # integral of the squared distance from here: |p|^2 - 2 p here + |here|^2
         weights[0], weights[1:4], weights[10 + WHOLE.diagonal()] = here @ here, -2 * here, 1
-        lever = np.abs(sums @ weights) + step**3 / 3
-        length = np.abs(sums[:, 0]) + step
+        lever, length = np.abs(sums @ weights), np.abs(sums[:, 0])
         across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
         return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
 

@@ -42,44 +42,19 @@ class Graph(NamedTuple):
 def write_g2o(
     path: Path | str,
     loops: Sequence[Loop],
-    odometry: Float[np.ndarray, "n 4 4"] | None = None,
+    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]] = (),
     *,
     drift: DriftModel = DriftModel(),
-    numbers: Int[np.ndarray, " n"] | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
     """Write a pose graph: a vertex for each pose, an edge for each step of the odometry, an edge for each loop.
 
     Arguments:
       path: File to write.
-      loops: Loops.
-      odometry: Pose of the LiDAR at each frame. Without it, the file has only the edges of the loops.
+      loops: Loops. Their frames are vertices.
+      chains: Vertices and poses of the LiDAR for each session with odometry. Without them, the file has only the edges
+        of the loops.
       drift: Drift of the odometry, which determines the information matrices of its edges (`step_deviations`).
-      numbers: Number of the vertex of each pose, as in the loops. By default 0, 1, 2, ...
-
-    Raises:
-      WriteError: If the file cannot be written.
-    """
-    chains = []
-    if odometry is not None:
-        chains.append((np.arange(len(odometry)) if numbers is None else numbers, odometry))
-    write_joint_g2o(path, loops, chains, drift=drift)
-
-
-def write_joint_g2o(
-    path: Path | str,
-    loops: Sequence[Loop],
-    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
-    *,
-    drift: DriftModel = DriftModel(),
-    comments: Sequence[str] = (),
-) -> None:
-    """Write the pose graph of several recordings.
-
-    Arguments:
-      path: File to write.
-      loops: Loops between vertices.
-      chains: Vertices and poses of each recording with odometry.
-      drift: Drift of the odometry.
       comments: Lines at the beginning of the file. Readers ignore them.
 
     Raises:
@@ -309,7 +284,8 @@ def _from_json(line: bytes, where: str) -> Loop:
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
     _check_loop(query, match, shares, where)
-    return Loop(query, match, pose, covariance, shares[0], *shares[1:])
+    overlap = None if len(shares) == 1 else shares[1]
+    return Loop(query, match, pose, covariance, shares[0], overlap)
 
 
 def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:

@@ -54,9 +54,9 @@ def slam(
       params: Weights, or their name or folder.
       config: Settings of the loop search.
       odometry: Settings of the odometry.
-      registered: Whether loops are registered by their full scans (`find_loops`).
-      scale: Factor for all lengths, as in `find_loops`.
-      on_bad_scan: Called with id and error of an unreadable scan. The scan is skipped. Without it the error is raised.
+      registered: See `find_loops`, also for `scale` and `on_bad_scan`.
+      scale: Factor for all lengths, also of the odometry.
+      on_bad_scan: Called with id and error of an unreadable scan.
       kept_in: Folder of checkpoints, from which an interrupted call resumes. It is not removed.
 
     Raises:

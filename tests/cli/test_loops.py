@@ -88,9 +88,9 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
 def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
     command, town, tmp_path, monkeypatch, unregistered, status
 ):
-    def ended_meanwhile(recording, params, *, should_stop, **options):
+    def ended_meanwhile(recordings, params, *, should_stop, **options):
         should_stop.signal = 2
-        return search.FoundLoops(recording, len(recording), (), (), None, unregistered=unregistered)
+        return search.FoundLoops((search.Session(recordings[0], SCANS, unregistered=unregistered),))
 
     monkeypatch.setattr(search, "find_loops", ended_meanwhile)
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
@@ -115,8 +115,8 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
     """And a degenerate loop is kept, or rejected with `--degenerate drop`."""
     unsure = Loop(35, 1, np.eye(4), np.diag([4.0, 0.01, 1, 1, 1, 1]), 0.995)
 
-    def some(recording, params, **options):
-        return search.FoundLoops(recording, SCANS, (unsure,), (Rejected(unsure, "repeats"),), None)
+    def some(recordings, params, **options):
+        return search.FoundLoops((search.Session(recordings[0], SCANS),), (unsure,), (Rejected(unsure, "repeats"),))
 
     monkeypatch.setattr(search, "find_loops", some)
     run = ("loops", town, "--seq", "08", "--out", tmp_path / "found")
@@ -241,9 +241,9 @@ def test_scans_are_registered_if_they_can_be(
 ):
     asked = []
 
-    def searched(recording, params, *, registered, **options):
+    def searched(recordings, params, *, registered, **options):
         asked.append(registered)
-        return search.FoundLoops(recording, len(recording), (), (), None)
+        return search.FoundLoops((search.Session(recordings[0], len(recordings[0])),))
 
     monkeypatch.setattr(search, "find_loops", searched)
     monkeypatch.setattr(search, "is_installed", lambda: installed)

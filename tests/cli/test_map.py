@@ -205,7 +205,8 @@ def places_file(tmp_path):
     index = Index.empty(256, weights_hash=weights_hash(params))
     index.add(np.ones(256), positions=np.zeros(3))
     mountings = np.array([[1.73, 0, 0, 1.0]])
-    PlaceMap(index, np.zeros((1, 152, 152), np.uint8), np.eye(4)[None], mountings).save(tmp_path / "one.safetensors")
+    images, unknown = np.zeros((1, 152, 152), np.uint8), np.full((1, 2), np.nan)
+    PlaceMap(index, images, np.eye(4)[None], mountings, unknown).save(tmp_path / "one.safetensors")
     return tmp_path / "one.safetensors"
 
 

@@ -11,7 +11,7 @@ from sglpr_jax.evaluation.page.of_loops import loops_page
 from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.loops.search import FoundLoops, Session
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transform
 
@@ -24,7 +24,11 @@ def found(tmp_path) -> FoundLoops:
     images = {tmp_path / f"{i:06d}.png": rng.uniform(0, 10, (20, 20)).astype(np.float32) for i in range(8)}
     odometry = np.stack([transform(float(x), 0.0, 0.0) for x in range(8)])
     loops = tuple(Loop(q, q - 4, transform(1.0, 2.0, 0.3), np.eye(6), 0.99 + q / 1000) for q in (5, 6, 7))
-    return FoundLoops(of_images(images, times=np.arange(8.0)), 8, loops, (), odometry)
+    return FoundLoops((Session(of_images(images, times=np.arange(8.0)), 8, odometry),), loops)
+
+
+def with_session(found: FoundLoops, **change) -> FoundLoops:
+    return dataclasses.replace(found, sessions=(dataclasses.replace(found.sessions[0], **change),))
 
 
 def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_path):
@@ -37,12 +41,12 @@ def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_
 
 @pytest.mark.slow
 def test_without_odometry_or_loops_or_frames_it_says_so(found):
-    assert len(Parsed(loops_page(dataclasses.replace(found, odometry=None))).images) == 2
+    assert len(Parsed(loops_page(with_session(found, odometry=None))).images) == 2
     none = dataclasses.replace(found, loops=())
     assert loops_page(none).count("No loops.") == 2
     assert "No pair was compared: according to the" in Parsed(loops_page(none)).texts["Why no loops"]
     assert "Why no loops" not in Parsed(loops_page(found)).texts
-    assert "No scan was processed." in loops_page(dataclasses.replace(none, frames=0))
+    assert "No scan was processed." in loops_page(with_session(none, frames=0))
 
 
 @pytest.mark.slow
@@ -68,7 +72,7 @@ def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(found,
 
 
 def test_stopped_before_the_first_scan_there_is_nothing_corrected(found):
-    none = dataclasses.replace(found, loops=(), frames=0)
+    none = with_session(dataclasses.replace(found, loops=()), frames=0)
     page = Parsed(loops_page(none, optimized=OptimizedTrajectory(np.zeros((0, 4, 4)), np.zeros(0, bool))))
     assert "Corrected" not in page.texts and "No scan was processed." in page.texts["Trajectory"]
 
@@ -82,7 +86,7 @@ def known(found) -> FoundLoops:
     recording = dataclasses.replace(found.recording, positions=positions, pose_source="poses.txt")
     pairs = [(5, 1, 6.0), (6, 2, 7.0), (7, 3, -6.0)]
     candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, 0.0, c)) for q, m, c in pairs)
-    return dataclasses.replace(found, recording=recording, candidates=candidates, model=model)
+    return with_session(dataclasses.replace(found, model=model), recording=recording, candidates=candidates)
 
 
 @pytest.mark.slow
@@ -92,7 +96,7 @@ def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known
     said = page.texts["Reliability"]
     assert "0.99 to 1" in said and "1.000" in said and "0 to 0.01" in said and "by poses.txt" in said
     assert "not known" in Parsed(loops_page(found)).texts["Reliability"]
-    assert "No pair was compared." in loops_page(dataclasses.replace(known, candidates=()))
+    assert "No pair was compared." in loops_page(with_session(known, candidates=()))
     monkeypatch.setattr(figures, "can_draw", lambda: False)
     assert "0.99 to 1" in Parsed(loops_page(known)).texts["Reliability"]
 

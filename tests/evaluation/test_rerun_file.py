@@ -12,7 +12,7 @@ from recordings import of_images
 from sglpr_jax.evaluation import rerun_file
 from sglpr_jax.evaluation.rerun_file import write_rerun
 from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.search import FoundLoops, find_loops
+from sglpr_jax.loops.search import FoundLoops, Session, find_loops
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transform
@@ -32,7 +32,7 @@ def found(tmp_path) -> FoundLoops:
     images = {tmp_path / f"{i:06d}.png": rng.uniform(0, 10, (20, 20)).astype(np.float32) for i in range(8)}
     odometry = np.stack([transform(float(x), 0.0, 0.0) for x in range(8)])
     loops = tuple(Loop(q, q - 4, transform(1.0, 2.0, 0.3), np.eye(6), 0.99 + q / 1000) for q in (5, 6))
-    return FoundLoops(of_images(images, times=np.arange(8.0)), 8, loops, (), odometry)
+    return FoundLoops((Session(of_images(images, times=np.arange(8.0)), 8, odometry),), loops)
 
 
 def test_both_trajectories_and_each_loop_are_there(found, tmp_path):
@@ -44,7 +44,8 @@ def test_both_trajectories_and_each_loop_are_there(found, tmp_path):
 
 
 def test_without_poses_the_images_remain(found, tmp_path):
-    write_rerun(dataclasses.replace(found, odometry=None), tmp_path / "a.rrd")
+    bare = dataclasses.replace(found.sessions[0], odometry=None)
+    write_rerun(dataclasses.replace(found, sessions=(bare,)), tmp_path / "a.rrd")
     there = entities(tmp_path / "a.rrd")
     assert "/pair" in there and not any(name.startswith("/map") for name in there)
 

@@ -173,7 +173,7 @@ LOOPS = [
 INDEX = Index.empty(DESCRIPTORS.shape[1], weights_hash="ab")
 INDEX.add(DESCRIPTORS, times=TIMES, positions=POSITIONS)
 IMAGES = np.arange(N * 16, dtype=np.uint8).reshape(N, 4, 4)
-MAP = PlaceMap(INDEX, IMAGES, POSES, np.tile([1.73, 0.0, 0.0, 1.0], (N, 1)))
+MAP = PlaceMap(INDEX, IMAGES, POSES, np.tile([1.73, 0.0, 0.0, 1.0], (N, 1)), np.full((N, 2), np.nan))
 PACK, NUSCENES = pack(), nuscenes()
 TWELVE = text(POSES[:, :3].reshape(N, 12))
 UTIMES = [[1326652795280148 + 500000 * i, *POSITIONS[i], 0, 0, 0] for i in range(N)]
@@ -226,7 +226,9 @@ FORMATS = {
     "index": Format("a.safetensors", INDEX.to_bytes(), Index.load),
     "map": Format("a.safetensors", written(MAP.save, "a.safetensors"), PlaceMap.load),
     "g2o": Format(
-        "a.g2o", written(lambda path: loop_files.write_g2o(path, LOOPS, POSES), "a.g2o"), loop_files.read_g2o
+        "a.g2o",
+        written(lambda path: loop_files.write_g2o(path, LOOPS, [(np.arange(N), POSES)]), "a.g2o"),
+        loop_files.read_g2o,
     ),
     "loops .jsonl": Format(
         "a.jsonl", written(lambda path: loop_files.write_loops_jsonl(path, LOOPS), "a"), loop_files.read_loops_jsonl

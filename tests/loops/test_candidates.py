@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from scenes import seen_from
 
 import sglpr_jax
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.keyframes import Seen
-
-from .scenes import seen_from
 
 GRID = Grid(resolution_m=0.4, height=152, width=152)
 POSTS_UNTIL_M, REACH_M, FRAMES = 10.0, 25.0, 60

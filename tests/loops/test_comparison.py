@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scenes import place, seen_from
 
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
 from sglpr_jax.loops.config import CandidateConfig
@@ -14,8 +15,6 @@ from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
-
-from .scenes import place, seen_from
 
 EXACT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=0.0)
 THERE = (1.2, -0.8, 2.5)

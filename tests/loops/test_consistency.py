@@ -1,15 +1,20 @@
 """Right loops agree with each other whatever the odometry has drifted, wrong ones do not; the largest set is found."""
 
 import itertools
-import tracemalloc
 
 import numpy as np
 import pytest
+from drives import drifted, loop_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from session_pairs import loops_between, two_drives
 
 from sglpr_jax.loops.closure import Loop, planar_loop
-from sglpr_jax.loops.consistency import BLOCK, agree, largest_consistent_set
+from sglpr_jax.loops.config import ConsistencyConfig
+from sglpr_jax.loops.consistency import MIN_LOOPS, accepted_between, agree, largest_consistent_set
+from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.se3 import inverse, transform
 
@@ -22,20 +27,6 @@ def square_drive(laps: int = 2, side: int = 50) -> np.ndarray:
         yaw = edge * np.pi / 2
         poses.append(transform(*(corner + step * np.array([np.cos(yaw), np.sin(yaw)])), yaw))
     return np.stack(poses)
-
-
-def drifted(
-    poses: np.ndarray, rng: np.random.Generator, *, share: float = 0.01, deg_per_m: float = 0.005
-) -> np.ndarray:
-    """Odometry of the drive, its scale and heading off by so much."""
-    scale, turn = 1 + rng.normal(scale=share), rng.normal(scale=np.radians(deg_per_m))
-    steps = inverse(poses[:-1]) @ poses[1:]
-    found = [np.eye(4)]
-    for step in steps:
-        step = step.copy()
-        step[:3, 3] *= scale
-        found.append(found[-1] @ step @ transform(0.0, 0.0, turn))
-    return np.stack(found)
 
 
 def loop_of(poses: np.ndarray, query: int, match: int, error: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Loop:
@@ -51,10 +42,10 @@ def loop_of(poses: np.ndarray, query: int, match: int, error: tuple[float, float
 def test_right_loops_agree_and_wrong_ones_do_not(seed):
     rng = np.random.default_rng(seed)
     poses = square_drive()
-    odometry = drifted(poses, rng)
+    odometry = drifted(poses, percent=rng.normal(), deg_per_100m=rng.normal(scale=0.5))
     right = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[0.1, 0.1, 0.005]))) for i in range(210, 290, 4)]
     wrong = [loop_of(poses, i, i - 200, (15.0 * (-1) ** i, 5.0, 0.0)) for i in range(212, 290, 13)]
-    pairs = agree(right + wrong, odometry)
+    pairs = agree(right + wrong, DrivenPath.of(odometry))
     assert pairs[:20, :20].mean() > 0.98
     near = np.abs(np.subtract.outer([one.query for one in right], [one.query for one in wrong])) < 20
     assert not pairs[:20, 20:][near].any()
@@ -66,23 +57,20 @@ def test_a_loop_in_the_other_direction_agrees_with_one_in_the_same():
     poses = square_drive()
     back = poses.copy()
     back[200:] = poses[200:] @ transform(0.0, 0.0, np.pi)
-    assert agree([loop_of(back, 230, 30), loop_of(back, 240, 40)], back).all()
+    assert agree([loop_of(back, 230, 30), loop_of(back, 240, 40)], DrivenPath.of(back)).all()
     turned = [loop_of(back, 230, 30), loop_of(back, 240, 40, (0.0, 0.0, np.pi))]
-    assert not agree(turned, back)[0, 1]
+    assert not agree(turned, DrivenPath.of(back))[0, 1]
 
 
 def test_agreement_goes_both_ways_and_with_itself():
     poses = square_drive()
     rng = np.random.default_rng(0)
     loops = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[2, 2, 0.1]))) for i in range(205, 285, 5)]
-    pairs = agree(loops, drifted(poses, rng))
+    pairs = agree(loops, DrivenPath.of(drifted(poses, percent=1, deg_per_100m=0.5)))
     assert pairs.diagonal().all()
     assert (pairs == pairs.T).mean() > 0.9  # the lever is that of one of the two
-    np.testing.assert_array_equal(agree(loops, poses, loops[:3]), agree(loops, poses)[:, :3])
-
-
-def test_no_loops_are_no_pairs():
-    assert agree([], square_drive()).shape == (0, 0)
+    path = DrivenPath.of(poses)
+    np.testing.assert_array_equal(agree(loops, path, loops[:3]), agree(loops, path)[:, :3])
 
 
 @settings(deadline=None, max_examples=40)
@@ -119,25 +107,6 @@ def test_the_set_is_the_one_that_all_degrees_taken_anew_choose(n, share, seed):
     assert largest_consistent_set(pairs).tolist() == chosen_by_the_letter(pairs)
 
 
-def test_loops_are_compared_block_by_block():
-    poses, rng = square_drive(), np.random.default_rng(0)
-    queries = rng.integers(205, 395, 5 * BLOCK + 3).tolist()
-    loops = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[1, 1, 0.05]))) for i in queries]
-    odometry = drifted(poses, rng)
-    tracemalloc.start()
-    pairs = agree(loops, odometry)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 80 * len(loops) ** 2  # bytes; all at once took 150 a pair
-    for row in range(0, len(loops), 41):
-        np.testing.assert_array_equal(pairs[row], agree([loops[row]], odometry, loops)[0])
-
-
-def test_nothing_to_choose_from():
-    assert len(largest_consistent_set(np.zeros((0, 0), bool))) == 0
-    assert largest_consistent_set(np.ones((1, 1), bool)).tolist() == [0]
-
-
 def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
     """Unsure along the match's x; the query is turned by 90 degrees, so along its own y."""
     covariance = np.diag([4.0, 0.01, 0.001])
@@ -149,3 +118,54 @@ def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
     motions = rng.multivariate_normal(np.zeros(2), loop.covariance[:2, :2], 4000)
     moved = np.stack([(loop.match_from_query @ transform(*motion, 0.0))[:2, 3] for motion in motions])
     np.testing.assert_allclose(np.cov(moved.T), covariance[:2, :2], atol=0.3)
+
+
+RULES = {"mounting": None, "drift": DriftModel(), "config": ConsistencyConfig()}
+FIRST, SECOND, TRUE = two_drives()
+MOTION = Motion.joined([Motion.of(FIRST), Motion.of(SECOND)], [np.eye(3)] * 2)
+
+
+def joined_loops(true: np.ndarray) -> list[Loop]:
+    """Loops by this transform, with the rows of both recordings, one after the other."""
+    rng = np.random.default_rng(3)
+    return [
+        loop_at(len(FIRST) + one.query, one.match, one.match_from_query, rng)
+        for one in loops_between(FIRST, SECOND, true)
+    ]
+
+
+def test_a_few_wrong_loops_are_rejected_and_the_others_accepted():
+    right, rng = joined_loops(TRUE), np.random.default_rng(0)
+    wrong = [
+        loop_at(len(FIRST) + query, match, transform(*rng.uniform(-5, 5, 2), rng.uniform(-3, 3)), rng)
+        for query, match in ((3, 40), (30, 5), (50, 70), (60, 20))
+    ]
+    mixed = sorted([*right, *wrong], key=lambda loop: loop.query)
+    sets, rejected = accepted_between(mixed, MOTION, **RULES)
+    assert [len(one) for one in sets] == [len(right)]
+    assert {id(one.loop) for one in rejected} == set(map(id, wrong))
+    assert {one.reason for one in rejected} == {"contradicts other loops"}
+
+
+def test_too_few_loops_or_too_short_a_path_are_no_common_place():
+    loops = joined_loops(TRUE)
+    for some in (loops[: MIN_LOOPS - 1], loops[: MIN_LOOPS + 2], []):  # 5 loops are 2 m apart: 8 m
+        sets, rejected = accepted_between(some, MOTION, **RULES)
+        assert sets == [] and len(rejected) == len(some)
+        assert {one.reason for one in rejected} <= {"too few neighbours"}
+
+
+def test_a_place_that_repeats_gives_two_transforms_and_therefore_none():
+    farther = transform(12.0, 0.0, 0.0) @ TRUE
+    both = sorted([*joined_loops(TRUE), *joined_loops(farther)], key=lambda loop: loop.query)
+    sets, rejected = accepted_between(both, MOTION, **RULES)
+    assert sets == [] and len(rejected) == len(both)
+
+
+def test_parts_without_known_motion_are_accepted_one_by_one():
+    loops = joined_loops(TRUE)
+    middle = int(np.median([loop.query for loop in loops]))
+    offset, parts = middle - len(FIRST) + 1, [Motion.of(FIRST)]
+    parts += [Motion.of(some) for some in (SECOND[:offset], SECOND[offset:])]
+    sets, rejected = accepted_between(loops, Motion.joined(parts, [np.eye(3)] * 3), **RULES)
+    assert len(sets) == 2 and sum(map(len, sets)) == len(loops) and not rejected

@@ -24,16 +24,13 @@ NOW = CandidateConfig(recent_m=1e-9)
 
 
 @pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
-
-
-@pytest.fixture(scope="module")
-def streamed(drive, params):
+def streamed(drive, described, params):
     """The detector after the whole drive, with odometry, and what it returned frame by frame."""
-    detector = LoopDetector(params)
-    poses = drive.poses.world_from_lidar
-    returned = [detector.add(drive.points(i), time=drive.times[i], odometry=poses[i]) for i in range(len(drive))]
+    frames, detector = (
+        zip(described, drive.times.tolist(), drive.poses.world_from_lidar, strict=True),
+        LoopDetector(params),
+    )
+    returned = [detector.add_seen(seen, time=time, odometry=pose) for seen, time, pose in frames]
     return detector, returned
 
 
@@ -186,19 +183,6 @@ def test_the_height_of_a_loop_is_unknown_unless_the_odometry_measures_it(streame
         np.testing.assert_allclose(loop.covariance, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("value", [-0.1, 1.01, np.nan])
-def test_what_is_no_probability_is_refused(value):
-    with pytest.raises(ValueError, match=f"expected min_probability from 0 to 1, found {value}"):
-        DetectorConfig(min_probability=value)
-
-
-@pytest.mark.parametrize("name", ["candidates", "cohort"])
-@pytest.mark.parametrize("value", [10**9, -1])
-def test_more_comparisons_than_fit_into_memory_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name}: expected a number from [01] up to 1000, found {value}"):
-        CandidateConfig(**{name: value})
-
-
 def test_scans_without_points_or_with_one_close_no_loops(params):
     detector = LoopDetector(params, config=DetectorConfig(candidates=NOW))
     for cloud in (np.zeros((0, 3)), np.array([[5.0, 3, 1]]), np.full((4, 3), np.nan)) * 3:
@@ -228,3 +212,20 @@ def test_what_does_not_fit_is_one_clear_error(drive, params, random_params):
     reads = dataclasses.replace(params.config, categories=20, head=head)
     with pytest.raises(ValueError, match="describes images alone"):
         CandidateFinder(dataclasses.replace(params, config=reads))
+
+
+FRAMES, SECONDS = 40, np.arange(40.0) / 5
+DATES = np.datetime64("2026-01-02T03:04:05", "ns") + (SECONDS * 1e9).astype("timedelta64[ns]")
+
+
+@pytest.mark.parametrize("times", [1e6 * SECONDS, DATES, np.zeros(FRAMES), None], ids=["us", "dates", "0", "none"])
+def test_times_in_any_unit_give_the_same_loops(params, compare_only, times):
+    """A circle of 60 m that is driven around twice."""
+    angles = 2 * np.pi * np.arange(FRAMES) / (FRAMES // 2)
+    poses = [transform(30 * np.cos(a) / np.pi, 30 * np.sin(a) / np.pi, a) for a in angles]
+    expected = {query: query - FRAMES // 2 for query in range(FRAMES // 2, FRAMES)}
+    compare_only({query: (match, np.eye(4)) for query, match in expected.items()})
+    detector = LoopDetector(params)
+    for i, pose in enumerate(poses):
+        detector.add(np.eye(152), time=None if times is None else times[i], odometry=pose)
+    assert {loop.query: loop.match for loop in detector.loops} == expected

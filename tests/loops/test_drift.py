@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from drives import along, drifted, town, true_loops
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -16,8 +17,6 @@ from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o
 from sglpr_jax.se3 import inverse, transform
-
-from .drives import along, drifted, town, true_loops
 
 SHARP = dataclasses.replace(DriftModel(), position_m=1e-3, yaw_deg=1e-3)
 
@@ -32,7 +31,7 @@ def exact(poses: np.ndarray, query: int, match: int) -> Loop:
 def test_drift_of_constant_rate_is_at_most_its_multiple_of_the_model(percent, degrees, start, length):
     poses = town()
     odometry = drifted(poses, percent=percent, deg_per_100m=degrees)
-    (found,) = deviations([exact(poses, start + length, start)], odometry, drift=SHARP)
+    (found,) = deviations([exact(poses, start + length, start)], DrivenPath.of(odometry), drift=SHARP)
     assert found <= 1.1 * np.hypot(percent / 1.0, degrees / 0.5) + 0.05
 
 
@@ -41,14 +40,14 @@ def test_by_hand_straight_on():
     odometry = along([(0, 0), (101, 0)])
     pose = odometry[100] @ transform(3.0, 0.0, 0.0)
     ahead = Loop(100, 0, pose, np.zeros((6, 6)), 1.0)
-    np.testing.assert_allclose(deviations([ahead], odometry), 3 / np.hypot(1.0, 0.5), rtol=1e-6)
+    np.testing.assert_allclose(deviations([ahead], DrivenPath.of(odometry)), 3 / np.hypot(1.0, 0.5), rtol=1e-6)
     unsure = dataclasses.replace(ahead, covariance=np.diag([0.64, 0, 0, 0, 0, 0]))
-    np.testing.assert_allclose(deviations([unsure], odometry), 3 / np.sqrt(1 + 0.25 + 0.64), rtol=1e-6)
+    np.testing.assert_allclose(deviations([unsure], DrivenPath.of(odometry)), 3 / np.sqrt(1 + 0.25 + 0.64), rtol=1e-6)
     turned = Loop(100, 0, odometry[100] @ transform(0.0, 0.0, np.pi / 2), np.diag([0, 0.64, 0, 0, 0, 0]), 1.0)
     ahead_is_its_right = dataclasses.replace(
         turned, match_from_query=turned.match_from_query @ transform(0.0, -3.0, 0.0)
     )
-    both = deviations([turned, ahead_is_its_right], odometry)
+    both = deviations([turned, ahead_is_its_right], DrivenPath.of(odometry))
     np.testing.assert_allclose(both[1] ** 2 - both[0] ** 2, 9 / 1.89, rtol=0.01)
 
 
@@ -70,9 +69,9 @@ def test_a_guessed_path_drifts_in_every_direction():
     odometry = along([(0, 0), (101, 0)])
     guessed_m = np.where(np.arange(101) < 50, 0.0, 100.0)  # one step as uncertain as 100 m
     beside = Loop(100, 0, odometry[100] @ transform(0.0, 3.0, 0.0), np.zeros((6, 6)), 1.0)
-    before, after = (deviations([beside], odometry, guessed_m=given) for given in (None, guessed_m))
+    before, after = (deviations([beside], DrivenPath.of(odometry, guessed_m=one)) for one in (None, guessed_m))
     assert after < 0.6 * before
-    (same,) = deviations([exact(odometry, 100, 60)], odometry, guessed_m=guessed_m)
+    (same,) = deviations([exact(odometry, 100, 60)], DrivenPath.of(odometry, guessed_m=guessed_m))
     assert same == 0
 
 
@@ -93,8 +92,10 @@ def test_of_a_tilted_sensor_the_deviations_are_the_same(degrees):
         )
         for loop in loops
     ]
-    found = deviations(tilted, inverse(upright) @ odometry @ upright, mounting=mounting)
-    np.testing.assert_allclose(found, deviations(loops, odometry), rtol=1e-6)
+    found = deviations(
+        tilted, DrivenPath.of(inverse(upright) @ odometry @ upright, mounting=mounting), mounting=mounting
+    )
+    np.testing.assert_allclose(found, deviations(loops, DrivenPath.of(odometry)), rtol=1e-6)
 
 
 def test_far_from_the_origin_and_of_nothing():
@@ -102,8 +103,10 @@ def test_far_from_the_origin_and_of_nothing():
     odometry, loops = drifted(poses, percent=1, deg_per_100m=0.5), true_loops(poses, every=20)
     far = odometry.copy()
     far[:, :2, 3] += [4.5e5, 5.4e6]
-    np.testing.assert_allclose(deviations(loops, far), deviations(loops, odometry), rtol=1e-4)
-    assert deviations([], odometry).shape == (0,)
+    np.testing.assert_allclose(
+        deviations(loops, DrivenPath.of(far)), deviations(loops, DrivenPath.of(odometry)), rtol=1e-4
+    )
+    assert deviations([], DrivenPath.of(odometry)).shape == (0,)
 
 
 def test_the_steps_of_a_graph_add_up_to_the_model_after_100_m(tmp_path):
@@ -114,7 +117,7 @@ def test_the_steps_of_a_graph_add_up_to_the_model_after_100_m(tmp_path):
     metres, radians = step_deviations(np.tile(np.eye(4), (3, 1, 1)), DriftModel())
     assert (metres > 0).all() and (radians > 0).all()
     poses = along([(0, 0), (3, 0)])
-    write_g2o(tmp_path / "a.g2o", [], poses, drift=DriftModel(0.1, 0.05))
+    write_g2o(tmp_path / "a.g2o", [], [(np.arange(len(poses)), poses)], drift=DriftModel(0.1, 0.05))
     information = read_g2o(tmp_path / "a.g2o").edges[0][3]
     assert information[0, 0] == pytest.approx(1 / (1.0 + 2.5e-5), rel=1e-6)
 
@@ -141,17 +144,22 @@ def test_floors_that_look_alike_are_apart_in_height(tilt):
     lidar = inverse(upright_from_lidar(tilt))
     flat, rising = ramp(4, 0.0) @ inverse(lidar), ramp(4, 3.5) @ inverse(lidar)
     loops = [exact(flat, query, match) for query in (150, 250, 399) for match in range(query % 100, query - 99, 100)]
-    assert deviations(loops, flat, mounting=tilt).max() < 1e-6
-    assert deviations(loops, rising, mounting=tilt).min() > DriftModel().max_deviation
+    assert deviations(loops, DrivenPath.of(flat, mounting=tilt), mounting=tilt).max() < 1e-6
+    assert deviations(loops, DrivenPath.of(rising, mounting=tilt), mounting=tilt).min() > DriftModel().max_deviation
     unsure = dataclasses.replace(DriftModel(), height_per_metre=0.01)
-    assert deviations(loops, rising, mounting=tilt, drift=unsure).max() < DriftModel().max_deviation
+    assert (
+        deviations(loops, DrivenPath.of(rising, mounting=tilt), mounting=tilt, drift=unsure).max()
+        < DriftModel().max_deviation
+    )
 
 
 def test_height_by_hand():
     odometry = along([(0, 0), (101, 0)])
     above = Loop(100, 0, odometry[100] @ transform(0.0, 0.0, 0.0), np.diag([0, 0, 0.16, 0, 0, 0]), 1.0)
     above.match_from_query[2, 3] = 2.0
-    np.testing.assert_allclose(deviations([above], odometry), 2 / np.sqrt(0.3**2 + 0.3**2 + 0.16), rtol=1e-6)
+    np.testing.assert_allclose(
+        deviations([above], DrivenPath.of(odometry)), 2 / np.sqrt(0.3**2 + 0.3**2 + 0.16), rtol=1e-6
+    )
 
 
 @settings(deadline=None, max_examples=10)

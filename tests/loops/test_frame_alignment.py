@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from session_pairs import loops_between, two_drives
 
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.frame_alignment import aligned_frames
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse, moved_covariance, transform, travelled, yaw_of
-
-from .pairs import loops_between, two_drives
 
 EXACT = DriftModel(metres_per_metre=0.0, degrees_per_metre=0.0)
 

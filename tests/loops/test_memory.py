@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-import sglpr_jax
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
@@ -15,17 +14,6 @@ from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, transform
 
 LIMIT = 150
-
-
-@pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
-
-
-@pytest.fixture(scope="module")
-def described(drive, params) -> list[Seen]:
-    finder = CandidateFinder(params)
-    return [finder.seen(drive.record(i, labels=False)) for i in range(len(drive))]
 
 
 def searched(params, drive, described, *, odometry: bool, **limits) -> LoopDetector:

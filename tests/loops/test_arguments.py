@@ -1,0 +1,125 @@
+"""What is handed in from Python is taken where it is clear, and refused in one sentence where it is not."""
+
+import datetime
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import of_scans
+
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.recording import Record
+from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops.arguments import check_is, given_pose, given_poses, given_record, given_time
+from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.search import find_loops
+from sglpr_jax.maps.build import map_recording
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import transform
+
+POSES = [np.eye(4).tolist(), transform(1.0, 0.0, 0.5)]
+FLAT = np.zeros((2, 4, 4))
+EMPTY = Seen(np.ones(256, np.float32), np.zeros((152, 152), np.uint8), None)
+
+
+@pytest.fixture
+def recording():
+    return of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
+
+
+def test_lists_are_taken_for_arrays():
+    np.testing.assert_array_equal(given_poses(POSES, of="odometry"), np.array(POSES))
+    np.testing.assert_array_equal(given_pose(POSES[0]), np.eye(4))
+    record = Record()
+    assert given_record(record) is record
+    points = given_record([[1, 2, 3], [4, 5, 6]])
+    assert points.points.dtype == np.float32 and points.points.shape == (2, 3) and points.mounting is None
+    assert given_record(np.ones((9, 9), int)).image.shape == (9, 9)
+    assert given_time(np.int64(3)) == 3.0 and given_time(None) is None and given_pose(None) is None
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "message"),
+    [
+        (lambda: given_poses("odometry.tum", of="odometry"), TypeError, r"odometry \(n, 4, 4\), found the path odo"),
+        (lambda: given_poses(Path("a.tum"), of="poses"), TypeError, "path a.tum; read it with sglpr_jax.read_odometry"),
+        (lambda: given_poses({"a": 1}, of="poses"), TypeError, r"poses \(n, 4, 4\), found a dict"),
+        (lambda: given_poses([np.eye(4), np.eye(3)], of="poses"), TypeError, "found a list"),
+        (lambda: given_poses(np.zeros((5, 3)), of="odometry"), ValueError, r"odometry .*, found .* shape \(5, 3\)"),
+        (lambda: given_poses(FLAT, of="odometry"), ValueError, r"with rotations, found \[\[0\.0.* in row 0"),
+        (lambda: given_pose(np.eye(3)), ValueError, "odometry as a 4 x 4 pose with a rotation, found"),
+        (lambda: given_record("000000.bin"), TypeError, "found the path 000000.bin; read it with sglpr_jax.read_scan"),
+        (lambda: given_record([[1, 2, 3], [4]]), TypeError, r"points \(n, 3\) or an image \(h, w\), found a list"),
+        (lambda: given_record(np.zeros((3, 3, 3))), ValueError, r"found an array of shape \(3, 3, 3\)"),
+        (lambda: given_time("now"), TypeError, "expected a time in seconds, found 'now'"),
+        (lambda: given_time(np.nan), ValueError, "expected a time in seconds, found nan"),
+        (lambda: check_is("a", Params, by="load"), TypeError, "a Params, found 'a'; sglpr_jax.load returns one"),
+        (lambda: check_is([], Params, by="load"), TypeError, "found a list"),
+    ],
+)  # fmt: skip
+def test_what_is_something_else_is_named(call, kind, message):
+    with pytest.raises(kind, match=message):
+        call()
+
+
+def test_the_functions_ask_so(recording, params):
+    for given, found in (("a.tum", "found the path a.tum"), (np.eye(4), r"found an array of shape \(4, 4\)")):
+        with pytest.raises((TypeError, ValueError), match=rf"expected odometry \(n, 4, 4\), {found}"):
+            find_loops(recording, params, odometry=given)
+    with pytest.raises(ValueError, match=r"expected poses \(n, 4, 4\), found an array of shape \(2, 3\)"):
+        map_recording(recording, params, np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="08: expected a pose for each of 2 scans, found 1"):
+        map_recording(recording, params, POSES[:1])
+    with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
+        LoopDetector(params).add("0.bin")
+    with pytest.raises(ValueError, match=r"expected a density image, floats from 0 to 10, found floats from 0 to 255"):
+        LoopDetector(params).add(255.0 * np.eye(151))
+
+
+@pytest.mark.parametrize("function", [find_loops, map_recording])
+def test_what_is_no_recording_is_named(function, params):
+    """The tests check all types beforehand; `unwrap` gives what users call."""
+    given = {"poses": POSES} if function is map_recording else {}
+    with pytest.raises(TypeError, match=r"expected a Recording, found 'KITTI'; sglpr_jax\.open_recording returns one"):
+        inspect.unwrap(function)("KITTI", params, **given)
+
+
+def test_points_are_looked_for_in_a_map_as_those_of_its_sensor(params, monkeypatch):
+    index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
+    index.add(np.ones(index.width), positions=np.zeros(3))
+    places = PlaceMap(
+        index, np.zeros((1, 152, 152), np.uint8), np.eye(4)[None], np.array([[2.5, 0, 0, 1.0]]), np.full((1, 2), np.nan)
+    )
+    seen = []
+    monkeypatch.setattr(CandidateFinder, "seen", lambda self, record: seen.append(record) or EMPTY)
+    assert places.relocate(params, [[5, 3, 1]]) == [] and places.relocate(params, np.zeros((9, 9))) == []
+    assert seen[0].mounting == Mounting(2.5) and seen[1].image is not None
+    with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
+        places.relocate(params, "0.bin")
+
+
+def test_loops_and_maps_warn_of_poses_in_the_cameras_axes(params):
+    way = np.stack([transform(2.0 * x, 0.0, 0.0) for x in range(20)])
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(20)})
+    camera = CAMERA_FROM_LIDAR @ way @ CAMERA_FROM_LIDAR.T
+    for given, function in (({"odometry": camera}, find_loops), ({"poses": camera}, map_recording)):
+        with pytest.warns(DataWarning, match="found 38 of 38 m of path up or down; are they in camera axes"):
+            function(recording, params, **given, should_stop=lambda: True)
+
+
+def test_dates_are_seconds_and_numbers_stay_as_they_are():
+    day, later = np.datetime64("2026-01-02", "D"), np.timedelta64(1_500_000_000, "ns")
+    for one in ("s", "ms", "us", "ns"):
+        assert given_time(day.astype(f"datetime64[{one}]")) == 1767312000
+    assert given_time(day.astype("datetime64[ns]") + later) == 1767312001.5
+    assert given_time(later) == 1.5 == given_time(datetime.timedelta(seconds=1.5))
+    noon = datetime.datetime(2026, 1, 2, 12, tzinfo=datetime.timezone(datetime.timedelta(hours=12)))
+    assert given_time(noon) == 1767312000
+    assert given_time(1500) == 1500

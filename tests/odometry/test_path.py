@@ -1,0 +1,72 @@
+"""A path adds up what a sum over its steps gives, whether its poses come one by one or at once."""
+
+import numpy as np
+import pytest
+from drives import along, town
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.se3 import travelled
+
+
+def test_one_by_one_is_at_once():
+    poses = town()
+    whole, found = DrivenPath.of(poses), DrivenPath()
+    for pose in poses:
+        found.add(pose)
+    np.testing.assert_array_equal(found.poses, poses)
+    np.testing.assert_allclose(found.travelled, travelled(poses), rtol=1e-12)
+    rows = np.arange(len(poses))
+    for one, other in zip(found.between(rows * 0, rows), whole.between(rows * 0, rows), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    positions=arrays(np.float64, (12, 3), elements=st.floats(-50, 50)),
+    guesses=arrays(np.float64, (12,), elements=st.floats(0, 5)),
+    ends=st.tuples(st.integers(0, 11), st.integers(0, 11)),
+)
+def test_the_integrals_are_sums_over_small_steps(positions, guesses, ends):
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, :3, 3] = positions
+    guessed_m = guesses.cumsum()
+    start, end = ends
+    found = DrivenPath.of(poses, guessed_m=guessed_m).between(np.array([start]), np.array([end]))
+    sign, (first, last) = (1, (start, end)) if start <= end else (-1, (end, start))
+    length, place, squares = 0.0, np.zeros(3), np.zeros((3, 3))
+    for k in range(first, last):
+        step = np.linalg.norm(positions[k + 1] - positions[k]) + guessed_m[k + 1] - guessed_m[k]
+        for share in (np.arange(200) + 0.5) / 200:
+            at = positions[k] + share * (positions[k + 1] - positions[k]) - positions[0]
+            length, place, squares = (
+                length + step / 200,
+                place + step / 200 * at,
+                squares + step / 200 * np.outer(at, at),
+            )
+    np.testing.assert_allclose(found.length, sign * length, atol=1e-6)
+    np.testing.assert_allclose(found.first[0], sign * place, atol=1e-4 * max(1, np.abs(place).max()))
+    np.testing.assert_allclose(found.squares[0], sign * squares, atol=1e-4 * max(1, np.abs(squares).max()))
+
+
+def test_positions_drift_along_and_by_the_turns_before():
+    poses = along([(0, 0), (101, 0)])
+    rows = np.arange(len(poses))
+    found = DrivenPath.of(poses).position_deviations(rows, 100)
+    assert found[100] == 0 and (np.diff(found) < 0).all()
+    lever = np.radians(0.5) * 100 / np.sqrt(3)
+    assert found[0] == pytest.approx(np.sqrt(1 + 0.25**2 + lever**2), rel=1e-3)
+    np.testing.assert_allclose(DrivenPath.of(poses[::-1]).position_deviations(rows, 0), found[::-1], atol=1e-6)
+
+
+def test_up_is_that_of_the_sensor_on_average_and_level_only_where_the_sensor_is_tilted():
+    poses = town()
+    tilted = Mounting(1.0, (0.5, 0.0, np.sqrt(0.75)))
+    path = DrivenPath.of(poses, mounting=tilted)
+    rotation = path.level(tilted)
+    np.testing.assert_allclose(rotation @ path.up, [0, 0, 1], atol=1e-12)
+    assert not np.allclose(rotation, np.eye(3)) and (path.level(None) == np.eye(3)).all()
+    assert len(DrivenPath()) == 0 and (DrivenPath().up == [0, 0, 1]).all()

@@ -1,0 +1,147 @@
+"""A drifted drive of known truth is corrected by its loops; wrong loops do not bend it; gtsam reads our g2o."""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import drifted
+from recordings import of_images
+from scipy.spatial.transform import Rotation
+from session_pairs import found_pair, two_drives
+
+from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.search import FoundLoops, Session
+from sglpr_jax.pose_graph.files import read_g2o, write_g2o
+from sglpr_jax.pose_graph.optimize import (
+    MOST_RISEN_M,
+    OptimizedTrajectory,
+    PoseGraph,
+    optimize_trajectory,
+    placements,
+    trajectory_error,
+)
+from sglpr_jax.se3 import from_quaternions, inverse, transform
+
+from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
+
+
+def optimized(odometry: np.ndarray, loops: Sequence[Loop]) -> OptimizedTrajectory:
+    return PoseGraph({0: odometry}, loops).solve()
+
+
+def test_the_error_of_a_drifted_drive_falls(two_laps, two_laps_odometry, second_lap_loops):
+    true = two_laps[:, :3, 3]
+    before = trajectory_error(two_laps_odometry, true)
+    found = optimized(two_laps_odometry, second_lap_loops)
+    assert found.inliers.all() and len(found.inliers) == len(second_lap_loops)
+    assert before > 2 and trajectory_error(found.poses, true) < 0.4 * before
+    np.testing.assert_allclose(found.poses[0], two_laps_odometry[0], atol=1e-6)
+    for loop in second_lap_loops:
+        error = inverse(inverse(found.poses[loop.match]) @ found.poses[loop.query]) @ loop.match_from_query
+        assert np.linalg.norm(error[:3, 3]) < 1
+
+
+def test_wrong_loops_do_not_bend_it(two_laps, two_laps_odometry, second_lap_loops):
+    true = two_laps[:, :3, 3]
+    wrong = tuple(Loop(100 + k, 20 + k, transform(1.0, 0.0, 0.1), LOOP_COVARIANCE, 1.0) for k in range(3))
+    found = optimized(two_laps_odometry, (*wrong, *second_lap_loops))
+    assert not found.inliers[:3].any() and found.inliers[3:].all()
+    assert trajectory_error(found.poses, true) == pytest.approx(
+        trajectory_error(optimized(two_laps_odometry, second_lap_loops).poses, true), abs=0.05
+    )
+
+
+def test_of_a_recording_the_searched_frames_are_corrected(two_laps_odometry, second_lap_loops, tmp_path, monkeypatch):
+    images = {tmp_path / f"{i:06d}.png": np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
+    early = tuple(loop for loop in second_lap_loops if loop.query < 90)
+    session = Session(of_images(images), 90, two_laps_odometry)
+    found = FoundLoops((session,), early)
+    corrected = optimize_trajectory(found)
+    assert corrected.poses.shape == (90, 4, 4)
+    np.testing.assert_allclose(corrected.poses, optimized(two_laps_odometry[:90], early).poses, atol=1e-9)
+    with pytest.raises(ValueError, match="08: expected loops found with odometry, found loops without it"):
+        optimize_trajectory(FoundLoops((dataclasses.replace(session, odometry=None),), early))
+    none = optimize_trajectory(FoundLoops((session,)))
+    np.testing.assert_array_equal(none.poses, two_laps_odometry[:90])
+    assert none.inliers.shape == (0,)
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(ImportError, match=r"gtsam: pip install 'sglpr-jax\[gtsam\]'"):
+        optimize_trajectory(found)
+
+
+def test_sessions_fit_together_better_than_by_one_transform():
+    first, second, true = two_drives()
+    odometry = drifted(first, percent=1, deg_per_100m=0.5), drifted(second, percent=-1, deg_per_100m=-0.5)
+    found = found_pair(odometry=odometry)
+    corrected = optimize_trajectory(found)
+    assert corrected.inliers.all() and len(found.split(corrected.poses)[1]) == len(second)
+    np.testing.assert_allclose(corrected.poses[0], odometry[0][0], atol=1e-5)
+    truth = np.concatenate([first, true @ second])[:, :3, 3]
+    (_, own), (group, placed) = placements(found)
+    assert group == 0 and np.array_equal(own, np.eye(4))
+    before = trajectory_error(np.concatenate([odometry[0], placed @ odometry[1]]), truth)
+    assert trajectory_error(corrected.poses, truth) < 0.8 * before
+
+
+def test_sessions_without_a_common_place_stay_as_they_are():
+    found = dataclasses.replace(found_pair(), loops=(), transforms=())
+    assert [group for group, _ in placements(found)] == [0, 1]
+    expected = np.concatenate([one.odometry for one in found.sessions])
+    np.testing.assert_allclose(optimize_trajectory(found).poses, expected, atol=1e-9)
+
+
+def test_a_third_session_is_placed_through_the_second():
+    pair = found_pair()
+    (first,) = pair.transforms
+    second = first._replace(match=first.match._replace(session=1), query=first.query._replace(session=2))
+    step = first.alignment.match_from_query
+    chain = dataclasses.replace(pair, sessions=(*pair.sessions, pair.sessions[1]), transforms=(first, second))
+    np.testing.assert_allclose([to for _, to in placements(chain)], [np.eye(4), step, step @ step], atol=1e-9)
+    around = second._replace(match=first.match)
+    found = placements(dataclasses.replace(chain, transforms=(around, second)))
+    assert [group for group, _ in found] == [0, 0, 0]
+    np.testing.assert_allclose(found[1][1], step @ inverse(step), atol=1e-9)
+
+
+def test_gtsam_reads_the_graph_that_we_write(two_laps_odometry, second_lap_loops, tmp_path):
+    import gtsam
+
+    path = tmp_path / "loops.g2o"
+    write_g2o(path, second_lap_loops, [(np.arange(LAPS_FRAMES), two_laps_odometry)])
+    graph, start = gtsam.readG2o(str(path), True)
+    assert start.size() == LAPS_FRAMES and graph.size() == LAPS_FRAMES - 1 + len(second_lap_loops)
+    read = np.stack([start.atPose3(frame).matrix() for frame in range(LAPS_FRAMES)])
+    np.testing.assert_allclose(read, two_laps_odometry, atol=1e-5)
+    ours = read_g2o(path)
+    for k, (first, second, pose, information) in enumerate(ours.edges):
+        factor = graph.at(k)
+        assert (first, second) == tuple(factor.keys())
+        np.testing.assert_allclose(factor.measured().matrix(), pose, atol=1e-6)
+        theirs = factor.noiseModel().information()  # rotation first
+        order = np.array([3, 4, 5, 0, 1, 2])
+        np.testing.assert_allclose(theirs, information[np.ix_(order, order)], rtol=1e-6, atol=1e-6)
+
+
+def test_the_error_does_not_mind_where_a_trajectory_lies():
+    rng = np.random.default_rng(0)
+    true = rng.normal(scale=20, size=(50, 3))
+    rotations = Rotation.random(50, rng=rng).as_quat()
+    world = transform(5.0, -3.0, 2.0) @ from_quaternions(np.zeros((1, 3)), Rotation.random(rng=rng).as_quat()[None])[0]
+    poses = world @ from_quaternions(true, rotations)
+    assert trajectory_error(poses, true) == pytest.approx(0, abs=1e-9)
+    noise = rng.normal(size=(50, 3))
+    assert trajectory_error(from_quaternions(true + noise, rotations), true) == pytest.approx(np.sqrt(3), rel=0.15)
+
+
+def test_heights_that_move_by_metres_are_told(two_laps, two_laps_odometry, second_lap_loops):
+    images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
+    low = two_laps_odometry.copy()
+    low[:, 2, 3] -= 0.06 * np.arange(LAPS_FRAMES)  # odometry that sinks, which loops of known heights correct
+    moved = FoundLoops((Session(of_images(images), LAPS_FRAMES, low),), second_lap_loops)
+    with pytest.warns(DataWarning, match="08: expected heights near those of the odometry, found them moved by"):
+        corrected = optimize_trajectory(moved)
+    assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MOST_RISEN_M

@@ -1,0 +1,118 @@
+"""The exhaustive search against one by whole Fourier transforms in numpy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import place, relative, seen_from
+
+from sglpr_jax.registration.bev_search import search, search_near, search_spectra
+from sglpr_jax.registration.bev_spectra import (
+    cells,
+    lower_half,
+    match_spectra,
+    merged,
+    prepared,
+    query_spectra,
+    rotations,
+    spectrum,
+)
+from sglpr_jax.registration.config import VerificationConfig
+
+SMALL = VerificationConfig(reach_m=12.8, max_shift_m=4.0)
+
+
+def correlations(query: np.ndarray, match: np.ndarray) -> np.ndarray:
+    """Of all rotations and shifts (rotation, down, right), by inverse transforms of the whole spectra."""
+    angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
+    cell_m = SMALL.resolution_m * SMALL.coarse
+    small = [merged(prepared(image, SMALL), SMALL.coarse) for image in (query, match)]
+    queries = np.asarray(spectrum(rotations(small[0], jnp.asarray(angles)), cell_m, SMALL))
+    there = np.asarray(spectrum(small[1][None], cell_m, SMALL))
+    size, reach = queries.shape[1], cells(SMALL.max_shift_m, cell_m)
+    shifted = np.fft.irfft2(there * np.conj(queries), (size, size))
+    return np.roll(shifted, (reach, reach), (-2, -1))[:, : 2 * reach + 1, : 2 * reach + 1]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_peaks_are_those_of_whole_transforms(seed):
+    query = seen_from(place(seed), (0.7, -0.5, 2.0))
+    matches = np.stack([seen_from(place(k), (0.0, 0.0, 0.0)) for k in (seed, seed + 1)])
+    found = jax.device_get(search(query, matches, config=SMALL))
+    for k, match in enumerate(matches):
+        volume = correlations(query, match)
+        turn, down, right = np.unravel_index(volume.argmax(), volume.shape)
+        cell_m, step_deg = SMALL.resolution_m * SMALL.coarse, 360 / SMALL.turns
+        reach = cells(SMALL.max_shift_m, cell_m)
+        assert found.correlation[k] == pytest.approx(volume.max(), abs=1e-5)
+        assert abs(found.x[k] - (right - reach) * cell_m) <= cell_m / 2 + 1e-5
+        assert abs(found.y[k] - (reach - down) * cell_m) <= cell_m / 2 + 1e-5
+        assert abs((np.degrees(found.yaw[k]) - turn * step_deg + 180) % 360 - 180) <= step_deg / 2 + 1e-3
+        apart = np.abs(np.arange(SMALL.turns) - turn)
+        near_turn = np.minimum(apart, SMALL.turns - apart) * step_deg <= SMALL.second_deg
+        near = [np.abs(np.arange(2 * reach + 1) - at) * cell_m <= SMALL.second_m for at in (down, right)]
+        elsewhere = ~(near_turn[:, None, None] & near[0][None, :, None] & near[1][None, None])
+        assert found.second[k] == pytest.approx(volume[elsewhere].max(), abs=1e-5)
+
+
+def test_the_pose_lies_between_the_cells():
+    match, errors = (0.0, 0.0, 0.0), []
+    for seed, pose in enumerate([(0.3, 0.1, 0.4), (-0.7, 0.5, 2.0), (1.1, -0.3, -1.2), (0.1, 0.9, 3.0)]):
+        found = search(seen_from(place(seed), pose), seen_from(place(seed), match)[None], config=SMALL).one(0)
+        expected = relative(match, pose)
+        errors.append(np.hypot(found.x - expected[0], found.y - expected[1]))
+    assert np.mean(errors) < 0.2  # of cells of .8 m, whose middles would be .3 m off
+
+
+def test_rotations_by_quarter_turns_follow_from_the_first_quarter():
+    query = seen_from(place(3), (0.4, -0.2, 1.0))
+    angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
+    rotated = rotations(merged(prepared(query, SMALL), SMALL.coarse), jnp.asarray(angles))
+    whole = np.asarray(spectrum(rotated, SMALL.resolution_m * SMALL.coarse, SMALL))
+    whole, (size, width) = whole.reshape(4, -1, *whole.shape[1:]), whole.shape[1:]
+    found = np.asarray(query_spectra(query, config=SMALL)).swapaxes(1, 2)
+    inside = np.s_[..., np.arange(size) != size // 2, : width - 1]  # the highest frequency stands for its opposite, too
+    np.testing.assert_allclose(found[inside], whole[:2][inside], atol=1e-3)
+    np.testing.assert_allclose(found.conj()[inside], whole[2:][inside], atol=1e-3)
+    np.testing.assert_allclose(abs(found), abs(whole[:2]), atol=1e-3)
+
+
+def test_the_lower_half_of_a_spectrum_is_that_of_larger_cells():
+    """Of an image without high frequencies, up to a factor: the power is 1 for both."""
+    size, cell_m = 40, SMALL.resolution_m * SMALL.coarse
+    down, right = (np.arange(size) - (size - 1) / 2) * cell_m, (np.arange(size // 2) - (size // 2 - 1) / 2) * 2 * cell_m
+
+    def waves(at: np.ndarray) -> jnp.ndarray:
+        angle = 2 * np.pi / (size * cell_m) * at
+        return jnp.asarray(np.cos(3 * angle[:, None] + 0.4) + np.sin(2 * angle[None] + 5 * angle[:, None]))
+
+    here = VerificationConfig(reach_m=12.8, max_shift_m=0.0)
+    wide = VerificationConfig(reach_m=12.8, max_shift_m=0.0, blur_m=2 * here.blur_m, wide_blur_m=2 * here.wide_blur_m)
+    expected = spectrum(waves(right)[None], 2 * cell_m, wide)
+    np.testing.assert_allclose(lower_half(spectrum(waves(down)[None], cell_m, here), here), expected, atol=1e-4)
+
+
+def test_a_pose_near_an_expected_one_is_found_beside_the_best_one():
+    query, match = seen_from(place(1), (0.7, -0.5, 2.0)), seen_from(place(1), (0.0, 0.0, 0.0))
+    spectra, there = query_spectra(query, config=SMALL), match_spectra(match[None], config=SMALL)
+    best = search(query, match[None], config=SMALL).one(0)
+    unknown = search_near(spectra, there[0], np.full(3, np.nan), config=SMALL)
+    right = search_near(spectra, there[0], np.stack([best.x + 1, best.y - 1, best.yaw]), config=SMALL)
+    np.testing.assert_allclose(np.stack(unknown), np.stack(best)[:, None].repeat(2, 1), atol=1e-5)
+    np.testing.assert_allclose(np.stack(right), np.stack(best)[:, None].repeat(2, 1), atol=1e-5)
+    wrong = search_near(spectra, there[0], np.array([-2.0, 2.0, best.yaw + np.pi], np.float32), config=SMALL)
+    assert wrong.correlation[0] == pytest.approx(float(best.correlation), abs=1e-5)
+    assert wrong.correlation[1] < wrong.correlation[0] and np.hypot(wrong.x[1] + 2, wrong.y[1] - 2) < 3.5
+
+
+def test_matches_beyond_the_count_are_not_searched():
+    query = query_spectra(seen_from(place(1), (0.7, -0.5, 2.0)), config=SMALL)
+    matches = match_spectra(np.stack([seen_from(place(k), (0.0, 0.0, 0.0)) for k in (1, 2, 3)]), config=SMALL)
+    whole, part = (jax.device_get(search_spectra(query, matches, count, config=SMALL)) for count in (None, 2))
+    for values, some in zip(whole, part, strict=True):
+        np.testing.assert_allclose(some, [*values[:2], 0.0], atol=1e-6)
+
+
+def test_rotations_are_whole_quarter_turns():
+    with pytest.raises(ValueError, match="expected turns to be a multiple of 4, found 70"):
+        VerificationConfig(turns=70)
