@@ -15,6 +15,7 @@ FLOORS = (
         "fields",
         "files",
         "grid",
+        "frame_log",
         "growing",
         "labels",
         "losses",

@@ -1,11 +1,11 @@
-"""Publisher of scans and odometry on topics of ROS, for `live_dds`, `live_zenoh` and `live_ros1`."""
+"""Publisher of scans and odometry on topics of ROS, for `live_dds` and `live_zenoh`."""
 
 from collections.abc import Callable
 
 import numpy as np
 
+from sglpr_jax.live.ros import Transport
 from sglpr_jax.live.ros_messages import CLOUD, TRANSFORMS, encode, transform_message, typestore
-from sglpr_jax.live.ros_wire import Wire
 
 
 class RosPublisher:
@@ -13,10 +13,10 @@ class RosPublisher:
 
     flags = ("--topic", "/points", "--odometry-topic", "/odometry")
 
-    def __init__(self, connect: Callable[[], Wire]):
+    def __init__(self, connect: Callable[[], Transport]):
         """`connect` opens the connection with the first scan. Scans before the subscription finds it are lost."""
         self._connect = connect
-        self._wire: Wire | None = None
+        self._wire: Transport | None = None
 
     def put(self, points: np.ndarray, world_from_lidar: np.ndarray, stamp: float) -> None:
         """Publish a scan with its odometry at a time in seconds since 1970."""

@@ -5,9 +5,9 @@ import os
 import tempfile
 
 from benchmarks.speed.live_ros import RosPublisher
-from sglpr_jax.live.report import Reports
-from sglpr_jax.live.ros_wire import domain_of
-from sglpr_jax.live.zenoh_wire import ZenohWire
+from sglpr_jax.live.messages import Reports
+from sglpr_jax.live.ros import domain_of
+from sglpr_jax.live.zenoh import ZenohTransport
 
 
 def publisher(where: str) -> RosPublisher:
@@ -15,10 +15,10 @@ def publisher(where: str) -> RosPublisher:
     return RosPublisher(lambda: _listening(where))
 
 
-def _listening(endpoint: str) -> ZenohWire:
+def _listening(endpoint: str) -> ZenohTransport:
     config = {"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
     with tempfile.NamedTemporaryFile("w", suffix=".json5") as file:
         json.dump(config, file)
         file.flush()
         os.environ["ZENOH_SESSION_CONFIG_URI"] = file.name
-        return ZenohWire("", domain_of("", source="zenoh"), Reports())
+        return ZenohTransport("", domain_of("", source="zenoh"), Reports())

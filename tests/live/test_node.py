@@ -1,15 +1,16 @@
 """The node lives on, whatever a scan, a sink or the odometry does, and hands on what the map finds."""
 
 import json
+import threading
 
 import numpy as np
 import pytest
 
 from sglpr_jax.data.recording import Record
-from sglpr_jax.live.frame import FrameStatus, LiveFrame, LoopEdge
+from sglpr_jax.live.endpoints import SinkOptions, open_sink
 from sglpr_jax.live.live_map import LiveMap
+from sglpr_jax.live.messages import AGAIN_S, FrameStatus, Latest, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.node import Node
-from sglpr_jax.live.sinks import SinkOptions, open_sink
 
 EDGE = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, np.eye(4), None, 0.01)
 
@@ -96,6 +97,31 @@ def test_a_node_stops_when_it_is_asked(frame, said):
     node = Node(FakeMap(), [], report=said, say=print)
     node.run(Frames(frame), should_stop=lambda: True)
     assert node.scans == 1
+
+
+def test_a_newer_item_replaces_one_that_waits():
+    latest = Latest()
+    assert latest.take(0.0) is None
+    for item in range(3):
+        latest.put(item)
+    assert latest.take(0.0) == 2 and latest.dropped == 2 and latest.take(0.0) is None
+
+
+def test_a_waiting_reader_is_woken():
+    latest = Latest()
+    threading.Timer(0.05, latest.put, ["new"]).start()
+    assert latest.take(5.0) == "new"
+
+
+def test_equal_kinds_share_a_line():
+    lines, now = [], [0.0]
+    report = Reports(lines.append, clock=lambda: now[0])
+    for i in range(5):
+        report("a", f"a{i}")
+        report("b", f"b{i}") if i == 3 else None
+    now[0] = AGAIN_S
+    report("a", "a5")
+    assert lines == ["a0", "b3", "a5 (4 more since the last line)"] and report.counts == {"a": 6, "b": 1}
 
 
 def test_results_are_lines_of_json(tmp_path, said):

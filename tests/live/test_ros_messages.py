@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.live.frame import LoopEdge
+from sglpr_jax.live.messages import LoopEdge
 from sglpr_jax.live.ros_messages import (
     CLOUD,
     EDGE,

@@ -1,45 +1,14 @@
-"""The small parts of the node: a queue of one, reports, times, continuity of odometry, and the mounting."""
-
-import threading
+"""Times of a live map never go back, odometry continues only if it can, and the mounting is that of the first scans."""
 
 import numpy as np
 import pytest
 
-from sglpr_jax.live.clock import Clock
-from sglpr_jax.live.continuity import HOLD_S, WAIT_S, Continuity
-from sglpr_jax.live.latest import Latest
-from sglpr_jax.live.mounting import SCANS, FirstScans
-from sglpr_jax.live.report import AGAIN_S, Reports
+from sglpr_jax.live.odometry_input import HOLD_S, SCANS, WAIT_S, Clock, Continuity, FirstScans
 from sglpr_jax.se3 import transform
 
 
 def at(x: float, y: float = 0.0) -> np.ndarray:
     return transform(float(x), float(y), 0.0)
-
-
-def test_a_newer_item_replaces_one_that_waits():
-    latest = Latest()
-    assert latest.take(0.0) is None
-    for item in range(3):
-        latest.put(item)
-    assert latest.take(0.0) == 2 and latest.dropped == 2 and latest.take(0.0) is None
-
-
-def test_a_waiting_reader_is_woken():
-    latest = Latest()
-    threading.Timer(0.05, latest.put, ["new"]).start()
-    assert latest.take(5.0) == "new"
-
-
-def test_equal_kinds_share_a_line():
-    lines, now = [], [0.0]
-    report = Reports(lines.append, clock=lambda: now[0])
-    for i in range(5):
-        report("a", f"a{i}")
-        report("b", f"b{i}") if i == 3 else None
-    now[0] = AGAIN_S
-    report("a", "a5")
-    assert lines == ["a0", "b3", "a5 (4 more since the last line)"] and report.counts == {"a": 6, "b": 1}
 
 
 def times(clock: Clock, stamps, received=None) -> list[float]:

@@ -1,4 +1,4 @@
-"""Scans come from a growing folder and from a bag once each, in order, with their times and poses."""
+"""Scans come from a growing folder once each, in order, with their times and poses."""
 
 import os
 import time
@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.live.sinks import SinkOptions, open_sink
-from sglpr_jax.live.sources import SourceOptions, folder, open_source
-from sglpr_jax.live.sources.growing_poses import GrowingPoses
+from sglpr_jax.live import folder
+from sglpr_jax.live.endpoints import SourceOptions, open_source
+from sglpr_jax.live.folder import GrowingPoses
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import transform
-from tests.bags import CLOUD, cloud, header, typestore, write_bag
 
 POINTS = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
 STAMP = 1_700_000_000.0
@@ -111,70 +110,3 @@ def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
     assert found.of(2, None)[0, 3] == 2 and found.of(0, None)[0, 3] == 0
     with pytest.raises(ValueError, match="pass --pose-format kitti or lidar"):
         GrowingPoses(path, "auto", "auto").look()
-
-
-def odometry(seconds: float, x: float):
-    store = typestore("ros2").types
-
-    def of(name: str, **fields):
-        return store[f"geometry_msgs/msg/{name}"](**fields)
-
-    turn = of("Quaternion", x=0.0, y=0.0, z=float(np.sin(x / 20)), w=float(np.cos(x / 20)))
-    pose = of("Pose", position=of("Point", x=x, y=0.0, z=0.0), orientation=turn)
-    return of("PoseStamped", header=header("ros2", seconds, "odom"), pose=pose)
-
-
-@pytest.fixture
-def bag(tmp_path):
-    """Ten clouds at 20 Hz, with poses."""
-    messages = []
-    for i in range(10):
-        at = STAMP + 0.05 * i
-        messages += [("/points", CLOUD, at, cloud("ros2", at, POINTS + i))]
-        messages += [("/odom", "geometry_msgs/msg/PoseStamped", at, odometry(at, float(i)))]
-    return write_bag(tmp_path / "drive", "ros2", messages)
-
-
-def test_a_bag_is_replayed_as_fast_as_possible(bag, said):
-    options = SourceOptions(rate=0.0, sensor_height=1.5, odometry_topic="/odom")
-    frames = list(open_source(f"bag:{bag}", options, said).frames())
-    np.testing.assert_allclose([frame.time for frame in frames], STAMP + 0.05 * np.arange(10))
-    assert [frame.odometry[0, 3] for frame in frames] == pytest.approx(range(10), abs=1e-6)
-    assert frames[3].record.mounting.height_m == 1.5 and frames[3].record.name.endswith("scan 000003")
-    known = {frames[3].record.name, frames[6].record.name}
-    rest = open_source(f"bag:{bag}", SourceOptions(rate=0.0, taken=known.__contains__), said)
-    assert [frame.time for frame in rest.frames()] == [frame.time for frame in frames[7:]]
-
-
-def test_a_bag_is_replayed_at_its_own_pace_and_drops_what_is_late(bag, said):
-    source = open_source(f"bag:{bag}", SourceOptions(), said)
-    begin, found = time.monotonic(), []
-    for frame in source.frames():
-        if frame is not None:
-            found.append(frame)
-            time.sleep(0.11)
-    assert time.monotonic() - begin > 0.45 and source.dropped > 0
-    assert len(found) + source.dropped == 10 and found[-1].time == pytest.approx(STAMP + 0.45)
-    assert found[0].odometry is None
-
-
-@pytest.mark.parametrize("text", ["", "ros", "folders:x"])
-def test_an_unknown_source_or_sink_is_refused(text, said):
-    with pytest.raises(ValueError, match="expected one of the sources folder, bag, dds, zenoh, ros1, found"):
-        open_source(text, SourceOptions(), said)
-    with pytest.raises(ValueError, match="expected one of the sinks json, dds, zenoh, ros1, rerun, found"):
-        open_sink(text, SinkOptions(), said)
-
-
-def test_a_missing_folder_topic_and_extra_are_named(bag, tmp_path, said, monkeypatch):
-    with pytest.raises(FileNotFoundError, match=r"folder:.*: expected a folder"):
-        open_source(f"folder:{tmp_path}/none", SourceOptions(), said)
-    with pytest.raises(ValueError, match=r"/other"):
-        open_source(f"bag:{bag}", SourceOptions(odometry_topic="/other"), said)
-    monkeypatch.setattr("sglpr_jax.live.sources.importlib.import_module", missing)
-    with pytest.raises(ImportError, match=r"dds: expected the package cyclonedds, found none; pip install .*\[live\]"):
-        open_source("dds", SourceOptions(), said)
-
-
-def missing(name: str):
-    raise ModuleNotFoundError("No module named 'cyclonedds'", name="cyclonedds")

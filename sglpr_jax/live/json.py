@@ -11,9 +11,8 @@ from typing import IO, Any
 import numpy as np
 
 from sglpr_jax.files import writing
-from sglpr_jax.live.frame import FrameStatus, LoopEdge
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.sinks import SinkOptions
+from sglpr_jax.live.endpoints import SinkOptions
+from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
 
 
 class JsonLines:

@@ -22,9 +22,10 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.ros_messages import typestore
-from sglpr_jax.live.ros_wire import Receive, Received, ros_type, wire_type
+from sglpr_jax.live.endpoints import SinkOptions, SourceOptions
+from sglpr_jax.live.messages import Report
+from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
+from sglpr_jax.live.ros_messages import Received, typestore
 
 PREFIX = "rt"
 """Beginning of the names of ROS 2 topics on the wire. Services have others."""
@@ -53,8 +54,8 @@ class _Reader(NamedTuple):
     depth: int
 
 
-class DdsWire:
-    """Participant of a DDS domain. A thread takes the messages. See `ros_wire.Wire`."""
+class DdsTransport:
+    """Participant of a DDS domain. A thread takes the messages. See `ros.Transport`."""
 
     def __init__(self, domain: int, report: Report):
         """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2.
@@ -236,3 +237,13 @@ def _field(node: Any, of: Any) -> Any:
         return _inner_type(of)
     (inner, count) = of
     return types.array[_field(*inner), count] if node.name == "ARRAY" else types.sequence[_field(*inner)]
+
+
+def open_source(where: str, options: SourceOptions, report: Report) -> RosSource:
+    """Open the source `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
+    return RosSource(DdsTransport(domain_of(where, source="dds"), report), options, report)
+
+
+def open_sink(where: str, options: SinkOptions, report: Report) -> RosSink:
+    """Open the sink `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
+    return RosSink(DdsTransport(domain_of(where, source="dds"), report), options)

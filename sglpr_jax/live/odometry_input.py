@@ -1,13 +1,21 @@
-"""Odometry of a live map: whether the pose of a scan continues the trajectory, and what to do without one."""
+"""Input of a live map: time, sensor mounting and odometry of each scan, whatever the headers and the robot do."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
-from sglpr_jax.live.report import Report
+from sglpr_jax.data.choices import SensorHeight
+from sglpr_jax.data.mounting import Mounting, common_mounting, estimate_mounting
+from sglpr_jax.live.messages import Report
 from sglpr_jax.se3 import inverse
 
+JUMP_S = 60.0
+"""Minimum step of the headers' times beyond the time that has passed that counts as a change of the clock, in
+seconds."""
+SCANS = 11
+"""Number of scans from which the mounting is estimated."""
 FASTEST_M_PER_S, SLACK_M = 60.0, 1.0
 """Maximum speed of a vehicle, and an additional distance between two scans, in metres."""
 RESTART_S = 60.0
@@ -106,3 +114,75 @@ class Continuity:
         reset = float(np.linalg.norm(pose[:3, 3])) < RESET_M and moved > 5 * RESET_M
         near = moved <= SLACK_M + FASTEST_M_PER_S * passed
         return near and not reset and (not resumed or passed <= RESTART_S)
+
+
+class Clock:
+    """Adds an offset to the times of the headers. The offset changes when the clock of the sensor changes.
+
+    Scans without a time, and the first scan after a change, get the time at which they arrived.
+    """
+
+    def __init__(self, report: Report):
+        self._report = report
+        self._offset = 0.0
+        self._last: float | None = None
+        self._received = 0.0
+
+    def resume(self, time: float, stamp: float, *, received: float) -> None:
+        """Continue after a scan of an earlier process.
+
+        Arguments:
+          time: Time of the last scan by this clock, in seconds.
+          stamp: Time of its header.
+          received: Time at which it arrived, by `time.monotonic()` of this process.
+        """
+        self._last, self._received = time, received
+        self._offset = time - stamp if _is_time(stamp) else 0.0
+
+    def time(self, stamp: float, received: float) -> float:
+        """Return the time of the next scan, in seconds, which is not before that of the previous one.
+
+        Arguments:
+          stamp: Time of the header, in seconds.
+          received: Time at which the scan arrived, by `time.monotonic()`.
+        """
+        passed = max(received - self._received, 0.0)
+        expected = received if self._last is None else self._last + passed
+        found = stamp + self._offset
+        if not _is_time(stamp):
+            self._report("time", f"expected the time of a scan in its header, found {stamp:g}; its arrival is used")
+            found = expected
+        elif self._last is not None and not self._last <= found <= expected + JUMP_S:
+            self._report(
+                "clock",
+                f"expected a scan about {passed:.1f} s after the last one, found {found - self._last:+.1f} s in its "
+                "header; from now on times are counted from its arrival",
+            )
+            self._offset = expected - stamp
+            found = expected
+        self._last, self._received = found, received
+        return found
+
+
+def _is_time(stamp: float) -> bool:
+    return math.isfinite(stamp) and stamp > 0
+
+
+class FirstScans:
+    """Estimates the mounting from the ground in the first scans. Then it is fixed."""
+
+    def __init__(self, height: SensorHeight = "auto", *, known: Mounting | None = None):
+        """Begin with the height that the user gave, in metres, or with the mounting of an earlier process."""
+        given = None if isinstance(height, str) else Mounting(float(height))
+        self.mounting = known or given
+        """Mounting found by now, or None if the scans do not show the ground."""
+        self._fixed = self.mounting is not None
+        self._found: list[Mounting | None] = []
+
+    def see(self, points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
+        """Return the mounting at the next scan."""
+        if not self._fixed:
+            self._found.append(estimate_mounting(points))
+            self.mounting = common_mounting(self._found)
+            self._fixed = len(self._found) >= SCANS
+        return self.mounting

@@ -1,6 +1,7 @@
-"""Sources of scans, one module each. A module is imported when its source is asked for.
+"""Sources of scans and sinks of loops, by name. The module of a name is imported when it is asked for.
 
-A module has the function `open_source(where, options, report)`. To support a new source, add a module and its name.
+The module `live/NAME.py` has the function `open_source(where, options, report)`, `open_sink(where, options, report)` or
+both. To support another source or sink, add a module and its name.
 """
 
 import dataclasses
@@ -11,11 +12,11 @@ from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
-from sglpr_jax.live.frame import LiveFrame
-from sglpr_jax.live.report import Report
+from sglpr_jax.live.messages import FrameStatus, LiveFrame, LoopEdge, Report
 
-SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live", "ros1": "live"}
-"""Names of the sources, with the extra that each needs."""
+SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
+SINKS = {"json": None, "dds": "live", "zenoh": "live", "rerun": "view"}
+"""Names of sources and sinks, with the extra that each needs."""
 WAIT_S = 0.2
 """Maximum time that `Source.frames` blocks before it yields None, in seconds."""
 
@@ -39,12 +40,29 @@ class Source(Protocol):
         ...
 
 
+@runtime_checkable
+class Sink(Protocol):
+    """Receiver of results. A sink that raises an error is reported once and left out."""
+
+    def frame(self, status: FrameStatus) -> None:
+        """Receive the status after a scan."""
+        ...
+
+    def loop(self, edge: LoopEdge) -> None:
+        """Receive a loop. It is on disk before."""
+        ...
+
+    def close(self) -> None:
+        """Release files and connections."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True)
 class SourceOptions:
     """Options of all sources. Each source uses those that apply to it."""
 
     topic: str | None = None
-    """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh, ros1)."""
+    """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh)."""
     odometry_topic: str | None = None
     """Topic of the odometry (Odometry or tf). None: no odometry, except that of a bag's own poses."""
     reliable: bool = False
@@ -64,6 +82,17 @@ class SourceOptions:
     """Whether a scan with this `Record.name` is in the map already."""
 
 
+@dataclasses.dataclass(frozen=True)
+class SinkOptions:
+    """Options of all sinks. Each sink uses those that apply to it."""
+
+    prefix: str = "/sglpr"
+    """Beginning of the names of published topics."""
+    map_frame: str = "map"
+    odometry_frame: str = "odom"
+    """Frames of the published transform and markers."""
+
+
 def open_source(text: str, options: SourceOptions, report: Report) -> Source:
     """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
 
@@ -77,7 +106,23 @@ def open_source(text: str, options: SourceOptions, report: Report) -> Source:
       ImportError: If the extra of the source is not installed.
     """
     name, where = check_name(text, SOURCES, kind="sources")
-    return module_of(name, SOURCES, kind="sources").open_source(where, options, report)
+    return _module(name, SOURCES[name]).open_source(where, options, report)
+
+
+def open_sink(text: str, options: SinkOptions, report: Report) -> Sink:
+    """Open the sink that a text names: `NAME` or `NAME:WHERE`, such as `json:loops.jsonl`.
+
+    Arguments:
+      text: Name of the sink and, after a colon, its file, domain or endpoint.
+      options: Options of the sink.
+      report: Function for trouble with single messages.
+
+    Raises:
+      ValueError: If no sink has this name.
+      ImportError: If the extra of the sink is not installed.
+    """
+    name, where = check_name(text, SINKS, kind="sinks")
+    return _module(name, SINKS[name]).open_sink(where, options, report)
 
 
 def check_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str]:
@@ -88,13 +133,13 @@ def check_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[s
     return name, where
 
 
-def module_of(name: str, known: dict[str, str | None], *, kind: str) -> ModuleType:
+def _module(name: str, extra: str | None) -> ModuleType:
     """Import the module of a source or sink. Raises ImportError, which names the extra, if a package is missing."""
     try:
-        return importlib.import_module(f"sglpr_jax.live.{kind}.{name}")
+        return importlib.import_module(f"sglpr_jax.live.{name}")
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.startswith("sglpr_jax"):
             raise
         raise ImportError(
-            f"{name}: expected the package {error.name}, found none; pip install 'sglpr-jax[{known[name]}]'"
+            f"{name}: expected the package {error.name}, found none; pip install 'sglpr-jax[{extra}]'"
         ) from error

@@ -6,18 +6,15 @@ import time as clock
 import numpy as np
 import pytest
 
-from sglpr_jax.live.frame import FrameStatus, LoopEdge
+from sglpr_jax.live.endpoints import SinkOptions, SourceOptions
+from sglpr_jax.live.messages import FrameStatus, LoopEdge
+from sglpr_jax.live.ros import TAKEN_OVER_S, RosSink, RosSource, domain_of, ros_type, wire_type
 from sglpr_jax.live.ros_messages import CLOUD, EDGE, MARKERS, TRANSFORMS
-from sglpr_jax.live.ros_sink import RosSink
-from sglpr_jax.live.ros_source import TAKEN_OVER_S, RosSource
-from sglpr_jax.live.ros_wire import domain_of, ros_type, wire_type
-from sglpr_jax.live.sinks import SinkOptions
-from sglpr_jax.live.sources import SourceOptions
-from tests.live.messages import LIVOX, ODOMETRY, POINTS, Said, cloud, decoded, livox, odometry, received
+from tests.live.messages import LIVOX, ODOMETRY, POINTS, cloud, decoded, livox, odometry, received
 
 
 class Memory:
-    """A `Wire` without a network."""
+    """A `Transport` without a network."""
 
     def __init__(self):
         self.topics: dict[str, set[str]] = {}
@@ -37,25 +34,20 @@ class Memory:
 
 
 @pytest.fixture
-def said() -> Said:
-    return Said()
-
-
-@pytest.fixture
-def wire() -> Memory:
+def transport() -> Memory:
     return Memory()
 
 
 @pytest.fixture
-def source(wire, said) -> RosSource:
-    return RosSource(wire, SourceOptions(topic="points", odometry_topic="/odom"), said, missing_s=0.0)
+def source(transport, said) -> RosSource:
+    return RosSource(transport, SourceOptions(topic="points", odometry_topic="/odom"), said, missing_s=0.0)
 
 
-def test_a_scan_has_points_time_and_pose(wire, source, said):
+def test_a_scan_has_points_time_and_pose(transport, source, said):
     for seconds in (12.4, 12.6):
         message = odometry(seconds, (seconds, 0, 0), child="lidar")
-        wire.receive["/odom"](received(ODOMETRY, message, at=clock.monotonic()))
-    wire.receive["/points"](received(CLOUD, cloud(12.5), at=3.0))
+        transport.receive["/odom"](received(ODOMETRY, message, at=clock.monotonic()))
+    transport.receive["/points"](received(CLOUD, cloud(12.5), at=3.0))
     frame = next(source.frames())
     np.testing.assert_array_equal(frame.record.points, POINTS)
     assert (frame.time, frame.received, frame.record.name) == (12.5, 3.0, "")
@@ -63,23 +55,23 @@ def test_a_scan_has_points_time_and_pose(wire, source, said):
     assert not said
 
 
-def test_of_two_scans_the_newer_one_is_taken(wire, source):
+def test_of_two_scans_the_newer_one_is_taken(transport, source):
     for seconds, message in ((1.0, cloud), (2.0, livox)):
         kind = LIVOX if message is livox else CLOUD
-        wire.receive["/points"](received(kind, message(seconds)))
+        transport.receive["/points"](received(kind, message(seconds)))
     assert next(source.frames()).time == 2.0 and source.dropped == 1
 
 
-def test_an_invalid_cloud_is_reported_and_the_next_one_taken(wire, source, said):
-    wire.receive["/points"](received(CLOUD, cloud()[:50]))
+def test_an_invalid_cloud_is_reported_and_the_next_one_taken(transport, source, said):
+    transport.receive["/points"](received(CLOUD, cloud()[:50]))
     frames = source.frames()
     assert next(frames) is None
-    assert said["cloud"][0].startswith("/points: expected a cloud with points, found an invalid one (")
-    wire.receive["/points"](received(CLOUD, cloud()))
+    assert said.of("cloud")[0].startswith("/points: expected a cloud with points, found an invalid one (")
+    transport.receive["/points"](received(CLOUD, cloud()))
     assert next(frames) is not None
 
 
-def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(wire, source, said):
+def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(transport, source, said):
     frames = source.frames()
     for publisher, at, taken in (
         ("a", 1.0, True),
@@ -87,9 +79,9 @@ def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(wire
         ("a", 1.2, True),
         ("b", 1.3 + TAKEN_OVER_S, True),
     ):
-        wire.receive["/points"](received(CLOUD, cloud(at), publisher=publisher, at=at))
+        transport.receive["/points"](received(CLOUD, cloud(at), publisher=publisher, at=at))
         assert (next(frames) is not None) == taken
-    assert said["publishers"] == ["/points: expected one publisher, found several; the scans of the first are used"]
+    assert said.of("publishers") == ["/points: expected one publisher, found several; the scans of the first are used"]
 
 
 @pytest.mark.parametrize(
@@ -101,15 +93,15 @@ def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(wire
         ({"/points": {CLOUD}}, "silent", "found a publisher but no message for 0 s; waiting"),
     ],
 )
-def test_a_topic_that_does_not_come_is_reported(wire, source, said, topics, kind, found):
-    wire.topics = topics
+def test_a_topic_that_does_not_come_is_reported(transport, source, said, topics, kind, found):
+    transport.topics = topics
     assert list(itertools.islice(source.frames(), 1)) == [None]
-    assert said[kind][0].startswith(f"/points: expected {CLOUD} or {LIVOX}, ") and found in said[kind][0]
+    assert said.of(kind)[0].startswith(f"/points: expected {CLOUD} or {LIVOX}, ") and found in said.of(kind)[0]
 
 
-def test_a_closed_source_ends(wire, source):
+def test_a_closed_source_ends(transport, source):
     source.close()
-    assert list(source.frames()) == [] and wire.closed
+    assert list(source.frames()) == [] and transport.closed
 
 
 def moved(x: float, y: float = 0.0) -> np.ndarray:
@@ -128,38 +120,38 @@ def status(time: float = 50.0, map_from_world: np.ndarray | None = None) -> Fram
     return FrameStatus(4, time, 0.01, 0.02, 0, 5, 100, map_from_world)
 
 
-def sent(wire: Memory, kind: str) -> list:
-    return [message for _, one, message in wire.sent if one == kind]
+def sent(transport: Memory, kind: str) -> list:
+    return [message for _, one, message in transport.sent if one == kind]
 
 
-def test_an_edge_is_published_and_drawn(wire):
-    sink = RosSink(wire, SinkOptions())
+def test_an_edge_is_published_and_drawn(transport):
+    sink = RosSink(transport, SinkOptions())
     sink.loop(edge(80, 2, moved(9, 1), moved(0), moved(0.5)))
-    assert {topic for topic, *_ in wire.sent} == {"/sglpr/loops", "/sglpr/loop_markers"}
-    ends = sent(wire, MARKERS)[-1].markers[0].points
+    assert {topic for topic, *_ in transport.sent} == {"/sglpr/loops", "/sglpr/loop_markers"}
+    ends = sent(transport, MARKERS)[-1].markers[0].points
     assert [(one.x, one.y) for one in ends] == [(0, 0), (9, 1)]
 
 
-def test_the_correction_of_the_odometry_is_published(wire):
-    sink = RosSink(wire, SinkOptions())
+def test_the_correction_of_the_odometry_is_published(transport):
+    sink = RosSink(transport, SinkOptions())
     sink.frame(status())
-    assert wire.sent == []
+    assert transport.sent == []
     sink.frame(status(map_from_world=moved(-8.5, -1)))
-    found = sent(wire, TRANSFORMS)[-1].transforms[0]
+    found = sent(transport, TRANSFORMS)[-1].transforms[0]
     assert (found.header.frame_id, found.child_frame_id, found.header.stamp.sec) == ("map", "odom", 50)
     assert (found.transform.translation.x, found.transform.translation.y) == (-8.5, -1)
 
 
-def test_an_edge_to_another_odometry_is_published_only(wire):
-    sink = RosSink(wire, SinkOptions())
+def test_an_edge_to_another_odometry_is_published_only(transport):
+    sink = RosSink(transport, SinkOptions())
     sink.loop(edge(80, 2, moved(9), None, moved(0.5)))
-    assert len(sent(wire, EDGE)) == 1 and not sent(wire, MARKERS)
+    assert len(sent(transport, EDGE)) == 1 and not sent(transport, MARKERS)
 
 
 @pytest.mark.parametrize("time", [0.0, float("nan")])
-def test_the_transform_of_a_scan_without_time_has_the_present_one(wire, time):
-    RosSink(wire, SinkOptions()).frame(status(time, np.eye(4)))
-    assert sent(wire, TRANSFORMS)[0].transforms[0].header.stamp.sec > 1e9
+def test_the_transform_of_a_scan_without_time_has_the_present_one(transport, time):
+    RosSink(transport, SinkOptions()).frame(status(time, np.eye(4)))
+    assert sent(transport, TRANSFORMS)[0].transforms[0].header.stamp.sec > 1e9
 
 
 def test_names_of_types():

@@ -8,10 +8,8 @@ from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.live.frame import LiveFrame
-from sglpr_jax.live.latest import Latest
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.sources import WAIT_S, SourceOptions
+from sglpr_jax.live.endpoints import WAIT_S, SourceOptions
+from sglpr_jax.live.messages import Latest, LiveFrame, Report
 
 
 class BagSource:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import check_writable, writing
-from sglpr_jax.live.frame import FrameStatus, LoopEdge
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.sinks import SinkOptions
+from sglpr_jax.live.endpoints import SinkOptions
+from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
 
 os.environ.setdefault("RUST_LOG", "off")  # read by the import; the node has its own line for a lost viewer
 import rerun
@@ -28,7 +27,7 @@ LINE = (60, 180, 75)
 
 
 class RerunSink:
-    """Draws loops and plots the status. See `sinks.Sink`.
+    """Draws loops and plots the status. See `endpoints.Sink`.
 
     A loop with odometry of both scans is a line between their positions. Every loop is a line of text with its
     probability. The time lines are `frame` and, if scans have times, `time`.

@@ -8,12 +8,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rosidl_runtime_py.utilities import get_message
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.ros_wire import Receive, Received
+from sglpr_jax.live.messages import Report
+from sglpr_jax.live.ros import Receive
+from sglpr_jax.live.ros_messages import Received
 
 
-class RclpyWire:
-    """Subscriptions and publishers of a node. See `sglpr_jax.live.ros_wire.Wire`.
+class RclpyTransport:
+    """Subscriptions and publishers of a node. See `sglpr_jax.live.ros.Transport`.
 
     rclpy does not tell the publishers of a topic apart.
     """

@@ -29,9 +29,10 @@ from zenoh.ext import (
 )
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.ros_messages import typestore
-from sglpr_jax.live.ros_wire import Receive, Received, ros_type, wire_type
+from sglpr_jax.live.endpoints import SinkOptions, SourceOptions
+from sglpr_jax.live.messages import Report
+from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
+from sglpr_jax.live.ros_messages import Received, typestore
 
 ROUTER = "tcp/localhost:7447"
 """Endpoint of rmw_zenoh's router."""
@@ -43,8 +44,8 @@ ANSWER_S = 1.0
 """Maximum time for answers about publishers, in seconds."""
 
 
-class ZenohWire:
-    """Session of zenoh. See `ros_wire.Wire`."""
+class ZenohTransport:
+    """Session of zenoh. See `ros.Transport`."""
 
     def __init__(self, endpoint: str, domain: int, report: Report):
         """Open a session.
@@ -153,3 +154,13 @@ def _config(endpoint: str) -> zenoh.Config:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def open_source(where: str, options: SourceOptions, report: Report) -> RosSource:
+    """Open the source `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
+    return RosSource(ZenohTransport(where, domain_of("", source="zenoh"), report), options, report)
+
+
+def open_sink(where: str, options: SinkOptions, report: Report) -> RosSink:
+    """Open the sink `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
+    return RosSink(ZenohTransport(where, domain_of("", source="zenoh"), report), options)
