@@ -17,7 +17,6 @@ INPUTS_NOT_OPTIONS = {
     ("open_recording", "name"),
     ("describe", "labels"),
     ("forward", "labels"),
-    ("nearest", "database"),
     ("evaluate", "protocols"),
     ("taxonomy", "categories"),
 }

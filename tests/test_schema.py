@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.schema import Column, check_about, check_columns, check_texts
+from sglpr_jax.schema import Column, check_about, check_columns
 
 COLUMNS = {"rows": Column("float32", ("n", "width")), "times": Column("float64", ("n",), optional=True)}
 ROWS = np.ones((3, 2), np.float32)
@@ -47,12 +47,3 @@ def test_a_value_that_does_not_fit_is_named(about, message):
     check_about({"format": "mine 1", "width": 4, "more": []}, {"width": int}, format="mine 1")
     with pytest.raises(ValueError, match=message):
         check_about(about, {"width": int}, format="mine 1")
-
-
-def test_names_are_strings_and_as_many_as_places():
-    check_texts(["a", "b"], name="ids", count=2)
-    for values in ("ab", ["a", 1], None, {"a": 1}):
-        with pytest.raises(ValueError, match="expected `ids` as a list of strings, found"):
-            check_texts(values, name="ids")
-    with pytest.raises(ValueError, match="expected 3 `ids`, found 2"):
-        check_texts(["a", "b"], name="ids", count=3)

@@ -16,10 +16,10 @@ import tyro
 
 import sglpr_jax
 from benchmarks.fleet.embed import local_copy
+from benchmarks.fleet.overlaps import overlaps
 from sglpr_jax.files import replacing
 from sglpr_jax.pose_graph.folder import write_several
 from sglpr_jax.retrieval.fleet_index import FleetIndex
-from sglpr_jax.retrieval.overlaps import overlaps
 from sglpr_jax.retrieval.parquet import read_places, stored_places
 
 

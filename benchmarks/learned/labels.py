@@ -24,7 +24,7 @@ from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Record
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import to_raw
-from sglpr_jax.retrieval.semantic_maps import semantic_map
+from sglpr_jax.retrieval.image_maps import semantic_map
 
 BUILDING = 50
 """The label of all points without labels: raw id of SemanticKITTI."""

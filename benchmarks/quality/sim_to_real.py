@@ -25,7 +25,7 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.retrieval.embed import embed
-from sglpr_jax.retrieval.semantic_maps import SemanticMap, semantic_map
+from sglpr_jax.retrieval.image_maps import SemanticMap, semantic_map
 
 ROTATION_SEED = 0
 

@@ -25,7 +25,6 @@ from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index import Index
-from sglpr_jax.retrieval.nearest import nearest
 
 WIDTH = 256
 """Numbers of a descriptor."""
@@ -112,7 +111,8 @@ def asking(n: int) -> Job:
 def searching(n: int) -> Job:
     names = tuple(map(str, range(n)))
     file = DescriptorFile("08", names, None, None, descriptors(n), pose_source=None, config={}, weights_hash="")
-    return lambda: nearest(file)
+    index = Index.of(file)
+    return lambda: index.query(file.descriptors)
 
 
 def descriptors(n: int) -> np.ndarray:

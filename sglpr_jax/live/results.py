@@ -1,11 +1,14 @@
 """Results of a live map: the trajectory that its loops correct after each scan, and files for other programs."""
 
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.files import write_all
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.messages import Report
 from sglpr_jax.pose_graph.files import write_joint_g2o, write_loops_csv, write_rejected_jsonl, write_tum
@@ -70,15 +73,14 @@ def write_results(live: LiveMap, folder: Path, *, corrected: CorrectedTrajectory
     segments = detector.finder.motion.segments
     parts = np.split(np.arange(len(odometry)), np.flatnonzero(np.diff(segments)) + 1) if len(odometry) else []
     driven = [(rows, odometry[rows]) for rows in parts]
-    paths = [folder / name for name in (GRAPH, TABLE, REJECTED)]
-    write_joint_g2o(paths[0], detector.loops, driven, drift=detector.config.drift)
-    write_loops_csv(paths[1], detector.loops)
-    write_rejected_jsonl(paths[2], detector.rejected)
+    files: dict[str, Callable[[Path], object]] = {
+        GRAPH: partial(write_joint_g2o, loops=detector.loops, chains=driven, drift=detector.config.drift),
+        TABLE: partial(write_loops_csv, loops=detector.loops),
+        REJECTED: partial(write_rejected_jsonl, rejected=detector.rejected),
+    }
     if len(odometry):
-        paths.append(folder / TRAJECTORY)
-        write_tum(paths[-1], odometry, live.stamps)
+        files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)
     if len(odometry) and corrected is not None:
         known = np.isfinite(poses := corrected.poses).all(axis=(1, 2))
-        paths.append(folder / CORRECTED)
-        write_tum(paths[-1], poses[known], live.stamps[known])
-    return paths
+        files[CORRECTED] = partial(write_tum, poses=poses[known], times=live.stamps[known])
+    return write_all(folder, files)

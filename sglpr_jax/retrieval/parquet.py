@@ -136,10 +136,6 @@ def usable(address: str) -> Iterator[None]:
         raise ValueError(f"{address}: expected a store that can be read and written, found: {found}") from error
 
 
-if TYPE_CHECKING:
-    import pyarrow
-
-
 class Stored(NamedTuple):
     """Result of `embed_to_store`."""
 

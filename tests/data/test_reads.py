@@ -14,7 +14,7 @@ from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.method import ImageMethod, ScanMethod
-from sglpr_jax.retrieval.embed import embed_images, embed_scans
+from sglpr_jax.retrieval.embed import embed
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_a_record_opens_each_of_its_files_once(recording, opened):
 
 def test_labels_that_nobody_asked_for_are_not_read(recording, opened):
     assert recording.record(0, labels=False).labels is None
-    embed_images(ImageMethod(flatten, Grid(2.0, 160, 160), about={}), recording)
+    embed(ImageMethod(flatten, Grid(2.0, 160, 160), about={"method": "flat"}), recording)
     assert set(opened) == {"000000.bin", "000002.bin", "000003.bin"}
 
 
@@ -86,5 +86,5 @@ def test_a_batch_and_an_embedding_open_each_file_once_a_place(recording, opened)
         name: 3 for name in ("000000.bin", "000000.label", "000003.bin", "000003.label")
     }
     opened.clear()
-    embed_scans(ScanMethod(lambda points, _: points[0], labels=False, distance="l2", about={}), recording)
+    embed(ScanMethod(lambda points, _: points[0], labels=False, distance="l2", about={"method": "first"}), recording)
     assert sum(opened.values()) == 3

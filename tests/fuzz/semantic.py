@@ -16,7 +16,7 @@ from sglpr_jax.data.recording import Record
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import as_tree, weight_shapes
 from sglpr_jax.models.weights_file import save
-from sglpr_jax.retrieval.semantic_maps import semantic_map
+from sglpr_jax.retrieval.image_maps import semantic_map
 
 from .damage import BYTES
 from .road import FolderRoad, plain

@@ -101,9 +101,7 @@ def test_a_damaged_scan_costs_itself_alone(drive, params, whole, tmp_path, said)
 
 
 @pytest.mark.slow
-def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(
-    drive, params, whole, tmp_path, said
-):
+def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(drive, params, whole, tmp_path, said):
     poses = drive.poses.world_from_lidar
     shutil.copy(whole[0] / SETTINGS, tmp_path)
     log = FrameLog(tmp_path / FRAMES)

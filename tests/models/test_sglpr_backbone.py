@@ -16,7 +16,7 @@ from sglpr_jax.models.sglpr import forward
 from sglpr_jax.models.swin_on_circular import CircularSwin
 from sglpr_jax.models.weights import weight_shapes
 from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.retrieval.heat_maps import heat_maps
+from sglpr_jax.retrieval.image_maps import heat_maps
 
 STEM = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1))
 BACKBONE = SglprConfig(stem=STEM, embed_dim=8, depths=(2, 2), heads=(1, 2), window=2)

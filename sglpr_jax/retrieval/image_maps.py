@@ -1,13 +1,13 @@
-"""Semantic maps of scans and ready-made images, predicted by the segmentation head that training uses."""
+"""Maps on the grid of the image: classes that the segmentation head predicts, and the strength of features."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 from PIL import Image
 
 from sglpr_jax.bev import uncropped
@@ -18,7 +18,8 @@ from sglpr_jax.files import replacing
 from sglpr_jax.labels import UNLABELLED, to_raw
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import segment
+from sglpr_jax.models.polar import from_polar
+from sglpr_jax.models.sglpr import forward, segment
 
 
 class SemanticMap(NamedTuple):
@@ -55,7 +56,7 @@ def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0)
     categories = 0 if record.labels is None else config.categories
     counts, truth = view(record, config.grid, image=config.image, categories=categories)
     truth = jnp.zeros(counts.shape, jnp.int32) if truth is None else truth
-    return SemanticMap(*jax.device_get((counts, *_maps(params, counts, truth, jnp.float32(min_confidence)))))
+    return SemanticMap(*jax.device_get((counts, *_predict(params, counts, truth, jnp.float32(min_confidence)))))
 
 
 def semantic_maps(
@@ -93,7 +94,7 @@ def save_map(path: Path, found: SemanticMap, record: Record, *, categories: int)
 
 
 @jax.jit
-def _maps(
+def _predict(
     params: Params, counts: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
 ) -> tuple[Int[Array, "h w"], Int[Array, "h w"]]:
     seen = (counts > 0) & field_of_view(params.config)[0]
@@ -112,3 +113,45 @@ def _class_probabilities(params: Params, counts: Float[Array, "h w"]) -> Float[A
     logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
     as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])
     return (as_it_is + mirrored[:, ::-1]) / 2
+
+
+def heat_maps(
+    params: Params, bev: Num[Array | np.ndarray, "h w"], labels: Int[Array | np.ndarray, "h w"] | None = None
+) -> Mapping[str, Float[np.ndarray, "h w"]]:
+    """Compute the root mean square over the channels of some feature maps, scaled from 0 to 1.
+
+    The model selects the feature maps (`config.pictures`): those of its backbone, and the first of its place head.
+
+    Arguments:
+      params: Weights of the model.
+      bev: One image of point counts.
+      labels: Map of classes, if `describe` needs it.
+
+    Returns:
+      Maps by title, with NaN outside the field of view of the model.
+    """
+    found = jax.device_get(_strengths(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
+    return {title: _scaled(found[name]) for title, name in params.config.pictures.items()}
+
+
+def _scaled(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    low, high = np.nanmin(values), np.nanmax(values)
+    return (values - low) / max(high - low, 1e-9)
+
+
+@jax.jit
+def _strengths(
+    params: Params, bev: Num[Array, "h w"], labels: Int[Array, "h w"] | None
+) -> dict[str, Float[Array, "h w"]]:
+    config, grid = params.config, params.config.grid
+    outputs = forward(params, bev, labels, segment=0)
+
+    def on_grid(features: Float[Array, "1 p q c"]) -> Float[Array, "h w"]:
+        strength = jnp.sqrt(jnp.mean(features.astype(jnp.float32) ** 2, axis=-1, keepdims=True))
+        if config.polar:
+            whole = from_polar(strength, grid)[0, ..., 0]
+        else:
+            whole = jax.image.resize(strength[0, ..., 0], (grid.height, grid.width), "linear")
+        return jnp.where(field_of_view(config)[0], whole, jnp.nan)
+
+    return {name: on_grid(outputs.intermediates[name]) for name in config.pictures.values()}

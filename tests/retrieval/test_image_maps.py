@@ -1,3 +1,5 @@
+"""Maps of classes and of features lie on the grid of the image, for every kind of model."""
+
 import dataclasses
 from pathlib import Path
 
@@ -14,11 +16,19 @@ from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_raw
-from sglpr_jax.models.config import model_preset
+from sglpr_jax.models.config import MODELS, HeadConfig, SwinConfig, model_preset
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import init, segment
-from sglpr_jax.retrieval.semantic_maps import semantic_map
+from sglpr_jax.models.sglpr import forward, init, segment
+from sglpr_jax.retrieval.image_maps import heat_maps, semantic_map
+
+HEAD = HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
+CONFIG = dataclasses.replace(
+    model_preset("tiny"),
+    grid=Grid(resolution_m=1.0, height=16, width=16),
+    backbone=SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.1),
+    head=HEAD,
+)
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +119,46 @@ def test_the_map_of_a_model_for_density_images_lies_on_such_an_image(random_para
     np.testing.assert_array_equal(found.truth, np.where(counts > 0, truth, 0))
     likeliest = probabilities(params, counts).argmax(-1) + 1
     np.testing.assert_array_equal(found.predicted, np.where(counts > 0, likeliest, 0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("polar", [None, (8, 32)])
+def test_maps_lie_on_the_grid_of_the_image_and_follow_it(random_params, polar):
+    params = random_params(dataclasses.replace(CONFIG, polar=polar, field="circle"))
+    image = np.zeros((16, 16), np.int32)
+    image[2:6, 7:12] = 5
+    found, other = heat_maps(params, image), heat_maps(params, image[::-1].copy())
+    assert list(found) == ["encoder, first", "encoder, last", "decoder", "CBAM"]
+    for name, values in found.items():
+        assert values.shape == (16, 16)
+        assert np.isnan(values[0, 0]) and np.isfinite(values[4, 8])
+        assert (np.nanmin(values), np.nanmax(values)) == (0, 1)
+        assert np.nanmax(np.abs(values - other[name])) > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", MODELS)
+def test_the_maps_that_a_preset_names_are_there_and_have_the_form_of_its_image(preset):
+    """Traced only, so that the paper's sizes cost nothing."""
+    config = model_preset(preset)
+    shape = (1, config.grid.height, config.grid.width)
+    params = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
+    maps = jax.eval_shape(lambda p, x: forward(p, x, segment=0), params, jnp.zeros(shape)).intermediates
+    height, width = config.image_size
+    for title, name in config.pictures.items():
+        _, rows, columns, _ = maps[name].shape
+        assert height % rows == 0 and width % columns == 0, title
+
+
+def test_a_head_without_a_backbone_shows_its_own_maps_or_what_it_reads(random_params):
+    """Table 6, with and without CBAM and convolutions."""
+    bare = dataclasses.replace(HEAD, input="counts", cbam=False)
+    none = dataclasses.replace(bare, tap="tokens", channels=(), kernels=(), strides=())
+    titles = {
+        "CBAM": dataclasses.replace(HEAD, input="counts"),
+        "place head, first": bare,
+        "input of the place head": none,
+    }
+    for title, head in titles.items():
+        params = random_params(dataclasses.replace(CONFIG, head=head))
+        assert list(heat_maps(params, np.arange(256).reshape(16, 16))) == [title]
