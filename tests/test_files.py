@@ -8,11 +8,16 @@ from pathlib import Path
 import pytest
 
 from sglpr_jax.files import (
+    MOST_BYTES,
+    MOST_SHOWN,
     WriteError,
     alone_in,
     check_writable,
+    file_name,
     half_written,
     json_in_short,
+    path_inside,
+    printable,
     read_json,
     remove_half_written,
     replacing,
@@ -21,6 +26,9 @@ from sglpr_jax.files import (
     write_text,
     writing,
 )
+
+HOSTILE = ("../../escaped", "/etc/passwd", "a/b", "a\\b", "", ".", "..", "a\0b", "a\nb")
+HOSTILE += ("x" * 2**20, "é" * 100, "\ud800")
 
 
 def names(folder: Path) -> list[str]:
@@ -163,7 +171,7 @@ def test_json_comes_back(tmp_path):
     assert read_json(tmp_path / "a.json") == {"a": [1, None, "b"]}
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": 1, "a": 2}', b"1" * 5000])
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": 1, "a": 2}', b"1" * 5000])
 def test_json_that_is_damaged_names_its_file(tmp_path, content):
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(ValueError, match=rf"^{tmp_path}/a\.json: expected JSON, found invalid JSON"):
@@ -177,3 +185,36 @@ def test_a_value_is_said_in_short():
     assert json_in_short("l2") == "l2"
     long = json_in_short(list(range(100)))
     assert len(long) == 80 and long.startswith("[0, 1, 2") and long.endswith("...")
+
+
+@pytest.mark.parametrize("name", ["08", "scene 0061", ".hidden", "Zürich [2]", "n\udcff"])
+def test_a_safe_name_is_its_file_name(name):
+    assert file_name(name) == name
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_any_other_name_becomes_the_name_of_a_file_in_the_folder(tmp_path, name):
+    path = tmp_path / file_name(name)
+    path.write_text("")
+    assert [*tmp_path.iterdir()] == [path] and len(path.name.encode()) <= MOST_BYTES
+
+
+def test_different_names_have_different_files():
+    names = (*HOSTILE, "a_b", "..-escaped", "x" * (2**20 + 1), "\ud801")
+    assert len({file_name(name) for name in names}) == len(names)
+
+
+def test_a_table_names_files_inside_its_dataset():
+    assert path_inside(Path("d"), "samples/a.bin", source=Path("t.json")) == Path("d/samples/a.bin")
+
+
+@pytest.mark.parametrize("listed", ["/etc/passwd", "samples/../../x", "", "a\0b", None])
+def test_another_path_is_refused_and_the_table_is_named(listed):
+    with pytest.raises(ValueError, match=r"t\.json: expected paths of files inside d, found "):
+        path_inside(Path("d"), listed, source=Path("t.json"))
+
+
+def test_a_printed_name_is_one_short_line():
+    assert printable("Zürich [2]") == "Zürich [2]"
+    assert printable("a\nb\udcff\x1b[31m") == "a\\nb\\udcff\\x1b[31m"
+    assert len(printable("x" * 2**20)) == MOST_SHOWN
