@@ -96,31 +96,15 @@ class SinkOptions:
 def open_source(text: str, options: SourceOptions, report: Report) -> Source:
     """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
 
-    Arguments:
-      text: Name of the source and, after a colon, its folder, file, domain or endpoint.
-      options: Options of the source.
-      report: Function for trouble with single scans and messages.
-
-    Raises:
-      ValueError: If no source has this name.
-      ImportError: If the extra of the source is not installed.
+    `report` takes trouble with single scans and messages. Raises ValueError if no source has this name, and ImportError
+    if its extra is not installed.
     """
     name, where = check_name(text, SOURCES, kind="sources")
     return _module(name, SOURCES[name]).open_source(where, options, report)
 
 
 def open_sink(text: str, options: SinkOptions, report: Report) -> Sink:
-    """Open the sink that a text names: `NAME` or `NAME:WHERE`, such as `json:loops.jsonl`.
-
-    Arguments:
-      text: Name of the sink and, after a colon, its file, domain or endpoint.
-      options: Options of the sink.
-      report: Function for trouble with single messages.
-
-    Raises:
-      ValueError: If no sink has this name.
-      ImportError: If the extra of the sink is not installed.
-    """
+    """Open the sink that a text names, such as `json:loops.jsonl`, as `open_source` does."""
     name, where = check_name(text, SINKS, kind="sinks")
     return _module(name, SINKS[name]).open_sink(where, options, report)
 

@@ -1,5 +1,6 @@
 """A folder into which another program writes scans, one file each. Every scan is taken once it is complete."""
 
+import bisect
 import dataclasses
 import time
 from collections.abc import Iterator
@@ -16,9 +17,9 @@ from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import BEYOND_S, interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.times import EPOCH, PER_SECOND
-from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.endpoints import SourceOptions
 from sglpr_jax.live.messages import LiveFrame, Report
+from sglpr_jax.se3 import quaternions
 
 LOOK_S = 0.05
 """Time between two looks at the folder, in seconds."""
@@ -154,10 +155,10 @@ class GrowingPoses:
             raise ValueError(f"{path}: expected poses as tum, kitti or lidar, found csv")
         self._path, self._format, self._unit = path, format, PER_SECOND[time_unit]
         self._read = self._line = 0
-        self._rows: GrowingArray | None = None
-
-    def __len__(self) -> int:
-        return 0 if self._rows is None else len(self._rows)
+        self._times: list[float] = []
+        """Time of each line, in seconds, in order. 0 in files without times."""
+        self._poses: list[np.ndarray | None] = []
+        """Pose (4, 4) of each line. None for an invalid line."""
 
     def look(self) -> None:
         """Read the lines that were added since the last look.
@@ -189,49 +190,35 @@ class GrowingPoses:
           row: Number of the scan in its folder, for files with a line for each scan, and scans without times.
           time: Time of the scan in seconds, for tum files, or None.
         """
-        if self._rows is None:
+        if time is None or self._format not in ("auto", "tum"):
+            return self._poses[row] if row < len(self._poses) else None
+        middle = bisect.bisect_left(self._times, time)
+        near = range(max(middle - AROUND, 0), min(middle + AROUND, len(self._poses)))
+        known = [(self._times[i], pose) for i in near if (pose := self._poses[i]) is not None]
+        if len(known) < 2 or known[-1][0] < time - BEYOND_S:
             return None
-        if time is not None and self._rows.rows.shape[1] == 8:
-            return self._at(time)
-        known = row < len(self) and np.isfinite(self._rows.rows[row]).all()
-        return self._poses(self._rows.rows[row : row + 1])[0] if known else None
+        stamps, poses = np.array([stamp for stamp, _ in known]), np.stack([pose for _, pose in known])
+        at = np.array([time])
+        found = interpolate(stamps, poses[:, :3, 3], at)
+        turns = interpolate_turns(stamps, quaternions(poses), at)
+        return poses_of(found.positions, turns)[0] if found.kept.all() else None
 
     def _add(self, words: list[str], where: str) -> None:
-        if self._rows is None:
-            self._rows = GrowingArray(np.empty((0, self._columns(len(words), where))))
-        unknown = np.full(self._rows.rows.shape[1], np.nan)
-        unknown[0] = self._rows.rows[-1, 0] if len(self) else 0.0  # times stay in order
-        self._rows.append(unknown)  # also if the line is invalid: the next line is that of the next scan
-        self._rows.rows[-1] = numbers_of(words, columns=len(unknown), where=where)
-
-    def _columns(self, found: int, where: str) -> int:
-        if self._format == "auto" and found == 12:
+        if self._format == "auto" and len(words) == 12:
             raise ValueError(
                 f"{where}: expected the axes of 12 numbers a line, found none; pass --pose-format kitti or lidar"
             )
-        return 8 if self._format in ("auto", "tum") else 12
-
-    def _at(self, time: float) -> Float[np.ndarray, "4 4"] | None:
-        """Pose interpolated at a time, or None if the poses do not reach it."""
-        assert self._rows is not None
-        middle = int(np.searchsorted(self._rows.rows[:, 0], time * self._unit))
-        rows = self._rows.rows[max(middle - AROUND, 0) : middle + AROUND]
-        rows = rows[np.isfinite(rows).all(axis=1)]
-        stamps = rows[:, 0] / self._unit
-        if len(stamps) < 2 or stamps[-1] < time - BEYOND_S:
-            return None
-        found = interpolate(stamps, rows[:, 1:4], np.array([time]))
-        if not found.kept.all():
-            return None
-        turns = rows[:, 4:] / np.linalg.norm(rows[:, 4:], axis=1, keepdims=True)
-        return poses_of(found.positions, interpolate_turns(stamps, turns, np.array([time])))[0]
-
-    def _poses(self, rows: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n 4 4"]:
-        if rows.shape[1] == 8:
-            return poses_of(rows[:, 1:4], rotations_of(self._path, rows[:, 4:]))
-        matrices = rows.reshape(-1, 3, 4)
-        poses = poses_of(matrices[:, :, 3], matrices[:, :, :3])
-        return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if self._format == "kitti" else poses
+        self._times.append(self._times[-1] if self._times else 0.0)
+        self._poses.append(None)  # also if the line is invalid: the next line is that of the next scan
+        if self._format in ("auto", "tum"):
+            numbers = numbers_of(words, columns=8, where=where)
+            pose = poses_of(numbers[None, 1:4], rotations_of(self._path, numbers[None, 4:]))[0]
+            self._times[-1] = float(numbers[0] / self._unit)
+        else:
+            matrix = numbers_of(words, columns=12, where=where).reshape(1, 3, 4)
+            pose = poses_of(matrix[:, :, 3], matrix[:, :, :3])[0]
+            pose = CAMERA_FROM_LIDAR.T @ pose @ CAMERA_FROM_LIDAR if self._format == "kitti" else pose
+        self._poses[-1] = pose
 
 
 def open_source(where: str, options: SourceOptions, report: Report) -> FolderSource:

@@ -112,9 +112,8 @@ def until(found: Callable[[], object]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reliable", [False, True])
-def test_scans_and_poses_come_in_types_that_cyclonedds_encodes_itself(domain, peer, opened, said, reliable):
-    frames = opened(odometry_topic="/tf", reliable=reliable).frames()
+def test_scans_and_poses_come_in_types_that_cyclonedds_encodes_itself(domain, peer, opened, said):
+    frames = opened(odometry_topic="/tf", reliable=True).frames()
     peer.advertise("/tf_static", TRANSFORMS, depth=1, latched=True)(
         transforms(0, [("base", "lidar", (0, 0, 2), STILL)])
     )
@@ -188,9 +187,3 @@ def test_a_subscriber_with_another_qos_is_reported(domain, peer, said):
     asked = "/tf: expected subscribers that accept the QoS reliable, volatile, found one that asks for more"
     until(lambda: any(text.startswith(f"{asked} (durability)") for _, text in said))
     sink.close()
-
-
-def test_a_wrong_configuration_is_one_clear_error(domain, monkeypatch, said):
-    monkeypatch.setenv("CYCLONEDDS_URI", "<nonsense")
-    with pytest.raises(ValueError, match=f"dds:{domain}: expected a network .* CYCLONEDDS_URI, found <nonsense"):
-        open_source(f"dds:{domain}", SourceOptions(), said)

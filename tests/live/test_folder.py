@@ -106,7 +106,7 @@ def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
     with pytest.raises(ValueError, match=r"poses.txt, line 3: expected 12 numbers, found 1"):
         found.look()
     found.look()
-    assert len(found) == 3 and found.of(1, None) is None and found.of(3, None) is None
+    assert found.of(1, None) is None and found.of(3, None) is None
     assert found.of(2, None)[0, 3] == 2 and found.of(0, None)[0, 3] == 0
     with pytest.raises(ValueError, match="pass --pose-format kitti or lidar"):
         GrowingPoses(path, "auto", "auto").look()

@@ -1,7 +1,6 @@
 """The node lives on, whatever a scan, a sink or the odometry does, and hands on what the map finds."""
 
 import json
-import threading
 
 import numpy as np
 import pytest
@@ -93,24 +92,12 @@ def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said):
     assert str(node).endswith("4 dropped, 2 left out, 1 loops; the map has 3 scans, 5 MB")
 
 
-def test_a_node_stops_when_it_is_asked(frame, said):
-    node = Node(FakeMap(), [], report=said, say=print)
-    node.run(Frames(frame), should_stop=lambda: True)
-    assert node.scans == 1
-
-
 def test_a_newer_item_replaces_one_that_waits():
     latest = Latest()
     assert latest.take(0.0) is None
     for item in range(3):
         latest.put(item)
     assert latest.take(0.0) == 2 and latest.dropped == 2 and latest.take(0.0) is None
-
-
-def test_a_waiting_reader_is_woken():
-    latest = Latest()
-    threading.Timer(0.05, latest.put, ["new"]).start()
-    assert latest.take(5.0) == "new"
 
 
 def test_equal_kinds_share_a_line():

@@ -16,11 +16,6 @@ def times(clock: Clock, stamps, received=None) -> list[float]:
     return [clock.time(stamp, at) for stamp, at in zip(stamps, received, strict=True)]
 
 
-def test_times_in_order_are_kept(said):
-    stamps = [1e9, 1e9 + 0.1, 1e9 + 0.1, 1e9 + 20]
-    assert times(Clock(said), stamps) == stamps and not said
-
-
 @pytest.mark.parametrize("other", [1e9 - 3600, 1e9 + 365 * 86400])
 def test_a_clock_that_jumps_is_followed(said, other):
     stamps = [1e9, 1e9 + 0.1, other, other + 0.1, other + 0.2, 1e9 + 0.5]
@@ -28,7 +23,7 @@ def test_a_clock_that_jumps_is_followed(said, other):
     assert said.kinds == ["clock", "clock"]
 
 
-@pytest.mark.parametrize("missing", [0.0, -5.0, np.nan, np.inf])
+@pytest.mark.parametrize("missing", [0.0, np.nan])
 def test_scans_without_a_time_get_that_of_their_arrival(said, missing):
     found = times(Clock(said), [1e9, missing, 1e9 + 0.2, missing])
     np.testing.assert_allclose(found, 1e9 + np.arange(4) * 0.1)
@@ -91,12 +86,6 @@ def test_after_a_restart_the_way_is_known_only_if_the_odometry_continues(said, l
     first = continuity.placed(pose, 100.0 + seconds)
     assert first.continues == continues and said.kinds == ["restart"]
     assert continuity.placed(pose, 100.1 + seconds).continues
-
-
-def test_after_a_restart_an_old_pose_does_not_continue(said):
-    continuity = Continuity(said, expected=False)
-    continuity.resume(at(40), 100.0, known=False)
-    assert not continuity.placed(at(41), 101.0).continues and continuity.placed(at(42), 101.1).continues
 
 
 def test_the_mounting_is_that_of_the_first_scans(drive):
