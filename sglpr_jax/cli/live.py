@@ -12,8 +12,7 @@ import tyro
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
-from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
-from sglpr_jax.fields import NotNegative
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, ConsistencyConfig, DetectorConfig, SequenceConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT, DriftModel
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class LiveCommand:
+class LiveCommand(LiveOptions):
     """Find loop closures while the robot drives, and publish them at once.
 
     Sources: `folder:PATH` (a folder into which scans are written), `bag:PATH` (a bag at its own pace), `dds` or
@@ -50,30 +49,6 @@ class LiveCommand:
     """Receivers of loops and of the status after each scan."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
-    topic: str | None = None
-    """Topic of the point clouds."""
-    odometry_topic: str | None = None
-    """Topic of the odometry. Without odometry, loops are found by the scans alone."""
-    reliable: bool = False
-    """Request lost scans again (dds). Publishers that are best effort then do not match."""
-    rate: NotNegative = 1.0
-    """Speed of a replayed bag. 0 is as fast as possible."""
-    poses: Path | None = None
-    """File of odometry for a folder, which may grow: tum, or a line for each scan."""
-    pose_format: PoseFormat = "auto"
-    """Format of --poses. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum."""
-    time_unit: TimeUnit = "auto"
-    """Unit of the times in --poses. `auto` expects seconds."""
-    format: ScanFormat = "auto"
-    """Format of the scan files of a folder."""
-    sensor_height: SensorHeight = "auto"
-    """Height of the sensor above the ground, in metres. `auto` estimates height and tilt from the first scans."""
-    topic_prefix: str = "/sglpr"
-    """Beginning of the names of published topics."""
-    map_frame: str = "map"
-    """Name of the map's frame in published messages."""
-    odometry_frame: str = "odom"
-    """Name of the odometry's frame in published messages."""
     drift_percent: float = DRIFT_PERCENT
     """Position drift of the odometry: one standard deviation, in percent of the travelled distance."""
     drift_deg_per_100m: float = DRIFT_DEG_PER_100M
@@ -105,20 +80,17 @@ class LiveCommand:
 
 def live(command: LiveCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.live.endpoints import SinkOptions, SourceOptions, open_sink, open_source
+    from sglpr_jax.live.endpoints import open_sink, open_source
     from sglpr_jax.live.messages import Reports
 
     _check(command)
     report = Reports()
 
     def source(found: "LiveMap") -> "Source":
-        names = [field.name for field in dataclasses.fields(SourceOptions) if field.name != "taken"]
-        options = SourceOptions(**{name: getattr(command, name) for name in names}, taken=found.names.__contains__)
-        return open_source(command.source, options, report)
+        return open_source(command.source, command, report, taken=found.names.__contains__)
 
     def sinks() -> Iterator["Sink"]:
-        options = SinkOptions(command.topic_prefix, command.map_frame, command.odometry_frame)
-        return (open_sink(text, options, report) for text in command.sinks)
+        return (open_sink(text, command, report) for text in command.sinks)
 
     with stop_on_signal() as stop:
         run_node(command, source, sinks, report=report, say=_say, should_stop=stop)

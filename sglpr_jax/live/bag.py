@@ -8,17 +8,18 @@ from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.live.endpoints import WAIT_S, SourceOptions
+from sglpr_jax.live.endpoints import WAIT_S, Taken
 from sglpr_jax.live.messages import Latest, LiveFrame, Report
+from sglpr_jax.live.options import LiveOptions
 
 
 class BagSource:
     """Scans of a recording at the times of their headers. With `rate=0`, as fast as they are taken."""
 
-    def __init__(self, root: Path, recording: Recording, options: SourceOptions, report: Report):
+    def __init__(self, root: Path, recording: Recording, options: LiveOptions, report: Report, taken: Taken):
         self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
         self._posed = options.odometry_topic is not None
-        done = [row for row in range(len(recording)) if options.taken(self._name(row))]
+        done = [row for row in range(len(recording)) if taken(self._name(row))]
         self._rows = range(done[-1] + 1 if done else 0, len(recording))
         self._latest: Latest[LiveFrame] = Latest()
         self._stopped, self._ended = threading.Event(), threading.Event()
@@ -74,7 +75,7 @@ class BagSource:
         return f"{self._root}, scan {self._recording.ids[row]}"
 
 
-def open_source(where: str, options: SourceOptions, report: Report) -> BagSource:
+def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> BagSource:
     """Open the bag `where`.
 
     Raises:
@@ -91,4 +92,4 @@ def open_source(where: str, options: SourceOptions, report: Report) -> BagSource
     )
     if options.odometry_topic is not None and recording.world_from_lidar is None:
         raise ValueError(f"{root}: expected poses with rotations on {options.odometry_topic}, found none")
-    return BagSource(root, recording, options, report)
+    return BagSource(root, recording, options, report, taken)

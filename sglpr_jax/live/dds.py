@@ -22,8 +22,9 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.endpoints import SinkOptions, SourceOptions
+from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import Report
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
 from sglpr_jax.live.ros_messages import Received, typestore
 
@@ -239,11 +240,11 @@ def _field(node: Any, of: Any) -> Any:
     return types.array[_field(*inner), count] if node.name == "ARRAY" else types.sequence[_field(*inner)]
 
 
-def open_source(where: str, options: SourceOptions, report: Report) -> RosSource:
+def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> RosSource:
     """Open the source `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
     return RosSource(DdsTransport(domain_of(where, source="dds"), report), options, report)
 
 
-def open_sink(where: str, options: SinkOptions, report: Report) -> RosSink:
+def open_sink(where: str, options: LiveOptions, report: Report) -> RosSink:
     """Open the sink `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
     return RosSink(DdsTransport(domain_of(where, source="dds"), report), options)

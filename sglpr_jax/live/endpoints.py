@@ -1,18 +1,16 @@
 """Sources of scans and sinks of loops, by name. The module of a name is imported when it is asked for.
 
-The module `live/NAME.py` has the function `open_source(where, options, report)`, `open_sink(where, options, report)` or
-both. To support another source or sink, add a module and its name.
+The module `live/NAME.py` has `open_source(where, options, report, taken)`, `open_sink(where, options, report)` or both.
+To support another source or sink, add a module and its name.
 """
 
-import dataclasses
 import importlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
-from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.live.messages import FrameStatus, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.options import LiveOptions
 
 SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
 SINKS = {"json": None, "dds": "live", "zenoh": "live", "rerun": "view"}
@@ -57,53 +55,21 @@ class Sink(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
-class SourceOptions:
-    """Options of all sources. Each source uses those that apply to it."""
-
-    topic: str | None = None
-    """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh)."""
-    odometry_topic: str | None = None
-    """Topic of the odometry (Odometry or tf). None: no odometry, except that of a bag's own poses."""
-    reliable: bool = False
-    """Whether scans that were lost on the way are requested again (dds). Publishers that are best effort then do not
-    match."""
-    rate: float = 1.0
-    """Speed of a replayed bag. 0 is as fast as possible."""
-    poses: Path | None = None
-    """File of poses of a folder, which may grow."""
-    pose_format: PoseFormat = "auto"
-    time_unit: TimeUnit = "auto"
-    format: ScanFormat = "auto"
-    """Format of the scan files of a folder."""
-    sensor_height: SensorHeight = "auto"
-    """Height of the sensor, for a bag, whose scans are all there. For other sources the node estimates it."""
-    taken: Callable[[str], bool] = lambda name: False
-    """Whether a scan with this `Record.name` is in the map already."""
+Taken = Callable[[str], bool]
+"""Whether a scan with this `Record.name` is in the map already."""
 
 
-@dataclasses.dataclass(frozen=True)
-class SinkOptions:
-    """Options of all sinks. Each sink uses those that apply to it."""
-
-    prefix: str = "/sglpr"
-    """Beginning of the names of published topics."""
-    map_frame: str = "map"
-    odometry_frame: str = "odom"
-    """Frames of the published transform and markers."""
-
-
-def open_source(text: str, options: SourceOptions, report: Report) -> Source:
+def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken = lambda name: False) -> Source:
     """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
 
-    `report` takes trouble with single scans and messages. Raises ValueError if no source has this name, and ImportError
-    if its extra is not installed.
+    `report` takes trouble with single scans and messages. Scans of files that are `taken` do not come again. Raises
+    ValueError if no source has this name, and ImportError if its extra is not installed.
     """
     name, where = check_name(text, SOURCES, kind="sources")
-    return _module(name, SOURCES[name]).open_source(where, options, report)
+    return _module(name, SOURCES[name]).open_source(where, options, report, taken)
 
 
-def open_sink(text: str, options: SinkOptions, report: Report) -> Sink:
+def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
     """Open the sink that a text names, such as `json:loops.jsonl`, as `open_source` does."""
     name, where = check_name(text, SINKS, kind="sinks")
     return _module(name, SINKS[name]).open_sink(where, options, report)

@@ -17,8 +17,9 @@ from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import BEYOND_S, interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.times import EPOCH, PER_SECOND
-from sglpr_jax.live.endpoints import SourceOptions
+from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import LiveFrame, Report
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.se3 import quaternions
 
 LOOK_S = 0.05
@@ -37,7 +38,7 @@ class FolderSource:
     dropped = 0
     """Scans are never dropped: their files stay until they are read."""
 
-    def __init__(self, root: Path, options: SourceOptions, report: Report):
+    def __init__(self, root: Path, options: LiveOptions, report: Report, taken: Taken):
         self._root, self._options, self._report = root, options, report
         self._records: RecordFormat | None = None
         self._sizes: dict[Path, int] = {}
@@ -47,7 +48,7 @@ class FolderSource:
         self._changed = 0
         self._stopped = False
         found = files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
-        last = max((i for i, path in enumerate(found) if options.taken(_name(path))), default=-1)
+        last = max((i for i, path in enumerate(found) if taken(_name(path))), default=-1)
         self._done.update(found[: last + 1])
         self._poses = (
             None if options.poses is None else GrowingPoses(options.poses, options.pose_format, options.time_unit)
@@ -221,9 +222,9 @@ class GrowingPoses:
         self._poses[-1] = pose
 
 
-def open_source(where: str, options: SourceOptions, report: Report) -> FolderSource:
+def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> FolderSource:
     """Open the folder `where`. Raises FileNotFoundError if it does not exist."""
     root = Path(where)
     if not where or not root.is_dir():
         raise FileNotFoundError(f"folder:{where}: expected a folder, into which scans are written, found none")
-    return FolderSource(root, options, report)
+    return FolderSource(root, options, report, taken)

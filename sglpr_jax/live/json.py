@@ -11,8 +11,8 @@ from typing import IO, Any
 import numpy as np
 
 from sglpr_jax.files import writing
-from sglpr_jax.live.endpoints import SinkOptions
 from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.options import LiveOptions
 
 
 class JsonLines:
@@ -46,7 +46,7 @@ def _plain(value: Any) -> Any:
     return round(value, 6) if isinstance(value, float) and abs(value) < 1e6 else value
 
 
-def open_sink(where: str, options: SinkOptions, report: Report) -> JsonLines:
+def open_sink(where: str, options: LiveOptions, report: Report) -> JsonLines:
     """Open standard output, or the file `where` for appending. Raises WriteError if the file cannot be written."""
     if not where:
         return JsonLines(sys.stdout)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import check_writable, writing
-from sglpr_jax.live.endpoints import SinkOptions
 from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.options import LiveOptions
 
 os.environ.setdefault("RUST_LOG", "off")  # read by the import; the node has its own line for a lost viewer
 import rerun
@@ -80,7 +80,7 @@ class RerunSink:
         self._stream.log(name, rerun.Scalars(value))
 
 
-def open_sink(where: str, options: SinkOptions, report: Report) -> RerunSink:
+def open_sink(where: str, options: LiveOptions, report: Report) -> RerunSink:
     """Connect to a viewer, or begin the file `where`. An existing file is replaced.
 
     Without a viewer, a line says so and nothing is drawn. The node starts all the same.

@@ -10,8 +10,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from sglpr_jax.data.recording import found_record
-from sglpr_jax.live.endpoints import WAIT_S, SinkOptions, SourceOptions
+from sglpr_jax.live.endpoints import WAIT_S
 from sglpr_jax.live.messages import FrameStatus, Latest, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_messages import (
     CLOUDS,
     EDGE,
@@ -78,7 +79,7 @@ class Transport(Protocol):
 class RosSource:
     """Source of the scans of a topic. See `sources.Source`."""
 
-    def __init__(self, transport: Transport, options: SourceOptions, report: Report, *, missing_s: float = MISSING_S):
+    def __init__(self, transport: Transport, options: LiveOptions, report: Report, *, missing_s: float = MISSING_S):
         """Subscribe to the topics.
 
         Arguments:
@@ -172,10 +173,10 @@ class RosSink:
     to odometry is that of the corrected trajectory (`FrameStatus.map_from_world`).
     """
 
-    def __init__(self, transport: Transport, options: SinkOptions):
+    def __init__(self, transport: Transport, options: LiveOptions):
         """Advertise the topics. `close` closes the connection."""
         self._transport, self._options = transport, options
-        prefix = full_name(options.prefix)
+        prefix = full_name(options.topic_prefix)
         self._edges = transport.advertise(f"{prefix}/loops", EDGE, depth=EDGES_KEPT, latched=True)
         self._markers = transport.advertise(f"{prefix}/loop_markers", MARKERS, depth=1, latched=True)
         self._transforms = transport.advertise("/tf", TRANSFORMS, depth=100, latched=False)

@@ -29,8 +29,9 @@ from zenoh.ext import (
 )
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.endpoints import SinkOptions, SourceOptions
+from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import Report
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
 from sglpr_jax.live.ros_messages import Received, typestore
 
@@ -156,11 +157,11 @@ def _config(endpoint: str) -> zenoh.Config:
     return config
 
 
-def open_source(where: str, options: SourceOptions, report: Report) -> RosSource:
+def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> RosSource:
     """Open the source `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
     return RosSource(ZenohTransport(where, domain_of("", source="zenoh"), report), options, report)
 
 
-def open_sink(where: str, options: SinkOptions, report: Report) -> RosSink:
+def open_sink(where: str, options: LiveOptions, report: Report) -> RosSink:
     """Open the sink `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
     return RosSink(ZenohTransport(where, domain_of("", source="zenoh"), report), options)

@@ -5,7 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from sglpr_jax.live.endpoints import SourceOptions, open_source
+from sglpr_jax.live.endpoints import open_source
+from sglpr_jax.live.options import LiveOptions
 from tests.bags import CLOUD, cloud, header, typestore, write_bag
 
 POINTS = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
@@ -35,18 +36,18 @@ def bag(tmp_path):
 
 
 def test_a_bag_is_replayed_as_fast_as_possible(bag, said):
-    options = SourceOptions(rate=0.0, sensor_height=1.5, odometry_topic="/odom")
+    options = LiveOptions(rate=0.0, sensor_height=1.5, odometry_topic="/odom")
     frames = list(open_source(f"bag:{bag}", options, said).frames())
     np.testing.assert_allclose([frame.time for frame in frames], STAMP + 0.05 * np.arange(10))
     assert [frame.odometry[0, 3] for frame in frames] == pytest.approx(range(10), abs=1e-6)
     assert frames[3].record.mounting.height_m == 1.5 and frames[3].record.name.endswith("scan 000003")
     known = {frames[3].record.name, frames[6].record.name}
-    rest = open_source(f"bag:{bag}", SourceOptions(rate=0.0, taken=known.__contains__), said)
+    rest = open_source(f"bag:{bag}", LiveOptions(rate=0.0), said, taken=known.__contains__)
     assert [frame.time for frame in rest.frames()] == [frame.time for frame in frames[7:]]
 
 
 def test_a_bag_is_replayed_at_its_own_pace_and_drops_what_is_late(bag, said):
-    source = open_source(f"bag:{bag}", SourceOptions(), said)
+    source = open_source(f"bag:{bag}", LiveOptions(), said)
     begin, found = time.monotonic(), []
     for frame in source.frames():
         if frame is not None:
@@ -59,4 +60,4 @@ def test_a_bag_is_replayed_at_its_own_pace_and_drops_what_is_late(bag, said):
 
 def test_a_topic_that_is_missing_is_named(bag, said):
     with pytest.raises(ValueError, match=r"/other"):
-        open_source(f"bag:{bag}", SourceOptions(odometry_topic="/other"), said)
+        open_source(f"bag:{bag}", LiveOptions(odometry_topic="/other"), said)

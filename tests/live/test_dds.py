@@ -17,7 +17,8 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sglpr_jax.live.dds import DdsTransport
-from sglpr_jax.live.endpoints import SinkOptions, SourceOptions, open_sink, open_source
+from sglpr_jax.live.endpoints import open_sink, open_source
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_messages import CLOUD, EDGE, TRANSFORMS
 from tests.live.messages import LIVOX, decoded, transforms
 from tests.live.test_ros_messages import edge
@@ -95,7 +96,7 @@ def opened(domain, said):
     sources = []
 
     def open_one(**options):
-        sources.append(open_source(f"dds:{domain}", SourceOptions(**options), said))
+        sources.append(open_source(f"dds:{domain}", LiveOptions(**options), said))
         return sources[-1]
 
     yield open_one
@@ -161,7 +162,7 @@ def test_topics_that_are_missing_or_of_another_type_are_reported_with_those_that
 
 
 def test_edges_reach_a_subscriber_that_comes_later(domain, peer, said):
-    sink = open_sink(f"dds:{domain}", SinkOptions(), said)
+    sink = open_sink(f"dds:{domain}", LiveOptions(), said)
     sink.loop(edge())
     found = []
     peer.subscribe("/sglpr/loops", [EDGE], found.append, depth=10, reliable=True, latched=True)
@@ -182,7 +183,7 @@ def test_a_connection_that_only_publishes_does_not_use_a_core(peer):
 
 
 def test_a_subscriber_with_another_qos_is_reported(domain, peer, said):
-    sink = open_sink(f"dds:{domain}", SinkOptions(), said)
+    sink = open_sink(f"dds:{domain}", LiveOptions(), said)
     peer.subscribe("/tf", [TRANSFORMS], lambda message: None, depth=1, reliable=True, latched=True)
     asked = "/tf: expected subscribers that accept the QoS reliable, volatile, found one that asks for more"
     until(lambda: any(text.startswith(f"{asked} (durability)") for _, text in said))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.live import folder
-from sglpr_jax.live.endpoints import SourceOptions, open_source
+from sglpr_jax.live.endpoints import open_source
 from sglpr_jax.live.folder import GrowingPoses
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import transform
 
@@ -45,7 +46,7 @@ def incoming(tmp_path):
 
 
 def test_scans_of_a_folder_come_in_order_once_they_are_complete(incoming, said):
-    source = open_source(f"folder:{incoming}", SourceOptions(), said)
+    source = open_source(f"folder:{incoming}", LiveOptions(), said)
     assert looked(source, 0.1) == []
     for i in (10, 9):
         scan(incoming / f"{STAMP + i}.bin")
@@ -65,7 +66,7 @@ def test_scans_of_a_folder_come_in_order_once_they_are_complete(incoming, said):
 def test_a_folder_is_continued_after_the_last_scan_of_the_map(incoming, said):
     paths = [scan(incoming / f"{i}.bin") for i in range(4)]
     known = {str(paths[1].resolve())}
-    source = open_source(f"folder:{incoming}", SourceOptions(taken=known.__contains__), said)
+    source = open_source(f"folder:{incoming}", LiveOptions(), said, taken=known.__contains__)
     assert [Path(frame.record.name).name for frame in looked(source, 0.5)] == ["2.bin", "3.bin"]
 
 
@@ -76,7 +77,7 @@ def test_a_scan_that_cannot_be_read_is_reported_and_the_others_come(incoming, sa
     (incoming / "3.bin").touch()
     for path in incoming.iterdir():
         os.utime(path, (STAMP, STAMP))
-    source = open_source(f"folder:{incoming}", SourceOptions(), said)
+    source = open_source(f"folder:{incoming}", LiveOptions(), said)
     assert [Path(frame.record.name).name for frame in looked(source, 1.0)] == ["0.bin", "2.bin"]
     assert said.kinds == ["scan", "scan"] and "1.bin" in said[0][1]
 
@@ -86,7 +87,7 @@ def test_poses_of_a_folder_are_those_of_their_line_or_time(incoming, tmp_path, s
     write_tum(tmp_path / "poses.tum", poses, STAMP + np.arange(4.0))
     for i in (0.5, 2.0):
         scan(incoming / f"{STAMP + i}.bin")
-    options = SourceOptions(poses=tmp_path / "poses.tum")
+    options = LiveOptions(poses=tmp_path / "poses.tum")
     first, second = taken(open_source(f"folder:{incoming}", options, said), 2)
     np.testing.assert_allclose(first.odometry, transform(0.5, 0.0, 0.05), atol=1e-6)
     np.testing.assert_allclose(second.odometry, poses[2], atol=1e-6)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.recording import Record
-from sglpr_jax.live.endpoints import SinkOptions, open_sink
+from sglpr_jax.live.endpoints import open_sink
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.messages import AGAIN_S, FrameStatus, Latest, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.node import Node
+from sglpr_jax.live.options import LiveOptions
 
 EDGE = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, np.eye(4), None, 0.01)
 
@@ -112,7 +113,7 @@ def test_equal_kinds_share_a_line():
 
 
 def test_results_are_lines_of_json(tmp_path, said):
-    sink = open_sink(f"json:{tmp_path}/lines", SinkOptions(), said)
+    sink = open_sink(f"json:{tmp_path}/lines", LiveOptions(), said)
     sink.frame(FrameStatus(3, 1e9 + 0.123456789, 0.0123456789, 0.02, 1, 4, 100))
     sink.loop(EDGE)
     frame, loop = map(json.loads, (tmp_path / "lines").read_text().splitlines())
@@ -121,7 +122,7 @@ def test_results_are_lines_of_json(tmp_path, said):
         loop["type"] == "loop" and loop["match_from_query"] == np.eye(4).tolist() and loop["world_from_match"] is None
     )
     sink.close()
-    again = open_sink(f"json:{tmp_path}/lines", SinkOptions(), said)
+    again = open_sink(f"json:{tmp_path}/lines", LiveOptions(), said)
     again.loop(EDGE)
     again.close()
     assert len((tmp_path / "lines").read_text().splitlines()) == 3

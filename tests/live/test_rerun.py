@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.live.endpoints import SinkOptions, open_sink
+from sglpr_jax.live.endpoints import open_sink
 from sglpr_jax.live.messages import FrameStatus, LoopEdge
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.rerun import RerunSink
 from sglpr_jax.se3 import transform
 
@@ -28,7 +29,7 @@ def entities(path: Path) -> set[str]:
 
 def test_a_file_has_the_status_and_the_loops(tmp_path, said):
     path = tmp_path / "live.rrd"
-    sink = open_sink(f"rerun:{path}", SinkOptions(), said)
+    sink = open_sink(f"rerun:{path}", LiveOptions(), said)
     sink.frame(STATUS)
     sink.frame(STATUS._replace(frame=8, time=float("nan")))
     sink.loop(PLACED)
@@ -43,7 +44,7 @@ def test_without_a_viewer_a_line_says_so_and_the_node_lives_on(said):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    sink = open_sink(f"rerun:127.0.0.1:{port}", SinkOptions(), said)
+    sink = open_sink(f"rerun:127.0.0.1:{port}", LiveOptions(), said)
     sink.frame(STATUS)
     sink.loop(PLACED)
     sink.close()
@@ -53,7 +54,7 @@ def test_without_a_viewer_a_line_says_so_and_the_node_lives_on(said):
 @pytest.mark.parametrize("where", ["found.txt", "host:70000"])
 def test_neither_a_file_nor_an_address(where, said):
     with pytest.raises(ValueError, match=r"expected rerun, rerun:HOST:PORT or rerun:FILE.rrd"):
-        open_sink(f"rerun:{where}", SinkOptions(), said)
+        open_sink(f"rerun:{where}", LiveOptions(), said)
 
 
 def test_a_lost_viewer_is_an_error_and_a_slow_one_is_not(monkeypatch):

@@ -6,8 +6,8 @@ import time as clock
 import numpy as np
 import pytest
 
-from sglpr_jax.live.endpoints import SinkOptions, SourceOptions
 from sglpr_jax.live.messages import FrameStatus, LoopEdge
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros import TAKEN_OVER_S, RosSink, RosSource, domain_of
 from sglpr_jax.live.ros_messages import CLOUD, MARKERS, TRANSFORMS
 from tests.live.messages import LIVOX, ODOMETRY, POINTS, cloud, decoded, odometry, received
@@ -40,7 +40,7 @@ def transport() -> Memory:
 
 @pytest.fixture
 def source(transport, said) -> RosSource:
-    return RosSource(transport, SourceOptions(topic="points", odometry_topic="/odom"), said, missing_s=0.0)
+    return RosSource(transport, LiveOptions(topic="points", odometry_topic="/odom"), said, missing_s=0.0)
 
 
 def test_a_scan_has_points_time_and_pose(transport, source, said):
@@ -112,7 +112,7 @@ def sent(transport: Memory, kind: str) -> list:
 
 
 def test_an_edge_is_published_and_drawn(transport):
-    sink = RosSink(transport, SinkOptions())
+    sink = RosSink(transport, LiveOptions())
     sink.loop(edge(80, 2, moved(9, 1), moved(0), moved(0.5)))
     assert {topic for topic, *_ in transport.sent} == {"/sglpr/loops", "/sglpr/loop_markers"}
     ends = sent(transport, MARKERS)[-1].markers[0].points
@@ -120,7 +120,7 @@ def test_an_edge_is_published_and_drawn(transport):
 
 
 def test_the_correction_of_the_odometry_is_published(transport):
-    sink = RosSink(transport, SinkOptions())
+    sink = RosSink(transport, LiveOptions())
     sink.frame(status())
     assert transport.sent == []
     sink.frame(status(map_from_world=moved(-8.5, -1)))
@@ -131,7 +131,7 @@ def test_the_correction_of_the_odometry_is_published(transport):
 
 @pytest.mark.parametrize("time", [float("nan")])
 def test_the_transform_of_a_scan_without_time_has_the_present_one(transport, time):
-    RosSink(transport, SinkOptions()).frame(status(time, np.eye(4)))
+    RosSink(transport, LiveOptions()).frame(status(time, np.eye(4)))
     assert sent(transport, TRANSFORMS)[0].transforms[0].header.stamp.sec > 1e9
 
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from sglpr_jax.cli.live import LiveCommand
-from sglpr_jax.live.endpoints import SourceOptions
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros import RosSource, Transport
 from sglpr_jax.live.ros_messages import CLOUD, EDGE, TRANSFORMS
 from tests.live.messages import ODOMETRY, POINTS, cloud, odometry, received
@@ -118,7 +118,7 @@ def test_messages_stay_encoded(package, said):
     node = Standing()
     wire = package.transport.RclpyTransport(node, said)
     assert isinstance(wire, Transport)
-    source = RosSource(wire, SourceOptions(odometry_topic="odom"), said)
+    source = RosSource(wire, LiveOptions(odometry_topic="odom"), said)
     assert not any("livox" in kind for _, kind in node.subscribed)
     for seconds in (12.4, 12.6):
         node.subscribed["/odom", ODOMETRY][0](odometry(seconds, (seconds, 0, 0), child="lidar"))

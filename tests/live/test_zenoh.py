@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import zenoh
 
-from sglpr_jax.live.endpoints import SinkOptions, SourceOptions, open_sink, open_source
+from sglpr_jax.live.endpoints import open_sink, open_source
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_messages import CLOUD, EDGE, TRANSFORMS
 from sglpr_jax.live.zenoh import ZenohTransport
 from tests.live.messages import cloud, decoded, transforms
@@ -39,7 +40,7 @@ def test_scans_and_poses_come(endpoint, said):
         node = f"@ros2_lv/0/{session.zid()}/0"
         keys = [f"{node}/{number}/MP/%/%/talker/%{name}/{kind}/::,5:,:,:,," for number, (name, kind) in topics]
         tokens = [session.liveliness().declare_token(key) for key in keys]
-        source = open_source(f"zenoh:{endpoint}", SourceOptions(odometry_topic="tf"), said)
+        source = open_source(f"zenoh:{endpoint}", LiveOptions(odometry_topic="tf"), said)
         frames = source.frames()
         for step in range(400):
             seconds = 100 + 0.0625 * step
@@ -61,7 +62,7 @@ def test_edges_reach_a_subscriber_that_comes_later(endpoint, said, monkeypatch, 
     listening = tmp_path / "listening.json5"
     listening.write_text(f'{{listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}')
     monkeypatch.setenv("ZENOH_SESSION_CONFIG_URI", str(listening))
-    sink = open_sink("zenoh", SinkOptions(), said)
+    sink = open_sink("zenoh", LiveOptions(), said)
     sink.loop(edge())
     other, found = ZenohTransport(endpoint, 0, said), []
     other.subscribe("/sglpr/loops", [EDGE], found.append, depth=10, reliable=True, latched=True)
@@ -75,4 +76,4 @@ def test_edges_reach_a_subscriber_that_comes_later(endpoint, said, monkeypatch, 
 
 def test_an_endpoint_that_is_none_is_one_clear_error(said):
     with pytest.raises(ValueError, match="zenoh: expected a valid endpoint or configuration, found nonsense"):
-        open_source("zenoh:nonsense", SourceOptions(), said)
+        open_source("zenoh:nonsense", LiveOptions(), said)

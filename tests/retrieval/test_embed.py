@@ -117,15 +117,15 @@ def test_images_are_turned_whole_and_cropped_to_the_grid(pictures):
 
 @pytest.mark.parametrize(("batch", "size"), [(1, 1), (3, 3), (64, 8)])
 def test_the_batches_do_not_show_and_are_all_of_one_shape(scans, batch, size):
-    shapes = set()
+    shapes, done = set(), []
 
     def describe(images):
         shapes.add(images.shape)
         return flatten(images)
 
-    found = embed_images(describe, scans, GRID, config={}, batch=batch)
+    found = embed_images(describe, scans, GRID, config={}, batch=batch, on_progress=done.append)
     np.testing.assert_array_equal(found.descriptors, embed_images(flatten, scans, GRID, config={}).descriptors)
-    assert shapes == {(size, GRID.height, GRID.width)}
+    assert shapes == {(size, GRID.height, GRID.width)} and done == [*range(1, SCANS + 1)]
 
 
 @pytest.mark.slow
@@ -158,12 +158,6 @@ def test_ready_made_images_that_are_none_of_densities_are_refused_where_these_ar
 def test_a_batch_has_at_least_one_image(pictures):
     with pytest.raises(ValueError, match=r"batch: expected a number from 1 .*found 0"):
         embed_images(flatten, pictures, GRID, config={}, batch=0)
-
-
-def test_progress_counts_every_scan_whatever_the_batches(scans):
-    seen = []
-    embed_images(flatten, scans, GRID, config={}, batch=3, on_progress=seen.append)
-    assert seen == [*range(1, SCANS + 1)]
 
 
 def test_bad_scans_are_reported_and_left_out_if_asked(scans):

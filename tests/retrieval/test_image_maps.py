@@ -46,14 +46,6 @@ def probabilities(params: Params, counts: np.ndarray) -> np.ndarray:
     return np.mean(views, axis=0)
 
 
-def test_the_map_of_a_mirrored_image_is_the_mirrored_map(params):
-    grid = params.config.grid
-    image = np.random.default_rng(1).poisson(0.3, (grid.height, grid.width)).astype(np.float32)
-    one, other = (semantic_map(params, Record(image=each)) for each in (image, np.fliplr(image)))
-    assert one.seen.any() and np.any(one.predicted != np.fliplr(one.predicted))
-    np.testing.assert_array_equal(other.predicted, np.fliplr(one.predicted))
-
-
 @pytest.mark.slow
 def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     rng = np.random.default_rng(0)

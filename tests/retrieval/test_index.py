@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from sglpr_jax import Index
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.files import WriteError
 from sglpr_jax.retrieval.index import FORMAT, _checksum
 
 from .places import WIDTH, add_places, draw, file_of
@@ -64,12 +63,6 @@ def test_recent_places_are_left_out_by_time_or_by_number():
     assert np.flatnonzero(index.recent(50.0)).tolist() == list(range(41, 100))
     assert np.flatnonzero(index.recent(frames=3)).tolist() == [97, 98, 99]
     assert index.query(draw(100)[99], 1, exclude=index.recent(50.0)).rows[0] <= 40
-
-
-def test_an_empty_index_has_no_answers():
-    index = Index.empty(WIDTH)
-    assert len(index) == 0 and list(index.ids) == [] and index.times is None and index.positions is None
-    assert index.query(draw(1)[0], 2).rows.tolist() == [-1, -1]
 
 
 def test_descriptors_of_another_model_scale_or_distance_are_refused(tmp_path):
@@ -177,14 +170,6 @@ def test_a_file_with_types_that_numpy_lacks_is_refused(tmp_path):
         Index.load(tmp_path / "i.safetensors")
 
 
-def test_a_full_disk_leaves_the_index_that_was_there(tmp_path, small_files):
-    path = tmp_path / "places.safetensors"
-    index_of(20).save(path)
-    with small_files(4000), pytest.raises(WriteError, match=r"places\.safetensors"):
-        index_of(2000).save(path)
-    assert len(Index.load(path)) == 20 and list(tmp_path.iterdir()) == [path]
-
-
 def test_lists_are_converted_and_others_are_one_error():
     index = index_of(5)
     expected = index.query(draw(5)[1], 2)
@@ -192,13 +177,13 @@ def test_lists_are_converted_and_others_are_one_error():
     np.testing.assert_array_equal(found.rows, expected.rows)
     with pytest.raises(ValueError, match="expected flags"):
         index.query(draw(1), exclude=[0] * 5)
-    for descriptors in ([["a"]], [[1.0], [1.0, 2.0]], np.array([object()])):
-        with pytest.raises(ValueError, match="expected descriptors of 8 numbers, found others"):
-            index.query(descriptors)
+    with pytest.raises(ValueError, match="expected descriptors of 8 numbers, found others"):
+        index.query([[1.0], [1.0, 2.0]])
 
 
 def test_no_places_begin_no_column():
     index = Index.empty(WIDTH)
+    assert index.query(draw(1)[0], 2).rows.tolist() == [-1, -1]
     index.add(np.zeros((0, WIDTH)), times=np.zeros(0), positions=np.zeros((0, 3)))
     index.add(draw(2))
     assert len(index) == 2 and index.times is None and index.positions is None

@@ -9,7 +9,6 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from sglpr_jax.cli.live import LiveCommand, run_node
-from sglpr_jax.live.endpoints import SinkOptions, SourceOptions
 from sglpr_jax.live.messages import Report, Reports
 from sglpr_jax.live.ros import RosSink, RosSource, Transport
 from sglpr_ros.parameters import command_of, defaults
@@ -28,12 +27,10 @@ def run(
 
     The other arguments and the errors are those of `run_node`.
     """
-    options = SourceOptions(topic=command.topic, odometry_topic=command.odometry_topic, reliable=command.reliable)
-    frames = SinkOptions(command.topic_prefix, command.map_frame, command.odometry_frame)
     run_node(
         command,
-        lambda found: RosSource(connect(), options, report),
-        lambda: [RosSink(connect(), frames)],
+        lambda found: RosSource(connect(), command, report),
+        lambda: [RosSink(connect(), command)],
         report=report,
         say=say,
         should_stop=should_stop,
