@@ -1,7 +1,7 @@
 """A circular CNN on the polar image, without attention: the cheaper of the two shipped networks.
 
 Reproduces no result of the paper. It answers the first open question of its conclusion: a descriptor that does not
-change when the scan is rotated. docs/decisions/models.md has the reasons, docs/results.md the measurements.
+change when the scan is rotated. docs/decisions.md has the reasons, docs/results.md the measurements.
 
 Expect: on the KITTI BEV images, trained on 00 and 02 for 320 steps and tested on 06: top-1 F1max .921, Recall@1 .952;
 rotated .919 and .981. The flags of that run were `--sampling.cluster 4 --sampling.positive-m 4 --steps 320

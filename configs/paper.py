@@ -1,7 +1,7 @@
 """SG-LPR as printed: the model of table 1 and its training, on KITTI, leave-one-out.
 
 Reproduces table 1: top-1 F1max .980 .918 .976 1.000 1.000 .898 on 00 02 05 06 07 08, mean .962. The paper does not
-define margin, distance, decay of the learning rate and place head. docs/decisions/paper.md explains their values.
+define margin, distance, decay of the learning rate and place head. docs/decisions.md explains their values.
 
 Expect: these numbers were not measured here. The 200,000 steps require a GPU: a step takes nine seconds on a CPU core.
 

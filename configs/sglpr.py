@@ -2,7 +2,7 @@
 
 Reproduces the network and the losses of the paper (figure 2, equations 5 to 8), but not its sizes. The image is polar,
 and circular convolutions make the tokens. CBAM and the convolutions of the head are circular, too
-(docs/decisions/models.md).
+(docs/decisions.md).
 
 Expect: on the KITTI BEV images, after training on simulated towns only, the numbers of
 sglpr_jax/weights/sglpr/README.md.

@@ -41,6 +41,7 @@ RUN_LONG = (
     "docs/test_blocks.py::test_python_runs[README.md]",
     "docs/test_blocks.py::test_python_runs[docs/guides/loops.md]",
     "docs/test_blocks.py::test_python_runs[docs/guides/maps.md]",
+    "docs/test_blocks.py::test_python_runs[docs/guides/sessions.md]",
     "live/test_live_map.py",
     "loops/",
     "sim/",

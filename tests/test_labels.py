@@ -1,7 +1,6 @@
-"""Raw SemanticKITTI ids become the classes of each setting of figure 9, as docs/reference/labels.md says."""
+"""Raw SemanticKITTI ids become the classes of each setting of figure 9."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import pytest
 from sglpr_jax.categories import RAW_NAMES
 from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes, to_raw
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "reference" / "labels.md"
 SETTINGS = (6, 15, 20, 25, 34)
 
 
@@ -58,16 +56,6 @@ def test_an_unknown_id_is_named(unknown):
 def test_an_unknown_setting_lists_those_there_are(categories):
     with pytest.raises(ValueError, match=rf"expected one of 6, 15, 20, 25, 34, found {categories}"):
         taxonomy(categories)
-
-
-def test_the_documented_table_is_the_code():
-    """A failure shows the table as it should be."""
-    lines = ["| raw id | name | " + " | ".join(map(str, SETTINGS)) + " |", "|---" * (2 + len(SETTINGS)) + "|"]
-    for raw, name in RAW_NAMES.items():
-        classes = [(to_classes(np.array(raw), categories=n).item(), taxonomy(n).names) for n in SETTINGS]
-        lines.append(f"| {raw} | {name} | " + " | ".join(f"{c} {names[c]}" for c, names in classes) + " |")
-    found = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("|")]
-    assert found == lines, "\n".join(lines)
 
 
 def test_the_map_names_and_colours_are_those_of_semantic_kitti(shared):

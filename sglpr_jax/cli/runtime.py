@@ -23,8 +23,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sglpr_jax.cli.config_file import ConfigFlags, flag_values
-from sglpr_jax.cli.defaults import default_command
+from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, with_defaults
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.fields import check_value, field_types, has_bounds
 from sglpr_jax.files import printable
@@ -104,7 +103,9 @@ def parse_command(
         [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
     )
     about = own_names(description or inspect.getdoc(command) or "")
-    default = line_type(default_command(command, arguments, load_preset=load_preset), ConfigFlags())
+    made, arguments = with_defaults(command, arguments, load_preset=load_preset)
+    hide_nested(made)
+    default = line_type(made, ConfigFlags())
     line = tyro.cli(line_type, args=arguments, prog=own_names(f"bin/{name}"), description=about, default=default)
     _check_numbers(line.command)
     if line.common.dump_config:

@@ -61,7 +61,7 @@ LARGEST_DEG = 32.0
 """Edge of the largest cells, in degrees."""
 SPACINGS = 0.5
 """Minimum edge of a cell, as a multiple of the distance between neighbouring points. With larger cells, vegetation
-hides more than it does from a real sensor (docs/decisions/data.md)."""
+hides more than it does from a real sensor (docs/decisions.md)."""
 BEHIND_M = 0.3
 """Minimum distance of a hidden point behind the nearest point of its cell, in metres."""
 BEHIND_CELLS = 3.0

@@ -2,7 +2,7 @@
 
 A narrow sensor sees more of a place in several scans than in one. `SubmapBuilder` takes a stream of scans, and
 `submaps` returns a recording whose scans are submaps. A submap holds the nearest point of each direction, as a scan
-does, because the weights are trained on scans (docs/decisions/data.md).
+does, because the weights are trained on scans (docs/decisions.md).
 """
 
 import dataclasses

@@ -21,7 +21,7 @@ from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import inverse, travelled
 
 MIN_OVERLAP = 0.6
-"""Minimum overlap of two registered scans of one place. Measurements: docs/decisions/loops.md."""
+"""Minimum overlap of two registered scans of one place. Measurements: docs/decisions.md."""
 LITTLE_OVERLAP = 0.3
 """Minimum overlap of two registered scans of one place whose pose agrees with that of their images."""
 AGREE, AGREE_M, AGREE_DEG = 6.0, 0.05, 0.3

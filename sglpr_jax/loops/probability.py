@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
 DEFAULT = Path(__file__).with_name("probability.json")
-"""File of the model fitted in the simulator. See docs/decisions/loops.md."""
+"""File of the model fitted in the simulator. See docs/decisions.md."""
 KNOTS: Mapping[str, tuple[float, ...]] = {
     "ambiguity_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "along_m": (0.03, 0.06, 0.1, 0.2, 0.4, 1.0, 3.0),

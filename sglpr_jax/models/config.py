@@ -220,7 +220,7 @@ class HeadConfig:
     """Place head: CBAM, three convolutions and NetVLAD (section 4.1.2).
 
     The paper gives no kernel sizes, strides or channels. The preset `paper` is one interpretation
-    (docs/decisions/paper.md).
+    (docs/decisions.md).
     """
 
     input: Literal["features", "counts", "labels", "counts+labels"] = "features"

@@ -12,7 +12,7 @@ from sglpr_jax.models.config import ModelConfig
 class LossConfig:
     """Weights and variants of the loss (equations 5 and 8).
 
-    The paper gives no margin and no distance. docs/decisions/paper.md explains the values used here.
+    The paper gives no margin and no distance. docs/decisions.md explains the values used here.
     """
 
     margin: NotNegative = 0.3

@@ -115,14 +115,6 @@ def test_maps_scores_and_pages_are_of_the_weights_categories(runs, command, town
 
 
 @pytest.mark.slow
-def test_weights_without_a_segmentation_head_are_refused_by_segment(runs, command, town, tmp_path):
-    folder = runs("RS, 6")
-    ended = command("segment", "--weights", folder, "--data", town, "--seq", "08", "--out", tmp_path / "maps")
-    assert_one_line_error(ended, folder, "expected weights with a segmentation head")
-    assert not (tmp_path / "maps").exists()
-
-
-@pytest.mark.slow
 def test_a_page_shows_what_there_is_of_weights_that_read_labels(runs, command, town, tmp_path):
     folder, out = runs("RS, 6"), tmp_path / "08.npz"
     options = ("--weights", folder, "--data", town, "--seq", "08")

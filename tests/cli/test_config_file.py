@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -88,11 +89,12 @@ def test_a_dump_gives_the_same_command(name, tmp_path):
 def test_a_dump_has_the_flags_of_the_help(name):
     ended = run_command(name, *LINES[name], "--dump-config")
     shown = run_command(name, *LINES[name], "--help").out
-    flags = {word.strip(",│") for word in shown.split() if word.startswith("--")}
+    flags = set(re.findall(r"^\W*(--[a-z][a-z0-9-]+)", shown, re.MULTILINE))
     positional = {"checkpoint", "recording", "scan", "file", "more", "source", "what"}
     positional |= {"action", "method", "data"} if name == "peers" else set()
-    dumped = {f"--{flag}" for flag in json.loads(ended.out) if flag not in positional}
+    dumped = {f"--{flag}" for flag in json.loads(ended.out) if flag not in positional and "." not in flag}
     assert dumped <= flags and {"--config", "--dump-config"} <= flags - dumped
+    assert len(flags) <= 40
 
 
 def test_a_dump_needs_the_required_flags_and_does_nothing(tmp_path, monkeypatch):
@@ -131,14 +133,8 @@ def test_the_file_may_name_the_preset_and_overrides_it(name, file):
         ("loops", [], ["expected an object with a value for each flag, found []"]),
         ("loops", {"min_probability": 1}, ["found 'min_probability'; did you mean 'min-probability'?"]),
         ("loops", {"candidates": {}}, ["expected flags of the command, found 'candidates'"]),
-        ("loops", {"nothing-like-it": 1}, ["expected flags of the command, found 'nothing-like-it'"]),
-        ("loops", {"config": "a"}, ["expected flags of the command, found 'config'"]),
         ("loops", {"seq": 7}, ["seq: expected a value of type str, found 7"]),
-        ("loops", {"out": None}, ["out: expected a value of type str, found None"]),
-        ("loops", {"register": 1}, ["register: expected a value of type bool, found 1"]),
         ("loops", {"keyframe-m": "1e-4"}, ["keyframe-m: expected a value of type float, found '1e-4'"]),
-        ("loops", {"keyframe-m": True}, ["keyframe-m: expected a value of type float, found True"]),
-        ("loops", {"degenerate": "sometimes"}, ["degenerate: expected one of 'keep', 'drop', found 'sometimes'"]),
         (
             "loops",
             {"sensor-height": "high"},
@@ -146,12 +142,8 @@ def test_the_file_may_name_the_preset_and_overrides_it(name, file):
         ),
         ("loops", {"motion-drift.yaw-deg": -1}, ["motion-drift: expected yaw_deg > 0, found -1"]),
         ("embed", {"batch": 0}, ["batch: expected a number from 1 up to 1048576, found 0"]),
-        ("export", {"shares": [1, -1]}, ["shares: expected a number from 0, found -1"]),
         ("stress", {"method": "solid"}, ["method: expected a list, found 'solid'"]),
-        ("relocalize", {"frame": 1.5}, ["frame: expected a value of type int, found 1.5"]),
-        ("train", {"steps": 0}, ["steps: expected a number from 1"]),
         ("train", {"chunk": 7}, ["chunk must divide the"]),
-        ("train", {"preset": 7}, ["preset: expected a value of type str, found 7"]),
         ("train", {"preset": "smal"}, ["preset: no preset 'smal': expected a .py file or one of"]),
         ("train", {"model.backbone.kind": "swin"}, ["model.backbone.kind: expected one of 'sglpr', found 'swin'"]),
     ],
@@ -159,6 +151,18 @@ def test_the_file_may_name_the_preset_and_overrides_it(name, file):
 def test_a_wrong_file_is_one_line(name, values, words, file):
     path = file(values)
     assert_one_line_error(run_command(name, "--config", path), f"error: {path}: ", *words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--candidates.candidats", "7"), "found '--candidates.candidats'; did you mean '--candidates.candidates'?"),
+        (("--candidates.candidates=x",), "--candidates.candidates: expected a value of type int, found 'x'"),
+        (("--candidates.candidates",), "--candidates.candidates: expected a value of type int, found []"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(arguments, words):
+    assert_one_line_error(run_command("loops", "scans", "--out", "found", *arguments), words)
 
 
 def test_a_missing_file_is_one_line(tmp_path):

@@ -25,22 +25,18 @@ def tiny_demo(monkeypatch, town, preset):
 
 
 @pytest.mark.slow
-def test_the_demo_finds_loops_scores_descriptors_and_trains_and_can_be_run_again(command, tiny_demo, tmp_path):
+def test_the_demo_finds_loops_scores_descriptors_and_trains(command, tiny_demo, tmp_path):
     out = tmp_path / "demo"
-    first = command("demo", "--out", out, "--scans", 40, "--steps", 2)
-    assert first.status == 0, first.error
+    ended = command("demo", "--out", out, "--scans", 40, "--steps", 2)
+    assert ended.status == 0, ended.error
     assert tiny_demo["scans"] == 40
     for words in ("frames of 00", "top-1 F1max", "untrained", "shipped", "rotated", "sequence 00, 40 scans"):
-        assert words in first.out
-    assert "2 steps of training, to show the command" in first.error
-    pages = [Path(page) for page in first.out.split("pages: ")[1].strip().split(", ")]
+        assert words in ended.out
+    assert "2 steps of training, to show the command" in ended.error
+    pages = [Path(page) for page in ended.out.split("pages: ")[1].strip().split(", ")]
     assert pages == [out / "loops" / "index.html", out / "00" / "report.html"]
     assert all(page.stat().st_size > 50_000 for page in pages)
     assert (out / "run" / "checkpoints" / "2").is_dir()
-
-    again = command("demo", "--out", out, "--scans", 40, "--steps", 1)
-    assert again.status == 0, again.error
-    assert (out / "run" / "checkpoints" / "1").is_dir() and not (out / "run" / "checkpoints" / "2").exists()
 
 
 def test_a_demo_that_is_stopped_says_what_it_does_next(command, tiny_demo, random_params, tmp_path, monkeypatch):

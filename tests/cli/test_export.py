@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models import weights_file
+from sglpr_jax.models import shipped
 
 from .conftest import assert_one_line_error
 
@@ -30,8 +30,8 @@ def weights(random_params, tmp_path_factory) -> Path:
 @pytest.fixture
 def exported(command, weights, tmp_path, monkeypatch) -> Path:
     """These weights, exported under the name `circular` into a package folder of their own."""
-    monkeypatch.setattr(weights_file, "FOLDER", tmp_path / "package")
-    folder = weights_file.FOLDER / "circular"
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
+    folder = shipped.FOLDER / "circular"
     ended = command("export", "--weights", weights, "--out", folder, "--half")
     assert ended.status == 0, ended.error
     assert f"{folder}: 0." in ended.out and "MB of weights" in ended.out
@@ -45,11 +45,6 @@ def test_exported_weights_embed_by_name_as_the_whole_ones_do(command, exported, 
         assert ended.status == 0, ended.error
     found, whole = (load(tmp_path / f"{name}.npz").descriptors for name in ("circular", "weights"))
     assert 0 < np.abs(found - whole).max() < 1e-2
-
-
-def test_exported_weights_have_no_segmentation_head(command, exported, town, tmp_path):
-    ended = command("segment", "--weights", "circular", "--data", town, "--seq", "08", "--out", tmp_path / "maps")
-    assert_one_line_error(ended, "circular: expected weights with a segmentation head, found none")
 
 
 def test_float32_weights_with_the_head_are_those_of_before(command, weights, tmp_path):
@@ -103,12 +98,6 @@ def test_a_program_is_written_in_place_of_weights(command, weights, tmp_path):
     assert files == {"describe.stablehlo", "config.json", "input.json"}
 
 
-def test_flags_of_weights_are_refused_beside_a_program(command, weights, tmp_path):
-    ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--format", "onnx", "--half")
-    assert_one_line_error(ended, "expected --half only with --format weights, found it with onnx")
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_average_is_that_of_the_weights_named_with_and_without_the_head(command, weights, tmp_path):
     params = sglpr_jax.load(weights)
     doubled = dataclasses.replace(params, weights=jax.tree.map(lambda leaf: 2 * leaf, params.weights))
@@ -122,9 +111,3 @@ def test_an_average_is_that_of_the_weights_named_with_and_without_the_head(comma
         found = sglpr_jax.load(out)
         assert found.config == expected.config
         chex.assert_trees_all_close(found.weights, jax.tree.map(lambda leaf: 1.25 * leaf, expected.weights), rtol=1e-6)
-
-
-def test_shares_without_an_average_are_refused(command, weights, tmp_path):
-    ended = command("export", "--weights", weights, "--shares", "1", "--out", tmp_path / "out")
-    assert_one_line_error(ended, "expected --shares only with --average, found it without")
-    assert not (tmp_path / "out").exists()

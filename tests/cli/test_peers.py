@@ -65,14 +65,6 @@ def test_trained_weights_describe_a_recording_and_compare_it(run, town, tmp_path
         assert (other.descriptors != file.descriptors).any() and other.distance != file.distance
 
 
-def test_scans_can_be_rotated_first(town, tmp_path):
-    options = ("--method", "rinet", "--weights", "random:0", "--data", town, "--seq", "08")
-    raw, turned = (tmp_path / f"{name}.npz" for name in ("raw", "turned"))
-    assert embed(raw, *options).status == embed(turned, *options, "--rotate").status == 0
-    a, b = (DescriptorFile.load(path).descriptors for path in (raw, turned))
-    assert (a != b).any(axis=1).all()
-
-
 def test_a_distance_whose_weights_are_gone_is_an_error(run, town, tmp_path):
     weights = tmp_path / "weights-1"
     shutil.copytree(run / "weights-1000", weights)

@@ -8,7 +8,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.cli.train import parse
-from sglpr_jax.models.config import MODELS, model_preset
+from sglpr_jax.models.config import MODELS
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.presets import load_preset, preset_names
 
@@ -35,23 +35,12 @@ def test_the_paper_presets_differ_in_the_model_alone():
     assert dataclasses.replace(other, model=paper.model) == paper
 
 
-def test_the_paper_on_ready_made_images_has_the_tokens_of_the_paper():
-    paper, other = model_preset("paper"), model_preset("paper-112")
-    tokens = [config.grid.height // config.backbone.patch for config in (paper, other)]
-    assert tokens == [56, 56] and other.grid.resolution_m * other.grid.width == pytest.approx(44.8)
-    assert dataclasses.replace(other.backbone, patch=4) == paper.backbone
-
-
 def test_the_flags_of_the_guide_train_the_semantic_map_of_the_shipped_network():
     guide = (CONFIGS[0].parents[1] / "docs/guides/semantics.md").read_text().replace("\\\n", " ")
     command = next(line for line in guide.splitlines() if "--weights sglpr" in line)
     config = parse(shlex.split(command)[1:]).config
     assert config.model == sglpr_jax.load("sglpr").config
     assert config.loss.segmentation_alone and not load_preset("sglpr").loss.segmentation_alone
-
-
-def test_a_file_of_ones_own_is_a_preset(preset):
-    assert load_preset(str(preset)).steps == 4
 
 
 @pytest.mark.parametrize("name", ["smal", "nowhere/mine.py"])

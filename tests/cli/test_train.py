@@ -43,13 +43,6 @@ def test_a_mistyped_flag_or_preset_is_refused(command):
     assert_one_line_error(command("train", "--preset", "sglp"), "sglp", "paper", "sglpr")
 
 
-def test_help_names_the_presets_and_the_examples(command):
-    ended = command("train", "--help")
-    assert ended.status == 0
-    for words in ("paper-112", "bin/train --seq 08", "--optimizer.learning-rate", "--resume"):
-        assert words in ended.out
-
-
 def test_a_run_leaves_everything_that_it_printed(trained, town):
     folder, ended = trained
     assert f"run: {folder}" in ended.out and "training on 00, 05; testing on 08" in ended.error

@@ -97,11 +97,6 @@ def test_a_semantic_map_learnt_alone_leaves_descriptors_to_the_bit(labelled_imag
     assert np.abs(sglpr_jax.segment(learnt, image) - sglpr_jax.segment(begun, image)).max() > 1e-4
 
 
-def test_nothing_to_train_on_is_refused(images, preset, tmp_path):
-    with pytest.raises(ValueError, match="expected recordings to train on, found none"):
-        train(load_preset(str(preset)), [], out=tmp_path / "run")
-
-
 def test_a_run_is_not_resumed_with_fewer_steps_than_it_has_made(images, preset, tmp_path):
     config, recordings, out = load_preset(str(preset)), [open_recording(images, "00")], tmp_path / "run"
     (out / "checkpoints" / "3").mkdir(parents=True)

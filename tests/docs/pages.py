@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
-GENERATED = {ROOT / "docs" / "reference" / f"{name}.md" for name in ("api", "commands", "configuration", "licences")}
+_NAMES = ("api", "commands", "configuration", "labels", "licences")
+GENERATED = {ROOT / "docs" / "reference" / f"{name}.md" for name in _NAMES}
 PAGES = [ROOT / "README.md", *sorted(set((ROOT / "docs").rglob("*.md")) - GENERATED)]
 
 

@@ -63,7 +63,7 @@ def test_flags_of_benchmarks_exist(line):
 
 
 def test_nothing_else_is_unknown():
-    known = ("bin/", "python ", "pip install", "for ", "done", "sed ", "docker ")  # the last: tests/test_docker.py
+    known = ("bin/", "python ", "pip install", "for ", "done", "taskset ", "docker ")  # the last: tests/test_docker.py
     assert not [(name_of(page), line) for page, line in COMMANDS if not line.startswith(known) and "s." not in line]
     assert {block.language for page in PAGES for block in blocks(page)} <= {"bash", "python", "text"}
 
@@ -71,12 +71,10 @@ def test_nothing_else_is_unknown():
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
 def test_python_runs(page, in_examples, monkeypatch):
-    """All blocks of a page, one after another, in a folder with a small dataset; what is trained is a tiny model, and
-    the guides that search a whole recording do so with the cheaper weights."""
-    model, load = model_preset("tiny"), sglpr_jax.load
-    if page.name in ("loops.md", "maps.md"):
-        monkeypatch.setattr(sglpr_jax, "load", lambda name: load("circular"))
-    preset = sglpr_jax.preset
+    """All blocks of a page, one after another, in a folder with a small dataset, with the cheaper weights; what is
+    trained is a tiny model."""
+    model, load, preset = model_preset("tiny"), sglpr_jax.load, sglpr_jax.preset
+    monkeypatch.setattr(sglpr_jax, "load", lambda name: load("circular"))
     monkeypatch.setattr(sglpr_jax, "preset", lambda name: dataclasses.replace(preset(name), model=model))
     found = {"__name__": "page"}
     for block in blocks(page):

@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from .pages import PAGES, ROOT, name_of
+from .pages import GENERATED, PAGES, ROOT, name_of
 
 SITE = ROOT / "build" / "manual"
 
@@ -69,8 +69,7 @@ def test_files_that_are_named_exist(page):
     """Links of the Markdown itself, as GitHub shows it, and paths of source files in the text."""
     text = page.read_text()
     links = [target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in target]
-    generated = ("api.md", "commands.md", "configuration.md", "licences.md")
-    lost = [link for link in links if link and not link.endswith(generated) and not (page.parent / link).exists()]
+    lost = [link for link in links if link and not _is_page((page.parent / link).resolve())]
     paths = re.findall(r"`((?:\w+/)+[\w-]+\.py)`", text)
     lost += [path for path in paths if "NAME" not in path and not _is_source(path)]
     assert not lost
@@ -79,7 +78,11 @@ def test_files_that_are_named_exist(page):
 def test_pages_that_the_source_names_exist():
     sources = [path for folder in ("sglpr_jax", "configs", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
     named = {(path.name, page) for path in sources for page in re.findall(r"docs/[\w/-]+\.md", path.read_text())}
-    assert not [(source, page) for source, page in named if not (ROOT / page).exists()]
+    assert not [(source, page) for source, page in named if not _is_page(ROOT / page)]
+
+
+def _is_page(path: Path) -> bool:
+    return path in GENERATED or path.exists()
 
 
 def _is_source(path: str) -> bool:

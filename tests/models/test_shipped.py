@@ -12,7 +12,7 @@ import pytest
 import safetensors.numpy
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models import weights_file
+from sglpr_jax.models import shipped
 from sglpr_jax.models.config import HeadConfig, SwinConfig, model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
@@ -63,16 +63,16 @@ def params(random_params) -> Params:
 def placeholder(params, tmp_path, monkeypatch) -> Path:
     """A set of weights `placeholder`, which is all that ships."""
     monkeypatch.setattr(weights_file, "FOLDER", tmp_path / "package")
-    folder = save(for_places(params), weights_file.FOLDER / "placeholder", half=True)
+    folder = save(for_places(params), shipped.FOLDER / "placeholder", half=True)
     (folder / CARD_FILE).write_text("# A card\n" + "".join(f"\n## {title}\n\n{text}\n" for title, text in CARD.items()))
     return folder
 
 
 @pytest.mark.slow
 def test_every_set_that_ships_is_fit_to():
-    assert shipped_weights(), f"{weights_file.FOLDER}: expected at least one set of weights"
+    assert shipped_weights(), f"{shipped.FOLDER}: expected at least one set of weights"
     for name in shipped_weights():
-        assert_fit_to_ship(weights_file.FOLDER / name)
+        assert_fit_to_ship(shipped.FOLDER / name)
 
 
 def test_the_placeholder_is_fit_to_ship(placeholder):

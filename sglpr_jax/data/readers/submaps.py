@@ -5,7 +5,7 @@
 - `business_run1/pointcloud_25m_25/*.bin` and `pointcloud_centroids_25.csv`.
 
 A density image counts points in metric cells around a sensor. Submaps have no sensor. Each submap is scaled to [-1, 1],
-and its factor is not stored (docs/decisions/data.md). Without this reader, a run looks like a plain folder of scans.
+and its factor is not stored (docs/decisions.md). Without this reader, a run looks like a plain folder of scans.
 """
 
 from pathlib import Path
