@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from sglpr_jax.data.formats.pose_files import read_poses, read_times
 from sglpr_jax.data.formats.scan_files import read_labels
 from sglpr_jax.data.recording import Record, Recording, image_record
+from sglpr_jax.se3 import positions_from_camera
 
 
 def of_scans(clouds: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
@@ -44,3 +46,10 @@ def _recording(paths: tuple[Path, ...], read: Callable[..., Record], **fields: A
     ids = tuple(path.stem for path in paths)
     unknown = {"name": "08", "ids": ids, "positions": None, "times": None, "pose_source": None}
     return Recording(**{**unknown, **fields}, paths=paths, read=read)
+
+
+def kitti_trajectory(root: Path, name: str, *, pose_source: str) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """Positions (n, 3) of all frames of a sequence in KITTI's layout, their times, and the name of the pose file."""
+    file = f"poses/{name}.txt" if pose_source == "kitti" else f"sequences/{name}/poses.txt"
+    times = root / "sequences" / name / "times.txt"
+    return positions_from_camera(read_poses(root / file)), read_times(times) if times.is_file() else None, file

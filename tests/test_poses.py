@@ -7,9 +7,9 @@ import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from recordings import kitti_trajectory
 
 from sglpr_jax.data.formats.pose_files import read_poses
-from sglpr_jax.data.readers.kitti import read_trajectory
 from sglpr_jax.revisits import database_end, revisits
 from sglpr_jax.same_place import EXCLUDED_FRAMES, POSITIVE_M
 from sglpr_jax.se3 import are_rotations, distances, positions_from_camera
@@ -95,7 +95,7 @@ def test_height_counts_only_in_3d():
 )
 def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
     published = json.loads((shared / "data/protocol/logg3d_is_revisit_D-3_T-30.json").read_text())[sequence]
-    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
+    positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     found = revisits(positions, times=times)
     assert found.sum() == count
     np.testing.assert_array_equal(found, np.array(published) == 1)
@@ -104,7 +104,7 @@ def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
 
 @pytest.mark.parametrize("sequence, count", [("02", 217), ("08", 158)])
 def test_the_pose_file_matters(shared, sequence, count):
-    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="kitti")
+    positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="kitti")
     assert revisits(positions, times=times).sum() == count
 
 

@@ -10,7 +10,7 @@ import jax
 
 from benchmarks.gpu.small_results import half_fits
 from benchmarks.speed.throughput import about, configured
-from sglpr_jax.data.leave_one_out import leave_one_out
+from sglpr_jax.data.training_recordings import leave_one_out
 from sglpr_jax.evaluation.final_test import final_test
 from sglpr_jax.files import read_json, write_json
 from sglpr_jax.models.params import Params

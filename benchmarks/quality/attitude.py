@@ -27,7 +27,7 @@ import sglpr_jax
 from benchmarks.quality.covariance import ALIAS_DEG, ALIAS_M, STEPS, revisits, twist
 from benchmarks.quality.loops import LOOP_M, OTHER_M, REVISIT_M, drifted
 from sglpr_jax.data.choices import Gravity
-from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.acceptance import settled

@@ -19,9 +19,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from benchmarks.quality.attitude import in_memory
 from benchmarks.quality.covariance import STEPS
-from sglpr_jax.data.gravity import IMU_TILT_DEG
+from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
-from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.sim.drive import TimedPoses

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import sglpr_jax
-from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import estimate_mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.se3 import distances

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
-from sglpr_jax.data import leave_one_out as split
 from sglpr_jax.data import readers
+from sglpr_jax.data import training_recordings as split
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import readable
 
@@ -83,7 +83,7 @@ def open_recording(root: Path, name: str | None, **options: Any) -> Recording:
 def leave_one_out(
     root: Path, seq: str, *, train_seqs: Sequence[str] = (), **options: Any
 ) -> tuple[list[Recording], Recording]:
-    """Run `data.leave_one_out` and describe the recordings on stderr."""
+    """Run `data.training_recordings` and describe the recordings on stderr."""
     recordings, test = split.leave_one_out(root, seq, train=train_seqs, **options)
     names = ", ".join(recording.name for recording in recordings)
     print(f"training on {names}; testing on {seq}, which is held out", file=sys.stderr)

@@ -143,7 +143,7 @@ def open_with_poses(
     Poses at other times are interpolated. Scans without a pose are removed and reported on stderr. If `root` is a point
     cloud map, the scans are those that its LiDAR would measure at the poses.
     """
-    from sglpr_jax.data.formats.cloud_files import is_cloud_file
+    from sglpr_jax.data.formats.scan_files import is_cloud_file
     from sglpr_jax.pose_graph.odometry_files import at_scans, is_own, own_odometry, read_odometry
 
     if is_cloud_file(root):

@@ -199,7 +199,7 @@ def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[R
 
 
 def _pseudo_labelled(recordings: "Sequence[Recording]", folder: Path, config: TrainConfig) -> "Sequence[Recording]":
-    from sglpr_jax.data.pseudo_labels import with_pseudo_labels
+    from sglpr_jax.data.training_recordings import with_pseudo_labels
 
     if not config.model.segments:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Trails of moving objects in a point cloud map: low things on ground that was seen beneath and all around them.
+"""Point cloud maps: trails of moving objects, visible points of a pose, and points near a trajectory.
 
 A map of scans shows a passing vehicle once for each scan. The ground beneath the vehicle was seen before or after it
 passed. Walls, hedges and parked vehicles hide the ground behind or beneath them. Trunks and poles are higher.

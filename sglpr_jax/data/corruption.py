@@ -1,4 +1,4 @@
-"""Assigns the points of a scan to rings, one ring per laser of the sensor."""
+"""Corruptions of scans for robustness tests: occlusion, fewer beams, noise, dropout and a moved sensor."""
 
 import dataclasses
 import difflib
@@ -127,17 +127,22 @@ class Kind:
 
 def occlude(scan: Scan, degrees: float) -> Bool[np.ndarray, " n"]:
     """Remove the points in a sector of the given width, in degrees, about a random heading."""
-    return outside_sector(scan.points, heading=scan.rng.uniform(-np.pi, np.pi), width=np.radians(degrees))
+    heading, width = scan.rng.uniform(-np.pi, np.pi), np.radians(degrees)
+    azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
+    return np.abs((azimuth - heading + np.pi) % (2 * np.pi) - np.pi) >= width / 2
 
 
 def fewer_beams(scan: Scan, beams: float) -> Bool[np.ndarray, " n"]:
-    """Keep the given number of lasers (`laser_rings.keep_rings`). Raises ValueError if the rings are unknown."""
+    """Keep the given number of lasers (`keep_rings`). Raises ValueError if the rings are unknown."""
     return keep_rings(ring_numbers(scan.points, lasers=scan.lasers), int(beams))
 
 
 def add_noise(scan: Scan, metres: float) -> Cloud:
-    """Add Gaussian noise along each ray, with the given standard deviation in metres."""
-    return add_to_range(scan.points, metres * scan.rng.standard_normal(len(scan.points)))
+    """Add Gaussian noise along each ray, with the given standard deviation in metres. A point at the sensor stays."""
+    distance = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    steps = metres * scan.rng.standard_normal(len(scan.points))
+    share = np.divide(steps, distance, out=np.zeros_like(distance), where=distance > 0)
+    return (scan.points * (1 + share[:, None])).astype(np.float32)
 
 
 def drop_out(scan: Scan, share: float) -> Bool[np.ndarray, " n"]:
@@ -146,13 +151,11 @@ def drop_out(scan: Scan, share: float) -> Bool[np.ndarray, " n"]:
 
 
 def offset(scan: Scan, metres: float) -> Cloud:
-    """Move the sensor by the given distance, in metres, to the left or to the right at random."""
-    return moved_left(scan.points, scan.rng.choice((-1, 1)) * metres)
+    """Move the sensor by the given distance, in metres, to the left or to the right at random.
 
-
-def leave(scan: Scan, strength: float) -> Cloud:
-    """Return the points unchanged."""
-    return scan.points
+    Only the points move. A sensor at the new place would see other occlusions, which one scan does not show.
+    """
+    return scan.points - np.array([0, scan.rng.choice((-1, 1)) * metres, 0], np.float32)
 
 
 def rotate_elsewhere(scan: Scan, strength: float) -> Cloud:
@@ -161,7 +164,7 @@ def rotate_elsewhere(scan: Scan, strength: float) -> Cloud:
 
 
 KINDS: dict[str, Kind] = {
-    "clean": Kind(leave, strengths=()),
+    "clean": Kind(lambda scan, strength: scan.points, strengths=()),
     "rotation": Kind(rotate_elsewhere, strengths=(0.0,)),
     "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), unit="°", limits=(0.0, 360.0)),
     "beams": Kind(fewer_beams, strengths=(32.0, 16.0), limits=(1.0, np.inf), needs_lasers=True),
@@ -254,28 +257,6 @@ def corrupt(
     if found.dtype == bool:
         return points[found], found
     return found, np.ones(len(points), bool)
-
-
-def outside_sector(points: Float[np.ndarray, "n 3"], *, heading: float, width: float) -> Bool[np.ndarray, " n"]:
-    """Return whether each point is outside a sector of `width` radians about `heading` (0: ahead,
-    counter-clockwise)."""
-    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
-    return np.abs((azimuth - heading + np.pi) % (2 * np.pi) - np.pi) >= width / 2
-
-
-def add_to_range(points: Cloud, metres: Float[np.ndarray, " n"]) -> Cloud:
-    """Move every point along its ray, away from the sensor. A point at the sensor has no ray and stays."""
-    distance = np.linalg.norm(points.astype(np.float64), axis=1)
-    share = np.divide(metres, distance, out=np.zeros_like(distance), where=distance > 0)
-    return (points * (1 + share[:, None])).astype(np.float32)
-
-
-def moved_left(points: Cloud, offset_m: float) -> Cloud:
-    """Return the scan relative to a place `offset_m` metres to the left of the sensor, or to the right if negative.
-
-    Only the points move. A sensor at the new place would see other occlusions, which one scan does not show.
-    """
-    return points - np.array([0, offset_m, 0], np.float32)
 
 
 def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:

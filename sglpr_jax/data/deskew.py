@@ -4,6 +4,7 @@ A scan takes about .1 s, and each point is relative to the pose of the sensor wh
 moves the points of a scan into the frame of one pose. `deskewed` does so for a recording, with the poses of its scans.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.data.given_poses import poses_of_scans
+from sglpr_jax.data.poses import poses_of_scans
 from sglpr_jax.data.recording import Record, Recording
 
 TICK_S = 2e-5
@@ -162,27 +163,25 @@ def has_point_times(recording: Recording) -> bool:
     """Whether scans have increasing times and the points of the first readable scan have valid times."""
     if recording.has_images or recording.times is None or not (np.diff(recording.times) > 0).all():
         return False
-    for row in range(min(len(recording), TRIED)):
-        try:
-            record = recording.record(row, labels=False)
-        except (ValueError, OSError):
-            continue
-        try:
-            return record.point_times is not None
-        except ValueError:
-            return False
-    return False
+    record = _first_readable(recording)
+    try:
+        return record is not None and record.point_times is not None
+    except ValueError:
+        return False
 
 
 def _check_point_times(recording: Recording) -> None:
     """Raise ValueError if the points of the first readable scan have no times."""
+    record = _first_readable(recording)
+    if record is not None and record.point_times is None:
+        raise ValueError(
+            f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
+        )
+
+
+def _first_readable(recording: Recording) -> Record | None:
+    """The first scan that can be read, among the first `TRIED`."""
     for row in range(min(len(recording), TRIED)):
-        try:
-            record = recording.record(row, labels=False)
-        except (ValueError, OSError):  # whoever reads the scans decides about bad ones
-            continue
-        if record.point_times is None:
-            raise ValueError(
-                f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
-            )
-        return
+        with contextlib.suppress(ValueError, OSError):  # whoever reads the scans decides about bad ones
+            return recording.record(row, labels=False)
+    return None

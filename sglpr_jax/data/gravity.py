@@ -1,9 +1,10 @@
-"""Gravity of each scan of a sensor that tilts, as in a hand: from the ground of the scans, an IMU, and odometry.
+"""Mounting of a recording's sensor: given, or estimated from the ground; for one that tilts, at each scan.
 
 The ground of one scan gives height and up (`estimate_mounting`). `GroundFilter` replaces ground that contradicts the
 scans before. With an IMU, the ground must agree with the IMU. With odometry, up is averaged over some metres of path.
 """
 
+import contextlib
 import dataclasses
 import os
 from collections.abc import Sequence
@@ -11,10 +12,20 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.mounting import Mounting, estimate_mounting
+from sglpr_jax.data.choices import Gravity, SensorHeight
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import scan_stream
+from sglpr_jax.data.warning import warn
+from sglpr_jax.fields import check_value, require
+from sglpr_jax.se3 import travelled
 
+SCANS = 11
+"""Number of scans for estimating the mounting, spread over the recording."""
+SCANS_CHECKED = 3
+"""Number of scans for checking the mounting that a layout defines."""
+ELSEWHERE_M, ELSEWHERE_DEG = 0.4, 10.0
+"""Maximum height difference, in metres, and maximum tilt, in degrees, of a sensor that fits its layout."""
 TILTS_DEG = 3.0
 """90 % quantile of the angle between up of the scans and its median above which a sensor tilts, in degrees."""
 GROUND_TILT_DEG, GROUND_HEIGHT_M = 0.25, 0.03
@@ -41,6 +52,87 @@ ODOMETRY_TILT_DEG = 0.3
 EXPLAINED = 0.5
 """Maximum angle between up of a scan and of odometry that shows the tilt, as a share of the tilt. Odometry in the plane
 does not show it."""
+
+
+def mounted(recording: Recording, height: SensorHeight, *, gravity: Gravity = "auto", known: bool) -> Recording:
+    """Return the recording with its sensor mounting, and a description of the mounting in `Recording.found`.
+
+    Recordings of images are returned unchanged. If the ground does not show the mounting, it stays unknown, and
+    models assume a sensor 1.73 m above the ground.
+
+    Arguments:
+      recording: Recording of scans or images.
+      height: Height above the ground in metres, "estimate" or "auto". "auto" estimates the mounting only if the layout
+        does not define it.
+      gravity: "recording" uses one mounting for all scans, "scan" estimates height and up of each scan. "auto" does so
+        if the mounting is estimated and the sensor tilts (`tilts`).
+      known: Whether the layout defines the mounting. If the scans contradict it, "auto" issues a `DataWarning`.
+    """
+    if recording.has_images:
+        return recording
+    check_value(gravity, Gravity, "gravity")
+    if height == "auto" and known:
+        _check_layout(recording)
+    elif height in ("auto", "estimate"):
+        return _estimated(recording, gravity)
+    else:
+        require(height, not isinstance(height, str), "metres above the ground, 'auto' or 'estimate'", "sensor_height")
+        mounting = Mounting(float(height))
+        found = f"sensor: {mounting}, as given"
+        recording = dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
+    return with_gravity(recording, recording.mounting or Mounting(MODEL_HEIGHT_M)) if gravity == "scan" else recording
+
+
+def _estimated(recording: Recording, gravity: Gravity) -> Recording:
+    each = _of_scans(recording, SCANS)
+    mounting = common_mounting(each)
+    hanging = [scan.up[2] < 0 for scan in each if scan is not None]
+    if mounting is None:
+        found = (
+            f"sensor: {_unclear(hanging, len(each))}, assumed {MODEL_HEIGHT_M} m above the ground; set --sensor-height"
+        )
+    else:
+        agreed = hanging.count(mounting.up[2] < 0)
+        found = f"sensor: {mounting}, estimated from the ground in {agreed} of {len(each)} scans"
+    recording = dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
+    if gravity == "scan" or (gravity == "auto" and tilts(each, mounting)):
+        return with_gravity(recording, mounting or Mounting(MODEL_HEIGHT_M))
+    return recording
+
+
+def _unclear(hanging: list[bool], scans: int) -> str:
+    """Explain why the scans show no mounting. `hanging` states for each scan with ground whether the sensor is upside
+    down."""
+    if 2 * len(hanging) < scans:
+        return f"ground found in {len(hanging)} of {scans} scans (is z up in these files?)"
+    return (
+        f"the ground is below the sensor in {hanging.count(False)} of {scans} scans and above it in"
+        f" {hanging.count(True)}"
+    )
+
+
+def _check_layout(recording: Recording) -> None:
+    """Warn if the scans contradict the mounting of the layout, as scans of other sensors in KITTI's layout do."""
+    believed = recording.mounting or Mounting(MODEL_HEIGHT_M)
+    found = common_mounting(_of_scans(recording, SCANS_CHECKED))
+    if found is None:
+        return
+    if abs(found.height_m - believed.height_m) > ELSEWHERE_M or found.tilt_deg > ELSEWHERE_DEG:
+        warn(
+            f"sequence {recording.name}: expected the sensor {believed}, as its layout defines, found it {found}; for"
+            " another sensor pass --sensor-height estimate, or its height in metres"
+        )
+
+
+def _of_scans(recording: Recording, scans: int) -> list[Mounting | None]:
+    """Estimate the mounting from some scans, spread over the recording, or None for unreadable ones."""
+    rows = np.unique(np.linspace(0, len(recording) - 1, scans).astype(int)).tolist()
+
+    def of_scan(row: int) -> Mounting | None:
+        with contextlib.suppress(ValueError, OSError):
+            return estimate_mounting(recording.points(row))
+
+    return [of_scan(row) for row in rows]
 
 
 class GroundFilter:
@@ -171,7 +263,7 @@ def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4
     turn = world_from_lidar[:, :3, :3]
     up = np.einsum("nij,nj->ni", turn, np.array([one.up for one in recording.mountings]))
     weight = np.array([1 / (one.tilt_deviation_deg or GROUND_TILT_DEG) ** 2 for one in recording.mountings])
-    mean = _averaged(up, weight, world_from_lidar[:, :3, 3])
+    mean = _averaged(up, weight, travelled(world_from_lidar))
     left = np.quantile(_angles_deg(up, mean), 0.9)
     whole = np.quantile(_angles_deg(np.array([one.up for one in recording.mountings]), None), 0.9)
     if left > EXPLAINED * whole:
@@ -211,13 +303,12 @@ def _beside(mean: Mounting, apart: Float[np.ndarray, "3"], deviation_m: float, d
 
 
 def _averaged(
-    values: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]
+    values: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"], way_m: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Weighted Gaussian average of directions along a path."""
     from scipy.ndimage import gaussian_filter1d  # imported here because the import is slow
 
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    metre = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    metre = way_m.astype(np.int64)
     sums = np.zeros((metre[-1] + 1, 3))
     np.add.at(sums, metre, values * weight[:, None])
     mean = gaussian_filter1d(sums, AVERAGED_M, axis=0, mode="constant")[metre]

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.times import nearest_rows
+
 AVERAGED_S = 20.0
 """Duration over which accelerations are averaged, in seconds."""
 BIN_S = 0.1
@@ -70,7 +72,7 @@ class Imu:
 
         ups = Rotation.from_quat(self.quaternions).as_matrix()[:, 2]
         found = np.full((len(times), 3), np.nan)
-        near = np.abs(self.times[_nearest(self.times, times)] - times) <= GAP_S
+        near = np.abs(self.times[nearest_rows(self.times, times)] - times) <= GAP_S
         found[near] = np.stack([np.interp(times[near], self.times, axis) for axis in ups.T], axis=1)
         return found / np.linalg.norm(found, axis=1, keepdims=True)
 
@@ -122,16 +124,10 @@ def averaged_up(
     width = min(round(AVERAGED_S / BIN_S), len(means) - 1) // 2 * 2 + 1
     smooth = np.asarray(savgol_filter(means, width, min(1, width - 1), axis=0))
     up = np.stack([np.interp(times, middles, axis) for axis in smooth.T], axis=1)
-    sample = _nearest(stamps, times)
+    sample = nearest_rows(stamps, times)
     since = Rotation.from_rotvec(rates[sample] * (times - stamps[sample])[:, None]).as_matrix()
     found = np.einsum("nji,nj->ni", start_from_imu[sample] @ since, up)
     return found / np.linalg.norm(found, axis=1, keepdims=True)
-
-
-def _nearest(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) -> np.ndarray:
-    """Row of the nearest of the ordered stamps for each time."""
-    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    return np.where(times - stamps[later - 1] <= stamps[later] - times, later - 1, later)
 
 
 def _median_angle_deg(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> float:

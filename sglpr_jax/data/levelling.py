@@ -1,4 +1,4 @@
-"""Mounting of the sensor at each frame of a search, for sensors that tilt."""
+"""Transforms between the LiDAR frame and its gravity-aligned frame, for one mounting or one at each frame."""
 
 from collections.abc import Iterable
 

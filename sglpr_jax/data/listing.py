@@ -24,6 +24,15 @@ def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
     return in_order(path for path in folder.iterdir() if path.name.lower().endswith(endings) and not hidden(path))
 
 
+def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ...]:
+    """Return the files of a folder like `files_in`. Raises FileNotFoundError if the folder has no such file."""
+    paths = files_in(folder, *endings)
+    if not paths:
+        expected = ", ".join(f"*{ending}" for ending in endings)
+        raise FileNotFoundError(f"{folder}: expected {kind} ({expected}), found none")
+    return paths
+
+
 def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
     """Sort paths by name, with numbers in names compared as numbers: full2 before full10.
 

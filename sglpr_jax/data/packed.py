@@ -1,4 +1,4 @@
-"""Stores arrays with rows of one shape one after another in a file, and maps the file into memory."""
+"""Packs of recordings: the arrays of all scans one after another in files that are mapped into memory."""
 
 import contextlib
 import dataclasses
@@ -34,21 +34,17 @@ class Stacked:
     """Checksum of each array. None for older files, which have no checksums."""
 
     def __getitem__(self, i: int) -> np.ndarray:
-        start, stop = self.offsets[i : i + 2]
-        if stop > start:
-            self._announce(*(row * self.rows.strides[0] for row in (start, stop)))
-        array = self.rows[start:stop]
+        array = self.rows[slice(*self.offsets[i : i + 2])]
+        if len(array):  # request the bytes at once: by default, the system reads 128 KiB at each first access
+            start = self.offsets[i] * self.rows.strides[0]
+            page = start - start % mmap.PAGESIZE
+            self.file.madvise(mmap.MADV_WILLNEED, page, start + array.nbytes - page)
         if self.checksums is not None and self.checksums[i] != (found := _checksum(array)):
             raise ValueError(
                 f"{self.path}: expected array {i} with the checksum {self.checksums[i]} of pack.json, found {found};"
                 " delete its folder to pack the recording again"
             )
         return array
-
-    def _announce(self, start: int, stop: int) -> None:
-        """Request these bytes from the disk at once. By default, the system reads 128 KiB at each first access."""
-        page = start - start % mmap.PAGESIZE
-        self.file.madvise(mmap.MADV_WILLNEED, page, stop - page)
 
 
 class StackWriter:
@@ -62,9 +58,7 @@ class StackWriter:
             self._stream = path.open("xb")
 
     def append(self, array: np.ndarray, *, of: str) -> None:
-        """Append an array. Raises ValueError, whose message names `of`, if the rows do not fit, and OSError if the disk
-        is full.
-        """
+        """Append an array. Raises ValueError, whose message names `of`, if the rows do not fit."""
         if (array.dtype, array.shape[1:]) != (self._dtype, self._row):
             raise ValueError(
                 f"{of}: expected {self._dtype} with rows of shape {self._row}, like the first array of the pack, "
@@ -80,8 +74,8 @@ class StackWriter:
         """Flush the file to disk and return its layout, the keyword arguments of `map_stacked`."""
         with writing(self._path):
             sync(self._stream)
-        lies = {"dtype": self._dtype.str, "row": self._row, "offsets": self._offsets}
-        return {**lies, "checksums": self._checksums}
+        rows = {"dtype": self._dtype.str, "row": self._row}
+        return {**rows, "offsets": self._offsets, "checksums": self._checksums}
 
     def close(self) -> None:
         """Close the file, whether finished or not."""
@@ -94,10 +88,8 @@ def map_stacked(
 ) -> Stacked:
     """Map a file written by `StackWriter` into memory. The keyword arguments are those that `finish` returned.
 
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file has the wrong size, or if the arguments contradict each other. Access to the missing part
-        of a file that is too short would kill the process.
+    Raises ValueError if the file has the wrong size, or if the arguments contradict each other. Access to the missing
+    part of a file that is too short would kill the process.
     """
     if any(type(number) is not int for number in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
         raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")

@@ -1,12 +1,13 @@
-"""Matches poses to scans with other times: nearest pose, or interpolation."""
+"""Poses of scans: checks, interpolation at the times of the scans, and poses that go row by row."""
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float
 
-from sglpr_jax.data.times import check_unit
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import usual_step
+from sglpr_jax.se3 import are_rotations, quaternions
 
 WIDEST_S = (1.0, 2.0)
 """Maximum time between two poses for interpolation, in seconds: the least and the greatest value (`widest_gap_s`)."""
@@ -14,64 +15,54 @@ JITTER = 1.5
 """Maximum time between two poses for interpolation, as a multiple of the median time between them."""
 BEYOND_S = 0.1
 """Maximum time of a scan before the first pose or after the last one, in seconds."""
+SAME_S = 0.001
+"""Maximum difference of equal times, in seconds. Programs round times differently."""
+LEAST_SHARE = 0.5
+"""Minimum fraction of scans with a pose. Below it, the pose file belongs to another drive or clock."""
 
 
-class Matched(NamedTuple):
-    """Nearest poses of the scans."""
-
-    kept: Bool[np.ndarray, " q"]
-    """True for scans with a pose near enough in time."""
-    rows: Int[np.ndarray, " k"]
-    """Row of the nearest pose, for the scans with a pose."""
-
-    def described(self, file: str, *, max_gap_s: float) -> str:
-        """Return the name of the pose file, with the number of skipped scans if there are any."""
-        left_out = len(self.kept) - int(self.kept.sum())
-        said = f"{file} ({left_out} of {len(self.kept)} scans left out: no pose within {max_gap_s:g} s)"
-        return said if left_out else file
+def poses_of(
+    positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None = None
+) -> Float[np.ndarray, "n 4 4"]:
+    """Combine positions and rotations to poses. The default is identity rotations."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions
+    if rotations is not None:
+        poses[:, :3, :3] = rotations
+    return poses
 
 
-def nearest_rows(stamps: Int64[np.ndarray, " n"], times: Int64[np.ndarray, " q"]) -> Int[np.ndarray, " q"]:
-    """Return the row of the nearest of the ordered `stamps` for each of `times`. Ties go to the earlier one."""
-    later = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
-    earlier = (later - 1).clip(0)
-    return np.where(np.abs(times - stamps[earlier]) <= np.abs(stamps[later] - times), earlier, later)
-
-
-def match_times(
-    stamps: Int64[np.ndarray, " n"],
-    times: Int64[np.ndarray, " q"],
-    *,
-    tick_s: float,
-    max_gap_s: float,
-    poses: Path,
-    scans: Path,
-) -> Matched:
-    """Find the nearest pose of each scan.
+def poses_of_scans(
+    recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"], *, use: str
+) -> Float[np.ndarray, "n 4 4"]:
+    """Return the poses that a caller gives for the scans of a recording, as float64.
 
     Arguments:
-      stamps: Times of the poses, in ticks.
-      times: Times of the scans, in ticks.
-      tick_s: Duration of a tick, in seconds.
-      max_gap_s: Maximum time between a scan and its pose, in seconds.
-      poses: Pose file, for messages.
-      scans: Folder of the scans, for messages.
+      recording: Recording of scans.
+      world_from_lidar: Pose of the LiDAR at each scan.
+      use: What the poses are used for, for messages.
 
     Raises:
-      ValueError: If no scan has a pose within `max_gap_s`, or the unit of times changes.
+      ValueError: If the recording has ready-made images, or if the poses have another length or no rotations.
     """
-    order = np.argsort(stamps, kind="stable")
-    check_unit(stamps[order] * tick_s, source=poses)
-    check_unit(times * tick_s, source=scans)
-    rows = order[nearest_rows(stamps[order], times)]
-    gaps_s = np.abs(stamps[rows] - times) * tick_s
-    kept = gaps_s <= max_gap_s
-    if not kept.any():
+    if recording.has_images:
+        raise ValueError(f"sequence {recording.name}: expected scans for {use}, found ready-made images")
+    poses = np.asarray(world_from_lidar, np.float64)
+    if poses.shape != (len(recording), 4, 4):
         raise ValueError(
-            f"{poses}: expected poses within {max_gap_s:g} s of the scans in {scans}, found the nearest "
-            f"{gaps_s.min():g} s away"
+            f"sequence {recording.name}: expected a pose (4, 4) for each of {len(recording)} scans, found an array of "
+            f"shape {poses.shape}"
         )
-    return Matched(kept, rows[kept])
+    return turned_poses(poses, use=use)
+
+
+def turned_poses(poses: Float[np.ndarray, "n 4 4"], *, use: str) -> Float[np.ndarray, "n 4 4"]:
+    """Return the poses. Raises ValueError if one of them is not finite or has no rotation."""
+    wrong = ~(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[:, :3, :3]))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ValueError(f"{use}: expected poses with rotations, found {poses[row].tolist()} at scan {row}")
+    return poses
 
 
 class Interpolated(NamedTuple):
@@ -88,9 +79,7 @@ def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
 
     It is 1.5 s for poses at 1 Hz, to allow for jitter, and from 1 s to 2 s for other rates.
     """
-    steps = np.diff(stamps)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    return float(np.clip(JITTER * usual, *WIDEST_S))
+    return float(np.clip(JITTER * usual_step(stamps), *WIDEST_S))
 
 
 def interpolate(
@@ -108,32 +97,22 @@ def interpolate(
 
 
 def interpolate_turns(
-    stamps: Float[np.ndarray, " n"], quaternions: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
+    stamps: Float[np.ndarray, " n"], turns: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
 ) -> Float[np.ndarray, "q 3 3"]:
-    """Interpolate rotations at `times` with constant angular velocity. At least two `stamps` are required."""
+    """Interpolate rotations (quaternions x, y, z, w) at `times` with constant angular velocity.
+
+    At least two `stamps` are required.
+    """
     from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     order = np.argsort(stamps, kind="stable")
-    stamps, quaternions = stamps[order], quaternions[order]
+    stamps, turns = stamps[order], turns[order]
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    before, after = Rotation.from_quat(quaternions[later - 1]), Rotation.from_quat(quaternions[later])
+    before, after = Rotation.from_quat(turns[later - 1]), Rotation.from_quat(turns[later])
     widths = stamps[later] - stamps[later - 1]
     shares = ((times - stamps[later - 1]) / np.where(widths > 0, widths, 1)).clip(0, 1)
     turned = before * Rotation.from_rotvec(shares[:, None] * (before.inv() * after).as_rotvec())
     return turned.as_matrix().reshape(-1, 3, 3)
-
-
-def poses_of(positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4 4"]:
-    """Combine positions and rotations to poses."""
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotations, positions
-    return poses
-
-
-SAME_S = 0.001
-"""Maximum difference of equal times, in seconds. Programs round times differently."""
-LEAST_SHARE = 0.5
-"""Minimum fraction of scans with a pose. Below it, the pose file belongs to another drive or clock."""
 
 
 class ScanPoses(NamedTuple):
@@ -176,24 +155,25 @@ def poses_at_scans(
     """
     if len(poses) == scans and (said := _row_by_row(stamps, times)) is not None:
         return ScanPoses(np.ones(scans, bool), poses, said)
+    expected, found = f"expected {scans} poses, one for each {of}", f"found {len(poses)}"
     if stamps is None or times is None:
         why = "the file has no times" if stamps is None else "the scans have no times"
         raise ValueError(
-            f"{source}: {_expected(scans, of)}, found {len(poses)}, and {why} to interpolate at (row numbers "
-            "0, 1, 2, ... are not times)"
+            f"{source}: {expected}, {found}, and {why} to interpolate at (row numbers 0, 1, 2, ... are not times)"
         )
     kept, positions = interpolate(stamps, poses[:, :3, 3], times)
     if kept.mean() < LEAST_SHARE:
-        raise ValueError(_other_clock(source, stamps, times, of))
+        by_row = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
+        raise ValueError(
+            f"{source}: {expected}, at its time, or poses at most {widest_gap_s(stamps):.2g} s apart that cover the "
+            f"scans, {times[0]:.1f} to {times[-1]:.1f} s, {found} from {stamps[0]:.1f} to {stamps[-1]:.1f} s"
+            f"{by_row if len(stamps) == len(times) else ''}"
+        )
     missing = len(kept) - int(kept.sum())
     left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
     said = f"interpolated at the times of the scans{left_out}"
-    return ScanPoses(kept, poses_of(positions, _turned(poses, stamps, times))[kept], said)
-
-
-def unturned(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:
-    """Poses at these positions with identity rotations, for files whose rotations are not used."""
-    return poses_of(positions, np.tile(np.eye(3), (len(positions), 1, 1)))
+    rotations = interpolate_turns(stamps, quaternions(poses), times)
+    return ScanPoses(kept, poses_of(positions, rotations)[kept], said)
 
 
 def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
@@ -207,25 +187,3 @@ def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray,
     if elsewhere and np.ptp(behind) <= SAME_S:
         return f"row by row: the scans have the same intervals and start {behind.mean():.1f} s later"
     return None
-
-
-def _turned(
-    poses: Float[np.ndarray, "m 4 4"], stamps: Float[np.ndarray, " m"], times: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n 3 3"]:
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
-
-    return interpolate_turns(stamps, Rotation.from_matrix(poses[:, :3, :3]).as_quat(), times)
-
-
-def _expected(scans: int, of: str) -> str:
-    return f"expected {scans} poses, one for each {of}"
-
-
-def _other_clock(source: str, stamps: Float[np.ndarray, " m"], times: Float[np.ndarray, " n"], of: str) -> str:
-    """Error message for poses whose times differ from those of the scans."""
-    found = f"found {len(stamps)} from {stamps[0]:.1f} to {stamps[-1]:.1f} s"
-    by_row = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
-    return (
-        f"{source}: {_expected(len(times), of)}, at its time, or poses at most {widest_gap_s(stamps):.2g} s apart that "
-        f"cover the scans, {times[0]:.1f} to {times[-1]:.1f} s, {found}{by_row if len(stamps) == len(times) else ''}"
-    )

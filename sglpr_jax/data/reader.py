@@ -17,6 +17,7 @@ class ReadOptions:
     """
 
     pose_source: PoseChoice = "auto"
+    """Pose file of KITTI's layout, which may contain two."""
     format: ScanFormat = "auto"
     """Format of the points in a .bin file, for a plain folder or KITTI's layout."""
     poses: Path | None = None
@@ -25,7 +26,7 @@ class ReadOptions:
     times: Path | None = None
     """File with one time per line."""
     time_unit: TimeUnit = "auto"
-    """Unit of the times in `times` and `se3`."""
+    """Unit of the times in text files."""
     pose_topic: str | None = None
     """Topic of the poses in a bag that has several."""
     imu_topic: str | None = None

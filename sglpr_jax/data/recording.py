@@ -1,4 +1,4 @@
-"""Rejects point clouds that show no place: no finite points, all points at the sensor, or coordinates not in metres."""
+"""Scans and recordings: what a reader returns, and how a scan is read from its files."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.clouds import Records, TimeField
 from sglpr_jax.data.formats.png import read_label_image
 from sglpr_jax.data.formats.scan_files import read_labels, read_scan_records
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.point_times import TimeField
 from sglpr_jax.files import naming
 from sglpr_jax.labels import to_classes
 
@@ -73,8 +72,6 @@ class Record:
     """Name for error messages: "scan 000052 of sequence 08"."""
     time_field: TimeField | None = None
     """Times of the points as the file states them, if it does."""
-    position: Float[np.ndarray, " 3"] | None = None
-    """Position in metres, z up."""
     time: float | None = None
     """Time in seconds."""
     mounting: Mounting | None = None
@@ -97,12 +94,6 @@ class Record:
         valid = np.isfinite(self.points).all(axis=1) & (self.points != 0).any(axis=1)
         with naming(self.name):
             return self.time_field.seconds(valid=valid, scan_time=self.time)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the labels: (n,) for a scan, (h, w) for an image."""
-        seen = self.image if self.points is None else self.points[:, 0]
-        return () if seen is None else seen.shape
 
     def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
         """Convert the labels to classes.
@@ -292,7 +283,6 @@ class Recording:
         return dataclasses.replace(
             self.read(self.paths[i], label_path, lasers),
             name=f"scan {self.ids[i]} of sequence {self.name}",
-            position=None if self.positions is None else self.positions[i],
             time=None if self.times is None else float(self.times[i]),
             mounting=self.mounting_of(i),
         )

@@ -4,15 +4,18 @@ An image shows 25 m in each direction, in cells of 0.4 m. With a factor of 4, it
 weights, the descriptors and the model of the probabilities stay as they are.
 """
 
+import contextlib
 import dataclasses
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.recording import ReadRecord, Record, Recording
 from sglpr_jax.fields import check_value
 
 SCALE = "scale"
@@ -47,7 +50,7 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
     each = recording.mountings
     return dataclasses.replace(
         recording,
-        read=_ScaledReader(recording, scale),
+        read=partial(_read_scaled, **{**recording.read_options, "read": recording.read, SCALE: str(scale)}),
         on_disk=False,
         mounting=_scaled_mounting(recording.mounting, scale),
         mountings=None if each is None else tuple(_scaled_mounting(mounting, scale) for mounting in each),
@@ -67,19 +70,13 @@ def typical_range_m(recording: Recording) -> float:
 
     Returns infinity if no scan can be read.
     """
-    rows = np.unique(np.linspace(0, len(recording) - 1, SCANS).astype(int)) if len(recording) else ()
-    ranges = [found for row in rows if (found := _range_m(recording, int(row))) is not None]
+    ranges = []
+    for row in np.unique(np.linspace(0, len(recording) - 1, SCANS).astype(int)).tolist() if len(recording) else ():
+        with contextlib.suppress(ValueError, OSError):  # an unreadable scan
+            points = recording.points(row)
+            distances = np.hypot(*points[np.isfinite(points).all(axis=1), :2].T)
+            ranges += [np.quantile(distances, 0.9)] if len(distances) else []
     return float(np.median(ranges)) if ranges else float("inf")
-
-
-def _range_m(recording: Recording, row: int) -> float | None:
-    """90 % quantile of the horizontal distances of a scan, or None if it cannot be read or is empty."""
-    try:
-        points = recording.points(row)
-    except (ValueError, OSError):
-        return None
-    distances = np.hypot(*points[np.isfinite(points).all(axis=1), :2].T)
-    return float(np.quantile(distances, 0.9)) if len(distances) else None
 
 
 def scale_of(recording: Recording) -> int:
@@ -112,14 +109,9 @@ def _scaled_mounting(mounting: Mounting | None, scale: Scale) -> Mounting:
     return (mounting or Mounting(MODEL_HEIGHT_M)).scaled(scale)
 
 
-class _ScaledReader:
-    """Reads scans and multiplies their points by a factor."""
-
-    def __init__(self, recording: Recording, scale: Scale):
-        self._read = recording.read
-        self._scale: Scale = scale
-        self.keywords = {**recording.read_options, SCALE: str(scale)}
-        """Read options, which identify a recording (`Recording.read_options`)."""
-
-    def __call__(self, path: Path, label_path: Path | None, lasers: bool) -> Record:
-        return scaled_record(self._read(path, label_path, lasers), self._scale)
+def _read_scaled(
+    path: Path, label_path: Path | None, lasers: bool, *, read: ReadRecord, scale: str, **options: Any
+) -> Record:
+    """Read a scan and scale it. The options identify the recording (`Recording.read_options`)."""
+    factor: Any = int(scale)
+    return scaled_record(read(path, label_path, lasers), factor)

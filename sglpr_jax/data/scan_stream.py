@@ -121,15 +121,12 @@ def readable(
 
 def only(recording: Recording, rows: Sequence[int]) -> Recording:
     """Return the recording with only the given scans or images. They keep their ids and numbers."""
+    arrays = {name: getattr(recording, name) for name in ("positions", "times", "world_from_lidar")}
+    tuples = {name: getattr(recording, name) for name in ("ids", "paths", "label_paths", "mountings")}
     return dataclasses.replace(
         recording,
-        ids=tuple(recording.ids[row] for row in rows),
-        paths=tuple(recording.paths[row] for row in rows),
-        label_paths=tuple(recording.label_paths[row] for row in rows) if recording.label_paths else (),
-        positions=None if recording.positions is None else recording.positions[list(rows)],
-        times=None if recording.times is None else recording.times[list(rows)],
+        **{name: None if values is None else values[list(rows)] for name, values in arrays.items()},
+        **{name: tuple(values[row] for row in rows) if values else values for name, values in tuples.items()},
         rows=recording.numbers[list(rows)],
-        mountings=None if recording.mountings is None else tuple(recording.mountings[row] for row in rows),
         read_ups=None,
-        world_from_lidar=None if recording.world_from_lidar is None else recording.world_from_lidar[list(rows)],
     )

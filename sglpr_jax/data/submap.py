@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt64
 
-from sglpr_jax.data.given_poses import poses_of_scans, turned_poses
+from sglpr_jax.data.poses import poses_of_scans, turned_poses
 from sglpr_jax.data.recording import Record, Recording, check_cloud
 from sglpr_jax.data.warning import warn
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Num
 
 from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.warning import warn
@@ -16,8 +16,6 @@ LATEST_S = 1e11
 """Maximum time in seconds, after the year 5000. Larger numbers are milli-, micro- or nanoseconds."""
 SLOWEST_S = 10.0
 """Maximum median step of scans and poses, in seconds: keyframes at 0.1 Hz."""
-FASTEST_S = 0.005
-"""Minimum mean step of scans, in seconds: twice the rate of the fastest LiDARs (100 Hz)."""
 FACTORS = (1e3, 1e6, 1e9)
 """Ratios of two units."""
 SAME_FACTOR = 3.0
@@ -68,18 +66,23 @@ def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
         return changed.found
     if len(times) and abs(times[-1]) > LATEST_S:
         return f"{times[-1]:g}, after the year 5000"
-    steps = np.diff(times)
-    if len(steps) < PROOF:
+    if len(times) <= PROOF:
         return ""
     if counts_rows(times):
         return f"row numbers ({times[0]:g}, {times[1]:g}, {times[2]:g}, ...)"
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    usual = usual_step(times)
     if usual > SLOWEST_S:
         unit = next((unit for unit in NAMES if usual <= SLOWEST_S * PER_SECOND[unit]), "ns")
         return f"steps of {usual:g}, which fit {NAMES[unit]}"
     if numbers and usual >= 1 and times[0] < EPOCH and (times == np.round(times)).all():
         return f"whole numbers from {times[0]:g} to {times[-1]:g}, as of frames"
     return ""
+
+
+def usual_step(times: Float[np.ndarray, " n"]) -> float:
+    """Median of the positive steps between consecutive times, or 0."""
+    steps = np.diff(times)
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
 
 class UnitChange(NamedTuple):
@@ -100,23 +103,14 @@ def unit_change(times: Float[np.ndarray, " n"]) -> UnitChange | None:
     if not len(before):
         return None
     row = int(np.argmax(times[1:] / before)) + 1
-    usual = [float(np.median(steps)) for steps in map(_steps, (times[:row], times[row:])) if len(steps) > 1]
-    if len(usual) < 2:
+    if any(np.count_nonzero(np.diff(part) > 0) < 2 for part in (times[:row], times[row:])):
         return None
-    grown = np.array([times[row] / before[row - 1], usual[1] / usual[0]])
-    near = (
-        factor for factor in FACTORS if (grown > factor / SAME_FACTOR).all() and (grown < factor * SAME_FACTOR).all()
-    )
-    factor = next(near, None)
-    if factor is None:
-        return None
-    return UnitChange(row, f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large")
-
-
-def _steps(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
-    """Positive steps between consecutive times."""
-    steps = np.diff(times)
-    return steps[steps > 0]
+    grown = np.array([times[row] / before[row - 1], usual_step(times[row:]) / usual_step(times[:row])])
+    for factor in FACTORS:
+        if (grown > factor / SAME_FACTOR).all() and (grown < factor * SAME_FACTOR).all():
+            found = f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large"
+            return UnitChange(row, found)
+    return None
 
 
 def counts_rows(times: Float[np.ndarray, " n"]) -> bool:
@@ -156,3 +150,10 @@ def check_jumps(times: Float[np.ndarray, " n"], *, source: str) -> None:
             f"{source}: expected one drive, found {steps[row] / 3600:.3g} h between scans {row} and {row + 1} "
             f"({far.size} jumps); scans before and after a jump count as separate visits of a place"
         )
+
+
+def nearest_rows(stamps: Num[np.ndarray, " n"], times: Num[np.ndarray, " q"]) -> Int[np.ndarray, " q"]:
+    """Return the row of the nearest of the ordered `stamps` for each of `times`. Ties go to the earlier one."""
+    later = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
+    earlier = (later - 1).clip(0)
+    return np.where(np.abs(times - stamps[earlier]) <= np.abs(stamps[later] - times), earlier, later)

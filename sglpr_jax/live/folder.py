@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import record_of_scan
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rotations_of
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, says_its_format
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import BEYOND_S, interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.recording import scan_record
@@ -129,7 +129,7 @@ class FolderSource:
 
     def _record_of(self, path: Path) -> RecordFormat:
         """Format of .bin files whose name does not define it, by the content of the first one."""
-        if self._records is None and self._options.format == "auto" and not says_its_format(path):
+        if self._records is None and self._options.format == "auto" and named_format(path) is None:
             self._records = record_of_scan(path)
         return self._records or "kitti"
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, Header, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.files import in_short
 from sglpr_jax.live.messages import LoopEdge

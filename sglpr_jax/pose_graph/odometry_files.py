@@ -14,7 +14,6 @@ from sglpr_jax.data.scan_stream import only
 from sglpr_jax.fields import check_value
 from sglpr_jax.odometry.config import OdometryFormat
 from sglpr_jax.pose_graph.files import read_g2o
-from sglpr_jax.se3 import are_rotations
 
 BAGS = (".bag", ".mcap", ".db3")
 
@@ -38,13 +37,12 @@ def read_odometry(
     check_value(format, OdometryFormat, f"{path}, format")
     check_value(time_unit, TimeUnit, f"{path}, time_unit")
     format = _format_of(path) if format == "auto" else format
-    poses = read_tum(path, time_unit=time_unit)[0] if format == "tum" else _READERS[format](path)
+    if format == "tum":
+        poses = read_tum(path, time_unit=time_unit)[0]
+    else:
+        poses = _vertices(path) if format == "g2o" else read_kitti(path, camera=format == "kitti")
     if not len(poses):
         raise ValueError(f"{path}: expected at least one pose, found none")
-    turned = poses[:, :3, :3]
-    wrong = ~are_rotations(turned)
-    if wrong.any():
-        raise ValueError(f"{path}, pose {int(wrong.argmax())}: expected a rotation, found {turned[wrong][0].tolist()}")
     return poses
 
 
@@ -135,10 +133,3 @@ def _vertices(path: Path) -> Float[np.ndarray, "n 4 4"]:
     if sorted(poses) != list(range(len(poses))):
         raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without gaps, found others")
     return np.array([poses[i] for i in range(len(poses))]).reshape(-1, 4, 4)
-
-
-_READERS = {
-    "kitti": read_kitti,
-    "lidar": lambda path: read_kitti(path, camera=False),
-    "g2o": _vertices,
-}

@@ -12,7 +12,7 @@ from PIL import Image
 
 import sglpr_jax
 from sglpr_jax.cli.train import TrainCommand, parse
-from sglpr_jax.data.readers.bev_images import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.evaluation import final_test
 from sglpr_jax.models.weights import weights_hash

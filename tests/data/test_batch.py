@@ -232,21 +232,6 @@ def test_scans_become_density_images_of_all_their_points(recordings, pool):
     assert unread.images.shape == (8, 151, 151)
 
 
-def test_images_that_are_none_of_densities_are_refused_where_these_are_wanted(pool):
-    grey = of_images({Path(f"{i}.png"): np.full((20, 22), 255, np.float32) for i in range(2)}, name="06")
-    assert read([grey, grey], pool, FRAMES[:1, :2]).images.max() == 255  # counts of points may be many
-    with pytest.raises(ValueError, match="scan 0 of sequence 06: expected a density image"):
-        read_batch([grey, grey], pool, FRAMES[:1, :2], max_points=9, share_negatives=False, image="density")
-
-
-def test_scans_and_images_do_not_mix(recordings, pool):
-    pictures = of_images({Path("0.png"): np.zeros((20, 20))}, name="06")
-    with pytest.raises(ValueError, match="expected only scans in a batch, found images in recording 06"):
-        read([recordings[0], pictures], pool)
-    with pytest.raises(ValueError, match="expected only images in a batch, found scans in recording 05"):
-        read([pictures, recordings[1]], pool, np.array([[20, 21, 22, 23]]))
-
-
 def test_images_of_two_sizes_are_refused(pool):
     sizes = {"00": (16, 16), "05": (12, 20)}
     mixed = [

@@ -1,15 +1,115 @@
-"""A point cloud map with the trajectory of its LiDAR: scans are computed at the poses."""
+"""A point cloud map with the trajectory of its LiDAR: trails are removed, and scans are computed at the poses."""
 
 import laspy
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from sglpr_jax.data.cloud_map import TILE_M, tiled_cloud
-from sglpr_jax.data.formats import las
-from sglpr_jax.data.formats.cloud_files import cloud_blocks
+from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, TILE_M, on_trail, tiled_cloud, visible_points
+from sglpr_jax.data.formats.scan_files import cloud_blocks
 from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
 from sglpr_jax.data.warning import DataWarning
+
+
+def plane(x, y, step=0.1):
+    """Ground at z = 0 over two ranges of coordinates."""
+    x, y = np.meshgrid(np.arange(*x, step), np.arange(*y, step))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+def sheet(x, z, y=0.05):
+    """Vertical sheet along x, such as the side of a car or a facade."""
+    x, z = np.meshgrid(np.arange(*x, 0.1), np.arange(*z, 0.1))
+    return np.stack([x.ravel(), np.full(x.size, y), z.ravel()], axis=1)
+
+
+STREET = plane((-5, 5), (-5, 5))
+
+
+@pytest.mark.parametrize(
+    ("ground", "thing", "moved"),
+    [
+        (STREET, sheet((-2, 2), (0.4, 1.5)), True),
+        (STREET, sheet((0, 0.3), (0, 1.8)), True),  # a pedestrian
+        (STREET, sheet((-2, 2), (0.4, 4.0)), False),  # a lorry or a wall
+        (STREET, sheet((0, 0.3), (0, 6.0)), False),  # a trunk
+        (STREET, sheet((-2, 2), (2.5, 4.0)), False),  # a crown
+        (plane((-5, 5), (-5, 0)), sheet((-4, 4), (0, 2.0)), False),  # nothing was seen behind it
+        (STREET[np.abs(STREET).max(axis=1) > 1], sheet((-0.9, 0.9), (0.2, 1.5)), False),  # it stayed
+    ],
+)
+def test_low_things_on_ground_that_was_seen_are_removed(ground, thing, moved):
+    points = np.concatenate([ground, thing]).astype(np.float32)
+    found = on_trail(points)
+    assert not found[: len(ground)].any()
+    assert found[len(ground) :].mean() > 0.75 if moved else not found.any()
+
+
+SPACING_M = 0.1
+CLOUDS = arrays(np.float32, st.tuples(st.integers(0, 60), st.just(3)), elements=st.floats(-30, 30, width=16))
+
+
+def wall(x, *, half_m=4.0, spacing=SPACING_M / 2):
+    """Points of a square wall across the x axis."""
+    y, z = np.meshgrid(*[np.arange(-half_m, half_m, spacing)] * 2)
+    return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1).astype(np.float32)
+
+
+def seen(points, **options):
+    return visible_points(points, **{"spacing_m": SPACING_M, "reach_m": 36.0, **options})
+
+
+def as_rows(points):
+    return {tuple(row) for row in points.tolist()}
+
+
+@pytest.mark.slow
+def test_a_wall_hides_almost_all_points_behind_it_and_none_beside_it():
+    for near_m in (2.0, 5.0, 10.0):
+        behind = wall(near_m + 8, half_m=0.8 * 4 * (near_m + 8) / near_m)
+        beside = wall(15.0, half_m=2) + np.float32([0, 40 / near_m + 60 / near_m, 0])
+        beside = beside[np.linalg.norm(beside, axis=1) < 36]
+        found = as_rows(seen(np.concatenate([wall(near_m), behind, beside])))
+        assert len(found & as_rows(behind)) < 0.03 * len(seen(behind)), "the wall has almost no holes"
+        assert found & as_rows(wall(near_m))
+        assert as_rows(seen(beside)) <= found
+
+
+def test_agreement_with_a_plain_loop():
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(400, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    points = (directions * rng.uniform(1, 30, (400, 1))).astype(np.float32)
+    ranges = np.linalg.norm(points, axis=1)
+    needed = np.degrees(0.5 * 0.5 / ranges)
+    level = np.ceil(np.log2(needed / 0.25).clip(0, 7)).astype(int)  # cells of 0.25, 0.5, 1, ..., 32 degrees
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    elevation = np.degrees(np.arcsin(points[:, 2] / ranges)) + 90
+    kept = []
+    for i in range(400):
+        edges = 0.25 * 2.0**level
+        same = (azimuth[i] // edges == azimuth // edges) & (elevation[i] // edges == elevation // edges)
+        nearest = {k: ranges[same & (level == k)].min() for k in set(level[same])}
+        if not any(ranges[i] > at + BEHIND_M + 3 * np.radians(0.25 * 2.0**k) * at for k, at in nearest.items()):
+            kept.append(i)
+    found = as_rows(seen(points, spacing_m=0.5))
+    assert found == as_rows(points[kept])
+
+
+@settings(max_examples=30, deadline=None)
+@given(CLOUDS, st.randoms(use_true_random=False))
+def test_points_are_of_the_cloud_and_their_order_does_not_matter(points, random):
+    found = seen(points)
+    assert as_rows(found) <= as_rows(points)
+    ranges = np.linalg.norm(found, axis=1)
+    assert ((ranges > NEAREST_M - 1e-3) & (ranges < 36.001)).all()
+    order = list(range(len(points)))
+    random.shuffle(order)
+    assert as_rows(seen(points[order])) == as_rows(found)
+
 
 HEIGHT_M = 1.5
 ORIGIN = np.array([1000.0, -2000.0, 40.0])
@@ -87,24 +187,11 @@ def test_points_are_in_the_frame_of_the_lidar(opened):
 @pytest.mark.parametrize("write", [write_pcd, write_ply, write_las])
 def test_every_format_has_the_same_points(write, tmp_path, monkeypatch):
     points = street()[::50]
-    for module in ("scan_size", "las"):
+    for module in ("clouds", "las"):
         monkeypatch.setattr(f"sglpr_jax.data.formats.{module}.BLOCK_POINTS", 1000)
     blocks = list(cloud_blocks(write(tmp_path / f"map.{write.__name__[6:]}", points)))
     assert len(blocks) > 1 and max(map(len, blocks)) == 1000
     np.testing.assert_allclose(np.concatenate(blocks), points, atol=6e-4)
-
-
-def test_text_is_read_as_one_block(tmp_path):
-    path = tmp_path / "map.pcd"
-    path.write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n")
-    np.testing.assert_array_equal(*cloud_blocks(path), [[1, 2, 3], [4, 5, 6]])
-
-
-def test_a_laz_file_needs_lazrs(tmp_path, monkeypatch):
-    monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
-    path = write_las(tmp_path / "map.las", street()[::50]).rename(tmp_path / "map.laz")
-    with pytest.raises(ImportError, match=r"map\.laz: \.laz files need lazrs \(pip install 'sglpr-jax\[las\]'\)"):
-        next(las.las_blocks(path))
 
 
 def test_a_tiled_cloud_has_one_point_per_voxel_near_the_trajectory(tmp_path):

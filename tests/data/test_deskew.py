@@ -12,7 +12,7 @@ from scipy.linalg import expm, logm
 
 import sglpr_jax
 from sglpr_jax.data.deskew import deskew, deskewed, poses_at
-from sglpr_jax.data.point_times import TimeField
+from sglpr_jax.data.formats.clouds import TimeField
 from sglpr_jax.data.recording import Record
 from sglpr_jax.data.submap import submaps
 
@@ -73,11 +73,6 @@ def test_interpolation_is_that_of_the_matrix_logarithm(numbers, share):
     np.testing.assert_allclose(found[0], expected, atol=1e-6)
 
 
-def test_poses_that_are_given_are_kept():
-    poses = np.array([expm(twist([0.1, 0.3 * i, 1.0 * i], [i, 2, 3])) for i in range(5)])
-    np.testing.assert_allclose(poses_at(np.arange(5.0), np.arange(5.0), poses), poses, atol=1e-12)
-
-
 def test_a_recording_is_deskewed_and_a_scan_without_a_neighbour_stays():
     times, poses, clouds = drive(twist([0, 0, 3], [2, 0, 0]))
     times[3] = 60.0
@@ -100,13 +95,6 @@ def test_submaps_of_deskewed_scans():
     in_world = found.points(3) @ poses[3][:3, :3].T + poses[3][:3, 3]
     apart = np.linalg.norm(in_world[:, None] - WORLD[None], axis=2).min(axis=1)
     assert apart.max() < 0.01 and set(found.read_options) == {"deskewed", "submaps"}
-
-
-def test_repeated_times_of_scans_do_not_divide_by_zero():
-    times, poses, clouds = drive(twist([0, 0, 1], [5, 0, 0]))
-    times[2], poses[2] = times[1], poses[1]
-    found = deskewed(recording_of(times, [clouds[0], clouds[1], clouds[1], clouds[3]]), poses)
-    np.testing.assert_allclose(found.points(2), measured(poses[1], WORLD), atol=2e-3)
 
 
 @pytest.mark.parametrize(

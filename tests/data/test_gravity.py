@@ -11,8 +11,7 @@ from recordings import of_scans
 from scipy.spatial.transform import Rotation
 
 import sglpr_jax
-from sglpr_jax.data.gravity import GROUND_TILT_DEG, ODOMETRY_TILT_DEG, GroundFilter, tilts, with_odometry
-from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.gravity import GROUND_TILT_DEG, ODOMETRY_TILT_DEG, GroundFilter, mounted, tilts, with_odometry
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.readers.kitti import open_recording, read_trajectory, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 
 
 def test_sparse_scans_take_their_own_rows(kitti_root):
@@ -25,12 +25,6 @@ def test_labels_where_there_are_any(kitti_root):
     assert not open_recording(kitti_root, "08").has_labels
 
 
-def test_labels_unlike_the_points_are_refused(kitti_root):
-    (kitti_root / "sequences/08/labels/000000.label").write_bytes(bytes(12))
-    with pytest.raises(ValueError, match=r"000000\.label: expected 5 labels of 4 bytes.*found 12 bytes"):
-        open_recording(kitti_root, "08").labels(0)
-
-
 @pytest.mark.parametrize(
     "poses, source, height",
     [
@@ -45,13 +39,6 @@ def test_the_pose_file_is_chosen_and_named(kitti_root, poses, source, height):
     assert sequence.positions[0, 2] == height
 
 
-def test_poses_of_kitti_are_taken_where_there_are_no_others(kitti_root):
-    (kitti_root / "sequences/08/poses.txt").unlink()
-    assert open_recording(kitti_root, "08").pose_source == "poses/08.txt"
-    with pytest.raises(FileNotFoundError, match=r"expected poses in sequences/08/poses\.txt, found none"):
-        open_recording(kitti_root, "08", pose_source="semantickitti")
-
-
 def test_a_sequence_without_poses_opens_and_those_that_were_asked_for_are_named(kitti_root):
     (kitti_root / "sequences/08/poses.txt").unlink()
     (kitti_root / "poses/08.txt").unlink()
@@ -61,10 +48,6 @@ def test_a_sequence_without_poses_opens_and_those_that_were_asked_for_are_named(
     assert len(sequence.points(1)) == 5
     with pytest.raises(FileNotFoundError, match=r"expected poses in poses/08\.txt, found none"):
         open_recording(kitti_root, "08", pose_source="kitti")
-    with pytest.raises(
-        FileNotFoundError, match=r"expected poses in sequences/08/poses\.txt or poses/08\.txt, found none"
-    ):
-        read_trajectory(kitti_root, "08")
 
 
 @pytest.mark.parametrize("file, what", [("poses.txt", "poses"), ("times.txt", "times")])
@@ -73,37 +56,6 @@ def test_too_few_rows_name_the_frame(kitti_root, file, what):
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
     with pytest.raises(ValueError, match=rf"{what}\.txt: expected at least 4 rows \(frame 3\), found 3"):
         open_recording(kitti_root, "08")
-
-
-def test_poses_that_are_not_numbers_name_the_line(kitti_root):
-    path = kitti_root / "sequences/08/poses.txt"
-    lines = path.read_text().splitlines()
-    lines[1] = "nan " * 12
-    path.write_text("\n".join(lines))
-    with pytest.raises(ValueError, match=r"poses\.txt, line 2: expected finite numbers, found 'nan"):
-        open_recording(kitti_root, "08")
-
-
-def test_times_are_optional(kitti_root):
-    (kitti_root / "sequences/08/times.txt").unlink()
-    assert open_recording(kitti_root, "08").times is None
-
-
-def test_empty_scans_at_both_ends_leave_the_others(kitti_root):
-    sequence = open_recording(kitti_root, "08")
-    for row in (0, -1):
-        sequence.paths[row].write_bytes(b"")
-    sequence = open_recording(kitti_root, "08")
-    assert len(sequence) == 3 and len(sequence.points(1)) == 5
-    with pytest.raises(ValueError, match=r"000003\.bin: expected 16 bytes for each point .*found 0 bytes"):
-        sequence.points(2)
-
-
-def test_a_sequence_without_scans_is_refused(kitti_root):
-    (kitti_root / "sequences/09/velodyne").mkdir(parents=True)
-    assert recording_names(kitti_root) == ("08", "09")
-    with pytest.raises(FileNotFoundError, match=r"09/velodyne: expected scans \(\*\.bin\), found none"):
-        open_recording(kitti_root, "09")
 
 
 def test_simulated_drives_know_how_high_their_sensor_stood(kitti_root):
@@ -137,8 +89,3 @@ def test_the_real_layout(shared):
         assert np.abs(points).max() < 120
     loop = [sequence.ids.index(name) for name in ("000052", "004501")]
     assert np.linalg.norm(np.diff(sequence.positions[loop], axis=0)) == pytest.approx(3.00, abs=0.01)
-
-
-def test_the_trajectory_needs_no_scans(shared):
-    positions, times, source = read_trajectory(shared / "data/kitti_odometry", "05", pose_source="kitti")
-    assert (positions.shape, times.shape, source) == ((2761, 3), (2761,), "poses/05.txt")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sglpr_jax.data.reader import ReadOptions
 from sglpr_jax.data.readers import boreas, helipr, kitti_raw, mulran, open_recording, recording_names
 from sglpr_jax.data.readers.stamped import read_table
 
@@ -92,14 +93,6 @@ def test_helipr(helipr_root, sensor):
     assert recording.found[0] == f"format: HeLiPR's {sensor} ({PACKED[sensor][1]} bytes a point)"
 
 
-def test_helipr_through_a_link(helipr_root, tmp_path):
-    (tmp_path / "links").mkdir()
-    (tmp_path / "links" / "today").symlink_to(helipr_root / "Roundabout01")
-    assert "today-Ouster" in recording_names(tmp_path / "links")
-    recording = open_recording(tmp_path / "links", "today-Ouster", sensor_height=1.8)
-    np.testing.assert_array_equal(recording.points(0), POINTS)
-
-
 def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
     path = tmp_path / f"{helipr.AEVA_CHANGED}.bin"
     path.write_bytes(helipr_scan("Aeva", "fffffiB"))
@@ -126,7 +119,7 @@ def test_boreas(boreas_root):
     np.testing.assert_array_equal(recording.positions, [[100, 200, 70], [101, 200, 70]])
     np.testing.assert_array_equal(recording.points(1), POINTS + 1)
     assert recording.times[0] == pytest.approx(NS / 1e9, abs=1e-5) and recording.pose_source == "lidar_poses.csv"
-    assert len(boreas.open_recording(boreas_root / recording.name, recording.name)) == 2
+    assert len(boreas.open_recording(boreas_root / recording.name, recording.name, ReadOptions())) == 2
 
 
 @pytest.fixture
@@ -172,33 +165,6 @@ def test_kitti_raw_without_gps_and_with_broken_times(raw_root):
             open_recording(raw_root)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"\xff\xfe4\x009\x00", "expected 30 numbers, found"),
-        (b"4_9" + b" 8" * 29, "expected numbers, found '4_9"),
-        (b"90" + b" 8" * 29, "expected a latitude below 90 degrees, found 90.0"),
-    ],
-)
-def test_kitti_raw_names_the_file_of_an_invalid_position(raw_root, content, message):
-    oxts = raw_root / "2011_09_26" / "2011_09_26_drive_0001_sync" / "oxts" / "data"
-    (oxts / "0000000002.txt").write_bytes(content)
-    with pytest.raises(ValueError, match=rf"0000000002\.txt: {message}"):
-        open_recording(raw_root)
-
-
-def test_kitti_raw_leaves_the_line_of_a_missing_scan_blank(raw_root):
-    file = raw_root / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps.txt"
-    first, _, last = file.read_text().splitlines()
-    file.write_text(f"{first}\n\n{last}\n\n")
-    np.testing.assert_allclose(np.diff(open_recording(raw_root).times), 0.2, atol=1e-6)
-    file.write_text(f"{first}\n{last}\n\n")
-    with pytest.raises(
-        ValueError, match=r"timestamps\.txt: expected a date and time such as .* \(the line of a scan is ''\)"
-    ):
-        open_recording(raw_root)
-
-
 @pytest.mark.parametrize("reader", [mulran, boreas])
 def test_what_is_missing_or_malformed_is_named(mulran_root, boreas_root, reader):
     root = mulran_root / "KAIST01" if reader is mulran else boreas_root / "boreas-2020-12-01-13-26"
@@ -209,27 +175,25 @@ def test_what_is_missing_or_malformed_is_named(mulran_root, boreas_root, reader)
         ("", "expected rows of a time and 12 numbers, found none"),
         (whole.replace("20.0", "nan").replace("200.0", "nan"), "line . ?: expected a time and 12 finite numbers"),
         (whole + "9" + ",1_0" * 12 + "\n", "expected a time and 12 finite numbers, found '9,1_0"),
-        (whole + "9" + ",１" * 12 + "\n", "expected a time and 12 finite numbers, found '9,"),
-        (whole + "1,2,3\n", "expected a time and 12 finite numbers, found 3 words"),
-        (whole + "noon" + ",1" * 12 + "\n", "expected a time and 12 finite numbers, found 'noon,1"),
+        (whole + "1,2,3\n", "expected a time and 12 finite numbers, found '1,2,3'"),
     ):
         poses.write_text(text)
         with pytest.raises(ValueError, match=rf"{poses.name}.*{message.replace(' ?', '')}"):
-            reader.open_recording(root, root.name)
+            reader.open_recording(root, root.name, ReadOptions())
     poses.write_text(whole)
     first = next(iter(sorted(scans.iterdir())))
     odd = first.rename(scans / "first.bin")
     with pytest.raises(ValueError, match=r"expected scans named by their time, .*found first\.bin"):
-        reader.open_recording(root, root.name)
+        reader.open_recording(root, root.name, ReadOptions())
     odd.unlink()
     for path in scans.iterdir():
         path.rename(scans / f"{int(path.stem) * 2}.bin")
     with pytest.raises(ValueError, match=r"expected poses within 0\.1 s of the scans in .*, found the nearest"):
-        reader.open_recording(root, root.name)
+        reader.open_recording(root, root.name, ReadOptions())
     for path in scans.iterdir():
         path.unlink()
     with pytest.raises(FileNotFoundError, match=r"expected scans \(\*\.bin\), found none"):
-        reader.open_recording(root, root.name)
+        reader.open_recording(root, root.name, ReadOptions())
 
 
 def test_long_times_keep_all_their_digits(tmp_path):
@@ -239,3 +203,20 @@ def test_long_times_keep_all_their_digits(tmp_path):
     np.testing.assert_array_equal(numbers, [[1], [2], [3]])
     with pytest.raises(FileNotFoundError, match="expected a table of poses, found none"):
         read_table(tmp_path / "none.csv", columns=2)
+
+
+OXFORD = ("pointcloud_20m_10overlap", "pointcloud_locations_20m_10overlap.csv")
+DISTRICT = ("pointcloud_25m_25", "pointcloud_centroids_25.csv")
+
+
+@pytest.mark.parametrize(("folder", "table"), [OXFORD, DISTRICT])
+def test_submaps_are_refused_with_the_reason(tmp_path, folder, table):
+    run = tmp_path / "oxford" / "2014-05-19-13-20-57"
+    (run / folder).mkdir(parents=True)
+    submap = np.random.default_rng(0).uniform(-1, 1, (4096, 3))
+    submap.tofile(run / folder / "1400505794141322.bin")
+    (run / table).write_text("timestamp,northing,easting\n1400505794141322,5735712.8,620084.4\n")
+    for root in (run / folder, run, run.parent, tmp_path):
+        assert recording_names(root) == (run.name,)
+        with pytest.raises(ValueError, match=r"expected scans in metres, found submaps .* by an unknown factor"):
+            open_recording(root)

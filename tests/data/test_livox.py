@@ -69,14 +69,6 @@ def test_a_bag_of_livox_is_a_recording(tmp_path, kind, driver):
     np.testing.assert_array_equal(record.lasers, np.arange(24) % 6)
 
 
-@pytest.mark.parametrize("kind", FILES)
-def test_an_empty_cloud_is_named(tmp_path, kind):
-    cloud = ("/livox/lidar", "livox_ros_driver/msg/CustomMsg", 100.0, message_of(kind, points_of(0, 0)))
-    recording = open_recording(write_bag(tmp_path / FILES[kind], kind, [cloud]), sensor_height=1.0)
-    with pytest.raises(ValueError, match=r"scan 000000: .*drive.* \(expected at least one point, found none\)"):
-        recording.points(0)
-
-
 @pytest.mark.parametrize("kind", ["ros1", "ros2"])
 def test_a_message_that_is_cut_off_is_refused(kind):
     types = typestore(kind)

@@ -1,18 +1,16 @@
 """The sensor's height and tilt: found from the ground, said by the user, and undone before a model looks."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import of_images, of_scans
+from recordings import of_images
 
 import sglpr_jax
-from sglpr_jax.data import mounted as mounted_module
 from sglpr_jax.data.density_image import density_bev
-from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Record
@@ -45,8 +43,8 @@ def turned(points: np.ndarray, *, pitch: float = 0.0, roll: float = 0.0) -> np.n
     return (points @ (about_y @ about_x)).astype(np.float32)
 
 
-@pytest.mark.parametrize("height", [0.0, 0.3, 0.5, 1.0, 1.73, 2.5, 4.0])
-@pytest.mark.parametrize("tilt", [{}, {"pitch": 12.0}, {"roll": -25.0}, {"pitch": 10.0, "roll": 10.0}], ids=str)
+@pytest.mark.parametrize("height", [0.0, 0.5, 1.73, 4.0])
+@pytest.mark.parametrize("tilt", [{}, {"roll": -25.0}, {"pitch": 10.0, "roll": 10.0}], ids=str)
 def test_height_and_tilt_are_found(height, tilt):
     found = estimate_mounting(turned(street(1, height=height), **tilt))
     assert found is not None and abs(found.height_m - height) < 0.1
@@ -54,7 +52,7 @@ def test_height_and_tilt_are_found(height, tilt):
     assert abs(found.tilt_deg - angle) < 1
 
 
-@pytest.mark.parametrize("height", [0.5, 1.0, 2.5])
+@pytest.mark.parametrize("height", [0.5, 2.5])
 def test_a_sensor_that_hangs_upside_down(height):
     points = street(2, height=height)
     found = estimate_mounting(points * np.float32([1, -1, -1]))
@@ -105,23 +103,6 @@ def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
     assert common_mounting([hanging, upright, None, hanging, Mounting(2.9, hanging.up)]) == hanging
     assert common_mounting([upright, upright, hanging]) == upright
     assert common_mounting([upright, hanging, hanging, upright]) is None
-
-
-@pytest.mark.parametrize(
-    ("heights", "said"),
-    [
-        ((1.0, 1.0, -2.0, 1.0), "1.00 m above the ground, estimated from the ground in 3 of 4 scans"),
-        ((1.0, -2.0, -2.0, 1.0), "the ground is below the sensor in 2 of 4 scans and above it in 2, assumed 1.73 m"),
-        ((1.0, None, None, None), "ground found in 1 of 4 scans (is z up in these files?), assumed 1.73 m"),
-    ],
-)
-def test_what_is_said_of_scans_that_disagree(heights, said, monkeypatch):
-    """Negative heights are those of a sensor that hangs."""
-    each = [h if h is None else Mounting(abs(h), (0.0, 0.0, float(np.sign(h)))) for h in heights]
-    scans = {Path(f"{i}.bin"): np.full((1, 3), i, np.float32) for i in range(4)}
-    monkeypatch.setattr(mounted_module, "estimate_mounting", lambda points: each[int(points[0, 0])])
-    found = mounted(of_scans(scans), "estimate", known=False).found[-1]
-    assert found.startswith(f"sensor: {said}")
 
 
 @settings(max_examples=25, deadline=None)

@@ -74,13 +74,6 @@ def test_a_scene_is_a_recording(root):
     np.testing.assert_array_equal(record.lasers, [3, 17])
 
 
-def test_a_scene_that_was_not_downloaded(root):
-    with pytest.raises(
-        FileNotFoundError, match="expected scans of scene-0103 in samples/LIDAR_TOP, found none of the 1"
-    ):
-        open_recording(root, "scene-0103")
-
-
 def test_the_smallest_version_that_has_a_scene_is_read(root):
     for name, scenes in (("v1.0-trainval", ("scene-0061", "scene-0999")), ("v1.0-test", ())):
         write(root / name / "scene.json", [{"token": "else", "name": scene} for scene in scenes])
@@ -126,50 +119,11 @@ def test_malformed_tables_are_named(root, table, row, values, message):
         open_recording(root, "scene-0061")
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("[{", "expected a table in JSON, found invalid JSON"),
-        ("3", "expected a list of rows, each an object, found something else"),
-        ('{"token": 1}', "expected a list of rows, each an object"),
-        ("[3]", "expected a list of rows, each an object"),
-        ('[{"token": "t0"}]', "expected 'name' in every row, found a row with token"),
-    ],
-)
-def test_what_is_no_table_is_named(root, content, message):
-    (root / "v1.0-mini" / "scene.json").write_text(content)
-    with pytest.raises(ValueError, match=rf"scene\.json: {message}"):
-        recording_names(root)
-
-
-@pytest.mark.parametrize("name", [None, "", 3, ["a"], {"a": 1}])
-def test_a_scene_without_a_name_is_refused(root, name):
-    write(root / "v1.0-mini" / "scene.json", [{"token": "t0", "name": name}])
-    with pytest.raises(ValueError, match=r"scene\.json: expected "):
-        recording_names(root)
-
-
-def test_two_scenes_of_one_name_are_refused(root):
-    write(root / "v1.0-mini" / "scene.json", [{"token": "t0", "name": "a"}, {"token": "t1", "name": "a"}])
-    with pytest.raises(ValueError, match=r"scene\.json: expected a unique name for each scene, found 'a' twice"):
-        recording_names(root)
-
-
-@pytest.mark.parametrize("file", ["/LIDAR_TOP/a.pcd.bin", "../LIDAR_TOP/a.pcd.bin", None, 5])
+@pytest.mark.parametrize("file", ["../LIDAR_TOP/a.pcd.bin", None])
 def test_a_scan_outside_the_dataset_is_refused(root, file):
     table = root / "v1.0-mini" / "sample_data.json"
     rows = json.loads(table.read_text())
     rows[1]["filename"] = file
     write(table, rows)
     with pytest.raises(ValueError, match=r"sample_data\.json: expected paths of files inside .*, found "):
-        open_recording(root, "scene-0061")
-
-
-@pytest.mark.parametrize("token", [None, ["e0"], 0])
-def test_a_reference_that_is_no_text_is_refused(root, token):
-    table = root / "v1.0-mini" / "sample_data.json"
-    rows = json.loads(table.read_text())
-    rows[1]["ego_pose_token"] = token
-    write(table, rows)
-    with pytest.raises(ValueError, match=r"sample_data\.json: expected text as 'ego_pose_token' in every row"):
         open_recording(root, "scene-0061")

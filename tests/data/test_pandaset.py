@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -115,20 +114,3 @@ def test_malformed_files_are_named(root, file, content, message):
     (root / "001" / "lidar" / file).write_text(json.dumps(content))
     with pytest.raises(ValueError, match=rf"{file}.*{message}"):
         open_recording(root, sensor_height=1.8)
-
-
-def test_poses_that_are_none_and_missing_scans_are_named(root):
-    poses = root / "001" / "lidar" / "poses.json"
-    whole = poses.read_text()
-    poses.write_text(whole.replace('"w": 1.0', '"w": 3.0'))
-    with pytest.raises(ValueError, match=r"poses\.json: expected a rotation qx qy qz qw of length 1 in row 1"):
-        open_recording(root)
-    poses.write_text(whole.replace('"x": 9.0', '"x": NaN'))
-    with pytest.raises(ValueError, match=r"poses\.json: expected finite positions"):
-        open_recording(root)
-    poses.write_text(whole)
-    shutil.rmtree(root / "001" / "lidar")
-    (root / "001" / "lidar").mkdir()
-    write_poses(root / "001" / "lidar")
-    with pytest.raises(FileNotFoundError, match=r"expected scans \(\*\.npy\), found none"):
-        open_recording(root)

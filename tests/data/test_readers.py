@@ -62,3 +62,37 @@ def test_points_of_images_and_images_of_scans_are_refused(kitti_root, bev_root):
         open_recording(bev_root, "06").points(0)
     with pytest.raises(ValueError, match="sequence 08: expected ready-made images, found scans"):
         open_recording(kitti_root, "08").image(0)
+
+
+def test_the_only_sequence_needs_no_name(kitti_root):
+    assert open_recording(kitti_root).name == "08"
+    (kitti_root / "sequences/05/velodyne").mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match="expected the name of one sequence, found 05, 08"):
+        open_recording(kitti_root)
+
+
+def test_an_unknown_sequence_lists_those_that_exist(kitti_root, bev_root):
+    with pytest.raises(FileNotFoundError, match="kitti: expected sequence '8', found 08"):
+        open_recording(kitti_root, "8")
+    with pytest.raises(FileNotFoundError, match="bev: expected sequence '00', found 06"):
+        open_recording(bev_root, "00")
+
+
+def test_an_unknown_layout_says_what_was_expected(tmp_path):
+    expected = "; expected sequences/NN/velodyne.*NN/imgs.*"
+    with pytest.raises(FileNotFoundError, match=rf"{tmp_path}: found no known layout: no files{expected}"):
+        recording_names(tmp_path)
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(FileNotFoundError, match=rf"no known layout: 1 .txt, 1 folder \(scans\){expected}"):
+        recording_names(tmp_path)
+    with pytest.raises(
+        FileNotFoundError, match=r"none: expected the folder of a recording, or a bag, found no such folder$"
+    ):
+        open_recording(tmp_path / "none", "08")
+
+
+@pytest.mark.parametrize("name", ["pose_source", "format"])
+def test_a_choice_that_there_is_not_is_told_with_those_that_there_are(as_installed, kitti_root, name):
+    with pytest.raises(ValueError, match=rf"^{name}: expected one of 'auto', .*'kitti'.*, found 'kiti'$"):
+        open_recording(kitti_root, **{name: "kiti"})

@@ -1,10 +1,82 @@
-"""A recording has everything once for each of its scans."""
+"""A recording has everything once for each scan, and opens each file of a record once."""
 
+import collections
 from pathlib import Path
 
 import numpy as np
 import pytest
 from recordings import of_scans
+
+from sglpr_jax.data.corruption import Corruption, corrupted
+from sglpr_jax.data.formats import bin_records, scan_files
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.sampling.batch import read_batch
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.methods.method import ScanMethod
+from sglpr_jax.retrieval.embed import embed
+
+
+@pytest.fixture
+def opened(monkeypatch) -> collections.Counter:
+    """How often each file of points or labels was opened, by its name."""
+    counts: collections.Counter = collections.Counter()
+
+    def fromfile(path: Path, **options):
+        counts[path.name] += 1
+        return np.fromfile(path, **options)
+
+    real = scan_files.np
+
+    class Counted:
+        def __getattr__(self, name: str):
+            return fromfile if name == "fromfile" else getattr(real, name)
+
+    for module in (bin_records, scan_files):
+        monkeypatch.setattr(module, "np", Counted())
+    return counts
+
+
+@pytest.fixture
+def recording(kitti_root):
+    return open_recording(kitti_root, "08")
+
+
+def test_a_record_opens_each_of_its_files_once(recording, opened):
+    record = recording.record(0)
+    assert record.labels is not None and opened == {"000000.bin": 1, "000000.label": 1}
+    assert (record.name, record.time) == ("scan 000000 of sequence 08", 0.0)
+
+
+def test_a_corrupted_record_opens_each_of_its_files_once(recording, opened):
+    corrupted(recording, Corruption("dropout", 0.5), seed=0).record(0)
+    assert opened == {"000000.bin": 1, "000000.label": 1}  # 3 when points and labels were read apart
+
+
+def test_lasers_come_from_the_read_of_the_points(tmp_path, opened):
+    points = np.random.default_rng(0).normal(scale=10, size=(64, 5)).astype("<f4")
+    points[:, 4] = np.arange(64) % 32
+    points.tofile(tmp_path / "0.bin")
+    recording = open_recording(tmp_path, format="nuscenes")
+    record = recording.record(0, lasers=True)
+    np.testing.assert_array_equal(record.lasers, np.arange(64) % 32)
+    assert recording.record(0).lasers is None
+    opened.clear()
+    left = corrupted(recording, Corruption("beams", 16.0), seed=0).record(0, lasers=True)
+    assert len(left.points) == len(left.lasers) == 32 and opened == {"0.bin": 1}
+
+
+def test_a_batch_and_an_embedding_open_each_file_once_a_place(recording, opened):
+    pool = TuplePool([np.zeros((3, 3))], TupleConfig(negatives=0))
+    frames = np.array([[0, 2], [2, 0], [0, 2]])
+    batch = read_batch([recording], pool, frames, max_points=8, share_negatives=False)
+    assert batch.labelled.all() and opened == {  # 6 places, 12 reads; 18 when labels read the scan again
+        name: 3 for name in ("000000.bin", "000000.label", "000003.bin", "000003.label")
+    }
+    opened.clear()
+    embed(ScanMethod(lambda points, _: points[0], labels=False, distance="l2", about={"method": "first"}), recording)
+    assert sum(opened.values()) == 3
+
 
 CLOUDS = {Path(f"{i}.bin"): np.ones((5, 3), np.float32) for i in range(3)}
 

@@ -11,7 +11,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from sglpr_jax.data.formats import ros_bag
 from sglpr_jax.data.readers import open_recording, recording_names, ros
 from sglpr_jax.data.scan_stream import readable
 
@@ -92,8 +91,6 @@ COMPRESSIONS = {
     "ros1, lz4": ("ros1", (Writer1.CompressionFormat.LZ4,)),
     "ros2, files": ("ros2", (CompressionMode.FILE, CompressionFormat.ZSTD)),
     "ros2, messages": ("ros2", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
-    "mcap, files": ("mcap", (CompressionMode.FILE, CompressionFormat.ZSTD)),
-    "mcap, messages": ("mcap", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
     "mcap, chunks": ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD)),
 }
 
@@ -118,19 +115,7 @@ def test_compressed_bags(tmp_path, name):
             open_recording(root)
 
 
-@pytest.mark.parametrize("name", COMPRESSIONS)
-def test_parts_that_inflate_beyond_the_bound_are_refused(tmp_path, name, monkeypatch):
-    kind, compression = COMPRESSIONS[name]
-    path = write(tmp_path / KINDS[kind], kind, compression=compression)
-    monkeypatch.setattr(ros_bag, "MOST_BYTES", 100)
-    monkeypatch.setattr(ros_bag, "INFLATION", 1)
-    most = "1 times the size" if "files" in name else "100 "
-    with pytest.raises(ValueError, match=rf"expected an intact ROS bag, found .*at most {most}"):
-        open_recording(path)
-
-
-@pytest.mark.parametrize("log", ["wal", "journal"])
-@pytest.mark.parametrize("lone", [True, False])
+@pytest.mark.parametrize(("log", "lone"), [("wal", True), ("journal", False)])
 def test_a_log_beside_a_bag_of_sqlite_is_named(tmp_path, log, lone):
     path = write(tmp_path / "drive", "ros2")
     (path / f"drive.db3-{log}").write_bytes(b"")
@@ -156,7 +141,7 @@ def test_a_recording_of_a_killed_recorder_has_no_metadata(tmp_path, kind):
         open_recording(root)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_an_empty_cloud_among_others_is_named_and_can_be_skipped(tmp_path, kind):
     def emptied(i, found):
         if i == 1:
@@ -197,22 +182,12 @@ def test_a_lone_mcap_and_folders_of_bags(tmp_path):
     assert recording.name == "parts" and len(recording) == 6
 
 
-def test_messages_of_one_time_are_told_apart(tmp_path):
-    parts = tmp_path / "parts"
-    parts.mkdir()
-    for i in range(2):  # both bags record at the same nanoseconds
-        write(parts / f"part{i}.bag", "ros1", scans=1)
-    recording = open_recording(parts)
-    assert len(recording) == 2
-    np.testing.assert_array_equal(recording.points(1), points_of(0))
-
-
 def test_times_that_go_back_are_the_recorders(tmp_path):
     root = write(tmp_path / "drive.bag", "ros1", stamps=[5.0, 4.0, 6.0])
     np.testing.assert_allclose(open_recording(root).times, [200, 200.1, 200.2])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_several_topics_are_several_recordings(tmp_path, kind):
     root = write(tmp_path / KINDS[kind], kind, topics=("/ouster/points", "/livox"))
     assert recording_names(root) == ("livox", "ouster_points")
@@ -221,22 +196,14 @@ def test_several_topics_are_several_recordings(tmp_path, kind):
     assert len(open_recording(root, "livox")) == 3
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_a_bag_without_clouds_lists_its_topics(tmp_path, kind):
     root = write(tmp_path / KINDS[kind], kind, topics=(), imu=True)
     with pytest.raises(ValueError, match=r"drive.*: expected a topic of point clouds .* found /imu \(sensor_msgs"):
         open_recording(root)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_topic_without_messages(tmp_path, kind):
-    root = write(tmp_path / KINDS[kind], kind, scans=0)
-    with pytest.raises(ValueError, match="expected point clouds on /velodyne_points, found no message"):
-        open_recording(root)
-
-
-@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
-@pytest.mark.parametrize("content", [b"", b"no bag at all", b"#ROSBAG V2.0\n" + bytes(90)])
+@pytest.mark.parametrize(("name", "content"), [("a.bag", b"#ROSBAG V2.0\n" + bytes(90)), ("a.mcap", b"")])
 def test_broken_bags_are_named(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=rf"{name}: expected an intact ROS bag, found a broken one"):

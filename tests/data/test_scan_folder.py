@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data import readers
-from sglpr_jax.data.readers.scan_folder import open_recording, recording_names
+from sglpr_jax.data.reader import ReadOptions
+from sglpr_jax.data.readers import scan_folder
+from sglpr_jax.data.readers.scan_folder import recording_names
 from sglpr_jax.data.warning import DataWarning
+
+
+def open_recording(folder, **options):
+    return scan_folder.open_recording(folder, folder.name, ReadOptions(**options))
 
 
 def write_scans(folder, *names, points=3):
@@ -29,42 +35,6 @@ def test_scans_without_poses(tmp_path):
     assert not sequence.has_labels
     assert sequence.labels(0) is None
     np.testing.assert_array_equal(sequence.points(0), np.ones((3, 3)))  # a.bin was written second
-
-
-def test_poses_beside_the_scans(tmp_path):
-    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
-    write_poses(folder / "poses.txt", [[1, 2, 3], [4, 5, 6]])
-    sequence = open_recording(folder)
-    assert sequence.pose_source == "poses.txt"
-    np.testing.assert_array_equal(sequence.positions, [[1, 2, 3], [4, 5, 6]])
-
-
-def test_each_scan_needs_a_pose(tmp_path):
-    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
-    write_poses(folder / "poses.txt", np.zeros((3, 3)))
-    message = r"poses\.txt: expected 2 poses, one for each scan of scans, found 3, and the file has no times"
-    with pytest.raises(ValueError, match=message):
-        open_recording(folder)
-
-
-def test_numbers_sort_as_numbers(tmp_path):
-    folder = write_scans(tmp_path / "scans", "10.bin", "9.bin", "100.bin")
-    assert open_recording(folder).ids == ("9", "10", "100")
-
-
-def test_the_format_is_passed_on(tmp_path):
-    folder = write_scans(tmp_path / "scans", "a.bin", points=5)
-    assert open_recording(folder).points(0).shape == (5, 3)
-    assert open_recording(folder, format="nuscenes").points(0).shape == (4, 3)
-
-
-def test_one_bad_scan_leaves_the_others(tmp_path):
-    folder = write_scans(tmp_path / "scans", "a.bin", "b.bin")
-    (folder / "a.bin").write_bytes(b"short")
-    sequence = open_recording(folder)
-    with pytest.raises(ValueError, match=r"a\.bin: expected 16 bytes"):
-        sequence.points(0)
-    assert sequence.points(1).shape == (3, 3)
 
 
 def test_a_folder_without_scans_is_refused(tmp_path):
@@ -109,20 +79,6 @@ def test_poses_of_any_format_beside_the_scans_or_named(tmp_path, name, text, tim
     assert readers.open_recording(folder, **named, times=tmp_path / "other.txt").times.tolist() == [2, 2]
 
 
-def test_poses_of_other_times_are_interpolated_or_name_the_scans_without(tmp_path):
-    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin", "3.bin")
-    (folder / "poses.tum").write_text(TUM)
-    (folder / "times.txt").write_text("1.5\n2\n2.5\n")
-    np.testing.assert_array_equal(open_recording(folder).positions[:, 0], [1, 2.5, 4])
-    (folder / "times.txt").write_text("1.5\n2\n9\n")
-    message = r"poses\.tum: expected poses at the times of all 3 scans, found none for 1, the first at 9\.0 s"
-    with pytest.raises(ValueError, match=message):
-        open_recording(folder)
-    (folder / "times.txt").unlink()
-    with pytest.raises(ValueError, match=r"poses\.tum: expected 3 poses, .* found 2, and the scans have no times"):
-        open_recording(folder)
-
-
 def test_poses_that_do_not_fit_are_refused(tmp_path):
     folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
     (folder / "times.txt").write_text("7\n9\n")
@@ -157,11 +113,6 @@ def test_names_that_are_times_sort_as_times(tmp_path):
     assert open_recording(dates).ids == ("2012.9.15", "2012.10.2")
 
 
-def test_endings_may_be_in_capitals(tmp_path):
-    folder = write_scans(tmp_path / "scans", "1.BIN", "2.bin")
-    assert open_recording(folder).ids == ("1", "2")
-
-
 def test_hidden_files_are_no_scans(tmp_path):
     folder = write_scans(tmp_path / "scans", "000003.bin", "._000003.bin", ".old.pcd")
     assert open_recording(folder).ids == ("000003",)
@@ -185,27 +136,6 @@ def test_two_files_of_one_scan_are_refused(tmp_path):
         open_recording(folder)
 
 
-def test_times_beside_the_scans(tmp_path):
-    folder = write_scans(tmp_path / "scans", "0.bin", "1.bin", "2.bin")
-    (folder / "times.txt").write_text("0\n0.1\n0.2\n")
-    recording = open_recording(folder)
-    np.testing.assert_array_equal(recording.times, [0, 0.1, 0.2])
-    assert "times: over 0.2 s; poses: none" in recording.description
-    (folder / "times.txt").write_text("0\n0.1\n")
-    with pytest.raises(ValueError, match=r"times\.txt: expected 3 rows, one per scan, found 2"):
-        open_recording(folder)
-
-
-@pytest.mark.parametrize("name", ["poses.txt", "poses.tum"])
-def test_tum_poses_beside_the_scans(tmp_path, name):
-    folder = write_scans(tmp_path / "scans", "0.bin", "1.bin")
-    (folder / name).write_text("# t x y z qx qy qz qw\n5 1 2 3 0 0 0 1\n6 4 5 6 0 0 0 1\n")
-    recording = open_recording(folder)
-    np.testing.assert_array_equal(recording.positions, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(recording.times, [5, 6])
-    assert recording.pose_source == name
-
-
 def test_consecutive_poses_far_apart_are_told(tmp_path, recwarn):
     folder = write_scans(tmp_path / "scans", *(f"full{i}.bin" for i in range(30)))
     way = np.stack([np.arange(30.0) * 2, np.zeros(30), np.zeros(30)], axis=1)
@@ -218,12 +148,4 @@ def test_consecutive_poses_far_apart_are_told(tmp_path, recwarn):
     way[20:] += 300
     write_poses(folder / "poses.txt", way)
     with pytest.warns(DataWarning, match=r"full19 and full20 5\d\d m apart \(1 jumps; half .* below 2\.0 m"):
-        open_recording(folder)
-
-
-def test_poses_of_the_camera_are_told(tmp_path):
-    folder = write_scans(tmp_path / "scans", *(f"{i}.bin" for i in range(200)))
-    way = np.linspace(0, 1, 200)[:, None] * [60, 1, 180]
-    write_poses(folder / "poses.txt", way)
-    with pytest.warns(DataWarning, match=r"expected z up, found heights over 180 m and 60 x 1 m on the ground"):
         open_recording(folder)

@@ -70,11 +70,6 @@ def test_a_nearer_point_hides_those_behind_it_in_a_submap_as_in_a_scan():
     np.testing.assert_allclose(found, np.array([beside, near]), atol=1e-6)
 
 
-def test_a_length_of_0_is_the_recording_itself():
-    recording, _ = drive(np.array([pose(0.0)]))
-    assert submaps(recording, np.eye(4)[None], length_m=0.0) is recording
-
-
 @pytest.mark.parametrize("step", [pose(0.0), pose(0.0, 30.0), pose(0.01), pose(5.0), pose(1e4)])
 def test_memory_is_bounded_for_a_robot_that_stands_turns_creeps_or_jumps(step):
     builder, where, sizes = SubmapBuilder(length_m=10.0), np.eye(4), []
@@ -107,15 +102,6 @@ def test_labels_stay_with_their_points(tmp_path):
     assert set(record.labels) == {40, 41} and record.labels.shape == (len(record.points),)
     assert record.labels[0] == 41  # the newest scan comes first
     assert submaps(recording, poses).record(2).labels is None
-
-
-def test_recordings_with_other_submaps_are_other_recordings():
-    poses = np.array([pose(2.0 * i) for i in range(3)])
-    recording, _ = drive(poses)
-    further = poses + 0.1 * np.eye(4, k=3)
-    kinds = [submaps(recording, poses), submaps(recording, poses, length_m=5.0), submaps(recording, further)]
-    assert len({one.read_options["submaps"] for one in kinds}) == 3
-    assert "submaps: the scans of the last 10 m, 1 m apart" in kinds[0].found[-1]
 
 
 @pytest.mark.parametrize(

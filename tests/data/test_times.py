@@ -1,13 +1,9 @@
 """Times in seconds are kept, row numbers are dropped, and other units are one clear error unless they are stated."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from sglpr_jax.data.formats.pose_files import read_times, read_trajectory, read_tum
-from sglpr_jax.data.formats.ros_messages import Stamps
-from sglpr_jax.data.poses import match_times
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, doubt, times_of, unit_change
 from sglpr_jax.data.warning import DataWarning
@@ -18,14 +14,14 @@ UNITS = {"ms": "steps of 100, which fit milliseconds", "us": "100000, .*microsec
 
 
 @pytest.mark.parametrize("start", [0.0, 12.5, 1.7e9])
-@pytest.mark.parametrize("hertz", [0.1, 1, 2, 9.6, 20, 100, 400])
+@pytest.mark.parametrize("hertz", [0.1, 1, 9.6, 400])
 def test_seconds_of_lidars_keyframes_and_odometry_are_kept(start, hertz):
     times = start + 0.003 + np.arange(40) / hertz
     np.testing.assert_array_equal(times_of(times, source="a"), times)
 
 
 @pytest.mark.parametrize("unit", UNITS)
-@pytest.mark.parametrize("hertz", [0.5, 2, 10, 95])
+@pytest.mark.parametrize("hertz", [0.5, 95])
 def test_other_units_are_refused_and_named_and_converted_if_stated(unit, hertz):
     times = np.arange(40) / hertz
     with pytest.raises(ValueError, match=r"a\.txt: expected times in seconds, found steps of .*--time-unit"):
@@ -33,12 +29,6 @@ def test_other_units_are_refused_and_named_and_converted_if_stated(unit, hertz):
     np.testing.assert_allclose(times_of(times * PER_SECOND[unit], source="a.txt", unit=unit), times)
     with pytest.raises(ValueError, match=r"a\.txt, row 1: expected seconds, found 1\.7e\+.*smaller unit.*--time-unit"):
         times_of((1.7e9 + times) * PER_SECOND[unit], source="a.txt")
-
-
-@pytest.mark.parametrize(("unit", "found"), UNITS.items())
-def test_the_unit_is_guessed_in_the_message(unit, found):
-    with pytest.raises(ValueError, match=found):
-        times_of(SECONDS * PER_SECOND[unit], source="a")
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -63,8 +53,7 @@ def test_few_steps_and_stops_prove_nothing():
 
 
 @pytest.mark.parametrize("start", [0.0, 12.5, 1.7e9])
-@pytest.mark.parametrize("row", [3, 140, 277])
-@pytest.mark.parametrize("factor", [1e3, 1e6, 1e9])
+@pytest.mark.parametrize(("row", "factor"), [(3, 1e3), (140, 1e6), (277, 1e9)])
 def test_a_unit_that_changes_in_the_middle_is_refused_whatever_unit_is_stated(start, row, factor):
     times = start + SECONDS
     times[row:] *= factor
@@ -81,37 +70,6 @@ def test_a_pause_a_new_clock_and_another_rate_are_no_change_of_the_unit():
         times = np.append(SECONDS, later)
         np.testing.assert_array_equal(times_of(times, source="a", unit="s"), times)
     assert unit_change(np.zeros(9)) is None and unit_change(-SECONDS[::-1]) is None
-
-
-def test_a_unit_that_changes_is_refused_on_every_road(tmp_path):
-    times = np.append(12 + np.arange(4) / 10, (12.4 + np.arange(4) / 10) * 1e9)
-    folder_of_scans(tmp_path / "scans", 8)
-    np.savetxt(tmp_path / "scans" / "times.txt", times)
-    write_tum(tmp_path / "poses.tum", times)
-    (tmp_path / "poses.csv").write_text("t,x,y,z\n" + "".join(f"{t},0,0,0\n" for t in times))
-    roads = {
-        "times.txt": lambda: open_recording(tmp_path / "scans"),
-        "poses.tum": lambda: read_tum(tmp_path / "poses.tum"),
-        "poses.csv": lambda: read_trajectory(tmp_path / "poses.csv"),
-        "stamps.csv": lambda: match(times, times[:4]),
-        "lidar": lambda: match(times[:4], times),
-    }
-    for name, read in roads.items():
-        with pytest.raises(
-            ValueError, match=rf"{name}, row 5: expected times in one unit, found 1\.24e\+10 after 12\.3"
-        ):
-            read()
-    assert not Stamps(times.astype(np.int64), times).orderly
-
-
-def match(stamps, times):
-    ticks = {"stamps": (stamps * 1e6).astype(np.int64), "times": (times * 1e6).astype(np.int64)}
-    return match_times(**ticks, tick_s=1e-6, max_gap_s=0.1, poses=Path("stamps.csv"), scans=Path("lidar"))
-
-
-def test_times_that_go_back_name_their_row():
-    with pytest.raises(ValueError, match=r"a, row 3: expected a time >= 0\.2, found 0\.1"):
-        times_of(np.array([0.0, 200, 100]), source="a", unit="ms")
 
 
 def write_tum(path, stamps):
@@ -146,28 +104,6 @@ def test_every_file_of_times_follows_the_rule(tmp_path):
     with pytest.warns(DataWarning, match=r"times\.txt: expected times, found row numbers .*not used; state the unit"):
         assert read_times(rows) is None
     assert read_tum(write_tum(tmp_path / "poses.tum", range(280)))[1] is None
-
-
-@pytest.mark.parametrize("unit", UNITS)
-def test_a_folder_of_scans_takes_the_unit_of_its_files(tmp_path, unit):
-    folder = folder_of_scans(tmp_path / "scans", 12)
-    write_tum(folder / "poses.tum", SECONDS[:12] * PER_SECOND[unit])
-    with pytest.raises(ValueError, match=r"poses\.tum: expected times in seconds, found steps"):
-        open_recording(folder, sensor_height=1.7)
-    np.testing.assert_allclose(open_recording(folder, sensor_height=1.7, time_unit=unit).times, SECONDS[:12])
-
-
-def test_an_unknown_unit_is_named(tmp_path, as_installed):
-    with pytest.raises(ValueError, match="time_unit: expected one of 'auto', 's', 'ms', 'us', 'ns', found 'h'"):
-        open_recording(folder_of_scans(tmp_path / "scans", 2), time_unit="h")
-
-
-def test_poses_beside_scans_that_count_rows_give_no_times(tmp_path):
-    folder = folder_of_scans(tmp_path / "scans", 12)
-    write_tum(folder / "poses.tum", range(12))
-    recording = open_recording(folder, sensor_height=1.7)
-    assert recording.times is None and recording.positions[:, 0].tolist() == list(range(12))
-    np.testing.assert_array_equal(open_recording(folder, sensor_height=1.7, time_unit="s").times, np.arange(12))
 
 
 def test_a_change_of_the_clock_is_told_for_every_layout(tmp_path):

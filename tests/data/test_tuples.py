@@ -122,14 +122,6 @@ def test_positives_and_negatives_repeat_only_where_there_are_too_few():
     assert all(set(row) == {2, 3} for row in far.tolist())
 
 
-def test_one_far_frame_among_many_is_found():
-    recording = np.zeros((500, 3))
-    recording[77, 0] = 30
-    config = TupleConfig(negatives=1)
-    _, _, far = columns(TuplePool([recording], config).draw(seed=0, step=0, tuples=10), config)
-    assert (far == 77).all()
-
-
 def test_drives_without_positives_or_negatives_are_refused():
     with pytest.raises(ValueError, match=r"expected frames within 3\.0 m"):
         TuplePool([np.arange(30.0).reshape(10, 3) * 5], TupleConfig())
@@ -242,12 +234,3 @@ def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
     for group, other_visit in ((pool.neighbours, False), (pool.revisits, True)):
         anchors = np.repeat(np.arange(len(pool)), np.diff(group.starts))
         assert ((np.abs(pool.frame[anchors] - pool.frame[group.frames]) > LAP // 2) == other_visit).all()
-
-
-def test_places_at_random_differ_and_follow_seed_and_step():
-    pool = TuplePool([circuit(2)], TupleConfig(negatives=3))
-    rows = pool.draw_places(seed=0, step=5, tuples=6)
-    assert rows.shape == (6, 5) and len(set(rows.ravel())) == 30
-    np.testing.assert_array_equal(pool.draw_places(seed=0, step=5, tuples=6), rows)
-    assert (pool.draw_places(seed=0, step=6, tuples=6) != rows).any()
-    assert pool.draw_places(seed=0, step=0, tuples=100).shape == (100, 5)

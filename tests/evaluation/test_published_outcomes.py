@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from recordings import kitti_trajectory
 
-from sglpr_jax.data.readers.kitti import read_trajectory
 from sglpr_jax.evaluation.protocols import TopK
 from sglpr_jax.evaluation.protocols.contour_context_f1max import contour_context_f1max
 from sglpr_jax.evaluation.protocols.listed_pairs_f1max import listed_pairs_f1max, score_listed_pairs
@@ -24,7 +24,7 @@ from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
     ],
 )
 def test_sscs_lists_give_its_recall(shared, sequence, rows, recall):
-    positions, times, source = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
+    positions, times, source = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     listed = np.loadtxt(shared / f"data/protocol/ssc_top25_{sequence}.txt", dtype=np.int64)
     result = ssc_recall(TopK(sequence, positions, times, source, listed[:, 0], listed[:, 1:]))
     assert round(result.score, 4) == recall
@@ -61,7 +61,7 @@ def test_contour_contexts_outcome_gives_its_f1max(shared):
     ("sequence", "revisits"), [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
 )
 def test_revisits_are_logg3ds(shared, make_file, sequence, revisits):
-    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
+    positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     result = top1_f1max(make_file(positions, positions, times=times, sequence=sequence))
     assert result.counts["revisits"] == revisits
 
@@ -78,7 +78,7 @@ def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
     published = {tuple(pair) for pair in pairs[positive].tolist()}
     found = {}
     for poses in ("kitti", "semantickitti"):
-        positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", pose_source=poses)
+        positions, _, _ = kitti_trajectory(shared / "data/kitti_odometry", "07", pose_source=poses)
         found[poses] = set(zip(*np.divmod(positive_pairs(positions[:, :2]), len(positions)), strict=True))
     assert found["kitti"] == published
     assert len(published) == 1833
@@ -87,7 +87,7 @@ def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
 
 def test_rinets_list_scores_descriptors(shared, make_file, neg_100):
     pairs, positive = neg_100
-    positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", pose_source="kitti")
+    positions, _, _ = kitti_trajectory(shared / "data/kitti_odometry", "07", pose_source="kitti")
     noise = np.random.default_rng(0).normal(scale=10, size=positions.shape)
     file = make_file(positions, positions + noise, sequence="07")
     by_label = listed_pairs_f1max(score_listed_pairs(file, pairs, positive))

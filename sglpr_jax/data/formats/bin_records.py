@@ -1,30 +1,21 @@
-"""Detects the record format of headerless scans: the format with which the files look like scans.
+"""Reads scans without a header (.bin), and detects their format.
 
-A wrong record format mixes the columns of a file. Then the coordinates are no longer metres, or the rows differ
-periodically. If float32x6 is read as float32x4, for example, only every third row begins with x. A format therefore
-fits if
-
-- nearly all coordinates are finite and within 300 m, half of the points are within 120 m, and few coordinates are
-  almost 0;
-- for periods of 5 to 8 rows (which include periods of 2 to 4), the rows of each phase have similar distributions of
-  directions and distances.
-
-If two formats fit and one record is a multiple of the other, the larger one combines several points. The smaller one is
-used.
+A wrong format mixes the columns of a file. A format fits if the sizes of most files are multiples of its record, if
+nearly all coordinates are plausible, and if the rows do not differ periodically. If a file of float32x6 is read as
+float32x4, for example, only every third row begins with x. If several formats fit, the user has to name one.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeGuard, get_args
+from typing import TypeGuard, get_args
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat
-from sglpr_jax.data.formats.cloud_text import check_points
-from sglpr_jax.data.point_times import TimeField
+from sglpr_jax.data.formats.clouds import Records, TimeField, check_points
 from sglpr_jax.data.warning import warn
-from sglpr_jax.files import in_short, naming
+from sglpr_jax.files import naming
 
 MOST_M = 300.0
 """Maximum absolute coordinate in metres, for all points but a fraction of `STRANGE`."""
@@ -34,30 +25,36 @@ LEAST_M = 1e-20
 """Minimum nonzero coordinate in metres. Smaller ones are not measurements but the low half of a wider number."""
 STRANGE = 0.02
 """Maximum fraction of points that violate a limit."""
-TURNS = (5, 6, 7, 8)
-"""Periods of rows that are compared."""
+PERIODS = (5, 6, 7, 8)
+"""Periods of rows that are compared. They include periods of 2 to 4."""
 DIRECTIONS_APART = 0.12
-"""Maximum difference of the distributions of directions between phases (Kolmogorov-Smirnov statistic)."""
+"""Maximum difference of the distributions of directions between rows of a period (Kolmogorov-Smirnov statistic)."""
 TIMES_AS_FAR = 8.0
-"""Maximum ratio of the median distances between phases."""
+"""Maximum ratio of the median distances between rows of a period."""
 SCALED_M = 1.0
 """Clouds whose coordinates are all within this limit are considered scaled, not in metres."""
-FEWEST = 200
-"""Minimum number of points, over all files, for the detection."""
-MOST = 20_000
-"""Maximum number of points that are read per file."""
+FEWEST, MOST = 200, 20_000
+"""Minimum number of points over all files, and maximum number of points that are read per file."""
 FILES = 5
 """Maximum number of files that are read."""
 CANDIDATES: tuple[RecordFormat, ...] = tuple(
     name for name in get_args(RecordFormat) if name not in ("nuscenes", "nclt", "float32x4")
 )
 """Formats that are tried. kitti covers float32x4, and float32x5 covers nuscenes. nclt would fit almost any file."""
+NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+NCLT_UNIT_M = 0.005
+NCLT_OFFSET_M = -100.0
+"""Scale and offset of NCLT's integers: metres = value * unit + offset."""
+Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
+"""Rotation by 180 degrees about x: from forward, right, down to forward, left, up. Negating only z would mirror
+scans."""
 
 
 def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, spread over the recording.
 
-    Empty and unreadable files are ignored. Fewer than half of the files may be broken.
+    Empty and unreadable files are ignored. Fewer than half of the files may be broken. If the record of one format
+    consists of several records of another one that fits, too, it combines several points and does not count.
 
     Returns:
       The format, or None if there are too few points; and a description of how it was detected.
@@ -68,22 +65,17 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     chosen = _some(paths)
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
         return None, "too few points to detect it"
-    strange: dict[RecordFormat, str] = {name: strangeness(chosen, name) for name in CANDIDATES}
-    fits: list[RecordFormat] = [name for name in CANDIDATES if not strange[name]]
+    misfits: dict[RecordFormat, str] = {name: _misfit(chosen, name) for name in CANDIDATES}
+    fits: list[RecordFormat] = [name for name in CANDIDATES if not misfits[name]]
     simplest: list[RecordFormat] = [
         name for name in fits if not any(_repeats(name, other) for other in fits if other != name)
     ]
     if len(simplest) == 1:
         return simplest[0], f"found from {len(chosen)} of {len(paths)} scans"
-    reasons = dict.fromkeys(strange.values())
-    tried = "; ".join(
-        f"{', '.join(described(name) for name in CANDIDATES if strange[name] == why)}: {why or 'fits'}"
-        for why in reasons
-    )
-    wanted = " or ".join(simplest) if simplest else "one of these"
+    tried = "; ".join(f"{described(name)}: {misfits[name] or 'fits'}" for name in CANDIDATES)
     raise ValueError(
         f"{paths[0] if len(paths) == 1 else paths[0].parent}: expected scans that fit exactly one format, found"
-        f" {len(simplest)}; pass --format {wanted}, or nuscenes or nclt ({tried})"
+        f" {len(simplest)}; pass --format {' or '.join(simplest) or 'one of these'}, or nuscenes or nclt ({tried})"
     )
 
 
@@ -92,23 +84,15 @@ def record_of_scan(path: Path) -> RecordFormat:
 
     Raises ValueError if no format fits, or several others do, like `find_record`.
     """
-    chosen = _some([path])
-    if not chosen or not strangeness(chosen, "kitti"):
-        return "kitti"
-    return find_record(chosen)[0] or "kitti"
+    return "kitti" if fits_record([path], "kitti") else find_record([path])[0] or "kitti"
 
 
-def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> RecordFormat | None:
-    """Detect scans whose format differs from the usual one of their dataset layout.
+def unusual_record(paths: Sequence[Path]) -> RecordFormat | None:
+    """Detect scans in KITTI's layout whose format differs from KITTI's, as users' own scans may have.
 
-    Users put their own recordings into the layout of a known dataset. If their points have another record size, they
-    would be read incorrectly.
-
-    Returns:
-      The detected format, or None if the scans fit `usual` or no single format is detected.
+    Returns None if the scans fit KITTI's format or no single format is detected.
     """
-    chosen = _some(paths)
-    if not chosen or not strangeness(chosen, usual):
+    if fits_record(paths, "kitti"):
         return None
     try:
         return find_record(paths)[0]
@@ -116,101 +100,76 @@ def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> R
         return None
 
 
-def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
-    """Warn if the files do not look like scans in the given format."""
+def fits_record(paths: Sequence[Path], format: RecordFormat) -> bool:
+    """Whether the files look like scans in the given format, or tell nothing."""
     chosen = _some(paths)
-    if sum(path.stat().st_size for path in chosen) < FEWEST * record_type(format).itemsize:
-        return
-    if strange := strangeness(chosen, format):
-        warn(f"{paths[0].parent}: expected scans of {described(format)}, found {strange}")
+    return not chosen or not _misfit(chosen, format)
+
+
+def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
+    """Warn if the files have enough points and do not look like scans in the given format."""
+    chosen = _some(paths)
+    enough = sum(path.stat().st_size for path in chosen) >= FEWEST * record_type(format).itemsize
+    if enough and (misfit := _misfit(chosen, format)):
+        warn(f"{paths[0].parent}: expected scans of {described(format)}, found {misfit}")
 
 
 def _some(paths: Sequence[Path]) -> list[Path]:
     """A few files, spread over the recording, without empty and unreadable ones. A crash leaves the last file empty."""
     chosen = (paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int)))
-    return [path for path in chosen if _has_bytes(path)]
+    return [path for path in chosen if path.is_file() and path.stat().st_size]
 
 
-def _has_bytes(path: Path) -> bool:
-    """Whether the file can be read and is not empty. False for dangling links and missing permissions."""
-    try:
-        with path.open("rb") as stream:
-            return bool(stream.read(1))
-    except OSError:
-        return False
-
-
-def strangeness(paths: Sequence[Path], format: RecordFormat) -> str:
+def _misfit(paths: Sequence[Path], format: RecordFormat) -> str:
     """Return "" if most files look like scans in this format, or else a description of the difference."""
-    clouds, reasons = [], []
+    width, clouds, reasons = record_type(format).itemsize, [], []
     for path in paths:
-        points, reason = _coordinates(path, format)
-        clouds += [] if reason else [points]
+        try:
+            with np.errstate(invalid="ignore"):  # of numbers of another type
+                points = read_records(path, format).points[:MOST].astype(np.float64)
+        except (OSError, ValueError):
+            reasons.append(f"a size that is not a multiple of {width} bytes, or an unreadable file")
+            continue
+        points[np.isnan(points).all(axis=1) | (points == 0).all(axis=1)] = np.nan
+        reason = _implausible(points[~np.isnan(points).all(axis=1)])
         reasons += [reason] if reason else []
-    if len(reasons) >= len(paths) / 2:
+        clouds += [] if reason else [points]
+    if 2 * len(reasons) >= len(paths):
         return max(set(reasons), key=reasons.count)
-    return _strange_turns(clouds)
+    return next((reason for period in PERIODS if (reason := _periodic(clouds, period))), "")
 
 
-def _coordinates(path: Path, format: RecordFormat) -> tuple[Float[np.ndarray, "n 3"], str]:
-    """The first points of a file, NaN if there was no return; and a description of invalid coordinates."""
-    nothing, width = np.zeros((0, 3)), record_type(format).itemsize
-    try:
-        if path.stat().st_size % width:
-            return nothing, f"a size that is not a multiple of {width} bytes"
-        with np.errstate(invalid="ignore"):
-            points = read_records(path, format).points[:MOST].astype(np.float64)
-    except (OSError, ValueError) as error:  # a disk error, or a file that is being written
-        return nothing, f"an unreadable file ({in_short(error)})"
-    missing = np.isnan(points).all(axis=1) | (points == 0).all(axis=1)
-    points[missing] = np.nan
-    return points, _strange_range(points[~missing])
-
-
-def _strange_range(points: Float[np.ndarray, "n 3"]) -> str:
+def _implausible(points: Float[np.ndarray, "n 3"]) -> str:
+    """Why points cannot be those of a scan in metres, or ""."""
     if not len(points):
         return "all points NaN or 0"
-    finite, size = np.isfinite(points).all(axis=1), np.abs(points)
-    shares = {
-        "not finite": ~finite,
-        f"beyond {MOST_M:g} m": (size > MOST_M).any(axis=1),
-        f"with a nonzero coordinate below {LEAST_M:g} m": ((size < LEAST_M) & (size > 0)).any(axis=1),
-        "1 m away, like normals": np.abs(np.linalg.norm(np.where(size < 2, size, 9), axis=1) - 1) < 1e-4,
-    }
-    for what, where in shares.items():
-        if where.mean() > STRANGE:
-            return f"{where.mean():.0%} of the points {what}"
-    if np.median(np.hypot(*size[finite, :2].T)) > USUAL_M:
+    size = np.abs(points)
+    wrong = ~((size <= MOST_M) & ((size >= LEAST_M) | (size == 0))).all(axis=1)  # True for NaN
+    if wrong.mean() > STRANGE:
+        return f"{wrong.mean():.0%} of the points not finite or beyond {MOST_M:g} m"
+    points, size = points[~wrong], size[~wrong]
+    if (np.abs(np.linalg.norm(points, axis=1) - 1) < 1e-4).mean() > STRANGE:
+        return "points 1 m away, like normals"
+    if np.median(np.hypot(*points[:, :2].T)) > USUAL_M:
         return f"half of the points beyond {USUAL_M:g} m"
-    if size[finite].max() <= SCALED_M:
+    if size.max() <= SCALED_M:
         return f"all points within {SCALED_M:g} m, as in scaled clouds"
-    flat = [axis for axis, spread in zip("xy", np.ptp(points[finite, :2], axis=0), strict=True) if spread < 0.1]
-    return f"all points with the same {flat[0]}" if flat else ""
+    return "all points with the same x or y" if np.ptp(points[:, :2], axis=0).min() < 0.1 else ""
 
 
-def _strange_turns(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> str:
-    direction = [np.arctan2(points[:, 1], points[:, 0]) for points in clouds]
-    to_axis = [np.arctan2(np.abs(points[:, 1]), np.abs(points[:, 0])) for points in clouds]
-    distance = [np.hypot(points[:, 0], points[:, 1]) for points in clouds]
-    for turn in TURNS:
-        values = (direction, to_axis, distance)
-        looks, turned, far = ([_each(value, start, turn) for start in range(turn)] for value in values)
-        fewest = min(map(len, looks))
-        if fewest < FEWEST / 2 / turn:
-            return f"every {turn}th point missing"
-        apart = max(_apart(angles[0], other) for angles in (looks, turned) for other in angles[1:])
-        if apart > DIRECTIONS_APART + 1.6 * np.sqrt(2 / fewest):
-            return f"every {turn}th point in another direction"
-        usual = [np.median(values) for values in far]
-        if max(usual) > TIMES_AS_FAR * min(usual):
-            return f"every {turn}th point at another distance"
-    return ""
-
-
-def _each(values: Sequence[Float[np.ndarray, "_"]], start: int, turn: int) -> Float[np.ndarray, "_"]:
-    """Every `turn`-th value of each file, beginning with `start`, without NaN."""
-    found = np.concatenate([each[start::turn] for each in values])
-    return found[~np.isnan(found)]
+def _periodic(clouds: Sequence[Float[np.ndarray, "_ 3"]], period: int) -> str:
+    """Why every `period`-th row differs from the others, or ""."""
+    rows = [np.concatenate([points[start::period] for points in clouds]) for start in range(period)]
+    x, y = zip(*(points[~np.isnan(points).any(axis=1), :2].T for points in rows), strict=True)
+    fewest = min(map(len, x))
+    if fewest < FEWEST / 2 / period:
+        return f"every {period}th point missing"
+    apart = DIRECTIONS_APART + 1.6 * np.sqrt(2 / fewest)
+    for angles in (list(map(np.arctan2, y, x)), [np.arctan2(np.abs(b), np.abs(a)) for a, b in zip(x, y, strict=True)]):
+        if max(_apart(angles[0], other) for other in angles[1:]) > apart:
+            return f"every {period}th point in another direction"
+    usual = [np.median(np.hypot(a, b)) for a, b in zip(x, y, strict=True)]
+    return f"every {period}th point at another distance" if max(usual) > TIMES_AS_FAR * min(usual) else ""
 
 
 def _apart(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> float:
@@ -224,28 +183,7 @@ def _apart(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> float:
 def _repeats(name: RecordFormat, other: RecordFormat) -> bool:
     """Whether a record consists of several records of `other`."""
     this, smaller = record_type(name), record_type(other)
-    same = this["xyz"].base == smaller["xyz"].base
-    return same and this.itemsize % smaller.itemsize == 0
-
-
-NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
-NCLT_UNIT_M = 0.005
-NCLT_OFFSET_M = -100.0
-"""Scale and offset of NCLT's integers: metres = value * unit + offset."""
-Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
-"""Rotation by 180 degrees about x: from forward, right, down to forward, left, up. Negating only z would mirror
-scans."""
-
-
-class Records(NamedTuple):
-    """Points of one scan, with their lasers and times."""
-
-    points: Float32[np.ndarray, "n 3"]
-    """Points in metres: x forward, y left, z up if the format defines its axes, or else the axes of the file."""
-    lasers: Int32[np.ndarray, " n"] | None
-    """Laser number of each point, or None if the format has none."""
-    times: TimeField | None = None
-    """Field with the times of the points, or None if the format has none."""
+    return this["xyz"].base == smaller["xyz"].base and this.itemsize % smaller.itemsize == 0
 
 
 def is_record(format: str) -> TypeGuard[RecordFormat]:
@@ -297,15 +235,11 @@ def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False
     records = np.fromfile(path, dtype=dtype)
     times = TimeField("time", records["more"][:, -1].copy()) if last_is_time else None
     lasers = records["laser"].astype(np.int32) if "laser" in (dtype.names or ()) else None
+    xyz = records["xyz"]
     with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers
+        if format == "nuscenes":
+            xyz = np.stack([xyz[:, 1], -xyz[:, 0], xyz[:, 2]], axis=1)
+        elif format == "nclt":
+            xyz = (xyz.astype(np.float64) * NCLT_UNIT_M + NCLT_OFFSET_M) * Z_UP_FROM_Z_DOWN
         # Column-major order: the copy takes half the time, and later steps work along the axes.
-        return Records(np.asfortranarray(_our_axes(records["xyz"], format), dtype=np.float32), lasers, times)
-
-
-def _our_axes(xyz: np.ndarray, format: RecordFormat) -> np.ndarray:
-    """Convert the coordinates of a format to metres, x forward, y left, z up."""
-    if format == "nuscenes":
-        return np.stack([xyz[:, 1], -xyz[:, 0], xyz[:, 2]], axis=1)
-    if format == "nclt":
-        return (xyz.astype(np.float64) * NCLT_UNIT_M + NCLT_OFFSET_M) * Z_UP_FROM_Z_DOWN
-    return xyz
+        return Records(np.asfortranarray(xyz, dtype=np.float32), lasers, times)

@@ -6,22 +6,15 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
-from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.cloud_text import BLOCK_POINTS, check_points
-from sglpr_jax.data.point_times import TimeField, time_field_of
+from sglpr_jax.data.formats.clouds import BLOCK_POINTS, Records, check_points, records_of, time_field_of
 from sglpr_jax.files import in_short, naming
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
 """Minimum size of a variable-length record before and after the points, in bytes."""
 _COMPRESSED = 0x80
 """Bit of the point format in the header of a .laz file."""
-
-
-def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the points (n, 3) of a .las file. Raises what `las_records` raises."""
-    return las_records(path).points
 
 
 def las_records(path: Path) -> Records:
@@ -32,16 +25,13 @@ def las_records(path: Path) -> Records:
       ImportError: If the extra `las` is not installed.
       ValueError: If the file is not a readable .las file, is truncated, or has no points.
     """
-    laspy = _laspy(path)
-    with naming(path):
-        _check_sizes(path, one_scan=True)
+    laspy = _laspy(path, one_scan=True)
     try:
         with laspy.open(path) as stream:
             found = stream.read()
-        with np.errstate(over="ignore", invalid="ignore"):
-            points = np.stack([np.asarray(axis) for axis in (found.x, found.y, found.z)], axis=1).astype(np.float32)
         time = time_field_of(list(found.point_format.dimension_names))
-        return Records(points, None, None if time is None else TimeField(time, np.array(found[time])))
+        columns = [np.asarray(axis) for axis in (found.x, found.y, found.z, *([] if time is None else [found[time]]))]
+        return records_of(columns, time)
     except Exception as error:  # laspy raises struct.error, MemoryError and others
         raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
 
@@ -49,13 +39,11 @@ def las_records(path: Path) -> Records:
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
     """Yield the points of a .las or .laz file of any size in parts, in metres, scaled by the header.
 
-    Raises the errors of `read_las`, and ImportError if a .laz file is given and lazrs is not installed.
+    Raises the errors of `las_records`, and ImportError if a .laz file is given and lazrs is not installed.
     """
-    laspy = _laspy(path)
+    laspy = _laspy(path, one_scan=False)
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
         raise ImportError(f"{path}: .laz files need lazrs (pip install 'sglpr-jax[las]')")
-    with naming(path):
-        _check_sizes(path, one_scan=False)
     try:
         with laspy.open(path) as stream:
             for block in stream.chunk_iterator(BLOCK_POINTS):
@@ -64,14 +52,16 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
         raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
 
 
-def _laspy(path: Path) -> ModuleType:
-    """The library. Raises FileNotFoundError if the file does not exist, and ImportError without the extra."""
+def _laspy(path: Path, *, one_scan: bool) -> ModuleType:
+    """The library, after a check of the sizes in the header. Raises ImportError without the extra."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a .las file, found none")
     try:
         import laspy
     except ImportError as error:
         raise ImportError(f"{path}: .las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
+    with naming(path):
+        _check_sizes(path, one_scan=one_scan)
     return laspy
 
 
@@ -94,8 +84,7 @@ def _check_sizes(path: Path, *, one_scan: bool) -> None:
         raise ValueError(f"expected {records} and {extended} records by the header, found {size} bytes in total")
     if one_scan:
         check_points(points, bytes_each=width)
-    if kind & _COMPRESSED:
-        return
     held = max(size - start, 0) // max(width, 1)
-    if points > held or (points < held and header[25] < 3):  # later versions may have records behind the points
+    # The size of compressed points is not known. Versions from 1.3 on may have records behind the points.
+    if not kind & _COMPRESSED and (points > held or (points < held and header[25] < 3)):
         raise ValueError(f"expected {points} points by the header, found {held}")

@@ -1,4 +1,4 @@
-"""Reads text files with one row of numbers per frame: poses and timestamps."""
+"""Reads text files with one row of numbers per frame: poses (KITTI, TUM, csv) and timestamps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
-from sglpr_jax.data.poses import poses_at_scans, poses_of, unturned
+from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.times import ADVICE, times_of
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value
@@ -19,6 +19,18 @@ CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 
 """Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
 FARTHEST_M = 1e8
 """Maximum absolute coordinate of a position, in metres."""
+MOST_HEIGHT_M = 100.0
+"""Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
+JUMP_M = 10.0
+JUMP_STEPS = 8.0
+"""A step between two scans is a jump if it exceeds `JUMP_M` metres and `JUMP_STEPS` times the median step."""
+TIME_COLUMNS = ("t", "time", "timestamp")
+"""Names of the csv column with the times in seconds."""
+TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
+"""Names with a unit, used if none of `TIME_COLUMNS` exists."""
+KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
+POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
+TIMES_FILE = "times.txt"
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
@@ -47,24 +59,20 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
         )
 
 
-def check_quaternions(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> None:
-    """Raise ValueError if a quaternion qx qy qz qw does not have length 1. The message names its row in `path`."""
+def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
+    """Convert quaternions qx qy qz qw to rotation matrices.
+
+    Raises ValueError if a quaternion does not have length 1. The message names its row in `path`.
+    """
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
+
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
     if wrong.size:
         found = " ".join(f"{value:g}" for value in quaternions[wrong[0]])
         raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
-
-
-def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Convert quaternions qx qy qz qw to rotation matrices. Raises what `check_quaternions` raises."""
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
-
-    check_quaternions(path, quaternions)
-    if not len(quaternions):
-        return np.zeros((0, 3, 3))
-    return Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
+    return Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3) if len(quaternions) else np.zeros((0, 3, 3))
 
 
 def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
@@ -175,13 +183,6 @@ def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.nd
     return values
 
 
-MOST_HEIGHT_M = 100.0
-"""Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
-JUMP_M = 10.0
-JUMP_STEPS = 8.0
-"""A step between two scans is a jump if it exceeds `JUMP_M` metres and `JUMP_STEPS` times the median step."""
-
-
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Positions and times of the frames of a sequence."""
@@ -197,12 +198,10 @@ class Trajectory:
     rotations: np.ndarray | None = None
     """Rotations (n, 3, 3) of the frames, or None for csv."""
 
-
-TIME_COLUMNS = ("t", "time", "timestamp")
-"""Names of the csv column with the times in seconds."""
-TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
-"""Names with a unit, used if none of `TIME_COLUMNS` exists."""
-KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
+    @property
+    def poses(self) -> Float[np.ndarray, "n 4 4"]:
+        """Poses of the frames, with identity rotations if the rotations are unknown."""
+        return poses_of(self.positions, self.rotations)
 
 
 def read_trajectory(
@@ -255,12 +254,14 @@ def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
 
 def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path: Path) -> None:
     """Warn if consecutive scans are much farther apart than most: the scans may have another order than the poses."""
+    from scipy.spatial import KDTree  # imported here because the import is slow
+
     if len(positions) < 3:
         return
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     usual = float(np.median(steps))
     far = np.flatnonzero(steps > max(JUMP_M, JUMP_STEPS * usual))
-    near = _nearest(positions)
+    near = float(np.median(KDTree(positions).query(positions, k=2)[0][:, 1]))
     if not len(far) and usual <= max(JUMP_M, JUMP_STEPS * near):
         return
     worst = int(np.argmax(steps))
@@ -269,13 +270,6 @@ def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path
         f" {steps[worst]:.0f} m apart ({len(far)} jumps; half of the steps are below {usual:.1f} m, the median distance"
         f" to the nearest other pose is {near:.1f} m); are the poses in the order of the scans?"
     )
-
-
-def _nearest(positions: Float[np.ndarray, "n 3"]) -> float:
-    """Median distance to the nearest other pose, in metres."""
-    from scipy.spatial import KDTree  # imported here because the import is slow
-
-    return float(np.median(KDTree(positions).query(positions, k=2)[0][:, 1]))
 
 
 def _format_of(path: Path, twelve_numbers: str | None) -> str:
@@ -298,18 +292,17 @@ def _format_of(path: Path, twelve_numbers: str | None) -> str:
 
 
 def _read(path: Path, format: str, unit: TimeUnit) -> Trajectory:
+    place = Path(*path.parts[-2:])  # for tables
     if format == "csv":
-        return _read_csv(path, unit)
-    if format == "tum":
-        poses, times = read_tum(path, time_unit=unit)
-        return Trajectory(poses[:, :3, 3], times, _said(path, "TUM"), rotations=poses[:, :3, :3])
-    camera = format == "kitti"
-    poses = read_kitti(path, camera=camera)
-    said = _said(path, "camera" if camera else "z up")
-    return Trajectory(poses[:, :3, 3], None, said, rotations=poses[:, :3, :3])
+        return Trajectory(*_read_csv(path, unit), f"{place} (csv)")
+    poses, times = (
+        read_tum(path, time_unit=unit) if format == "tum" else (read_kitti(path, camera=format == "kitti"), None)
+    )
+    said = {"tum": "TUM", "kitti": "camera", "lidar": "z up"}[format]
+    return Trajectory(poses[:, :3, 3], times, f"{place} ({said})", rotations=poses[:, :3, :3])
 
 
-def _read_csv(path: Path, unit: TimeUnit) -> Trajectory:
+def _read_csv(path: Path, unit: TimeUnit) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"] | None]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     names, clock = _header(path)
@@ -317,7 +310,7 @@ def _read_csv(path: Path, unit: TimeUnit) -> Trajectory:
     times = None if clock is None else times_of(columns[clock], source=path, unit=unit)
     positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
     check_positions(path, positions)
-    return Trajectory(positions, times, _said(path, "csv"))
+    return positions, times
 
 
 def _header(path: Path) -> tuple[list[str], str | None]:
@@ -335,15 +328,6 @@ def _header(path: Path) -> tuple[list[str], str | None]:
     if unused:
         warn(f"{path}: expected seconds in one of {', '.join(KNOWN_CLOCKS)}, found {', '.join(unused)}, not used")
     return names, clocks[0] if clocks else None
-
-
-def _said(path: Path, format: str) -> str:
-    """Short description of the file for tables: the last two parts of its path, and the format."""
-    return f"{Path(*path.parts[-2:])} ({format})"
-
-
-POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
-TIMES_FILE = "times.txt"
 
 
 def folder_trajectory(
@@ -372,7 +356,7 @@ def folder_trajectory(
       Positions in metres, times in seconds, and a description of the pose source. Each is `None` if unknown.
 
     Raises:
-      FileNotFoundError: If `se3` or `times` does not exist.
+      FileNotFoundError: If `poses` or `times` does not exist.
       ValueError: If the folder has several pose files, a file is malformed, `times` has another number of rows, or a
         scan has no pose.
     """
@@ -381,33 +365,22 @@ def folder_trajectory(
         raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")
     path = poses or next(iter(beside), None)
     clock = times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
-    seconds = None
-    if clock is not None:
-        seconds = read_times(clock, unit=time_unit)
-        _check_rows(clock, scans if seconds is None else len(seconds), scans)
+    seconds = None if clock is None else read_times(clock, unit=time_unit)
+    if seconds is not None and len(seconds) != scans:
+        raise ValueError(f"{clock}: expected {scans} rows, one per scan, found {len(seconds)}")
     if path is None:
         return None, seconds, None
-    twelve = "lidar" if poses is None else None
-    found = read_trajectory(path, format=pose_format, time_unit=time_unit, twelve_numbers=twelve)
-    positions, said = _at_scans(path, found, seconds, scans, of=f"scan of {root.resolve().name}")
-    source = found.source if poses is not None else path.name
-    return positions, found.times if seconds is None else seconds, f"{source}{said}"
-
-
-def _at_scans(
-    path: Path, trajectory: Trajectory, times: Float[np.ndarray, " n"] | None, scans: int, *, of: str
-) -> tuple[Float[np.ndarray, "n 3"], str]:
-    """Positions of all scans, and how they were matched if not row by row. Raises ValueError if a scan has no pose."""
-    found = poses_at_scans(str(path), unturned(trajectory.positions), trajectory.times, times, scans=scans, of=of)
-    if times is not None and not found.kept.all():
-        late = times[~found.kept]
+    given = read_trajectory(
+        path, format=pose_format, time_unit=time_unit, twelve_numbers="lidar" if poses is None else None
+    )
+    of = f"scan of {root.resolve().name}"
+    found = poses_at_scans(str(path), poses_of(given.positions), given.times, seconds, scans=scans, of=of)
+    if seconds is not None and not found.kept.all():
+        late = seconds[~found.kept]
         raise ValueError(
             f"{path}: expected poses at the times of all {scans} scans, found none for {len(late)}, the first at "
             f"{late[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
         )
-    return found.poses[:, :3, 3], f", {found.said}" if found.said else ""
-
-
-def _check_rows(path: Path, rows: int, scans: int) -> None:
-    if rows != scans:
-        raise ValueError(f"{path}: expected {scans} rows, one per scan, found {rows}")
+    source = given.source if poses is not None else path.name
+    said = f"{source}, {found.said}" if found.said else source
+    return found.poses[:, :3, 3], given.times if seconds is None else seconds, said

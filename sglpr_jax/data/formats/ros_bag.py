@@ -1,23 +1,17 @@
-"""Bounds what the compressed parts of a bag inflate to. A few kilobytes may declare or hold any number of bytes."""
+"""Reads bags of ROS 1 and ROS 2 with rosbags (extra `ros`): topics, times, clouds, poses and IMU."""
 
-import bz2
-import functools
-import io
 import itertools
-import os
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.formats.ros_messages import (
     CUSTOM_MSG,
-    IMU,
     POINT,
     POSES,
     TRANSFORMS,
@@ -32,101 +26,6 @@ from sglpr_jax.data.formats.ros_messages import (
     tracks_of,
 )
 from sglpr_jax.files import in_short
-
-MOST_BYTES = 2**28
-"""Maximum size of a chunk or a message: 256 MiB. Recorders write chunks of 4 MiB, or of a single larger message."""
-
-INFLATION = 64
-"""Maximum size of an inflated file, as a multiple of its compressed size, if it is larger than `MOST_BYTES`."""
-
-
-@functools.cache
-def bound_bags() -> None:
-    """Make rosbags inflate at most `MOST_BYTES` at a time. Its own functions inflate all that they are given."""
-    from lz4.frame import LZ4FrameDecompressor
-    from rosbags.rosbag1 import reader as rosbag1
-    from rosbags.rosbag2 import reader as rosbag2
-    from rosbags.rosbag2 import storage_mcap
-
-    zstd: Any = vars(storage_mcap)["zstd"]
-    rosbag1.decompressors.update(
-        bz2=functools.partial(inflated, bz2.BZ2Decompressor), lz4=functools.partial(inflated, LZ4FrameDecompressor)
-    )
-    storage_mcap.DECOMPRESSORS.update(
-        lz4=functools.partial(_declared, LZ4FrameDecompressor), zstd=functools.partial(_declared, zstd.ZstdDecompressor)
-    )
-    bounded = {"decompress": functools.partial(inflated, zstd.ZstdDecompressor), "open": _bounded_file(zstd)}
-    rosbag2.__dict__["zstd"] = SimpleNamespace(**{**vars(zstd), **bounded})
-
-
-def _bounded_file(zstd: Any) -> type:
-    """Class of an open zstd file that inflates to at most `INFLATION` times its size, or `MOST_BYTES`."""
-
-    class BoundedFile(zstd.ZstdFile):
-        def __init__(self, file: Any, mode: str):
-            super().__init__(file, mode)
-            self._left = max(MOST_BYTES, INFLATION * os.fstat(file.fileno()).st_size)
-
-        def read(self, size: int | None = -1, /) -> bytes:
-            part = super().read(size)
-            self._left -= len(part)
-            if self._left < 0:
-                raise ValueError(f"expected at most {INFLATION} times the size of a compressed file, found more")
-            return part
-
-    return BoundedFile
-
-
-def inflated(decompressor: Callable[[], Any], content: bytes, *, most: int | None = None) -> bytes:
-    """Inflate a chunk or a message of one frame or several.
-
-    Arguments:
-      decompressor: Makes a decompressor for a frame.
-      content: Compressed bytes.
-      most: Maximum number of bytes, by default `MOST_BYTES`.
-
-    Raises ValueError if the frames hold more bytes, or if the last one is cut. Decompressors raise many types of errors
-    for damaged frames.
-    """
-    most, parts = MOST_BYTES if most is None else most, []
-    while content or not parts:
-        one = decompressor()
-        parts.append(one.decompress(content, max_length=most + 1 - sum(map(len, parts))))
-        if sum(map(len, parts)) > most:
-            raise ValueError(f"expected at most {most} bytes in a compressed part, found more")
-        if not one.eof:
-            raise ValueError("expected a whole compressed part, found one that is cut")
-        content = one.unused_data or b""
-    return b"".join(parts)
-
-
-def _declared(decompressor: Callable[[], Any], content: bytes, size: int) -> bytes:
-    """Inflate a chunk of a declared size."""
-    if size > MOST_BYTES:
-        raise ValueError(f"expected a chunk of at most {MOST_BYTES} bytes, found {size} declared")
-    return inflated(decompressor, content, most=size)
-
-
-class BoundedPath(type(Path())):
-    """A path whose open file reads no more than it contains. Python allocates the memory for a read before it reads."""
-
-    def open(self, *options: Any, **more: Any) -> Any:
-        """Open the file. Options other than the mode "rb" open it without a bound."""
-        if options == ("rb",) and not more:
-            return _BoundedFile(io.FileIO(self, "rb"))
-        return super().open(*options, **more)
-
-
-class _BoundedFile(io.BufferedReader):
-    def __init__(self, raw: io.FileIO):
-        super().__init__(raw)
-        self._size = os.fstat(raw.fileno()).st_size
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if size is None or size < 0:
-            return super().read(size)
-        return super().read(min(size, max(self._size - self.tell(), 0)))
-
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
 """Message types of scans."""
@@ -163,32 +62,20 @@ class RosBag:
         spans = zip(self.paths, self._reader.readers, strict=True)
         return [(path, part.start_time, part.end_time) for path, part in spans if part.message_count]
 
-    @property
-    def has_clouds(self) -> bool:
-        """Whether the bag has a point cloud topic."""
-        return any(kind in CLOUDS for kind in self.topics.values())
+    def topics_of(self, kinds: Container[str]) -> tuple[str, ...]:
+        """Return the topics with one of some message types, in order of their names."""
+        return tuple(sorted(topic for topic, kind in self.topics.items() if kind in kinds))
 
     @property
     def cloud_topics(self) -> tuple[str, ...]:
         """Point cloud topics. Raises ValueError, with a list of all topics, if the bag has no point clouds."""
-        topics = self.topics
-        clouds = tuple(sorted(topic for topic, kind in topics.items() if kind in CLOUDS))
+        clouds = self.topics_of(CLOUDS)
         if not clouds:
-            found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topics"
+            found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.topics.items())) or "no topics"
             raise ValueError(
                 f"{self.paths[0]}: expected a topic of point clouds ({' or '.join(CLOUDS)}), found {found}"
             )
         return clouds
-
-    @property
-    def pose_topics(self) -> tuple[str, ...]:
-        """Pose topics."""
-        return tuple(sorted(topic for topic, kind in self.topics.items() if kind in POSES))
-
-    @property
-    def imu_topics(self) -> tuple[str, ...]:
-        """IMU topics."""
-        return tuple(sorted(topic for topic, kind in self.topics.items() if kind == IMU))
 
     def imu(self, topic: str) -> ImuMessages:
         """Read the messages of an IMU topic, in one pass over the bag. Raises ValueError if the bag is broken."""
@@ -209,9 +96,8 @@ class RosBag:
 
     def transforms(self) -> list[Track]:
         """Read the tf transforms: the poses of each frame in its parent frame. Needs one pass for each tf topic."""
-        topics = sorted(topic for topic, kind in self.topics.items() if kind in TRANSFORMS)
         with self._lock, _broken(self.paths[0]):
-            messages = [pair for topic in topics for pair in self._messages(topic)]
+            messages = [pair for topic in self.topics_of(TRANSFORMS) for pair in self._messages(topic)]
             return tracks_of((time, pose) for time, message in messages for pose in read_transforms(message))
 
     def frame(self, topic: str, time: int) -> str:
@@ -317,8 +203,7 @@ def _open(paths: tuple[Path, ...]) -> Any:
         raise ValueError(f"{paths[0]}: expected a file that is not compressed{_about_metadata(paths[0])}")
     for path in paths:
         _check_closed(path)
-    bound_bags()
     with _broken(paths[0]):
-        reader = AnyReader([BoundedPath(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader(list(paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
         return reader

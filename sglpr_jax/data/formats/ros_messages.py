@@ -13,12 +13,34 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.cloud_text import check_points
-from sglpr_jax.data.point_times import FIELDS, TimeField, time_field_of
-from sglpr_jax.data.poses import interpolate, poses_of
+from sglpr_jax.data.formats.clouds import TIME_FIELDS, Records, TimeField, check_points, time_field_of
+from sglpr_jax.data.poses import interpolate
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
+from sglpr_jax.se3 import from_quaternions
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LEAST_M, _MOST_M = 1e-3, 1e4
+"""Range of most nonzero coordinates, in metres. Numbers in the other byte order are spread over 10**-38 to 10**38."""
+_LASERS = ("ring", "channel", "line", "laser_id", "laser")
+"""Field names that drivers use for the laser number of a point."""
+CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+POINT = {
+    "offset_time": "u4",
+    "x": "f4",
+    "y": "f4",
+    "z": "f4",
+    "reflectivity": "u1",
+    "tag": "u1",
+    "line": "u1",
+}
+"""Fields of a point, and their numpy types."""
+LEAST_SHARE = 0.5
+"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
+UNIT = 0.01
+"""Maximum deviation of the length of a quaternion from 1."""
+IMU = "sensor_msgs/msg/Imu"
+"""Message type of an IMU."""
 
 
 class Header(NamedTuple):
@@ -74,13 +96,6 @@ class RosMessage:
         found = np.frombuffer(self._raw, kind, count, self._at) if count else np.zeros(0, kind)
         self._at = end
         return found
-
-
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_LEAST_M, _MOST_M = 1e-3, 1e4
-"""Range of most nonzero coordinates, in metres. Numbers in the other byte order are spread over 10**-38 to 10**38."""
-_LASERS = ("ring", "channel", "line", "laser_id", "laser")
-"""Field names that drivers use for the laser number of a point."""
 
 
 def read_point_cloud2(message: Any, *, name: str = "cloud") -> Records:
@@ -140,7 +155,7 @@ def _record(message: Any, order: str) -> np.dtype:
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
     wanted = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
-    wanted += [name for name in FIELDS if name in fields and fields[name].datatype in _TYPES]
+    wanted += [name for name in TIME_FIELDS if name in fields and fields[name].datatype in _TYPES]
     types = [_TYPES.get(fields[name].datatype) for name in wanted]
     if None in types:
         raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in wanted]}")
@@ -155,19 +170,6 @@ def _record(message: Any, order: str) -> np.dtype:
         )
     except (ValueError, OverflowError) as error:
         raise ValueError(f"expected fields within {message.point_step} bytes, found others ({error})") from error
-
-
-CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-POINT = {
-    "offset_time": "u4",
-    "x": "f4",
-    "y": "f4",
-    "z": "f4",
-    "reflectivity": "u1",
-    "tag": "u1",
-    "line": "u1",
-}
-"""Fields of a point, and their numpy types."""
 
 
 def read_custom_msg(message: RosMessage) -> Records:
@@ -223,12 +225,6 @@ POSES: dict[str, Callable[[RosMessage], StampedPose]] = {
 """Message types with poses of the vehicle, and their readers."""
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 """Message types of tf."""
-
-
-LEAST_SHARE = 0.5
-"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
-UNIT = 0.01
-"""Maximum deviation of the length of a quaternion from 1."""
 
 
 class Stamps(NamedTuple):
@@ -332,13 +328,10 @@ def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray,
 
 def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
     """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
-
     steps: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:
         if len(track) and not track.moves and abs(np.linalg.norm(track.quaternions[0]) - 1) <= UNIT:
-            turned = Rotation.from_quat(track.quaternions[:1]).as_matrix()
-            frame_from_child = poses_of(track.positions[:1], turned)[0]
+            frame_from_child = from_quaternions(track.positions[:1], track.quaternions[:1])[0]
             steps[track.frame].append((track.child, frame_from_child))
             steps[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
     reached, queue = {frame: np.eye(4)}, [frame]
@@ -348,10 +341,6 @@ def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np
                 reached[there] = reached[here] @ here_from_there
                 queue.append(there)
     return reached.get(other)
-
-
-IMU = "sensor_msgs/msg/Imu"
-"""Message type of an IMU."""
 
 
 class ImuMessages(NamedTuple):

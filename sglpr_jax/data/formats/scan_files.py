@@ -1,27 +1,35 @@
-"""Reads single scans: points in all supported formats, and SemanticKITTI labels."""
+"""Reads single scans in all supported formats, point cloud maps in parts, and SemanticKITTI labels."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.arrays import read_npy, read_npz
-from sglpr_jax.data.formats.bin_records import Records, is_record, read_records, record_of_scan
-from sglpr_jax.data.formats.las import las_records
-from sglpr_jax.data.formats.pcd import pcd_records
-from sglpr_jax.data.formats.ply import ply_records
+from sglpr_jax.data.formats.arrays import read_points
+from sglpr_jax.data.formats.bin_records import is_record, read_records, record_of_scan
+from sglpr_jax.data.formats.clouds import Records
+from sglpr_jax.data.formats.las import las_blocks, las_records
+from sglpr_jax.data.formats.pcd import pcd_blocks, pcd_records
+from sglpr_jax.data.formats.ply import ply_blocks, ply_records
 from sglpr_jax.fields import check_value
 
 READERS: dict[ScanFormat, Callable[[Path], Records]] = {
     "pcd": pcd_records,
     "ply": ply_records,
-    "npy": lambda path: Records(read_npy(path), None),
-    "npz": lambda path: Records(read_npz(path), None),
+    "npy": lambda path: Records(read_points(path)),
+    "npz": lambda path: Records(read_points(path)),
     "las": las_records,
 }
 """Readers of formats with a header. The name of each format is also its file ending."""
+BLOCKS: dict[str, Callable[[Path], Iterator[Float64[np.ndarray, "_ 3"]]]] = {
+    ".pcd": pcd_blocks,
+    ".ply": ply_blocks,
+    ".las": las_blocks,
+    ".laz": las_blocks,
+}
+"""Readers of point cloud maps in parts by file ending, so that a map may be larger than the memory."""
 ENDINGS = (".bin", ".pcd", ".ply")
 """File endings of scans."""
 ARRAY_ENDINGS = (".npy", ".npz", ".las")
@@ -34,31 +42,25 @@ def scan_id(path: Path) -> str:
     return Path(name).stem if Path(name).suffix.lower()[1:] in READERS else name
 
 
-def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
-    """Return the format of a scan by its name, for "auto".
+def named_format(path: Path) -> ScanFormat | None:
+    """Return the format that the name of a scan file defines, or None: that of most .bin files is in their content.
 
-    The ending defines the format of files with a header. `*.pcd.bin` is nuscenes. A file in a folder `velodyne_sync` is
-    nclt. The name of any other .bin file does not define a format. Such a file has the format `records`.
+    `*.pcd.bin` is nuscenes, and a file in a folder `velodyne_sync` is nclt.
     """
     for format in READERS:
         if path.suffix.lower() == f".{format}":
             return format
     if path.name.lower().endswith(".pcd.bin"):
         return "nuscenes"
-    return "nclt" if path.parent.name == "velodyne_sync" else records
-
-
-def says_its_format(path: Path) -> bool:
-    """Whether the name of a scan file defines its format."""
-    return guess_format(path) != "kitti"
+    return "nclt" if path.parent.name == "velodyne_sync" else None
 
 
 def found_format(path: Path) -> ScanFormat:
-    """Return the format of one scan by its name or, for a .bin whose name does not define it, by its content.
+    """Return the format of one scan by its name or its content.
 
     Raises ValueError if the content fits no format, as for a folder of scans.
     """
-    return guess_format(path) if says_its_format(path) else record_of_scan(path)
+    return named_format(path) or record_of_scan(path)
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
@@ -103,10 +105,20 @@ def read_scan_records(path: Path, *, format: ScanFormat = "auto", records: Recor
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a scan, found none")
     check_value(format, ScanFormat, f"{path}, format")
-    known = guess_format(path, records=records) if format == "auto" else format
+    known = (named_format(path) or records) if format == "auto" else format
     if is_record(known):
         return read_records(path, known)
     return READERS[known](path)
+
+
+def is_cloud_file(path: Path) -> bool:
+    """Whether the path is a file with the ending of a point cloud map."""
+    return path.suffix.lower() in BLOCKS and path.is_file()
+
+
+def cloud_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    """Yield the points of a map in parts, in metres. Raises the errors of the readers."""
+    return BLOCKS[path.suffix.lower()](path)
 
 
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
+from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.listing import left_aside
-from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
@@ -55,7 +55,7 @@ def open_recording(
     """Open one sequence of `root`, in any supported layout.
 
     Arguments:
-      root: Folder of a dataset or of scans, a bag, or a point cloud map with `se3`.
+      root: Folder of a dataset or of scans, a bag, or a point cloud map with `poses`.
       name: Name of the sequence. It may be omitted if `root` has only one sequence.
       pose_source: Choice between the two pose files of KITTI's layout. Other layouts ignore it.
       format: Format of the scan files, for a plain folder and for KITTI's layout. "auto" detects it.
@@ -72,7 +72,7 @@ def open_recording(
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.
-      ValueError: If a file is malformed, if times decrease, or if `se3`, `times` or a topic does not apply to the
+      ValueError: If a file is malformed, if times decrease, or if `poses`, `times` or a topic does not apply to the
         layout.
       ImportError: If `root` is a bag and the extra `ros` is not installed.
 

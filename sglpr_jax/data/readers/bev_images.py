@@ -1,7 +1,7 @@
 """Reader of ready-made BEV images in BEVPlace's layout.
 
 - `00/imgs/000000.png`: 8-bit density image. The file name is the number of the frame. Frames may be missing.
-- `00/labels/000000.png`: label image (`label_images.py`), optional for each frame.
+- `00/labels/000000.png`: label image (`read_label_image`), optional for each frame.
 - `00/pose.txt`: poses of the LiDAR, 12 numbers a line, one line per frame (optional).
 """
 
@@ -15,8 +15,8 @@ from jaxtyping import Float, Float32, UInt8
 from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.data.formats.png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
-from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.listing import files_in, scans_in
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, image_record
 
 
@@ -25,7 +25,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(sorted(folder.parent.name for folder in root.glob("*/imgs") if folder.is_dir()))
 
 
-def open_recording(root: Path, name: str) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open `root/<name>`. Without the file of poses, `positions` is `None`.
 
     Raises:
@@ -33,9 +33,7 @@ def open_recording(root: Path, name: str) -> Recording:
       ValueError: If the poses are malformed, or the name of an image is not the number of a row of poses.
     """
     folder = root / name
-    image_paths = files_in(folder / "imgs", ".png")
-    if not image_paths:
-        raise FileNotFoundError(f"{folder / 'imgs'}: expected images (*.png), found none")
+    image_paths = scans_in(folder / "imgs", ".png", kind="images")
     ids = tuple(path.stem for path in image_paths)
     poses = folder / "pose.txt"
     labels = {path.stem: path for path in files_in(folder / "labels", ".png")}
@@ -73,9 +71,4 @@ def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     return np.ascontiguousarray(grey) * np.float32(MAX_COUNT / 255)
 
 
-READER = Reader(
-    layout="NN/imgs/*.png (BEV images)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
-    rank=1,
-)
+READER = Reader("NN/imgs/*.png (BEV images)", recording_names, open_recording, rank=1)

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.formats.bin_records import described, read_records
-from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.readers.stamped import read_table, stamped_recording
+from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.stamped import read_table, sequences, stamped_recording
 from sglpr_jax.data.recording import Recording
 
 POSES = Path("applanix") / "lidar_poses.csv"
@@ -23,14 +23,12 @@ COLUMNS = 13
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return the names of the sequences in `root`. `root` may be a sequence itself."""
-    if _is_sequence(root):
-        return (root.resolve().name,)
-    return tuple(sorted(path.parent.name for path in root.glob("*/lidar") if _is_sequence(path.parent)))
+    return tuple(sequences(root, "lidar", POSES))
 
 
-def open_recording(root: Path, name: str) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a sequence. Raises what `stamped_recording` and `read_table` raise."""
-    folder = root if _is_sequence(root) else root / name
+    folder = sequences(root, "lidar", POSES)[name]
     stamps, numbers = read_table(folder / POSES, columns=COLUMNS, header_lines=1)
     return stamped_recording(
         folder / "lidar",
@@ -40,18 +38,14 @@ def open_recording(root: Path, name: str) -> Recording:
         pose_file=folder / POSES,
         tick_s=1e-6,
         read_points=partial(read_records, format="float32x6", last_is_time=True),
-        format=f"Boreas, {described('float32x6')}",
+        found=(f"format: Boreas, {described('float32x6')}",),
     )
 
 
-def _is_sequence(folder: Path) -> bool:
-    return (folder / "lidar").is_dir() and (folder / POSES).is_file()
-
-
 READER = Reader(
-    layout="NAME/lidar/*.bin with NAME/applanix/lidar_poses.csv (Boreas)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    "NAME/lidar/*.bin with NAME/applanix/lidar_poses.csv (Boreas)",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     rank=5,
 )

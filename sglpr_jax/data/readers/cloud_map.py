@@ -13,13 +13,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.cloud_map import TiledCloud, tiled_cloud, visible_points
-from sglpr_jax.data.formats.cloud_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.formats.pose_files import read_trajectory
+from sglpr_jax.data.formats.scan_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
-from sglpr_jax.data.poses import poses_of
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import warn
@@ -39,40 +37,25 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return (root.stem,) if is_cloud_file(root) else ()
 
 
-def open_recording(
-    root: Path,
-    *,
-    poses: Path | None = None,
-    pose_format: PoseFormat = "auto",
-    times: Path | None = None,
-    time_unit: TimeUnit = "auto",
-) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Read a map, and open the scans that its LiDAR would measure at each pose. Warns if the poses look wrong.
 
-    Arguments:
-      root: File of the map.
-      poses: Pose file of the LiDAR, in the frame of the map.
-      pose_format: Format of the pose file.
-      times: File of timestamps, one for each pose.
-      time_unit: Unit of the times (`times_of`).
-
     Raises:
-      FileNotFoundError: If `se3` or `times` does not exist.
+      FileNotFoundError: If `options.poses` or `options.times` does not exist.
       ValueError: If there are no poses, a file is malformed, no pose has points around it, or the map is too large.
       ImportError: If the map is a .las or .laz file and the extra `las` is not installed.
     """
+    poses = options.poses
     if poses is None:
         raise ValueError(
             f"{root}: expected a point cloud map with the poses of its LiDAR (--poses trajectory.tum), found no poses;"
             " put single scans into a folder, or read them with read_scan"
         )
-    path = read_trajectory(poses, format=pose_format, times=times, time_unit=time_unit)
-    unturned = np.tile(np.eye(3), (len(path.positions), 1, 1))
-    world_from_lidar = poses_of(path.positions, unturned if path.rotations is None else path.rotations)
+    path = read_trajectory(poses, format=options.pose_format, times=options.times, time_unit=options.time_unit)
     cloud = tiled_cloud(cloud_blocks(root), positions=path.positions, reach_m=REACH_M, source=root)
     kept = _has_points(cloud, path.positions)
     _check_kept(kept, cloud, path.positions, root, poses)
-    world_from_lidar = _raised(cloud, world_from_lidar, np.flatnonzero(kept), poses)
+    world_from_lidar = _raised(cloud, path.poses, np.flatnonzero(kept), poses)
     ids = tuple(f"{row:06d}" for row in range(len(kept)))
     recording = Recording(
         name=root.stem,
@@ -161,15 +144,9 @@ def _raised(
 
 
 READER = Reader(
-    layout="*.pcd, *.ply, *.las or *.laz (point cloud map, with poses)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(
-        root,
-        poses=options.poses,
-        pose_format=options.pose_format,
-        times=options.times,
-        time_unit=options.time_unit,
-    ),
+    "*.pcd, *.ply, *.las or *.laz (point cloud map, with poses)",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     takes_poses=True,
 )

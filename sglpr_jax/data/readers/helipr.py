@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.point_times import TimeField, time_field_of
-from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.readers.stamped import read_table, stamped_recording
+from sglpr_jax.data.formats.clouds import Records, TimeField, time_field_of
+from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.stamped import read_table, sequences, stamped_recording
 from sglpr_jax.data.recording import Recording
 
 RECORDS = {
@@ -37,20 +36,18 @@ AEVA_CHANGED = 1691936557946849179
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return SEQUENCE-SENSOR for each sensor with scans and poses. `root` holds sequences or is a sequence itself."""
-    itself = {root.resolve().name: root} if (root / "LiDAR").is_dir() else {}
-    folders = itself or {path.parent.name: path.parent for path in sorted(root.glob("*/LiDAR"))}
     return tuple(
         f"{sequence}-{sensor}"
-        for sequence, folder in folders.items()
+        for sequence, folder in sequences(root, "LiDAR").items()
         for sensor in RECORDS
         if (folder / "LiDAR" / sensor).is_dir() and (folder / "LiDAR_GT" / f"{sensor}_gt.txt").is_file()
     )
 
 
-def open_recording(root: Path, name: str) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the scans of one sensor in a sequence. Raises what `stamped_recording` and `read_table` raise."""
     sequence, _, sensor = name.rpartition("-")
-    folder = root if (root / "LiDAR").is_dir() else root / sequence
+    folder = sequences(root, "LiDAR")[sequence]
     poses = folder / "LiDAR_GT" / f"{sensor}_gt.txt"
     stamps, numbers = read_table(poses, columns=8)
     return stamped_recording(
@@ -61,7 +58,7 @@ def open_recording(root: Path, name: str) -> Recording:
         pose_file=poses,
         tick_s=1e-9,
         read_points=partial(read_points, sensor=sensor),
-        format=f"HeLiPR's {sensor} ({RECORDS[sensor].itemsize} bytes a point)",
+        found=(f"format: HeLiPR's {sensor} ({RECORDS[sensor].itemsize} bytes a point)",),
     )
 
 
@@ -83,9 +80,9 @@ def read_points(path: Path, *, sensor: str) -> Records:
 
 
 READER = Reader(
-    layout="NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    "NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     rank=4,
 )

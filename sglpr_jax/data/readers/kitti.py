@@ -4,7 +4,7 @@
 - `sequences/08/labels/000000.label`: SemanticKITTI's labels, optional for each frame.
 - `sequences/08/times.txt`: timestamps in seconds, one line per frame (optional).
 - `sequences/08/poses.txt`: SemanticKITTI's poses. Their loops are also closed in height.
-- `se3/08.txt`: KITTI's ground truth. Its height drifts. The test sequences 11 to 21 have no poses.
+- `poses/08.txt`: KITTI's ground truth. Its height drifts. The test sequences 11 to 21 have no poses.
 
 Both pose files contain poses of the left camera. Positions are computed without `calib.txt`.
 """
@@ -13,15 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from sglpr_jax.data.choices import PoseChoice, ScanFormat, TimeUnit
+from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import described, unusual_record
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
-from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.listing import files_in, scans_in
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
 from sglpr_jax.files import naming, read_json
 from sglpr_jax.se3 import positions_from_camera
@@ -35,50 +32,32 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(sorted(folder.parent.name for folder in root.glob("sequences/*/velodyne")))
 
 
-def open_recording(
-    root: Path,
-    name: str,
-    *,
-    pose_source: PoseChoice = "auto",
-    format: ScanFormat = "auto",
-    time_unit: TimeUnit = "auto",
-) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open `root/sequences/<name>`.
 
-    Arguments:
-      root: Folder of the dataset.
-      name: Name of the sequence.
-      pose_source: Choice of the pose file, as in `read_trajectory`. With "auto", a sequence needs no poses. Without
-        them, `positions` is `None`.
-      format: Format of the scans. With "auto", scans that do not fit KITTI's record but clearly fit another record are
-        read as the other one (`unusual_record`).
-      time_unit: Unit of times.txt (`times_of`).
+    Without poses, `positions` is `None`, unless `options.pose_source` names a pose file. With the format "auto", scans
+    that do not fit KITTI's record but clearly fit another record are read as the other one (`unusual_record`).
 
     Raises:
-      FileNotFoundError: If the scans or the poses of the given `pose_source` are missing.
+      FileNotFoundError: If the scans or the named pose file are missing.
       ValueError: If a file is malformed, has too few rows, or a scan is not named by its row.
     """
     folder = root / "sequences" / name
-    scan_paths = files_in(folder / "velodyne", ".bin")
-    if not scan_paths:
-        raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
+    scan_paths = scans_in(folder / "velodyne", ".bin")
     ids = tuple(path.stem for path in scan_paths)
-    if pose_source == "auto" and _pose_file(root, name, pose_source) is None:
-        positions, times, pose_file = None, _times(root, name, time_unit), None
-    else:
-        positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source, time_unit=time_unit)
+    poses, clock = _pose_file(root, name, options.pose_source), folder / "times.txt"
+    positions = None if poses is None else positions_from_camera(read_poses(root / poses))
+    times = read_times(clock, unit=options.time_unit) if clock.is_file() else None
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
-    reading, mounting = _read(scan_paths, format), _mounting(root)
+    reading, mounting = _read(scan_paths, options.format), _mounting(root)
     if mounting is not None:
         reading["found"] += (f"sensor: {mounting}, as simulated",)
     return Recording(
         name=name,
         ids=ids,
-        positions=None
-        if positions is None
-        else positions[rows_of(ids, rows=len(positions), path=root / str(pose_file))],
-        times=None if times is None else times[rows_of(ids, rows=len(times), path=folder / "times.txt")],
-        pose_source=pose_file,
+        positions=None if positions is None else positions[rows_of(ids, rows=len(positions), path=root / str(poses))],
+        times=None if times is None else times[rows_of(ids, rows=len(times), path=clock)],
+        pose_source=poses,
         paths=scan_paths,
         label_paths=tuple(labels.get(scan) for scan in ids),
         mounting=mounting,
@@ -110,51 +89,14 @@ def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
     return {"read": partial(scan_record, format=unusual), "found": (f"format: {described(unusual)}, not KITTI's",)}
 
 
-def read_trajectory(
-    root: Path, name: str, *, pose_source: PoseChoice = "auto", time_unit: TimeUnit = "auto"
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"] | None, str]:
-    """Read the trajectory of a sequence. The scans are not needed.
-
-    Arguments:
-      root: Folder of the dataset.
-      name: Name of the sequence.
-      pose_source: Choice of the pose file. "auto" prefers SemanticKITTI's.
-      time_unit: Unit of times.txt (`times_of`).
-
-    Returns:
-      Positions of all frames in metres, z up; their times in seconds, or None; and the name of the pose file.
-
-    Raises:
-      FileNotFoundError: If the pose file does not exist.
-      ValueError: If a file is malformed.
-    """
-    pose_file = _pose_file(root, name, pose_source)
-    if pose_file is None:
-        raise FileNotFoundError(f"{root}: expected poses in {' or '.join(_pose_files(name, pose_source))}, found none")
-    return positions_from_camera(read_poses(root / pose_file)), _times(root, name, time_unit), pose_file
-
-
-def _pose_files(name: str, pose_source: PoseChoice) -> list[str]:
+def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
+    """Name of the chosen pose file. "auto" prefers SemanticKITTI's, and returns None without any file."""
     files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
-    return list(files.values()) if pose_source == "auto" else [files[pose_source]]
+    wanted = list(files.values()) if choice == "auto" else [files[choice]]
+    found = next((file for file in wanted if (root / file).is_file()), None)
+    if found is None and choice != "auto":
+        raise FileNotFoundError(f"{root}: expected poses in {wanted[0]}, found none")
+    return found
 
 
-def _pose_file(root: Path, name: str, pose_source: PoseChoice) -> str | None:
-    """First existing pose file, or None."""
-    return next((file for file in _pose_files(name, pose_source) if (root / file).is_file()), None)
-
-
-def _times(root: Path, name: str, unit: TimeUnit) -> Float[np.ndarray, " m"] | None:
-    """Times of all frames in seconds, or None if the file does not exist."""
-    path = root / "sequences" / name / "times.txt"
-    return read_times(path, unit=unit) if path.is_file() else None
-
-
-READER = Reader(
-    layout="sequences/NN/velodyne/*.bin (KITTI)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(
-        root, name, pose_source=options.pose_source, format=options.format, time_unit=options.time_unit
-    ),
-    rank=0,
-)
+READER = Reader("sequences/NN/velodyne/*.bin (KITTI)", recording_names, open_recording, rank=0)

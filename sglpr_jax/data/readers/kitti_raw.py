@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import numbers_of
-from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.listing import scans_in
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
 from sglpr_jax.files import in_short
 
@@ -31,7 +31,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(folder.name for folder in _drives(root))
 
 
-def open_recording(root: Path, name: str) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a drive.
 
     Scans, GPS positions and timestamps are matched by number. Without the file of timestamps, `times` is `None`. If a
@@ -42,9 +42,7 @@ def open_recording(root: Path, name: str) -> Recording:
       ValueError: If the timestamps or GPS positions are malformed or invalid.
     """
     folder = next(folder for folder in _drives(root) if folder.name == name)
-    paths = files_in(folder / "velodyne_points" / "data", ".bin")
-    if not paths:
-        raise FileNotFoundError(f"{folder / 'velodyne_points' / 'data'}: expected scans (*.bin), found none")
+    paths = scans_in(folder / "velodyne_points" / "data", ".bin")
     oxts = [folder / "oxts" / "data" / f"{path.stem}.txt" for path in paths]
     has_gps = all(path.is_file() for path in oxts)
     return Recording(
@@ -109,8 +107,8 @@ def _seconds(line: str) -> float:
 
 
 READER = Reader(
-    layout="DATE/DRIVE/velodyne_points/data/*.bin (KITTI raw)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    "DATE/DRIVE/velodyne_points/data/*.bin (KITTI raw)",
+    recording_names,
+    open_recording,
     rank=6,
 )

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.bin_records import Records, described, read_records
-from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.readers.stamped import read_table, stamped_recording
+from sglpr_jax.data.formats.bin_records import described, read_records
+from sglpr_jax.data.formats.clouds import Records
+from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.stamped import read_table, sequences, stamped_recording
 from sglpr_jax.data.recording import Recording
 
 LIDAR_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
@@ -24,14 +25,12 @@ POSES = "global_pose.csv"
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return the names of the sequences in `root`. `root` may be a sequence itself."""
-    if _is_sequence(root):
-        return (root.resolve().name,)
-    return tuple(sorted(path.parent.name for path in root.glob("*/Ouster") if _is_sequence(path.parent)))
+    return tuple(sequences(root, "Ouster", POSES))
 
 
-def open_recording(root: Path, name: str) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a sequence. Raises what `stamped_recording` and `read_table` raise."""
-    folder = root if _is_sequence(root) else root / name
+    folder = sequences(root, "Ouster", POSES)[name]
     stamps, numbers = read_table(folder / POSES, columns=13)
     world_from_base = numbers.reshape(-1, 3, 4)
     return stamped_recording(
@@ -42,7 +41,7 @@ def open_recording(root: Path, name: str) -> Recording:
         pose_file=folder / POSES,
         tick_s=1e-9,
         read_points=read_points,
-        format=f"MulRan, {described('kitti')}, rotated to x forward",
+        found=(f"format: MulRan, {described('kitti')}, rotated to x forward",),
     )
 
 
@@ -51,14 +50,10 @@ def read_points(path: Path) -> Records:
     return Records(read_records(path, "kitti").points * FORWARD_FROM_LIDAR, None)
 
 
-def _is_sequence(folder: Path) -> bool:
-    return (folder / "Ouster").is_dir() and (folder / POSES).is_file()
-
-
 READER = Reader(
-    layout="NAME/Ouster/*.bin with NAME/global_pose.csv (MulRan)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    "NAME/Ouster/*.bin with NAME/global_pose.csv (MulRan)",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     rank=3,
 )

@@ -12,17 +12,17 @@ The reader negates y and z of both frames, a rotation by 180 degrees about x. Th
 north, y west, z up. The points are x forward, y left, z up.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN
-from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, read_records
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.poses import match_times
-from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.stamped import stamped_recording
+from sglpr_jax.data.recording import Recording
 
 MAX_GAP_S = 0.5
 """Maximum time between a scan and its pose, in seconds. A Segway moves half a metre in this time."""
@@ -41,36 +41,21 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(sorted(folder.parent.name for folder in root.glob(f"{_DATE}/velodyne_sync") if folder.is_dir()))
 
 
-def open_recording(root: Path, name: str, *, max_gap_s: float = MAX_GAP_S) -> Recording:
-    """Open the session `root/<name>`. Each scan gets the pose nearest in time.
-
-    Arguments:
-      root: Folder of the dataset.
-      name: Date of the session, such as "2012-01-15".
-      max_gap_s: Maximum time between a scan and its pose, in seconds. Scans without a pose are skipped, and
-        `pose_source` contains their number.
-
-    Raises:
-      FileNotFoundError: If the scans or the ground truth are missing.
-      ValueError: If a scan is not named by its time, the ground truth is malformed, or no scan has a pose.
-    """
-    paths = _scan_paths(root / name / "velodyne_sync")
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
+    """Open the session `root/<name>`. Raises what `stamped_recording` and `read_ground_truth` raise."""
     truth = _truth_path(root, name)
     stamps, positions = read_ground_truth(truth)
-    utimes = np.array([int(path.stem) for path in paths], dtype=np.int64)
-    matched = match_times(stamps, utimes, tick_s=1e-6, max_gap_s=max_gap_s, poses=truth, scans=paths[0].parent)
-    kept_paths = tuple(path for path, keep in zip(paths, matched.kept, strict=True) if keep)
-    return Recording(
-        name=name,
-        ids=tuple(path.stem for path in kept_paths),
-        positions=positions[matched.rows],
-        times=utimes[matched.kept] / 1e6,
-        pose_source=matched.described(truth.name, max_gap_s=max_gap_s),
-        paths=kept_paths,
-        read=scan_record,
+    return stamped_recording(
+        root / name / "velodyne_sync",
+        name,
+        stamps=stamps,
+        positions=positions,
+        pose_file=truth,
+        tick_s=1e-6,
+        read_points=partial(read_records, format="nclt"),
+        max_gap_s=MAX_GAP_S,
         mounting=BODY,
         found=("sensor: coordinates are relative to the ground below it",),
-        rows=np.flatnonzero(matched.kept),
     )
 
 
@@ -98,17 +83,6 @@ def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.nda
     return stamps, rows[known, 1:4] * Z_UP_FROM_Z_DOWN
 
 
-def _scan_paths(folder: Path) -> tuple[Path, ...]:
-    paths = files_in(folder, ".bin")
-    if not paths:
-        found = "none" if folder.is_dir() else "no such folder"
-        raise FileNotFoundError(f"{folder}: expected scans (*.bin), found {found}")
-    strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
-    if strange:
-        raise ValueError(f"{folder}: expected scans named by their time, as 1326652795280148.bin, found {strange}")
-    return paths
-
-
 def _truth_path(root: Path, name: str) -> Path:
     file = f"groundtruth_{name}.csv"
     places = (root / file, root / name / file, root / "ground_truth" / file)
@@ -131,8 +105,8 @@ def _read_table(path: Path) -> Float[np.ndarray, "n 7"]:
 
 
 READER = Reader(
-    layout="YYYY-MM-DD/velodyne_sync/*.bin (NCLT)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    "YYYY-MM-DD/velodyne_sync/*.bin (NCLT)",
+    recording_names,
+    open_recording,
     rank=2,
 )

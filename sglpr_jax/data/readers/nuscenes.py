@@ -8,7 +8,8 @@ The tables refer to each other by tokens. Positions are those of the LiDAR in th
 of the car is always 0. The points are rotated so that x points forward.
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,11 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.bin_records import described
-from sglpr_jax.data.formats.json_tables import column_of, numbers_of, table_rows, texts_of
 from sglpr_jax.data.formats.pose_files import rotations_of
 from sglpr_jax.data.formats.scan_files import scan_id
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
-from sglpr_jax.files import naming, path_inside
+from sglpr_jax.files import in_short, naming, path_inside
 
 CHANNEL = "LIDAR_TOP"
 
@@ -31,7 +31,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(sorted({name for tables in _versions(root) for name in _scenes(tables)}))
 
 
-def open_recording(root: Path, name: str) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a scene: its key frames and sweeps in order of time. Listed scans without a file are skipped.
 
     Raises:
@@ -40,17 +40,17 @@ def open_recording(root: Path, name: str) -> Recording:
     """
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
-    samples = set(texts_of(tables / "sample.json", table_rows(tables / "sample.json", "scene_token", {scene}), "token"))
+    samples = set(_texts(tables / "sample.json", _rows(tables / "sample.json", "scene_token", {scene}), "token"))
     table = tables / "sample_data.json"
-    listed = table_rows(table, "sample_token", samples)
-    files = [path_inside(root, file, source=table) for file in column_of(table, listed, "filename")]
+    listed = _rows(table, "sample_token", samples)
+    files = [path_inside(root, file, source=table) for file in _column(table, listed, "filename")]
     scans = [(file, row) for file, row in zip(files, listed, strict=True) if file.parent.name == CHANNEL]
     there = [(file, row) for file, row in scans if file.is_file()]
     if not there:
         raise FileNotFoundError(
             f"{root}: expected scans of {name} in samples/{CHANNEL}, found none of the {len(scans)} that {table} lists"
         )
-    ticks = numbers_of(table, [row for _, row in there], "timestamp", 1)[:, 0]  # microseconds
+    ticks = _numbers(table, [row for _, row in there], "timestamp", 1)[:, 0]  # microseconds
     order = np.argsort(ticks, kind="stable")
     paths, rows = zip(*(there[i] for i in order), strict=True)
     keys = sum(path.parent.parent.name == "samples" for path in paths)
@@ -80,12 +80,12 @@ def _versions(root: Path) -> tuple[Path, ...]:
 def _scenes(tables: Path) -> dict[str, str]:
     """Token of each scene, by name. Raises ValueError if two scenes have the same name."""
     path = tables / "scene.json"
-    rows = table_rows(path)
-    names = texts_of(path, rows, "name")
+    rows = _rows(path)
+    names = _texts(path, rows, "name")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{path}: expected a unique name for each scene, found {twice!r:.80} twice")
-    return dict(zip(names, texts_of(path, rows, "token"), strict=True))
+    return dict(zip(names, _texts(path, rows, "token"), strict=True))
 
 
 def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
@@ -99,22 +99,77 @@ def _poses(
     path: Path, rows: Sequence[dict[str, Any]], column: str
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """Rotations and translations of the table rows that a column of `rows` refers to."""
-    tokens = texts_of(path.with_name("sample_data.json"), rows, column)
-    found = {row["token"]: row for row in table_rows(path, "token", set(tokens))}
+    tokens = _texts(path.with_name("sample_data.json"), rows, column)
+    found = {row["token"]: row for row in _rows(path, "token", set(tokens))}
     lost = [token for token in tokens if token not in found]
     if lost:
         raise ValueError(
             f"{path}: expected a row with the token {lost[0]!r}, found none ({len(lost)} broken references)"
         )
     named = [found[token] for token in tokens]
-    quaternions = numbers_of(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
-    return rotations_of(path, quaternions), numbers_of(path, named, "translation", 3)
+    quaternions = _numbers(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
+    return rotations_of(path, quaternions), _numbers(path, named, "translation", 3)
+
+
+def _rows(path: Path, column: str = "", among: Container[Any] = ()) -> list[dict[str, Any]]:
+    """Return the rows of a table. With `column`, only the rows whose value in this column is in `among`.
+
+    Other rows are dropped while the file is parsed, because some tables have millions of rows.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is not a list of rows.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a table, found none")
+
+    def wanted(row: dict[str, Any]) -> dict[str, Any] | None:
+        return row if not column or row.get(column) in among else None
+
+    try:
+        rows = json.loads(path.read_bytes(), object_hook=wanted)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path}: expected a table in JSON, found invalid JSON ({in_short(error)})") from error
+    kept = [row for row in rows if row is not None] if isinstance(rows, list) else [rows]
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in kept):
+        raise ValueError(f"{path}: expected a list of rows, each an object, found something else")
+    return kept
+
+
+def _column(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
+    """Return the values of a column. Raises ValueError if a row does not have this column."""
+    lacking = next((row for row in rows if name not in row), None)
+    if lacking is not None:
+        raise ValueError(f"{path}: expected {name!r} in every row, found a row with {', '.join(lacking) or 'nothing'}")
+    return [row[name] for row in rows]
+
+
+def _texts(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[str]:
+    """Return a column of names or tokens. Raises ValueError if a value is missing, empty or no text."""
+    values = _column(path, rows, name)
+    strange = next((value for value in values if not isinstance(value, str) or not value), values)
+    if strange is not values:
+        raise ValueError(f"{path}: expected text as {name!r} in every row, found {strange!r:.80}")
+    return values
+
+
+def _numbers(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int) -> Float[np.ndarray, "n {size}"]:
+    """Return a column with `size` finite numbers in each row. Raises ValueError if a value is malformed."""
+    values = _column(path, rows, name)
+    try:
+        numbers = np.array(values, np.float64).reshape(len(rows), size)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"{path}: expected {size} numbers as {name!r}, found others ({in_short(error)})") from error
+    strange = ~np.isfinite(numbers).all(axis=1)
+    if strange.any():
+        raise ValueError(f"{path}: expected finite numbers as {name!r}, found {values[int(strange.argmax())]}")
+    return numbers
 
 
 READER = Reader(
-    layout="v1.0-*/scene.json with samples/LIDAR_TOP/*.pcd.bin (nuScenes)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    "v1.0-*/scene.json with samples/LIDAR_TOP/*.pcd.bin (nuScenes)",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     rank=5,
 )

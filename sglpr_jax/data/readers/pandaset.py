@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.arrays import read_npy
+from sglpr_jax.data.formats.arrays import read_points
 from sglpr_jax.data.formats.pose_files import check_positions, rotations_of, rows_of
-from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.listing import files_in, scans_in
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.times import check_order
 from sglpr_jax.files import read_json
@@ -35,7 +35,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(sorted(path.parent.parent.name for path in root.glob("*/lidar/poses.json")))
 
 
-def open_recording(root: Path, name: str) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a sequence.
 
     Raises:
@@ -43,14 +43,13 @@ def open_recording(root: Path, name: str) -> Recording:
       ValueError: If the scans are not converted, or the poses or timestamps are malformed or too few.
     """
     folder = root / "lidar" if (root / "lidar" / "poses.json").is_file() else root / name / "lidar"
-    paths, pickles = files_in(folder, ".npy"), files_in(folder, PICKLES)
-    if not paths and pickles:
+    pickles = files_in(folder, PICKLES)
+    if pickles and not files_in(folder, ".npy"):
         raise ValueError(
             f"{folder}: expected scans as .npy, found {len(pickles)} pickles (*{PICKLES}), which are not opened because"
             " they can execute code; docs/reference/files.md says how to convert them"
         )
-    if not paths:
-        raise FileNotFoundError(f"{folder}: expected scans (*.npy), found none")
+    paths = scans_in(folder, ".npy")
     ids = tuple(path.stem for path in paths)
     rotations, positions = read_poses(folder / "poses.json")
     rows = rows_of(ids, rows=len(positions), path=folder / "poses.json")
@@ -121,14 +120,14 @@ def _read(
 ) -> Record:
     """Read a scan. Caches of its points use `poses_hash` to detect changed poses."""
     world_from_lidar, position = poses[path]
-    x, y, z = ((read_npy(path) - position) @ world_from_lidar).T
+    x, y, z = ((read_points(path) - position) @ world_from_lidar).T
     return Record(points=np.stack([y, -x, z], axis=1).astype(np.float32))
 
 
 READER = Reader(
-    layout="NNN/lidar/*.npy with NNN/lidar/poses.json (PandaSet)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    "NNN/lidar/*.npy with NNN/lidar/poses.json (PandaSet)",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     rank=5,
 )

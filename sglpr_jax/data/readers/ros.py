@@ -1,4 +1,4 @@
-"""Gravity of the scans of a bag by the IMU beside the LiDAR."""
+"""Reader of bags of ROS 1 and ROS 2: point clouds of a topic, with poses and the gravity by an IMU if there are any."""
 
 import dataclasses
 import itertools
@@ -10,12 +10,20 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.formats.pose_files import check_height, check_order
-from sglpr_jax.data.formats.ros_bag import COMPRESSED, METADATA, RosBag
-from sglpr_jax.data.formats.ros_messages import LEAST_SHARE, Stamps, Track, fixed_transform, times_on_one_clock
+from sglpr_jax.data.formats.ros_bag import CLOUDS, COMPRESSED, METADATA, RosBag
+from sglpr_jax.data.formats.ros_messages import (
+    IMU,
+    LEAST_SHARE,
+    POSES,
+    Stamps,
+    Track,
+    fixed_transform,
+    times_on_one_clock,
+)
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import interpolate, interpolate_turns, poses_of
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Record, Recording, found_record
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.times import doubt
@@ -28,7 +36,7 @@ def imu_topic_of(bag: RosBag, lidar_topic: str, imu_topic: str | None) -> str | 
 
     Raises ValueError if `imu_topic` does not exist.
     """
-    topics = bag.imu_topics
+    topics = bag.topics_of((IMU,))
     if imu_topic is None:
         return max(topics, key=lambda topic: _shared(topic, lidar_topic), default=None)
     if imu_topic not in topics:
@@ -101,21 +109,16 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(_recordings(root)) if bag_files(root) else ()
 
 
-def open_recording(root: Path, name: str, *, pose_topic: str | None = None, imu_topic: str | None = None) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the point clouds of one topic, with poses if the bag has them.
 
     The bag is read once for the times and once for each topic of poses and of tf. If a pose topic is used, scans
-    without a pose are skipped.
-
-    Arguments:
-      root: File or folder of the bag.
-      name: Name of the recording, from `recording_names`.
-      pose_topic: Pose topic. By default, the topic that covers the largest number of scans is used.
-      imu_topic: Topic of the IMU. By default, the one whose name has most in common with that of the LiDAR is used.
+    without a pose are skipped. By default, this is the pose topic that covers the largest number of scans, and the IMU
+    is the one whose name has most in common with that of the LiDAR.
 
     Raises:
-      ValueError: If the bag is broken, the topic has no messages, `pose_topic` covers less than half of the scans, or
-        `imu_topic` does not exist.
+      ValueError: If the bag is broken, the topic has no messages, the given pose topic covers less than half of the
+        scans, or the given IMU topic does not exist.
       ImportError: If the extra `ros` is not installed.
     """
     bag, topic = _recordings(root)[name]
@@ -140,12 +143,14 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None, imu_
         found=(f"format: {topic} of {bag.name}, {bag.fields(topic, int(recorded[0]))}",),
     )
     lidar = bag.frame(topic, int(recorded[0])).strip("/")
-    posed = _with_poses(recording, bag, stamps, pose_topic, lidar)
-    imu = imu_topic_of(bag, topic, imu_topic)
+    posed = _with_poses(recording, bag, stamps, options.pose_topic, lidar)
+    imu = imu_topic_of(bag, topic, options.imu_topic)
     if imu is None:
         return posed
-    options = {"scans": stamps.of(posed.numbers), "lidar": lidar, "required": imu_topic is not None}
-    return dataclasses.replace(posed, read_ups=partial(ups_of_scans, bag, imu, **options))
+    scans, required = stamps.of(posed.numbers), options.imu_topic is not None
+    return dataclasses.replace(
+        posed, read_ups=partial(ups_of_scans, bag, imu, scans=scans, lidar=lidar, required=required)
+    )
 
 
 def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
@@ -169,7 +174,7 @@ def bag_files(root: Path) -> tuple[Path, ...]:
 def _recordings(root: Path) -> dict[str, tuple[RosBag, str]]:
     """Bag and point cloud topic of each recording, by name."""
     whole = RosBag(bag_files(root))
-    drives = [bag for bag in _drives(whole) if bag.has_clouds] or [whole]
+    drives = [bag for bag in _drives(whole) if bag.topics_of(CLOUDS)] or [whole]
     lone = root.resolve().stem if root.is_file() else root.resolve().name
     found = {}
     for bag in drives:
@@ -221,7 +226,7 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     `lidar` is the frame of the scans. The unused topics are listed in `found`.
     """
     transforms = bag.transforms()
-    tracks = {one: bag.track(one) for one in bag.pose_topics} | _tracks_of_lidar(transforms, lidar)
+    tracks = {one: bag.track(one) for one in bag.topics_of(POSES)} | _tracks_of_lidar(transforms, lidar)
     placed = {one: _Placed.at(scans, track) for one, track in tracks.items()}
     used = _chosen(placed, topic, bag.paths[0])
     others = [f"{one} (poses for {found.share:.0%} of the scans)" for one, found in placed.items() if one != used]
@@ -306,11 +311,9 @@ def _read(
 
 
 READER = Reader(
-    layout="*.bag, *.mcap or a folder of ROS 2 (ROS)",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(
-        root, name, pose_topic=options.pose_topic, imu_topic=options.imu_topic
-    ),
+    "*.bag, *.mcap or a folder of ROS 2 (ROS)",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     rank=8,
     takes_topics=True,

@@ -1,7 +1,7 @@
-"""Reader of a plain folder of scans, one file each. Poses and timestamps are optional (`folder_poses.py`).
+"""Reader of a plain folder of scans, one file each. Poses and timestamps are optional (`folder_trajectory`).
 
 - `my_scans/full0.bin`, `full1.bin`, ..., `full10.bin`: scans in the order of their numbers. Hidden files are ignored.
-- `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `se3.tum` and `se3.csv` work, too.
+- `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `poses.tum` and `poses.csv` work, too.
 - `my_scans/times.txt`: timestamps, one number a line, in seconds unless `time_unit` names another unit.
 """
 
@@ -9,12 +9,12 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
-from sglpr_jax.data.choices import PoseFormat, RecordFormat, ScanFormat, TimeUnit
+from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.bin_records import check_record, described, find_record, is_record
 from sglpr_jax.data.formats.pose_files import POSE_FILES, TIMES_FILE, check_order, folder_trajectory
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, guess_format, says_its_format, scan_id
-from sglpr_jax.data.listing import files_in, left_aside
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id
+from sglpr_jax.data.listing import files_in, left_aside, scans_in
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
 
 
@@ -23,41 +23,30 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return (root.resolve().name,) if _scans(root) else ()
 
 
-def open_recording(
-    root: Path,
-    *,
-    format: ScanFormat = "auto",
-    poses: Path | None = None,
-    pose_format: PoseFormat = "auto",
-    times: Path | None = None,
-    time_unit: TimeUnit = "auto",
-) -> Recording:
+def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the folder `root`. Warns if the format looks wrong or consecutive poses are far apart.
 
-    Arguments:
-      root: Folder of the scans.
-      format: Format of the scans (`read_scan`). If neither `format` nor the name defines the record of a .bin file, it
-        is detected (`find_record`).
-      poses: Pose file (`folder_trajectory`), if it is not beside the scans. Without poses, `positions` is `None`.
-      pose_format: Format of the pose file.
-      times: File of timestamps, if it is not beside the scans.
-      time_unit: Unit of the times (`times_of`).
+    If neither `options.format` nor the name defines the record of a .bin file, it is detected (`find_record`). Without
+    poses (`folder_trajectory`), `positions` is `None`.
 
     Raises:
-      FileNotFoundError: If the folder has no scans, or `se3` or `times` does not exist.
+      FileNotFoundError: If the folder has no scans, or `options.poses` or `options.times` does not exist.
       ValueError: If two files differ only by their ending, the record cannot be detected, or the poses or timestamps
         are malformed.
     """
-    paths = _scans(root)
-    if not paths:
-        raise FileNotFoundError(f"{root}: expected scans ({_endings()}), found none")
+    paths = _scans(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
     ids = _ids(root, paths)
     positions, seconds, source = folder_trajectory(
-        root, scans=len(paths), poses=poses, pose_format=pose_format, times=times, time_unit=time_unit
+        root,
+        scans=len(paths),
+        poses=options.poses,
+        pose_format=options.pose_format,
+        times=options.times,
+        time_unit=options.time_unit,
     )
-    records, kinds = _formats(paths, format)
+    records, kinds = _formats(paths, options.format)
     if positions is not None:
-        check_order(positions, ids, path=poses or root / str(source))
+        check_order(positions, ids, path=options.poses or root / str(source))
     return Recording(
         name=root.resolve().name,
         ids=ids,
@@ -65,7 +54,7 @@ def open_recording(
         times=seconds,
         pose_source=source,
         paths=paths,
-        read=partial(scan_record, format=format, records=records),
+        read=partial(scan_record, format=options.format, records=records),
         found=(f"format: {kinds}", *_left_aside(root, paths)),
     )
 
@@ -73,10 +62,6 @@ def open_recording(
 def _scans(root: Path) -> tuple[Path, ...]:
     """Scan files in a folder. Arrays count as scans if there are no other scans."""
     return files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
-
-
-def _endings() -> str:
-    return ", ".join(f"*{ending}" for ending in (*ENDINGS, *ARRAY_ENDINGS))
 
 
 def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
@@ -91,12 +76,12 @@ def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
 
 def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
     """Record of the .bin files whose name does not define it, and a description of all formats."""
-    unsaid = [path for path in paths if not says_its_format(path)] if format == "auto" else []
+    unsaid = [path for path in paths if named_format(path) is None] if format == "auto" else []
     found, how = find_record(unsaid) if unsaid else (None, "")
     if is_record(format):
         check_record(paths, format)
     records: RecordFormat = found or "kitti"
-    counts = Counter(guess_format(path, records=records) if format == "auto" else format for path in paths)
+    counts = Counter((named_format(path) or records) if format == "auto" else format for path in paths)
     said = {name: described(name) if is_record(name) else name for name in counts}
     kinds = ", ".join(said[name] if len(counts) == 1 else f"{count} {said[name]}" for name, count in counts.items())
     return records, f"{kinds}, {how}" if unsaid else kinds
@@ -109,16 +94,9 @@ def _left_aside(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
 
 
 READER = Reader(
-    layout=f"single scans ({_endings()})",
-    recording_names=recording_names,
-    open=lambda root, name, options: open_recording(
-        root,
-        format=options.format,
-        poses=options.poses,
-        pose_format=options.pose_format,
-        times=options.times,
-        time_unit=options.time_unit,
-    ),
+    f"single scans ({', '.join(f'*{ending}' for ending in (*ENDINGS, *ARRAY_ENDINGS))})",
+    recording_names,
+    open_recording,
     knows_mounting=False,
     rank=9,
     takes_poses=True,

@@ -1,19 +1,32 @@
-"""Shared code of the readers of MulRan, HeLiPR and Boreas: scans named by time, and poses with their own times."""
+"""Shared code of MulRan, HeLiPR, Boreas and NCLT: scans that are named by their time, and poses with other times."""
 
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.poses import match_times
+from sglpr_jax.data.formats.clouds import Records
+from sglpr_jax.data.listing import scans_in
 from sglpr_jax.data.recording import Record, Recording, found_record
+from sglpr_jax.data.times import check_unit, nearest_rows
 
 MAX_GAP_S = 0.1
 """Maximum time between a scan and its pose, in seconds: the duration of one sweep."""
+
+
+def sequences(root: Path, *parts: Path | str) -> dict[str, Path]:
+    """Folder of each sequence by name: those in `root` that contain all `parts`, or `root` itself if it does."""
+
+    def contains_all(folder: Path) -> bool:
+        return all((folder / part).exists() for part in parts)
+
+    if contains_all(root):
+        return {root.resolve().name: root}
+    found = sorted(path for path in root.glob("*") if contains_all(path)) if root.is_dir() else []
+    return {path.name: path for path in found}
 
 
 def stamped_recording(
@@ -25,11 +38,12 @@ def stamped_recording(
     pose_file: Path,
     tick_s: float,
     read_points: Callable[[Path], Records],
-    format: str,
+    max_gap_s: float = MAX_GAP_S,
+    **fields: Any,
 ) -> Recording:
     """Open the `.bin` files of `folder`. Each scan gets the pose nearest in time.
 
-    Scans without a pose within `MAX_GAP_S` are skipped. `pose_source` contains their number.
+    Scans without a pose within `max_gap_s` are skipped. `pose_source` contains their number.
 
     Arguments:
       folder: Folder of the scans, which are named by their time in ticks.
@@ -39,31 +53,41 @@ def stamped_recording(
       pose_file: Pose file, for messages.
       tick_s: Duration of a tick, in seconds.
       read_points: Function that reads a scan.
-      format: Description of the format.
+      max_gap_s: Maximum time between a scan and its pose, in seconds.
+      fields: More fields of the recording.
 
     Raises:
       FileNotFoundError: If there are no scans.
-      ValueError: If a scan is not named by its time, or no scan has a pose.
+      ValueError: If a scan is not named by its time, no scan has a pose, or the unit of times changes.
     """
-    paths = files_in(folder, ".bin")
-    if not paths:
-        raise FileNotFoundError(f"{folder}: expected scans (*.bin), found none")
+    paths = scans_in(folder, ".bin")
     strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
     if strange:
         raise ValueError(f"{folder}: expected scans named by their time, as 1561000444390857630.bin, found {strange}")
     times = np.array([int(path.stem) for path in paths], np.int64)
-    matched = match_times(stamps, times, tick_s=tick_s, max_gap_s=MAX_GAP_S, poses=pose_file, scans=folder)
-    kept = tuple(path for path, keep in zip(paths, matched.kept, strict=True) if keep)
+    order = np.argsort(stamps, kind="stable")
+    check_unit(stamps[order] * tick_s, source=pose_file)
+    check_unit(times * tick_s, source=folder)
+    nearest = order[nearest_rows(stamps[order], times)]
+    gaps_s = np.abs(stamps[nearest] - times) * tick_s
+    rows = np.flatnonzero(gaps_s <= max_gap_s)
+    if not len(rows):
+        raise ValueError(
+            f"{pose_file}: expected poses within {max_gap_s:g} s of the scans in {folder}, found the nearest "
+            f"{gaps_s.min():g} s away"
+        )
+    left_out = len(paths) - len(rows)
+    said = f" ({left_out} of {len(paths)} scans left out: no pose within {max_gap_s:g} s)" if left_out else ""
     return Recording(
         name=name,
-        ids=tuple(path.stem for path in kept),
-        positions=positions[matched.rows],
-        times=times[matched.kept] * tick_s,
-        pose_source=matched.described(pose_file.name, max_gap_s=MAX_GAP_S),
-        paths=kept,
+        ids=tuple(paths[row].stem for row in rows),
+        positions=positions[nearest[rows]],
+        times=times[rows] * tick_s,
+        pose_source=f"{pose_file.name}{said}",
+        paths=tuple(paths[row] for row in rows),
         read=partial(_read, read_points=read_points),
-        found=(f"format: {format}",),
-        rows=np.flatnonzero(matched.kept),
+        rows=rows,
+        **fields,
     )
 
 
@@ -88,19 +112,16 @@ def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int6
         words = line.replace(",", " ").split()
         if number < header_lines or not words:
             continue
-        where = f"{path}, line {number + 1}: expected a time and {columns - 1} finite numbers"
-        if len(words) != columns:
-            raise ValueError(f"{where}, found {len(words)} words")
-        if "_" in line or not line.isascii():  # Python parses 1_0 as 10
-            raise ValueError(f"{where}, found {line[:60]!r}")
         try:
             whole, _, fraction = words[0].partition(".")
             times.append(int(whole) if not fraction.strip("0") else round(float(words[0])))
             rows.append([float(word) for word in words[1:]])
-        except (ValueError, OverflowError) as error:
-            raise ValueError(f"{where}, found {line[:60]!r}") from error
-        if not np.isfinite(rows[-1]).all():
-            raise ValueError(f"{where}, found {line[:60]!r}")
+        except (ValueError, OverflowError):
+            words = []
+        # Python parses 1_0 as 10.
+        if len(words) != columns or "_" in line or not line.isascii() or not np.isfinite(rows[-1]).all():
+            expected = f"{path}, line {number + 1}: expected a time and {columns - 1} finite numbers"
+            raise ValueError(f"{expected}, found {line[:60]!r}")
     if not rows:
         raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
     return np.array(times, np.int64), np.array(rows, np.float64)

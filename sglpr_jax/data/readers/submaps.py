@@ -36,8 +36,8 @@ def refuse(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 READER = Reader(
-    layout="",
-    recording_names=recording_names,
-    open=refuse,
+    "",
+    recording_names,
+    refuse,
     rank=2,
 )

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sglpr_jax.data.formats.pose_files import Trajectory
-from sglpr_jax.data.poses import poses_at_scans, unturned
+from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.files import naming
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
@@ -36,7 +36,7 @@ def _placed(file: DescriptorFile, trajectory: Trajectory, name: str) -> Descript
         poses, times = poses[recorded], None if times is None else times[recorded]
     stamps = None if trajectory.by_row else times
     found = poses_at_scans(
-        trajectory.source, unturned(poses), stamps, file.times, scans=len(file), of=f"frame of {name}"
+        trajectory.source, poses_of(poses), stamps, file.times, scans=len(file), of=f"frame of {name}"
     )
     keeps_times = times is None or (file.times is not None and not trajectory.by_row)
     source = f"{trajectory.source}, {found.said}" if found.said else trajectory.source

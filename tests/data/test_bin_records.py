@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats import bin_records
 from sglpr_jax.data.formats.bin_records import find_record, read_records, unusual_record
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.readers import kitti
-from sglpr_jax.data.readers.scan_folder import open_recording
+from sglpr_jax.data.reader import ReadOptions
+from sglpr_jax.data.readers import kitti, scan_folder
 from sglpr_jax.data.warning import DataWarning
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))
 FIRING = np.arange(16).reshape(2, 8).T.reshape(-1)
 """Low and high beams in turn, as a VLP-16 fires."""
+
+
+def open_recording(folder, **options):
+    return scan_folder.open_recording(folder, folder.name, ReadOptions(**options))
 
 
 def scan(seed: int, *, steps: int = 180) -> np.ndarray:
@@ -53,15 +56,14 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize("order", ["fired", "shuffled", "with gaps"])
+@pytest.mark.parametrize("order", ["fired", "shuffled with gaps"])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_is_found(tmp_path, layout, order):
     written = []
     for i in range(3):
         points = scan(i)[: 2880 - 160 * i]  # a multiple of 16 points: every size can be divided by 16
-        if order == "shuffled":
+        if order != "fired":
             points = points[np.random.default_rng(i).permutation(len(points))]
-        if order == "with gaps":
             points[np.random.default_rng(i).random(len(points)) < 0.3] = np.nan
         records = columns(points, LAYOUTS[layout]).astype("<f8" if layout.startswith("float64") else "<f4")
         records.tofile(tmp_path / f"{i}.bin")
@@ -70,60 +72,26 @@ def test_every_layout_is_found(tmp_path, layout, order):
     recording = open_recording(tmp_path)
     assert recording.found[0].startswith(f"format: {layout} (") and "found from 3 of 3 scans" in recording.found[0]
     np.testing.assert_array_equal(recording.points(1), written[1])
+    np.testing.assert_array_equal(read_scan(tmp_path / "1.bin"), written[1])
 
 
 def test_a_broken_file_among_others_does_not_hide_it(tmp_path):
     for i in range(5):
         columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
-    (tmp_path / "2.bin").write_bytes(b"cut")
     (tmp_path / "4.bin").write_bytes(np.random.default_rng(0).bytes(48000))
+    (tmp_path / "0.bin").write_bytes(b"")
     assert find_record(sorted(tmp_path.iterdir()))[0] == "float32x6"
-
-
-def spoil(folder):
-    """In place of scan 0 an empty file, of 4 a dangling link, of 8 a folder: always the first and the last."""
-    for path in (folder / "0.bin", folder / "4.bin", folder / "8.bin"):
-        path.unlink(missing_ok=True)
-    (folder / "0.bin").touch()
-    (folder / "4.bin").symlink_to("none")
-    (folder / "8.bin").mkdir()
-
-
-@pytest.mark.parametrize("scans", [1, 2, 3, 5, 9])
-@pytest.mark.parametrize("said", ["auto", "float32x6"])
-def test_files_that_are_empty_or_cannot_be_read_tell_nothing(tmp_path, recwarn, scans, said):
-    for i in range(scans):
-        columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
-    spoil(tmp_path)
-    found = open_recording(tmp_path, format=said)
-    assert not recwarn.list
-    assert found.found[0].startswith("format: float32x6" if scans > 1 or said != "auto" else "format: kitti")
-    assert unusual_record(found.paths) == ("float32x6" if scans > 1 else None)
-    if scans > 1:
-        np.testing.assert_array_equal(found.points(1), scan(1).astype(np.float32))
-
-
-def test_a_file_that_fails_while_it_is_read_does_not_hide_it(tmp_path, monkeypatch):
-    for i in range(5):
-        columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
-
-    def read(path, format):
-        if path.name == "4.bin":
-            raise OSError(5, "Input/output error")
-        return read_records(path, format)
-
-    monkeypatch.setattr(bin_records, "read_records", read)
-    assert find_record(sorted(tmp_path.iterdir()))[0] == "float32x6"
+    assert unusual_record(sorted(tmp_path.iterdir())) == "float32x6"
 
 
 @pytest.mark.parametrize(
     ("points", "why"),
     [
-        (scan(0) * 1000, "of the points beyond 300 m"),
-        (np.full((2880, 3), 1e30), "100% of the points beyond 300 m"),
+        (scan(0) * 1000, "of the points not finite or beyond 300 m"),
+        (np.full((2880, 3), 1e30), "100% of the points not finite or beyond 300 m"),
         (np.full((2880, 3), np.nan), "all points NaN or 0"),
         (np.zeros((2880, 3)), "all points NaN or 0"),
-        (np.full((2880, 3), 4.0), "all points with the same x"),
+        (np.full((2880, 3), 4.0), "all points with the same x or y"),
     ],
     ids=["millimetres", "1e30", "NaN", "zeros", "one point"],
 )
@@ -137,17 +105,10 @@ def test_what_fits_nothing_is_refused_with_what_was_tried(tmp_path, points, why)
     assert why in str(error.value) and "kitti (16 bytes a point)" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_random_bytes_are_refused(tmp_path):
-    for i in range(3):
-        (tmp_path / f"{i}.bin").write_bytes(np.random.default_rng(i).bytes(48000))
-    with pytest.raises(ValueError, match="found 0; pass --format"):
-        open_recording(tmp_path)
-
-
 def test_what_fits_twice_is_refused_and_may_be_said(tmp_path):
     noise = np.random.default_rng(0).normal(scale=10, size=(4000, 4)).astype("<f4")  # all columns alike
     noise.tofile(tmp_path / "0.bin")
-    with pytest.raises(ValueError, match=r"found 2; pass --format kitti or float32x5, .*float32x8.*: fits"):
+    with pytest.raises(ValueError, match=r"found 2; pass --format kitti or float32x5, .*float32x8[^;]*: fits"):
         open_recording(tmp_path)
     np.testing.assert_array_equal(open_recording(tmp_path, format="float32x4").points(0), noise[:, :3])
     assert open_recording(tmp_path, format="float32x5").points(0).shape == (3200, 3)
@@ -160,53 +121,21 @@ def test_a_wrong_format_that_was_said_is_told(tmp_path):
         open_recording(tmp_path, format="kitti")
 
 
-def test_names_that_say_it_are_believed(tmp_path):
-    noise = np.random.default_rng(0).normal(scale=10, size=(4000, 5)).astype("<f4")
-    noise.tofile(tmp_path / "sweep.pcd.bin")
-    assert open_recording(tmp_path).found == ("format: nuscenes (20 bytes a point)",)
-
-
 def test_own_scans_in_the_layout_of_kitti(kitti_root):
     """Read as what they are; a fixture of a few points, and scans that are KITTI's, as KITTI's."""
     folder = kitti_root / "sequences" / "08" / "velodyne"
-    assert kitti.open_recording(kitti_root, "08").found == ("format: kitti (16 bytes a point)",)
+    assert kitti.open_recording(kitti_root, "08", ReadOptions()).found == ("format: kitti (16 bytes a point)",)
     for layout in ("float32x6", "float32x3", "kitti"):
         for i, path in enumerate(sorted(folder.iterdir())):
             columns(scan(i), LAYOUTS[layout]).astype("<f4").tofile(path)
-        recording = kitti.open_recording(kitti_root, "08")
+        recording = kitti.open_recording(kitti_root, "08", ReadOptions())
         size = {"float32x6": 24, "float32x3": 12, "kitti": 16}[layout]
         said = "" if layout == "kitti" else ", not KITTI's"
         assert recording.found == (f"format: {layout} ({size} bytes a point){said}",)
         np.testing.assert_array_equal(recording.points(1), scan(1).astype(np.float32))
-    assert kitti.open_recording(kitti_root, "08", format="float64x3").found == ("format: float64x3, as given",)
-
-
-def test_the_share_that_differs_from_turn_to_turn():
-    a, b = np.arange(100.0), np.arange(100.0) + 25
-    assert bin_records._apart(a, b) == pytest.approx(0.25)
-    assert bin_records._apart(a, a) == 0
-
-
-@pytest.mark.parametrize("format", ["float32x3", "float64x5"])
-def test_a_record_can_be_named_for_one_scan(tmp_path, format):
-    points = columns(scan(0), LAYOUTS[format])
-    points.astype("<f4" if format == "float32x3" else "<f8").tofile(tmp_path / "0.bin")
-    np.testing.assert_array_equal(read_scan(tmp_path / "0.bin", format=format), points[:, :3].astype(np.float32))
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_one_scan_is_read_as_a_folder_with_it(tmp_path, layout):
-    records = columns(scan(0), LAYOUTS[layout]).astype("<f8" if layout.startswith("float64") else "<f4")
-    records.tofile(tmp_path / "0.bin")
-    points = read_scan(tmp_path / "0.bin")
-    np.testing.assert_array_equal(points, scan(0).astype(np.float32))
-    np.testing.assert_array_equal(points, open_recording(tmp_path).points(0))
-
-
-def test_one_scan_that_fits_nothing_is_named(tmp_path):
-    columns(scan(0) * 1000, "0").astype("<f4").tofile(tmp_path / "0.bin")
-    with pytest.raises(ValueError, match=r"0\.bin: expected scans that fit exactly one format, found 0; pass --format"):
-        read_scan(tmp_path / "0.bin")
+    assert kitti.open_recording(kitti_root, "08", ReadOptions(format="float64x3")).found == (
+        "format: float64x3, as given",
+    )
 
 
 def test_one_scan_with_few_points_is_kittis(tmp_path):

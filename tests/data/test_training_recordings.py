@@ -1,14 +1,11 @@
 """A model's label images beside images that have no labels of their own, and nowhere else."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data.pseudo_labels import with_pseudo_labels
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.files import file_name
+from sglpr_jax.data.training_recordings import with_pseudo_labels
 
 
 def write_map(path, raw: int) -> None:
@@ -48,12 +45,3 @@ def test_a_folder_without_a_single_map_is_an_error_and_one_drive_without_is_not(
     (bev_root / "06").symlink_to(bev_root / "00")
     first, second = with_pseudo_labels([*recordings, open_recording(bev_root, "06")], tmp_path / "more")
     assert not first.has_labels and second.has_labels
-
-
-def test_a_recording_of_any_name_gets_labels_from_the_folder_alone(bev_root, tmp_path):
-    recording = dataclasses.replace(open_recording(bev_root, "06"), name="../outside")
-    write_map(tmp_path / "outside/000001.png", 50)
-    with pytest.raises(FileNotFoundError, match="maps: expected label images"):
-        with_pseudo_labels([recording], tmp_path / "maps")
-    write_map(tmp_path / "maps" / file_name(recording.name) / "000001.png", 50)
-    assert with_pseudo_labels([recording], tmp_path / "maps")[0].labelled == (False, True, False)

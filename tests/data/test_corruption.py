@@ -1,0 +1,237 @@
+"""Corruptions of clouds against numpy loops, the rings of a scan, and corrupted recordings."""
+
+import math
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sglpr_jax.data.corruption import (
+    CORRUPTIONS,
+    ROTATION,
+    Corruption,
+    chosen_corruptions,
+    corrupt,
+    keep_rings,
+    ring_numbers,
+)
+from sglpr_jax.data.corruption import corrupted as corrupted_recording
+from sglpr_jax.data.formats.scan_files import read_scan, read_scan_records
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.sim.sensor import HDL64E_DEG
+
+coordinates = st.one_of(st.just(0.0), st.floats(0.125, 100, width=32), st.floats(-100, -0.125, width=32))
+clouds = st.integers(0, 40).flatmap(lambda n: hnp.arrays(np.float32, (n, 3), elements=coordinates))
+seeds = st.integers(0, 2**32 - 1)
+any_cloud = settings(deadline=None, max_examples=50)
+
+
+def corrupted(points, kind, strength, seed=0):
+    return corrupt(points, Corruption(kind, strength), rng=np.random.default_rng(seed))
+
+
+@pytest.mark.slow
+@any_cloud
+@given(clouds, seeds, st.floats(0, 360))
+def test_an_occlusion_removes_exactly_the_wedge(points, seed, degrees):
+    left, kept = corrupted(points, "occlusion", degrees, seed)
+    np.testing.assert_array_equal(left, points[kept])
+    heading = np.random.default_rng(seed).uniform(-np.pi, np.pi)
+    for point, outside in zip(points, kept, strict=True):
+        cosine = math.cos(math.atan2(point[1], point[0]) - heading)
+        angle = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+        if abs(angle - degrees / 2) > 1e-3:
+            assert outside == (angle > degrees / 2)
+
+
+@any_cloud
+@given(clouds, seeds, st.floats(0.01, 2))
+def test_noise_moves_points_along_their_rays(points, seed, sigma):
+    metres = sigma * np.random.default_rng(seed).standard_normal(len(points))
+    found, kept = corrupted(points, "noise", sigma, seed)
+    assert kept.all()
+    for before, after, step in zip(points.astype(float), found.astype(float), metres, strict=True):
+        distance = math.hypot(*before)
+        expected = before * (distance + step) / distance if distance else before
+        np.testing.assert_allclose(after, expected, rtol=1e-5, atol=1e-5)
+
+
+@any_cloud
+@given(clouds, seeds, st.floats(0, 1))
+def test_dropout_keeps_points_in_order(points, seed, share):
+    left, kept = corrupted(points, "dropout", share, seed)
+    np.testing.assert_array_equal(kept, np.random.default_rng(seed).random(len(points)) >= share)
+    np.testing.assert_array_equal(left, points[kept])
+
+
+@any_cloud
+@given(clouds, seeds, st.floats(0, 5))
+def test_an_offset_is_to_either_side(points, seed, metres):
+    moved, _ = corrupted(points, "offset", metres, seed)
+    side = np.random.default_rng(seed).choice((-1, 1))
+    np.testing.assert_allclose(moved, points.astype(float) - [0, side * metres, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["clean", "occlusion", "noise", "dropout", "offset"])
+@any_cloud
+@given(points=clouds, seed=seeds)
+def test_no_strength_is_no_corruption(kind, points, seed):
+    left, kept = corrupted(points, kind, 0.0, seed)
+    np.testing.assert_array_equal(left, points)
+    assert kept.all() and left.dtype == np.float32
+
+
+def test_rotation_is_left_to_embedding():
+    with pytest.raises(ValueError, match="rotation_seed"):
+        corrupt(np.zeros((1, 3), np.float32), ROTATION, rng=np.random.default_rng(0))
+
+
+def test_a_kind_stands_for_all_its_strengths():
+    assert chosen_corruptions(()) == CORRUPTIONS
+    assert [d.name for d in chosen_corruptions(("beams-16", "rotation", "noise", "noise-0.1"))] == [
+        *("rotation", "beams-16", "noise-0.05", "noise-0.1", "noise-0.2")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "strength"),
+    [("beams", 0.0), ("dropout", 1.5)],
+)
+def test_a_strength_that_cannot_be_is_refused(kind, strength):
+    with pytest.raises(ValueError, match=f"expected {kind} with a strength from . to .*, found {strength:g}"):
+        Corruption(kind, strength)
+
+
+def turn(elevations_deg, *, azimuths=90, wobble_deg=0.0, seed=0):
+    """Points of one turn, ring after ring from the highest, and the number of each point's ring from the lowest."""
+    rng = np.random.default_rng(seed)
+    elevation = np.radians(np.sort(elevations_deg)[::-1])[:, None]
+    azimuth = (np.arange(azimuths) + 0.5)[None, :] * (2 * np.pi / azimuths)
+    elevation = elevation + np.radians(wobble_deg) * np.sin(azimuth)
+    distance = rng.uniform(3, 60, elevation.shape if wobble_deg else (len(elevation), azimuths))
+    rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth]
+    points = np.stack([distance * axis for axis in rays], axis=-1).reshape(-1, 3).astype(np.float32)
+    return points, np.repeat(np.arange(len(elevation))[::-1], azimuths)
+
+
+@pytest.mark.slow
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 64))
+def test_elevations_that_stand_apart_tell_the_ring_in_any_order(seed, rings):
+    points, expected = turn(HDL64E_DEG[:rings], seed=seed)
+    order = np.random.default_rng(seed).permutation(len(points))
+    np.testing.assert_array_equal(ring_numbers(points[order]), expected[order])
+
+
+def test_rings_that_waver_are_told_by_the_order_of_the_points():
+    points, expected = turn(HDL64E_DEG, wobble_deg=0.5)
+    np.testing.assert_array_equal(ring_numbers(points), expected)
+    some = np.random.default_rng(0).random(len(points)) < 0.7
+    np.testing.assert_array_equal(ring_numbers(points[some]), expected[some])
+
+
+def test_laser_numbers_of_the_file_come_first_whatever_their_order():
+    points, expected = turn(HDL64E_DEG, wobble_deg=0.5)
+    order = np.random.default_rng(0).permutation(len(points))
+    names = np.random.default_rng(1).permutation(64) + 7
+    found = ring_numbers(points[order], lasers=names[expected[order]])
+    np.testing.assert_array_equal(found, expected[order])
+
+
+def test_points_without_rings_are_refused():
+    points = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32)
+    with pytest.raises(ValueError, match=r"expected a scan with rings .* found 5000 points without"):
+        ring_numbers(points)
+    shuffled = np.random.default_rng(0).permutation(turn(HDL64E_DEG, wobble_deg=0.5)[0])
+    with pytest.raises(ValueError, match="expected a scan with rings"):
+        ring_numbers(shuffled)
+
+
+@pytest.mark.parametrize(("found", "beams", "every"), [(64, 32, 2), (61, 16, 4), (16, 16, 1)])
+def test_every_second_or_fourth_ring_is_kept(found, beams, every):
+    rings = np.random.default_rng(0).permutation(np.repeat(np.arange(found), 5))
+    kept = keep_rings(rings, beams)
+    assert sorted(set(rings[kept])) == list(range(0, found, every))
+    assert set(rings[~kept]) == set(range(found)) - set(range(0, found, every))
+
+
+def test_real_scans_of_kitti_have_64_rings(shared):
+    for path in sorted((shared / "data/kitti_odometry/sequences").glob("*/velodyne/*.bin")):
+        rings = ring_numbers(read_scan(path))
+        assert set(rings) == set(range(64)), path
+        assert keep_rings(rings, 32).mean() == pytest.approx(0.5, abs=0.01)
+        assert keep_rings(rings, 16).mean() == pytest.approx(0.25, abs=0.01)
+
+
+def test_real_scans_of_other_sensors(shared):
+    samples = shared / "data/samples"
+    (nclt,) = (samples / "nclt/velodyne_sync").glob("*.bin")
+    for path, expected in ((nclt, 32), (samples / "nuscenes_32_beams.pcd.bin", 32), (samples / "16_beams.pcd", 16)):
+        points, lasers, _ = read_scan_records(path)
+        finite = np.isfinite(points).all(axis=1)
+        found = ring_numbers(points[finite], lasers=None if lasers is None else lasers[finite])
+        assert set(found) == set(range(expected)), path
+
+
+ON_POINTS = list({one.kind: one for one in CORRUPTIONS if one != ROTATION}.values())
+by_name = pytest.mark.parametrize("corruption", ON_POINTS, ids=lambda corruption: corruption.name)
+
+
+@pytest.fixture(scope="module")
+def rings_recording(tmp_path_factory):
+    """Four scans of 64 rings of 30 points in KITTI's layout, each point with a label of its own."""
+    root = tmp_path_factory.mktemp("rings")
+    folder = root / "sequences" / "00"
+    for part in ("velodyne", "labels"):
+        (folder / part).mkdir(parents=True)
+    elevation, azimuth = np.radians(np.linspace(2, -24, 64)), np.arange(0.05, 2 * np.pi, 2 * np.pi / 30)
+    ray = [np.outer(np.cos(elevation), axis(azimuth)).ravel() for axis in (np.cos, np.sin)]
+    ray = np.stack([*ray, np.repeat(np.sin(elevation), 30)], axis=1)
+    for scan in range(4):
+        points = ray * np.random.default_rng(scan).uniform(5, 50, (len(ray), 1))
+        np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(folder / "velodyne" / f"{scan:06d}.bin")
+        np.arange(len(ray), dtype="<u4").tofile(folder / "labels" / f"{scan:06d}.label")
+    np.savetxt(folder / "poses.txt", np.tile(np.eye(3, 4).ravel(), (4, 1)))
+    return open_recording(root, "00")
+
+
+@by_name
+def test_labels_stay_with_their_points(rings_recording, corruption):
+    points, labels = rings_recording.points(1), rings_recording.labels(1)
+    found = corrupted_recording(rings_recording, corruption, seed=3)
+    left, kept = found.points(1), found.labels(1)
+    assert len(left) == len(kept)
+    assert not np.array_equal(left, points)
+    if len(left) < len(points):
+        np.testing.assert_array_equal(left, points[kept])  # a label is its point's row
+    else:
+        np.testing.assert_array_equal(kept, labels)
+
+
+@by_name
+def test_a_scan_is_corrupted_by_seed_and_row_alone(rings_recording, corruption):
+    first = corrupted_recording(rings_recording, corruption, seed=3)
+    forwards = [first.points(i) for i in range(4)]
+    again = corrupted_recording(rings_recording, corruption, seed=3)
+    for i in reversed(range(4)):
+        np.testing.assert_array_equal(again.points(i), forwards[i])
+    if corruption.kind in ("occlusion", "noise", "dropout"):
+        assert not np.array_equal(corrupted_recording(rings_recording, corruption, seed=4).points(0), forwards[0])
+
+
+def test_points_that_are_not_finite_go_with_their_labels(kitti_root):
+    path = kitti_root / "sequences" / "08" / "velodyne" / "000000.bin"
+    records = np.fromfile(path, "<f4").reshape(-1, 4)
+    records[1, 2] = np.nan
+    records.tofile(path)
+    found = corrupted_recording(open_recording(kitti_root, "08"), Corruption("offset", 1.0), seed=0)
+    assert np.isfinite(found.points(0)).all()
+    np.testing.assert_array_equal(found.labels(0), [48, 50, 51, 52])
+    assert found.labels(1) is None
+
+
+def test_images_have_no_points(bev_root):
+    with pytest.raises(ValueError, match=r"beams-16 needs points, found only images in sequence 06.*rotation"):
+        corrupted_recording(open_recording(bev_root, "06"), Corruption("beams", 16.0), seed=0)

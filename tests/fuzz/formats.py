@@ -1,0 +1,246 @@
+"""One intact file of each format that the package reads, and the function that reads it."""
+
+import dataclasses
+import io
+import json
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import bags
+import laspy
+import numpy as np
+import safetensors.numpy
+from PIL import Image
+
+from sglpr_jax.data.formats.png import read_label_image
+from sglpr_jax.data.formats.pose_files import Trajectory, read_times, read_trajectory
+from sglpr_jax.data.formats.scan_files import read_labels, read_scan
+from sglpr_jax.data.packed import open_pack, packed
+from sglpr_jax.data.readers import bev_images, nclt, open_recording
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
+from sglpr_jax.evaluation.inputs import read_input
+from sglpr_jax.files import read_json
+from sglpr_jax.grid import Grid
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.models.config import HeadConfig, ModelConfig, SwinConfig, config_from_dict
+from sglpr_jax.models.weights import hash_of, weight_shapes
+from sglpr_jax.models.weights_file import CHECKSUM, CONFIG_FILE, WEIGHTS_FILE, load
+from sglpr_jax.pose_graph import files as loop_files
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import transform
+from sglpr_jax.training.metrics_log import read_metrics
+
+N = 5
+RNG = np.random.default_rng(0)
+POSITIONS, TIMES = np.round(RNG.normal(scale=30, size=(N, 3)), 3), np.arange(N) * 0.5
+DESCRIPTORS = RNG.normal(size=(N, 4)).astype(np.float32)
+POINTS = RNG.normal(scale=9, size=(N, 4)).astype("<f4")
+TRAJECTORY = Trajectory(POSITIONS, TIMES, "poses")
+
+
+class Format(NamedTuple):
+    """A file, and how it is read."""
+
+    file: str
+    whole: bytes
+    read: Callable[[Path], Any]
+    beside: Mapping[str, bytes] = {}
+    """Files that must lie beside it."""
+
+
+def written(write: Callable[[Path], Any], name: str) -> bytes:
+    """Content of the file that a function writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
+
+
+def text(rows: Iterable[Iterable[float]], separator: str = " ") -> bytes:
+    """Rows of numbers, one a line."""
+    return "".join(separator.join(f"{value:.17g}" for value in row) + "\n" for row in rows).encode()
+
+
+def stream_of(save: Callable[..., Any], *arguments: Any, **named: Any) -> bytes:
+    """Bytes that a function writes into a stream, its first argument."""
+    stream = io.BytesIO()
+    save(stream, *arguments, **named)
+    return stream.getvalue()
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """A PNG image."""
+    return stream_of(lambda stream: Image.fromarray(pixels).save(stream, "PNG"))
+
+
+def pcd(data: str) -> bytes:
+    """The points as a .pcd file."""
+    header = f"VERSION .7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {N}\nHEIGHT 1\nPOINTS {N}\n"
+    columns = b"".join(bytes([column.nbytes - 1]) + column.tobytes() for column in POINTS.T.copy())
+    sizes = np.array([len(columns), POINTS.nbytes], "<u4").tobytes()
+    body = {"binary": POINTS.tobytes(), "ascii": text(POINTS), "binary_compressed": sizes + columns}[data]
+    return f"{header}DATA {data}\n".encode() + body
+
+
+def ply(order: str) -> bytes:
+    """The points as a .ply file: in text, or in one of two byte orders."""
+    named = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    properties = "".join(f"property float {name}\n" for name in "xyzi")
+    header = f"ply\nformat {named} 1.0\nelement vertex {N}\n{properties}end_header\n"
+    return header.encode() + (POINTS.astype(f"{order}f4").tobytes() if order else text(POINTS))
+
+
+def las(stream: io.BytesIO) -> None:
+    """Write the points as a .las file."""
+    cloud = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    cloud.header.scales = [0.001] * 3
+    cloud.x, cloud.y, cloud.z = POINTS[:, :3].astype(np.float64).T
+    cloud.write(stream)
+
+
+def bag(kind: str, file: str) -> bytes:
+    """A file of a bag with three clouds."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / bags.FILES[kind]
+        clouds = [bags.cloud(kind, 100.0 + i, POINTS[:, :3] + i) for i in range(3)]
+        bags.write_bag(path, kind, [("/points", bags.CLOUD, 100.0 + i, one) for i, one in enumerate(clouds)])
+        return path.joinpath(file).read_bytes() if path.is_dir() else path.read_bytes()
+
+
+def read_bag(path: Path) -> list[np.ndarray]:
+    """All clouds of a bag."""
+    recording = open_recording(path, sensor_height=1.73)
+    return [recording.points(i) for i in range(len(recording))]
+
+
+def pack() -> dict[str, bytes]:
+    """Files of a pack of five scans."""
+    clouds = [np.arange(12.0 * (i + 1), dtype=np.float32).reshape(-1, 3) for i in range(N)]
+    with tempfile.TemporaryDirectory() as folder:
+        paths = tuple(Path(folder) / f"{i}.bin" for i in range(N))
+        for path in paths:
+            path.touch()
+        read = dict(zip(paths, clouds, strict=True))
+        names = tuple(path.stem for path in paths)
+        packed(
+            Recording("08", names, None, None, None, paths, lambda path, *_: Record(points=read[path])),
+            Path(folder) / "packs",
+        )
+        return {path.name: path.read_bytes() for path in (Path(folder) / "packs").glob("*/*")}
+
+
+def read_pack(path: Path) -> list[np.ndarray]:
+    """All arrays of the pack that a file belongs to."""
+    points = open_pack(path.parent)["points"]
+    return [points[i] for i in range(len(points.offsets) - 1)]
+
+
+def nuscenes() -> dict[str, bytes]:
+    """A scene of three key frames."""
+    scans = {f"samples/LIDAR_TOP/{i}.pcd.bin": np.full((3, 5), i, "<f4").tobytes() for i in range(3)}
+    keys = {"calibrated_sensor_token": "c", "sample_token": "s", "ego_pose_token": "e"}
+    posed = {"rotation": [0.5, 0.5, 0.5, 0.5], "translation": [9.0, 2.0, 0.0]}
+    tables = {
+        "scene": [{"token": "t", "name": "scene-0061"}],
+        "sample": [{"token": "s", "scene_token": "t"}],
+        "sample_data": [{"token": f"d{i}", **keys, "timestamp": i, "filename": file} for i, file in enumerate(scans)],
+        "ego_pose": [{"token": "e", **posed}],
+        "calibrated_sensor": [{"token": "c", **posed}],
+    }
+    return {f"v1.0-mini/{name}.json": json.dumps(rows).encode() for name, rows in tables.items()} | scans
+
+
+CONFIG = ModelConfig(
+    grid=Grid(resolution_m=3.2, height=16, width=16),
+    backbone=SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.0),
+    head=HeadConfig(channels=(8,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=2, descriptor_size=8),
+    categories=0,
+)
+CONFIG_JSON = json.dumps(dataclasses.asdict(CONFIG), indent=2).encode()
+WEIGHTS = {name: RNG.normal(size=shape).astype(np.float32) for name, shape in weight_shapes(CONFIG).items()}
+IDS = tuple(f"{i:06d}" for i in range(N))
+ABOUT = {"sequence": "08", "pose_source": "poses.txt", "config": {"method": "m"}, "weights_hash": "ab"}
+DESCRIBED = DescriptorFile(ids=IDS, positions=POSITIONS, times=TIMES, descriptors=DESCRIPTORS, distance="l2", **ABOUT)
+POSES = np.stack([transform(x, y, 0.1 * i) for i, (x, y, _) in enumerate(POSITIONS)])
+LOOPS = [
+    Loop(3, 0, transform(1.0, 0.5, 0.2), np.diag([0.1] * 6), 0.9375),
+    Loop(4, 1, transform(-1.0, 0.25, 3.0), np.diag([0.2] * 6), 0.5, 0.75),
+]
+INDEX = Index.empty(DESCRIPTORS.shape[1], weights_hash="ab")
+INDEX.add(DESCRIPTORS, times=TIMES, positions=POSITIONS)
+IMAGES = np.arange(N * 16, dtype=np.uint8).reshape(N, 4, 4)
+MAP = PlaceMap(INDEX, IMAGES, POSES, np.tile([1.73, 0.0, 0.0, 1.0], (N, 1)))
+PACK, NUSCENES = pack(), nuscenes()
+TWELVE = text(POSES[:, :3].reshape(N, 12))
+UTIMES = [[1326652795280148 + 500000 * i, *POSITIONS[i], 0, 0, 0] for i in range(N)]
+METRICS = "".join(f'{{"step": {step}, "loss": {step / 8}}}\n' for step in range(1, N + 1)).encode()
+
+
+def read_list(path: Path) -> Any:
+    """A matrix or list of another program."""
+    return read_input(path, TRAJECTORY, sequence="08")
+
+
+def read_scenes(path: Path) -> Recording:
+    """The scene of the tables in a folder."""
+    return open_recording(path.parents[1], sensor_height=1.84)
+
+
+FORMATS = {
+    "scan .bin": Format("1.bin", POINTS.tobytes(), read_scan),
+    **{f"scan .pcd {data}": Format("1.pcd", pcd(data), read_scan) for data in ("binary", "ascii", "binary_compressed")},
+    **{f"scan .ply {order}": Format("1.ply", ply(order), read_scan) for order in ("", "<", ">")},
+    "scan .npy": Format("1.npy", stream_of(np.save, POINTS), read_scan),
+    "scan .npz": Format("1.npz", stream_of(np.savez, points=POINTS), read_scan),
+    "scan .las": Format("1.las", stream_of(las), read_scan),
+    "bag .bag": Format("1.bag", bag("ros1", ""), read_bag),
+    "bag .mcap": Format("1.mcap", bag("mcap", "drive.mcap"), read_bag),
+    "bag .db3": Format("1.db3", bag("ros2", "drive.db3"), read_bag),
+    "labels": Format("1.label", np.arange(N, dtype="<u4").tobytes(), lambda path: read_labels(path, points=N)),
+    "image": Format("1.png", png(RNG.integers(0, 255, (6, 8)).astype(np.uint8)), bev_images.read_image),
+    "label image": Format(
+        "1.png", png(np.full((6, 8), 40, np.uint16)), lambda path: read_label_image(path, shape=(8, 6))
+    ),
+    "KITTI poses": Format("poses.txt", TWELVE, lambda path: read_trajectory(path, format="kitti")),
+    "TUM poses": Format("a.tum", text(np.column_stack([TIMES, POSITIONS, [[0, 0, 0, 1]] * N])), read_trajectory),
+    "csv poses": Format("a.csv", b"t,x,y,z\n" + text(np.column_stack([TIMES, POSITIONS]), ","), read_trajectory),
+    "times": Format("times.txt", text(TIMES[:, None]), read_times),
+    "NCLT ground truth": Format("groundtruth_2012-01-15.csv", text(UTIMES, ","), nclt.read_ground_truth),
+    **{
+        f"nuScenes {Path(name).stem}": Format(name, NUSCENES[name], read_scenes, NUSCENES)
+        for name in NUSCENES
+        if "json" in name
+    },
+    **{f"pack {name}": Format(name, PACK[name], read_pack, PACK) for name in PACK},
+    "matrix": Format("mine.npy", stream_of(np.save, DESCRIPTORS), read_list),
+    "top-k list": Format("top.txt", b"0: 1=0.5 2=0.25\n3: 4=2\n4:\n", read_list),
+    "scored pairs": Format("pairs.txt", b"1 0 0.5 1\n2 0 0.25 0\n4 3 2 1\n", read_list),
+    "descriptor file": Format("08.npz", written(DESCRIBED.save, "08.npz"), DescriptorFile.load),
+    "descriptor cache": Format(
+        "3.npz", stream_of(np.savez, places=np.arange(N), descriptors=DESCRIPTORS), DescriptorCache.load
+    ),
+    "index": Format("a.safetensors", INDEX.to_bytes(), Index.load),
+    "map": Format("a.safetensors", written(MAP.save, "a.safetensors"), PlaceMap.load),
+    "g2o": Format(
+        "a.g2o", written(lambda path: loop_files.write_g2o(path, LOOPS, POSES), "a.g2o"), loop_files.read_g2o
+    ),
+    "loops .jsonl": Format(
+        "a.jsonl", written(lambda path: loop_files.write_loops_jsonl(path, LOOPS), "a"), loop_files.read_loops_jsonl
+    ),
+    "loops .csv": Format(
+        "a.csv", written(lambda path: loop_files.write_loops_csv(path, LOOPS), "a"), loop_files.read_loops_csv
+    ),
+    "configuration": Format(CONFIG_FILE, CONFIG_JSON, lambda path: config_from_dict(read_json(path), source=path)),
+    "weights": Format(
+        WEIGHTS_FILE,
+        safetensors.numpy.save(WEIGHTS, {CHECKSUM: hash_of(WEIGHTS)}),
+        lambda path: load(path.parent),
+        {CONFIG_FILE: CONFIG_JSON},
+    ),
+    "metrics": Format("metrics.jsonl", METRICS, read_metrics),
+}
+"""All formats by name."""
