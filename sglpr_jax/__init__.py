@@ -7,7 +7,7 @@
 - describe a place, under jit, vmap and grad: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
   `estimate_mounting`, `GroundFilter`; `deskewed`, `deskew`, `submaps`, `SubmapBuilder`, `scaled`
-- find places again: `embed`, `DescriptorFile`, `nearest`; incrementally `Index`, for a fleet `FleetIndex`
+- find places again: `embed`, `DescriptorFile`, `Index`, for a fleet `FleetIndex`
 - score retrieval: `evaluate`
 - find loops: `find_loops` of recordings, `LoopDetector` for a stream of scans; `read_odometry`, `optimize_trajectory`,
   `IncrementalTrajectory`; `scan_odometry`, and `slam` for all of it; `map_recording`, `PlaceMap` for scans of another

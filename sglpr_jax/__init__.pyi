@@ -82,8 +82,6 @@ from .retrieval.embed import embed as embed
 from .retrieval.embed import scan_image as scan_image
 from .retrieval.fleet_index import FleetIndex as FleetIndex
 from .retrieval.index import Index as Index
-from .retrieval.nearest import Nearest as Nearest
-from .retrieval.nearest import nearest as nearest
 from .sim.dataset import simulate as simulate
 from .sim.drive import CARRIERS as CARRIERS
 from .sim.recording import simulate_recording as simulate_recording

@@ -2,30 +2,16 @@
 
 import contextlib
 import errno
-import functools
 import hashlib
 import json
 import os
 import re
 import shutil
 import tempfile
-import time
 import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
-ABANDONED_S = 3600
-"""Age of unchanged temporary files, in seconds, after which they are considered left by a killed process."""
-
-
-_HIDDEN = re.compile(r"\.[0-9a-f]{32}\.tmp$")
-"""End of the names of temporary files."""
 
 
 class WriteError(OSError):
@@ -42,7 +28,6 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
 
     The block writes to the path that it receives, a hidden path beside `path`. At the end of the block, it replaces
     `path`. After an error it is removed, and the earlier content of `path` stays. Missing parent folders are created.
-    Hidden paths that killed processes left beside `path` more than an hour ago are removed.
 
     Arguments:
       path: File or folder to write.
@@ -55,20 +40,12 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
       with replacing(path) as temporary:
           temporary.write_bytes(content)
     """
-    with _temporary(path) as temporary:
-        yield temporary
-        _put(temporary, path, keep=keep)
-
-
-@contextlib.contextmanager
-def _temporary(path: Path) -> Iterator[Path]:
-    """A hidden path beside `path`. At the end of the block, what is left there is removed."""
     temporary = _hidden(path)
     try:
         with writing(path, temporary, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _sweep(path.parent.resolve())
             yield temporary
+            _put(temporary, path, keep=keep)
     finally:
         _remove(temporary)
 
@@ -84,29 +61,12 @@ def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> li
       The paths of the files.
 
     Raises:
-      WriteError: If a file cannot be written. All files in the folder then stay as they were. If only a replacement
-        fails, the message names the files that are new and those that stay.
+      WriteError: If a file cannot be written. All files in the folder then stay as they were.
     """
-    written: dict[Path, Path] = {}
     with contextlib.ExitStack() as opened:
         for name, write in files.items():
-            temporary = opened.enter_context(_temporary(folder / name))
-            write(temporary)
-            written[folder / name] = temporary
-        _put_all(written)
-    return list(written)
-
-
-def _put_all(written: Mapping[Path, Path]) -> None:
-    """Rename temporary files to their final names. Raises WriteError with the files that stay if one cannot be."""
-    paths = list(written)
-    for at, path in enumerate(paths):
-        try:
-            _put(written[path], path, keep=False)
-        except OSError as error:
-            new, old = (", ".join(one.name for one in some) or "none" for some in (paths[:at], paths[at:]))
-            reason = f"{error.strerror or error}; new files: {new}; files that stay as they were: {old}"
-            raise WriteError(path, reason) from error
+            write(opened.enter_context(replacing(folder / name)))
+    return [folder / name for name in files]
 
 
 def check_holds_only(folder: Path, names: Collection[str]) -> None:
@@ -121,46 +81,21 @@ def check_holds_only(folder: Path, names: Collection[str]) -> None:
 
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Lock an existing folder against other processes that also lock it.
+    """Lock an existing folder against other processes of this computer that also lock it.
 
-    The lock ends with the process and leaves no file. If the file system does not support locks, nothing is locked.
+    The lock is a file in the system's temporary folder. It ends with the process.
 
     Raises:
       BlockingIOError: If another process holds the lock.
     """
-    busy = f"{folder}: expected exclusive use, found another process at work"
-    with _locked(folder, busy) if fcntl is not None else _locked_by_file(folder, busy):
-        yield
-
-
-@contextlib.contextmanager
-def _locked(folder: Path, busy: str) -> Iterator[None]:
-    """Lock the folder itself. Without locks in the file system, nothing is locked."""
-    assert fcntl is not None
-    held = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BlockingIOError(busy) from error
-        except OSError:  # the file system has no locks
-            pass
-        yield
-    finally:
-        os.close(held)
-
-
-@contextlib.contextmanager
-def _locked_by_file(folder: Path, busy: str) -> Iterator[None]:
-    """Lock a file in the system's temporary folder: Windows does not lock folders."""
-    import filelock
+    import filelock  # slow import
 
     name = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
     try:
         with filelock.FileLock(Path(tempfile.gettempdir()) / f"sglpr-jax-{name}.lock", timeout=0):
             yield
     except filelock.Timeout as error:
-        raise BlockingIOError(busy) from error
+        raise BlockingIOError(f"{folder}: expected exclusive use, found another process at work") from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -279,21 +214,6 @@ def remove_half_written(folder: Path) -> None:
 
 def _hidden(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # not a process id: several hosts may share a disk
-
-
-@functools.cache
-def _sweep(folder: Path) -> None:
-    """Remove the hidden paths that killed processes left in a folder, once in each process."""
-    for left in folder.glob(".*.tmp"):
-        with contextlib.suppress(OSError):  # another process may also remove it, or it may be unreadable
-            if _HIDDEN.search(left.name) and time.time() - _newest(left) > ABANDONED_S:
-                _remove(left)
-
-
-def _newest(path: Path) -> float:
-    """Time of the last change of a path and of everything below it. Links are not followed."""
-    inside = () if path.is_symlink() else path.rglob("*")
-    return max(one.lstat().st_mtime for one in (path, *inside))
 
 
 def _put(new: Path, path: Path, *, keep: bool) -> None:

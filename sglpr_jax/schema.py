@@ -64,14 +64,6 @@ def check_columns(arrays: Mapping[str, np.ndarray], columns: Mapping[str, Column
             _check_column(name, arrays[name], column, sizes)
 
 
-def check_texts(values: Any, *, name: str, count: int | None = None) -> None:
-    """Raise ValueError if values are not a list of strings or, with `count`, if the list has another length."""
-    if not isinstance(values, list) or not all(type(value) is str for value in values):
-        raise ValueError(f"expected `{name}` as a list of strings, found {values!r:.60}")
-    if count is not None and len(values) != count:
-        raise ValueError(f"expected {count} `{name}`, found {len(values)}")
-
-
 def _check_column(name: str, array: np.ndarray, column: Column, sizes: dict[str, int]) -> None:
     """Check an array, and add the lengths of its named axes to `sizes`."""
     if array.ndim == len(column.shape):

@@ -13,7 +13,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 def entry_point(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Run the entry point with two commands installed in `folder`/bin."""
-    (folder / "bin").mkdir()
+    (folder / "bin").mkdir(exist_ok=True)
     for name in ("sglpr-loops", "sglpr-live"):
         path = folder / "bin" / name
         path.write_text(f'#!/bin/sh\necho "{name}:$*"\n')
@@ -38,12 +38,8 @@ def test_the_extras_and_the_python_are_those_of_the_project():
     assert re.search(r"^ARG PYTHON=3\.1[1-9]$", DOCKERFILE, re.MULTILINE)
 
 
-def test_commands_run_with_and_without_the_prefix(tmp_path):
-    for number, name in enumerate(("loops", "sglpr-loops")):
-        (tmp_path / str(number)).mkdir()
-        assert entry_point(tmp_path / str(number), name, "my scans").stdout == "sglpr-loops:my scans\n"
-
-
-def test_an_unknown_command_lists_the_commands(tmp_path):
+def test_commands_run_with_and_without_the_prefix_and_an_unknown_one_lists_them(tmp_path):
+    for name in ("loops", "sglpr-loops"):
+        assert entry_point(tmp_path, name, "my scans").stdout == "sglpr-loops:my scans\n"
     done = entry_point(tmp_path, "lops")
     assert done.returncode == 1 and "  live\n  loops\n" in done.stderr

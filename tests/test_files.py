@@ -1,23 +1,23 @@
 """A file or folder is written whole or not at all, and errors of writing name it."""
 
 import os
-import subprocess
-import sys
 import time
-import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from sglpr_jax import files
 from sglpr_jax.files import (
-    ABANDONED_S,
+    MOST_BYTES,
+    MOST_SHOWN,
     WriteError,
     alone_in,
     check_writable,
+    file_name,
     half_written,
     json_in_short,
+    path_inside,
+    printable,
     read_json,
     remove_half_written,
     replacing,
@@ -26,6 +26,9 @@ from sglpr_jax.files import (
     write_text,
     writing,
 )
+
+HOSTILE = ("../../escaped", "/etc/passwd", "a/b", "a\\b", "", ".", "..", "a\0b", "a\nb")
+HOSTILE += ("x" * 2**20, "é" * 100, "\ud800")
 
 
 def names(folder: Path) -> list[str]:
@@ -84,23 +87,7 @@ def test_several_that_replace_one_folder_at_once_all_end_well(tmp_path, monkeypa
     assert (path / "a").read_text() == (path / "b").read_text()
 
 
-def test_what_was_left_long_ago_is_removed_and_nothing_else(tmp_path):
-    half = [tmp_path / f".08.npz.{uuid.uuid4().hex}.tmp" for _ in range(3)]
-    half[0].write_text("old")
-    (half[1] / "in").mkdir(parents=True)
-    half[2].write_text("new")
-    others = [tmp_path / ".mine.tmp", tmp_path / "08.tmp"]
-    for path in (half[0], half[1] / "in", half[1], *others):
-        path.touch()
-        os.utime(path, (0, path.stat().st_mtime - ABANDONED_S - 1))
-    write_json(tmp_path / "a.json", 1)
-    assert names(tmp_path) == sorted([half[2].name, ".mine.tmp", "08.tmp", "a.json"])
-
-
-@pytest.mark.parametrize("system", ["posix", "windows"])
-def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path, monkeypatch, system):
-    if system == "windows":  # which has no fcntl
-        monkeypatch.setattr(files, "fcntl", None)
+def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path):
     with (
         alone_in(tmp_path),
         pytest.raises(BlockingIOError, match=rf"^{tmp_path}: expected .* found another process"),
@@ -109,20 +96,6 @@ def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path
         pass
     with alone_in(tmp_path):
         assert names(tmp_path) == []
-
-
-@pytest.mark.slow
-def test_the_package_works_without_fcntl():
-    code = """
-import sys
-sys.modules["fcntl"] = None  # importing it fails, as on Windows
-import numpy as np, sglpr_jax
-params = sglpr_jax.load("sglpr")
-points = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
-assert sglpr_jax.describe(params, sglpr_jax.scan_image(points, params.config)).shape == (256,)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files):
@@ -155,38 +128,6 @@ def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
     assert names(tmp_path / "run") == ["test"] and names(tmp_path / "run" / "test") == ["a.png"]
 
 
-def test_half_written_files_are_found_while_another_process_removes_folders(tmp_path, monkeypatch):
-    (tmp_path / "gone").mkdir()
-    (tmp_path / ".a.png.3.tmp").touch()
-    scandir = os.scandir
-
-    def scan(place):
-        if Path(place).name == "gone":
-            raise FileNotFoundError(place)
-        return scandir(place)
-
-    monkeypatch.setattr(os, "scandir", scan)
-    assert half_written(tmp_path) == [tmp_path / ".a.png.3.tmp"]
-
-
-@pytest.mark.parametrize("name", [".x.tmp", f".x.{32 * 'a'}.tmp"])
-def test_a_link_to_itself_does_not_stop_the_writing_in_its_folder(tmp_path, name):
-    (tmp_path / name).symlink_to(name)
-    write_text(tmp_path / "t.txt", "x")
-    assert (tmp_path / "t.txt").read_text() == "x"
-
-
-def test_an_old_link_with_the_name_of_a_temporary_file_goes_and_what_it_leads_to_stays(tmp_path):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "a").write_text("kept")
-    link = tmp_path / "out" / f".x.{32 * 'a'}.tmp"
-    link.parent.mkdir()
-    link.symlink_to(tmp_path / "mine")
-    os.utime(link, (0, 0), follow_symlinks=False)
-    write_text(tmp_path / "out" / "t.txt", "x")
-    assert names(tmp_path / "out") == ["t.txt"] and (tmp_path / "mine" / "a").read_text() == "kept"
-
-
 def test_a_name_that_is_not_utf_8_is_written_escaped(tmp_path):
     write_text(tmp_path / "t.txt", "Zürich n\udcff")
     assert (tmp_path / "t.txt").read_text(encoding="utf-8") == "Zürich n\\udcff"
@@ -215,18 +156,6 @@ def test_several_files_are_written_together_or_not_at_all(tmp_path):
     assert names(tmp_path) == ["new"]
 
 
-def test_of_several_files_whose_renaming_fails_the_error_names_what_is_new(tmp_path):
-    """A folder cannot be replaced by a file."""
-    (tmp_path / "b" / "mine").mkdir(parents=True)
-    for name in "ac":
-        (tmp_path / name).write_text("old")
-    found = rf"{tmp_path}/b: cannot be written: .*; new files: a; files that stay as they were: b, c$"
-    with pytest.raises(WriteError, match=found):
-        write_all(tmp_path, {name: lambda path: path.write_text("new") for name in "abc"})
-    assert names(tmp_path) == ["a", "b", "c"]
-    assert (tmp_path / "a").read_text() == "new" and (tmp_path / "c").read_text() == "old"
-
-
 def test_an_error_below_a_temporary_path_names_the_final_one(tmp_path, monkeypatch):
     def full(path, content):
         raise OSError(28, "No space left on device")
@@ -242,7 +171,7 @@ def test_json_comes_back(tmp_path):
     assert read_json(tmp_path / "a.json") == {"a": [1, None, "b"]}
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": 1, "a": 2}', b"1" * 5000])
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": 1, "a": 2}', b"1" * 5000])
 def test_json_that_is_damaged_names_its_file(tmp_path, content):
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(ValueError, match=rf"^{tmp_path}/a\.json: expected JSON, found invalid JSON"):
@@ -256,3 +185,36 @@ def test_a_value_is_said_in_short():
     assert json_in_short("l2") == "l2"
     long = json_in_short(list(range(100)))
     assert len(long) == 80 and long.startswith("[0, 1, 2") and long.endswith("...")
+
+
+@pytest.mark.parametrize("name", ["08", "scene 0061", ".hidden", "Zürich [2]", "n\udcff"])
+def test_a_safe_name_is_its_file_name(name):
+    assert file_name(name) == name
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_any_other_name_becomes_the_name_of_a_file_in_the_folder(tmp_path, name):
+    path = tmp_path / file_name(name)
+    path.write_text("")
+    assert [*tmp_path.iterdir()] == [path] and len(path.name.encode()) <= MOST_BYTES
+
+
+def test_different_names_have_different_files():
+    names = (*HOSTILE, "a_b", "..-escaped", "x" * (2**20 + 1), "\ud801")
+    assert len({file_name(name) for name in names}) == len(names)
+
+
+def test_a_table_names_files_inside_its_dataset():
+    assert path_inside(Path("d"), "samples/a.bin", source=Path("t.json")) == Path("d/samples/a.bin")
+
+
+@pytest.mark.parametrize("listed", ["/etc/passwd", "samples/../../x", "", "a\0b", None])
+def test_another_path_is_refused_and_the_table_is_named(listed):
+    with pytest.raises(ValueError, match=r"t\.json: expected paths of files inside d, found "):
+        path_inside(Path("d"), listed, source=Path("t.json"))
+
+
+def test_a_printed_name_is_one_short_line():
+    assert printable("Zürich [2]") == "Zürich [2]"
+    assert printable("a\nb\udcff\x1b[31m") == "a\\nb\\udcff\\x1b[31m"
+    assert len(printable("x" * 2**20)) == MOST_SHOWN

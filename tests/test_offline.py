@@ -26,4 +26,4 @@ def test_weights_descriptors_and_scores_need_no_network(no_network, tmp_path):
     file = sglpr_jax.embed(sglpr_jax.load("circular"), recording)
     file.save(tmp_path / "08.npz")
     sglpr_jax.evaluate(tmp_path / "08.npz")
-    assert np.isfinite(sglpr_jax.nearest(file, exclude_frames=0).distances[1:]).all()
+    assert np.isfinite(sglpr_jax.Index.of(file).query(file.descriptors).distances).all()

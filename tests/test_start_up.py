@@ -17,19 +17,40 @@ COMMANDS = sorted(path.stem for path in CLI.glob("*.py") if (CLI.parents[1] / "b
 def imported_by(program: str, *, of: tuple[str, ...] = SLOW) -> set[str]:
     """Which of these modules a Python of its own has imported at the end of the program."""
     program += f"\nimport sys; print('imported', *(name for name in {of} if name in sys.modules))"
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
     return set(ended.stdout.splitlines()[-1].split()[1:])
 
 
-@pytest.mark.parametrize("module", ["sglpr_jax", "sglpr_jax.data", "sglpr_jax.sim"])
-def test_an_import_brings_nothing_slow(module):
-    assert imported_by(f"import {module}") == set()
+def test_imports_help_and_wrong_flags_of_the_commands_bring_nothing_slow():
+    """One process for all: the first command after which a slow module is there is named."""
+    program = f"""
+import importlib, sys
+def check(after):
+    found = [name for name in {SLOW} if name in sys.modules]
+    assert not found, (after, found)
+for module in "sglpr_jax", "sglpr_jax.data", "sglpr_jax.sim":
+    importlib.import_module(module)
+    check(module)
+for command in {COMMANDS}:
+    main = importlib.import_module(f"sglpr_jax.cli.{{command}}").main
+    for flag, status in ("--help", 0), ("--no-such-flag", 2):
+        sys.argv = [command, flag]
+        try:
+            main()
+        except SystemExit as ended:
+            assert ended.code == status, (command, flag, ended.code)
+        else:
+            raise AssertionError(f"expected {{command}} to exit")
+    check(command)
+"""
+    assert imported_by(program) == set()
 
 
 @pytest.mark.slow
 def test_a_name_of_the_library_brings_what_it_needs():
-    assert imported_by("import sglpr_jax; sglpr_jax.CATEGORIES") == {"numpy", "jaxtyping"}
-    assert "jax" in imported_by("import sglpr_jax; sglpr_jax.describe")
+    program = "import sglpr_jax, sys; sglpr_jax.CATEGORIES; assert 'jax' not in sys.modules; sglpr_jax.describe"
+    assert imported_by(program) == set(SLOW)
 
 
 def test_a_folder_of_scans_is_opened_without_scipy_and_without_the_simulator(tmp_path):
@@ -41,20 +62,3 @@ from sglpr_jax.cli.datasets import open_recording
 assert len(open_recording(Path({str(tmp_path)!r}), None, sensor_height=1.7)) == 1
 """
     assert imported_by(program, of=("scipy", "sglpr_jax.sim.dataset")) == set()
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_imports_help_and_wrong_flags_of_a_command_do_not_wait_for_jax(command):
-    program = f"""
-import sys
-from sglpr_jax.cli.{command} import main
-for flag, status in ("--help", 0), ("--no-such-flag", 2):
-    sys.argv = ["{command}", flag]
-    try:
-        main()
-    except SystemExit as ended:
-        assert ended.code == status, (flag, ended.code)
-    else:
-        raise AssertionError("expected main() to exit")
-"""
-    assert imported_by(program) == set()

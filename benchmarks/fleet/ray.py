@@ -18,11 +18,11 @@ import fsspec
 import tyro
 
 import sglpr_jax
+from benchmarks.fleet.overlaps import overlaps
 from sglpr_jax.files import replacing
 from sglpr_jax.methods.registry import network
 from sglpr_jax.pose_graph.folder import write_found
 from sglpr_jax.retrieval.fleet_index import FleetIndex
-from sglpr_jax.retrieval.overlaps import overlaps
 from sglpr_jax.retrieval.parquet import embed_to_store, read_places, stored_places
 
 

@@ -21,7 +21,7 @@ from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import to_raw
-from sglpr_jax.retrieval.semantic_maps import semantic_map
+from sglpr_jax.retrieval.image_maps import semantic_map
 from sglpr_jax.sim.dataset import simulate
 
 TRAIN, TRAIN_IMAGES, HELD_OUT, TEST = "train", "train-images", "held-out", "test"

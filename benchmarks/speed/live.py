@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.timing import resident_mb
-from sglpr_jax.live.report import Reports
+from sglpr_jax.live.messages import Reports
+from sglpr_jax.live.ros import Transport, domain_of
 from sglpr_jax.live.ros_messages import CLOUD, TRANSFORMS, encode, transform_message, typestore
-from sglpr_jax.live.ros_wire import Wire, domain_of
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.se3 import quaternions
 from sglpr_jax.sim.recording import simulate_recording
@@ -54,10 +54,10 @@ class RosPublisher:
 
     flags = ("--topic", "/points", "--odometry-topic", "/odometry")
 
-    def __init__(self, connect: Callable[[], Wire]):
+    def __init__(self, connect: Callable[[], Transport]):
         """`connect` opens the connection with the first scan. Scans before the subscription finds it are lost."""
         self._connect = connect
-        self._wire: Wire | None = None
+        self._wire: Transport | None = None
 
     def put(self, points: np.ndarray, world_from_lidar: np.ndarray, stamp: float) -> None:
         """Publish a scan with its odometry at a time in seconds since 1970."""
@@ -91,23 +91,23 @@ def _cloud(points: np.ndarray, stamp: float) -> bytes:
     return encode(found)
 
 
-def _dds(where: str) -> Wire:
+def _dds(where: str) -> Transport:
     """Connection in a domain."""
-    from sglpr_jax.live.dds_wire import DdsWire
+    from sglpr_jax.live.dds import DdsTransport
 
-    return DdsWire(domain_of(where, source="dds"), Reports())
+    return DdsTransport(domain_of(where, source="dds"), Reports())
 
 
-def _zenoh(endpoint: str) -> Wire:
+def _zenoh(endpoint: str) -> Transport:
     """Connection that listens at an endpoint, such as tcp/127.0.0.1:7450."""
-    from sglpr_jax.live.zenoh_wire import ZenohWire
+    from sglpr_jax.live.zenoh import ZenohTransport
 
     config = {"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
     with tempfile.NamedTemporaryFile("w", suffix=".json5") as file:
         json.dump(config, file)
         file.flush()
         os.environ["ZENOH_SESSION_CONFIG_URI"] = file.name
-        return ZenohWire("", domain_of("", source="zenoh"), Reports())
+        return ZenohTransport("", domain_of("", source="zenoh"), Reports())
 
 
 PUBLISHERS: dict[str, Callable[[str], Any]] = {

@@ -8,7 +8,7 @@ GROUPS = {
         *("open_recording", "recording_names", "Recording", "Record"),
         *("deskewed", "deskew", "submaps", "SubmapBuilder", "scaled"),
     ],
-    "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "Index", "FleetIndex"],
+    "Finding places again": ["embed", "DescriptorFile", "Index", "FleetIndex"],
     "Scores": ["evaluate", "Evaluation"],
     "Loops": ["find_loops", "LoopDetector", "Loop"],
     "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import sys
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,27 +12,25 @@ import tyro
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
-from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
-from sglpr_jax.fields import NotNegative
+from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, ConsistencyConfig, DetectorConfig, SequenceConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT, DriftModel
 from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
+    from sglpr_jax.live.endpoints import Sink, Source
     from sglpr_jax.live.live_map import LiveMap
-    from sglpr_jax.live.report import Report
-    from sglpr_jax.live.sinks import Sink
-    from sglpr_jax.live.sources import Source
+    from sglpr_jax.live.messages import Report
 
 
 @dataclasses.dataclass(frozen=True)
-class LiveCommand:
+class LiveCommand(LiveOptions):
     """Find loop closures while the robot drives, and publish them at once.
 
     Sources: `folder:PATH` (a folder into which scans are written), `bag:PATH` (a bag at its own pace), `dds` or
-    `dds:DOMAIN` (ROS 2), `zenoh` or `zenoh:ENDPOINT`, `ros1` or `ros1:MASTER`. Sinks: `json` (lines on standard
-    output), `json:FILE`, `dds`, `zenoh`, `ros1`.
+    `dds:DOMAIN` (ROS 2), `zenoh` or `zenoh:ENDPOINT`. Sinks: `json` (lines on standard output), `json:FILE`, `dds`,
+    `zenoh`, `rerun`.
 
     The output folder holds the map. A command with the same --out continues it, also after a crash. Ctrl-C or SIGTERM
     ends the command and writes loops.g2o, loops.csv, rejected.jsonl, trajectory.tum and trajectory-optimized.tum.
@@ -50,30 +49,6 @@ class LiveCommand:
     """Receivers of loops and of the status after each scan."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
-    topic: str | None = None
-    """Topic of the point clouds."""
-    odometry_topic: str | None = None
-    """Topic of the odometry. Without odometry, loops are found by the scans alone."""
-    reliable: bool = False
-    """Request lost scans again (dds). Publishers that are best effort then do not match."""
-    rate: NotNegative = 1.0
-    """Speed of a replayed bag. 0 is as fast as possible."""
-    poses: Path | None = None
-    """File of odometry for a folder, which may grow: tum, or a line for each scan."""
-    pose_format: PoseFormat = "auto"
-    """Format of --poses. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum."""
-    time_unit: TimeUnit = "auto"
-    """Unit of the times in --poses. `auto` expects seconds."""
-    format: ScanFormat = "auto"
-    """Format of the scan files of a folder."""
-    sensor_height: SensorHeight = "auto"
-    """Height of the sensor above the ground, in metres. `auto` estimates height and tilt from the first scans."""
-    topic_prefix: str = "/sglpr"
-    """Beginning of the names of published topics."""
-    map_frame: str = "map"
-    """Name of the map's frame in published messages."""
-    odometry_frame: str = "odom"
-    """Name of the odometry's frame in published messages."""
     drift_percent: float = DRIFT_PERCENT
     """Position drift of the odometry: one standard deviation, in percent of the travelled distance."""
     drift_deg_per_100m: float = DRIFT_DEG_PER_100M
@@ -105,18 +80,76 @@ class LiveCommand:
 
 def live(command: LiveCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.checkpoint import alone  # slow import, not needed for --help
+    from sglpr_jax.live.endpoints import open_sink, open_source
+    from sglpr_jax.live.messages import Reports
 
     _check(command)
-    with alone(command.out):
-        return _run(command)
+    report = Reports()
+
+    def source(found: "LiveMap") -> "Source":
+        return open_source(command.source, command, report, taken=found.names.__contains__)
+
+    def sinks() -> Iterator["Sink"]:
+        return (open_sink(text, command, report) for text in command.sinks)
+
+    with stop_on_signal() as stop:
+        run_node(command, source, sinks, report=report, say=_say, should_stop=stop)
+    return stop.exit_status
+
+
+def run_node(
+    command: LiveCommand,
+    open_source: Callable[["LiveMap"], "Source"],
+    open_sinks: Callable[[], Iterable["Sink"]],
+    *,
+    report: "Report",
+    say: Callable[[str], object],
+    should_stop: Callable[[], bool],
+) -> None:
+    """Find loops until the source ends or `should_stop` is true, and write the results.
+
+    Arguments:
+      command: Settings. Source and sinks are those of the functions.
+      open_source: Function that opens the source for a map.
+      open_sinks: Function that opens the sinks.
+      report: Function for trouble.
+      say: Function for lines about the progress.
+      should_stop: Whether the node ends.
+
+    Raises:
+      ValueError: If a setting is invalid, or the folder has a map of other settings.
+      WriteError: If the folder cannot be written.
+    """
+    from sglpr_jax.live.node import Node
+    from sglpr_jax.live.results import corrected_trajectory, write_results
+    from sglpr_jax.loops.checkpoint import alone
+
+    with alone(command.out), contextlib.ExitStack() as opened:
+        found = _map(command, report)
+        opened.callback(found.close)
+        missed = found.recall()
+        corrected = corrected_trajectory(found, odometry=command.expects_odometry, report=report)
+        sinks = []
+        for sink in open_sinks():
+            opened.callback(_close, sink, report)
+            sinks.append(sink)
+        source = open_source(found)
+        opened.callback(source.close)
+        node = Node(found, sinks, report=report, say=say, corrected=corrected)
+        node.publish(missed)
+        say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
+        try:
+            node.run(source, should_stop=should_stop)
+        finally:
+            say(str(node))
+            paths = [*write_results(found, command.out, corrected=corrected), record_command(command, command.out)]
+            say(f"{command.out}: {', '.join(path.name for path in paths)}")
 
 
 def _check(command: LiveCommand) -> None:
     """Raises ValueError before any work for an unknown source or sink, or if an input would be overwritten."""
+    from sglpr_jax.live.endpoints import SINKS, SOURCES, check_name
     from sglpr_jax.live.results import CORRECTED, TRAJECTORY
-    from sglpr_jax.live.sinks import SINKS
-    from sglpr_jax.live.sources import SOURCES, check_name
 
     check_name(command.source, SOURCES, kind="sources")
     for text in command.sinks:
@@ -129,70 +162,21 @@ def _check(command: LiveCommand) -> None:
         )
 
 
-def _run(command: LiveCommand) -> int:
-    from sglpr_jax.live.corrected import corrected_trajectory
-    from sglpr_jax.live.node import Node
-    from sglpr_jax.live.report import Reports
-    from sglpr_jax.live.results import write_results
-
-    report = Reports()
-    with stop_on_signal() as stop, contextlib.ExitStack() as opened:
-        found = _map(command, report)
-        opened.callback(found.close)
-        missed = found.recall()
-        corrected = corrected_trajectory(found, odometry=command.expects_odometry, report=report)
-        sinks = [_sink(text, command, report) for text in command.sinks]
-        for sink in sinks:
-            opened.callback(_closed, sink, report)
-        source = _source(command, found, report)
-        opened.callback(source.close)
-        node = Node(found, sinks, report=report, say=_say, corrected=corrected)
-        node.publish(missed)
-        _say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
-        try:
-            node.run(source, should_stop=stop)
-        finally:
-            _say(str(node))
-            paths = [*write_results(found, command.out, corrected=corrected), record_command(command, command.out)]
-            _say(f"{command.out}: {', '.join(path.name for path in paths)}")
-    return stop.exit_status
-
-
 def _map(command: LiveCommand, report: "Report") -> "LiveMap":
     """Open the map, with all programs compiled."""
     from sglpr_jax.live.live_map import LiveMap
-    from sglpr_jax.live.warm_up import warm_up
+    from sglpr_jax.live.node import warm_up
     from sglpr_jax.loops.detector import LoopDetector
     from sglpr_jax.models.weights_file import load
 
-    params, config = load(command.weights), command.detector
-    found = LiveMap(
-        LoopDetector(params, config=config),
-        command.out,
-        report=report,
-        sensor_height=command.sensor_height,
-        expects_odometry=command.expects_odometry,
-    )
-    warm_up(params, config, odometry=command.expects_odometry)
+    params, config, odometry = load(command.weights), command.detector, command.expects_odometry
+    height, detector = command.sensor_height, LoopDetector(params, config=config)
+    found = LiveMap(detector, command.out, report=report, sensor_height=height, expects_odometry=odometry)
+    warm_up(params, config, odometry=odometry)
     return found
 
 
-def _source(command: LiveCommand, found: "LiveMap", report: "Report") -> "Source":
-    from sglpr_jax.live.sources import SourceOptions, open_source
-
-    names = [field.name for field in dataclasses.fields(SourceOptions) if field.name != "taken"]
-    options = SourceOptions(**{name: getattr(command, name) for name in names}, taken=found.names.__contains__)
-    return open_source(command.source, options, report)
-
-
-def _sink(text: str, command: LiveCommand, report: "Report") -> "Sink":
-    from sglpr_jax.live.sinks import SinkOptions, open_sink
-
-    options = SinkOptions(command.topic_prefix, command.map_frame, command.odometry_frame)
-    return open_sink(text, options, report)
-
-
-def _closed(sink: "Sink", report: "Report") -> None:
+def _close(sink: "Sink", report: "Report") -> None:
     """Close a sink, and report if it fails: the other results are still written."""
     try:
         sink.close()

@@ -100,7 +100,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.maps.place_names import poses_by_id
     from sglpr_jax.models.weights import weights_hash
-    from sglpr_jax.retrieval.index_rows import check_scale
+    from sglpr_jax.retrieval.index import check_scale
 
     before = None
     if command.add_to is not None:

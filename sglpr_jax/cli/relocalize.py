@@ -67,7 +67,7 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     from sglpr_jax.maps.query import query_of, read_query
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.models.weights_file import load
-    from sglpr_jax.retrieval.index_rows import check_scale
+    from sglpr_jax.retrieval.index import check_scale
 
     if command.out is not None:
         check_writable(command.out)

@@ -46,7 +46,7 @@ def segment_recording(command: SegmentCommand) -> Path:
     from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
     from sglpr_jax.files import check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
-    from sglpr_jax.retrieval.semantic_maps import save_map, semantic_maps
+    from sglpr_jax.retrieval.image_maps import save_map, semantic_maps
 
     check_writable(command.out / RESULT_FILE)
     params = load(command.weights)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
-from sglpr_jax.retrieval.semantic_maps import SemanticMap
+from sglpr_jax.retrieval.image_maps import SemanticMap
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from sglpr_jax.evaluation.segmentation import (
 )
 from sglpr_jax.models.params import Params
 from sglpr_jax.progress import Progress, no_progress
-from sglpr_jax.retrieval.semantic_maps import semantic_map, semantic_maps
+from sglpr_jax.retrieval.image_maps import semantic_map, semantic_maps
 
 PICTURE = "segmentation.png"
 

@@ -1,34 +1,72 @@
-"""Map of a running node: the loop detector with a journal on disk, from which the next process continues."""
+"""Map of a running node: the loop detector, with a log on disk from which the next process continues."""
 
 import contextlib
 import dataclasses
+import json
+import os
 import time
+import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import safetensors.numpy
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
+from sglpr_jax.data.formats.tensors import tensors_as_bytes
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.files import in_short, parse_json, read_json, write_json, writing
+from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.live.clock import Clock
-from sglpr_jax.live.continuity import Continuity
-from sglpr_jax.live.frame import LiveFrame, LoopEdge
-from sglpr_jax.live.journal import Journal
-from sglpr_jax.live.loop_log import LoopLog
-from sglpr_jax.live.mounting import FirstScans
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.scan_bytes import LiveScan, from_bytes, to_bytes
+from sglpr_jax.live.messages import LiveFrame, LoopEdge, Report
+from sglpr_jax.live.odometry_input import Clock, Continuity, FirstScans
 from sglpr_jax.loops.arguments import given_pose
+from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.checkpoint import COLUMNS, columns, compared_of
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
+from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT = "sglpr-jax live 3"
-JOURNAL, LOOPS = "journal.bin", "loops.jsonl"
+FORMAT = "sglpr-jax live 4"
+SETTINGS, FRAMES, LOOPS = "settings.json", "frames.log", "loops.jsonl"
+OLD = "journal.bin"
+"""File of the scans in maps of earlier versions, which are not read."""
 SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""
 MOST_WALL_S = 1e8
 """Maximum time between two processes that is believed, in seconds."""
+ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int, "mounting": dict | None}
+"""JSON values of each scan in the log."""
+ARRAYS = {
+    "descriptor": Column("float32", ("d",)),
+    "image": Column("uint8", ("h", "h")),
+    "pose": Column("float64", (4, 4), optional=True),
+    **{name: COLUMNS[name] for name in ("counts", "fitted", "fits", "links")},
+}
+"""Arrays of each scan in the log."""
+
+
+class LiveScan(NamedTuple):
+    """A described scan of a live map."""
+
+    seen: Seen | None
+    """None for a scan that is damaged in the log."""
+    compared: Compared | None
+    pose: Float[np.ndarray, "4 4"] | None
+    """Pose of the LiDAR by odometry."""
+    part: int
+    """Number of the part of the map. A part begins where the motion since the last scan is unknown."""
+    name: str
+    """`Record.name` of the scan."""
+    stamp: float
+    """Time of the header, in seconds."""
+    time: float
+    """Time of `Clock`, in seconds."""
+    wall: float
+    """Time of the computer when the scan was added, in seconds since 1970."""
 
 
 class LiveMap:
@@ -60,7 +98,7 @@ class LiveMap:
           expects_odometry: Whether the first scans wait for odometry.
 
         Raises:
-          ValueError: If the folder has a map of other settings or weights.
+          ValueError: If the folder has a map of another version, other settings or weights.
           WriteError: If the folder cannot be written.
         """
         self.detector, self._report = detector, report
@@ -69,11 +107,14 @@ class LiveMap:
         """Names of the scans that have one."""
         self._stamps = GrowingArray(np.empty(0))
         self._poses = GrowingArray(np.empty((0, 4, 4)))
+        self._part = 0
         self._clock = Clock(report)
         self._continuity = Continuity(report, expected=expects_odometry)
         self._mounting = FirstScans(sensor_height)
-        self._journal: Journal | None = Journal(folder / JOURNAL, _settings(detector, sensor_height))
-        self._log = LoopLog(folder / LOOPS, report)
+        about = {"format": FORMAT, "weights": detector.finder.index.weights_hash, "sensor_height": sensor_height}
+        _check_settings(folder, {**about, **dataclasses.asdict(detector.config)})
+        self._log: FrameLog | None = FrameLog(folder / FRAMES)
+        self._loops_path, self._loops_file = folder / LOOPS, -1
         self._synced = time.monotonic()
 
     def __len__(self) -> int:
@@ -90,21 +131,27 @@ class LiveMap:
         return self._poses.rows
 
     def recall(self) -> list[LoopEdge]:
-        """Add the scans of the journal. Returns the loops of an earlier process that it did not write any more.
+        """Add the scans of the log. Returns the loops of an earlier process that it did not write any more.
 
-        Raises ValueError if a scan of the journal is invalid.
+        A damaged scan becomes a frame without an image. Later scans are then compared anew, because the stored
+        comparisons assume its image. Raises ValueError if the log is of another program.
         """
-        assert self._journal is not None
-        scan = None
-        for content in self._journal.records():
-            scan = from_bytes(content, len(self), source=self._journal.path)
-            self._extend(scan)
-        if self._journal.cut:
-            self._report("cut", f"{self._journal.path}: {self._journal.cut} bytes of an unfinished scan were removed")
+        assert self._log is not None
+        scan, lost, known = None, 0, True
+        for frame, content in self._log.records():
+            scan = from_bytes(content, frame, source=self._log.path)
+            known = scan.part == self._part
+            for _ in range(len(self), frame):
+                self._extend(scan._replace(seen=None, compared=None, name=""))
+                lost += 1
+            self._extend(scan._replace(compared=None) if lost else scan)
+        if lost:
+            self._report("lost", f"{self._log.path}: {lost} damaged scans are left out")
+        if self._log.cut:
+            self._report("cut", f"{self._log.path}: {self._log.cut} bytes of an unfinished scan were removed")
         if scan is not None:
-            self._resume(scan)
-        missed = self._log.restore(self.detector.loops)
-        return [self._edge(loop, time.monotonic()) for loop in missed]
+            self._resume(scan, known=known)
+        return [self._edge(loop, time.monotonic()) for loop in self._restore_loops()]
 
     def add(self, frame: LiveFrame) -> list[LoopEdge] | None:
         """Add a scan and return its loops, or None if the scan is left out, which is reported.
@@ -123,8 +170,8 @@ class LiveMap:
             return None
         loops = self.detector.add_seen(seen, time=clock, odometry=placed.pose, continues=placed.continues)
         compared, stamp, wall = self.detector.finder.compared, float(frame.time), time.time()
-        stamp = stamp if np.isfinite(stamp) else 0.0
-        scan = LiveScan(seen, compared, placed.pose, placed.continues, record.name, stamp, clock, wall)
+        stamp, part = stamp if np.isfinite(stamp) else 0.0, self._part + (not placed.continues)
+        scan = LiveScan(seen, compared, placed.pose, part, record.name, stamp, clock, wall)
         self._note(scan)
         if self.detector.finder.empty[-1]:
             self._report("empty", f"{record.name or f'scan {len(self) - 1}'}: expected a place, found almost no points")
@@ -133,48 +180,63 @@ class LiveMap:
 
     def close(self) -> None:
         """Force everything to the disk and close the files."""
-        self._log.close()
-        if self._journal is not None:
-            self._journal.close()
+        if self._loops_file >= 0:
+            os.close(self._loops_file)
+        if self._log is not None:
+            self._log.close()
 
     def _extend(self, scan: LiveScan) -> None:
-        self.detector.add_seen(
-            scan.seen, time=scan.time, odometry=scan.pose, compared=scan.compared, continues=scan.continues
-        )
+        """Add a scan of the log."""
+        known = {"compared": scan.compared, "continues": scan.part == self._part}
+        self.detector.add_seen(scan.seen, time=scan.time, odometry=scan.pose, **known)
         self._note(scan)
 
     def _note(self, scan: LiveScan) -> None:
+        self._part = scan.part
         self._stamps.append(scan.stamp)
         if scan.pose is not None:
             self._poses.append(scan.pose)
         if scan.name:
             self.names.add(scan.name)
-        self.detector.candidates.clear()  # they are in the journal
+        self.detector.candidates.clear()  # they are in the log
 
-    def _resume(self, scan: LiveScan) -> None:
-        """Continue after the last scan of an earlier process."""
+    def _resume(self, scan: LiveScan, *, known: bool) -> None:
+        """Continue after the last scan of an earlier process. `known`: whether the motion up to it is known."""
         passed = min(max(time.time() - scan.wall, 0.0), MOST_WALL_S)
         self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - passed)
-        self._continuity.resume(scan.pose, scan.time, known=scan.continues)
+        self._continuity.resume(scan.pose, scan.time, known=known)
+        assert scan.seen is not None
         self._mounting = FirstScans(self._height, known=scan.seen.mounting)
         self._report("recall", f"the map continues after {len(self)} scans and {len(self.detector.loops)} loops")
 
+    def _restore_loops(self) -> list[Loop]:
+        """Write all loops so far, and return those that the file of an earlier process lacks."""
+        written, loops = _pairs(self._loops_path), self.detector.loops
+        missed = [loop for loop in loops if (loop.query, loop.match) not in written]
+        if missed and written:
+            self._report("log", f"{self._loops_path}: {len(missed)} loops were added that the last process missed")
+        write_loops_jsonl(self._loops_path, loops)
+        with writing(self._loops_path):
+            self._loops_file = os.open(self._loops_path, os.O_WRONLY | os.O_APPEND)
+        return missed
+
     def _write(self, scan: LiveScan, loops: list[Loop]) -> None:
         """Write a scan and its loops. After an error the map lives on in memory."""
-        if self._journal is None:
+        if self._log is None:
             return
         try:
-            self._journal.append(to_bytes(scan))
-            self._log.append(loops)
+            self._log.append(len(self) - 1, to_bytes(scan))
+            with writing(self._loops_path):
+                os.write(self._loops_file, loop_lines(loops).encode())
             if time.monotonic() - self._synced > SYNC_S:
-                self._journal.sync()
                 self._log.sync()
+                os.fsync(self._loops_file)
                 self._synced = time.monotonic()
         except OSError as error:
             self._report("disk", f"{error}; the map is not written any more, and a restart continues before this scan")
             with contextlib.suppress(OSError):
-                self._journal.close()
-            self._journal = None
+                self._log.close()
+            self._log = None
 
     def _edge(self, loop: Loop, received: float) -> LoopEdge:
         """The loop, with the times of its scans, and their poses if these are in the present frame of the odometry."""
@@ -186,7 +248,67 @@ class LiveMap:
         return LoopEdge(loop.query, loop.match, *times, *found, query, match, time.monotonic() - received)
 
 
-def _settings(detector: LoopDetector, height: SensorHeight) -> dict[str, Any]:
-    """Settings that determine the content of a map."""
-    about = {"format": FORMAT, "weights": detector.finder.index.weights_hash, "sensor_height": height}
-    return {**about, **dataclasses.asdict(detector.config)}
+def to_bytes(scan: LiveScan) -> bytes:
+    """Return the compressed bytes of a scan."""
+    assert scan.seen is not None and scan.compared is not None
+    arrays = {"descriptor": scan.seen.descriptor, "image": scan.seen.image, **columns([scan.compared])}
+    if scan.pose is not None:
+        arrays["pose"] = np.asarray(scan.pose, np.float64)
+    mounting = None if scan.seen.mounting is None else scan.seen.mounting.fields
+    about = {**{name: getattr(scan, name) for name in ABOUT if name != "mounting"}, "mounting": mounting}
+    contiguous = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    text = json.dumps({"format": FORMAT, **about})
+    return zlib.compress(tensors_as_bytes(contiguous, {"scan": text}), 1)
+
+
+def from_bytes(content: bytes, frame: int, *, source: Path) -> LiveScan:
+    """Return the scan of `to_bytes`, which has this frame number.
+
+    Raises ValueError, which names `source`, if the content is invalid.
+    """
+    try:
+        plain = zlib.decompress(content)
+        arrays = safetensors.numpy.load(plain)
+        size = int.from_bytes(plain[:8], "little")
+        about = json.loads(json.loads(plain[8 : 8 + size])["__metadata__"]["scan"])
+        check_about(about, ABOUT, format=FORMAT)
+        check_columns(arrays, ARRAYS, n=1)
+        fitted = arrays["fitted"]
+        if arrays["counts"][0] != len(fitted) or ((fitted < 0) | (fitted >= frame)).any():
+            raise ValueError(f"expected comparisons of frame {frame}, found others")
+        mounting = about.pop("mounting")
+        mounting = None if mounting is None else Mounting(**{**mounting, "up": tuple(mounting["up"])})
+    except Exception as error:  # another program may have written it
+        raise ValueError(f"{source}: expected scan {frame} of a live map, found others ({in_short(error)})") from error
+    (compared,) = compared_of(arrays)
+    seen = Seen(arrays["descriptor"], arrays["image"], mounting)
+    known = {name: about[name] for name in ABOUT if name != "mounting"}
+    return LiveScan(seen, compared, arrays.get("pose"), **known)
+
+
+def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
+    """Write the settings of a new map, or raise ValueError if those in the folder are others."""
+    wanted, path = json.loads(json.dumps(wanted)), folder / SETTINGS
+    if (folder / OLD).exists():
+        raise ValueError(f"{folder}: expected a map of this version, found {OLD} of an earlier one; use another --out")
+    if not (folder / FRAMES).exists():
+        return write_json(path, wanted)
+    found = read_json(path)
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected the settings of a live map ({FORMAT}), found others; use another --out")
+    other = [name for name, value in wanted.items() if found.get(name) != value]
+    if other:
+        raise ValueError(
+            f"{path}: expected a map with the same settings, found another {', '.join(other)}; "
+            "use the flags and weights of the map, or another --out"
+        )
+
+
+def _pairs(path: Path) -> set[tuple[int, int]]:
+    """Query and match of each whole line of a file. A line that is cut or damaged is left out."""
+    found = set()
+    for line in path.read_bytes().splitlines() if path.is_file() else ():
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            value = parse_json(line, source=path)
+            found.add((value["query"], value["match"]))
+    return found

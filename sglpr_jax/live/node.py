@@ -1,5 +1,6 @@
 """The running node: scans from a source, through the map, to sinks. It survives errors of single scans and sinks."""
 
+import dataclasses
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -8,17 +9,20 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.corrected import CorrectedTrajectory
-from sglpr_jax.live.frame import FrameStatus, LiveFrame, LoopEdge
+from sglpr_jax.live.endpoints import Sink, Source
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.sinks import Sink
-from sglpr_jax.live.sources import Source
+from sglpr_jax.live.messages import FrameStatus, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.results import CorrectedTrajectory
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.models.params import Params
 
 EVERY_S = 10.0
 """Time between two lines about the progress, in seconds."""
 LATEST = 100
 """Number of latest scans whose times are summed up in a line."""
+WARM_UP = 12
+"""Number of scans after which every program of the search was used: each is compared with those before it."""
 
 
 class Node:
@@ -30,7 +34,7 @@ class Node:
         sinks: Sequence[Sink],
         *,
         report: Report,
-        say: Callable[[str], None],
+        say: Callable[[str], object],
         corrected: CorrectedTrajectory | None = None,
     ):
         """Connect a map to sinks.
@@ -114,3 +118,16 @@ class Node:
             except Exception as error:  # a sink may use any library
                 self._sinks.remove(sink)
                 self._report(f"sink {id(sink)}", f"{type(sink).__name__} is left out: {in_short(error, most=300)}")
+
+
+def warm_up(params: Params, config: DetectorConfig, *, odometry: bool) -> None:
+    """Compile all programs of the search by random scans, so that no scan is dropped meanwhile."""
+    anything = {"recent_m": 1e-9, "good_correlation": 2.0, "min_coarse_correlation": -1.0, "min_correlation": -1.0}
+    rules = dataclasses.replace(config.candidates, **anything)
+    detector = LoopDetector(params, config=dataclasses.replace(config, candidates=rules, max_places=None))
+    draw = np.random.default_rng(0)
+    for i in range(WARM_UP):
+        points = draw.uniform((-20, -20, -1), (20, 20, 3), (4000, 3)).astype(np.float32)
+        pose = np.eye(4)
+        pose[0, 3] = 0.01 * i
+        detector.add(points, time=0.7 * i, odometry=pose if odometry else None)

@@ -1,16 +1,64 @@
-"""Files of a live map for other programs, written when the node ends."""
+"""Results of a live map: the trajectory that its loops correct after each scan, and files for other programs."""
 
+from collections import deque
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from sglpr_jax.files import write_all
-from sglpr_jax.live.corrected import CorrectedTrajectory
 from sglpr_jax.live.live_map import LiveMap
+from sglpr_jax.live.messages import Report
 from sglpr_jax.pose_graph.files import write_g2o, write_loops_csv, write_rejected_jsonl, write_tum
+from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
 GRAPH, TABLE, REJECTED = "loops.g2o", "loops.csv", "rejected.jsonl"
 TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
+
+
+class CorrectedTrajectory:
+    """Follows a `LiveMap`: `update` takes its new scans and loops."""
+
+    def __init__(self, live: LiveMap):
+        """Create the trajectory of a map. Raises ImportError if gtsam is not installed."""
+        self._live, self._trajectory = live, IncrementalTrajectory(drift=live.detector.config.drift)
+        self._loops = 0
+
+    @property
+    def map_from_world(self) -> Float[np.ndarray, "4 4"] | None:
+        """Correction of the odometry at the last scan. None without odometry, and while no loop connects the odometry
+        with that before a restart."""
+        return self._trajectory.map_from_world if len(self._trajectory) else None
+
+    @property
+    def poses(self) -> Float[np.ndarray, "n 4 4"]:
+        """Corrected poses. NaN in parts that no loop connects with the first one."""
+        return self._trajectory.poses
+
+    def update(self) -> None:
+        """Take the scans and loops since the last call."""
+        poses, segments = self._live.odometry, self._live.detector.finder.motion.segments
+        loops = deque(sorted(self._live.detector.loops[self._loops :], key=lambda loop: loop.query))
+        self._loops += len(loops)
+        for frame in range(len(self._trajectory), len(poses)):
+            known = []
+            while loops and loops[0].query <= frame:
+                known.append(loops.popleft())
+            continues = frame == 0 or segments[frame] == segments[frame - 1]
+            self._trajectory.add(poses[frame], known, continues=bool(continues))
+
+
+def corrected_trajectory(live: LiveMap, *, odometry: bool, report: Report) -> CorrectedTrajectory | None:
+    """Create the trajectory of a map with odometry. Without gtsam, report a line and return None."""
+    if not odometry:
+        return None
+    try:
+        return CorrectedTrajectory(live)
+    except ImportError as error:
+        report("gtsam", f"the map has no transform from map to odometry: {error}")
+        return None
 
 
 def write_results(live: LiveMap, folder: Path, *, corrected: CorrectedTrajectory | None = None) -> list[Path]:
@@ -21,19 +69,18 @@ def write_results(live: LiveMap, folder: Path, *, corrected: CorrectedTrajectory
     The graph has no edge between scans whose motion is unknown, as before and after a restart. Returns the paths.
     Raises WriteError if a file cannot be written.
     """
-    detector, loops, odometry = live.detector, live.detector.loops, live.odometry
+    detector, odometry = live.detector, live.odometry
     segments = detector.finder.motion.segments
     parts = np.split(np.arange(len(odometry)), np.flatnonzero(np.diff(segments)) + 1) if len(odometry) else []
-    files = {
-        GRAPH: lambda path: write_g2o(
-            path, loops, [(rows, odometry[rows]) for rows in parts], drift=detector.config.drift
-        ),
-        TABLE: lambda path: write_loops_csv(path, loops),
-        REJECTED: lambda path: write_rejected_jsonl(path, detector.rejected),
+    driven = [(rows, odometry[rows]) for rows in parts]
+    files: dict[str, Callable[[Path], object]] = {
+        GRAPH: partial(write_g2o, loops=detector.loops, chains=driven, drift=detector.config.drift),
+        TABLE: partial(write_loops_csv, loops=detector.loops),
+        REJECTED: partial(write_rejected_jsonl, rejected=detector.rejected),
     }
     if len(odometry):
-        files[TRAJECTORY] = lambda path: write_tum(path, odometry, live.stamps)
+        files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)
     if len(odometry) and corrected is not None:
         known = np.isfinite(poses := corrected.poses).all(axis=(1, 2))
-        files[CORRECTED] = lambda path: write_tum(path, poses[known], live.stamps[known])
+        files[CORRECTED] = partial(write_tum, poses=poses[known], times=live.stamps[known])
     return write_all(folder, files)

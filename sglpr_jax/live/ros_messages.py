@@ -6,7 +6,7 @@ Messages are encoded by rosbags. Scans and poses are decoded by the readers of b
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, Header, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.files import in_short
-from sglpr_jax.live.frame import LoopEdge
+from sglpr_jax.live.messages import LoopEdge
 from sglpr_jax.se3 import quaternions
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -34,6 +34,19 @@ LINE_M = 0.3
 """Width of the lines of loops, in metres."""
 
 
+class Received(NamedTuple):
+    """A message as it arrived."""
+
+    kind: str
+    """Type, such as "sensor_msgs/msg/PointCloud2"."""
+    raw: bytes
+    """The encoded message."""
+    publisher: Any
+    """Value that tells one publisher of the topic from others."""
+    at: float
+    """Time of arrival by `time.monotonic()`, in seconds."""
+
+
 @functools.cache
 def typestore() -> Any:
     """Definitions of messages by rosbags: those of ROS 2 Jazzy, and Livox's CustomMsg."""
@@ -43,36 +56,21 @@ def typestore() -> Any:
     return types
 
 
-@functools.cache
-def ros1_typestore() -> Any:
-    """Definitions of messages by rosbags: those of ROS 1 Noetic, and tf's."""
-    types = get_typestore(Stores.ROS1_NOETIC)
-    types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TRANSFORMS))
-    return types
-
-
 def encode(message: Any) -> bytes:
     """Encode a message of `typestore`, with the four bytes of the encapsulation header."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
-def decode_cloud(raw: bytes, kind: str, *, cdr: bool = True) -> tuple[Header, Records]:
-    """Decode a scan.
+def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Records]:
+    """Decode a scan, a message of one of the types `CLOUDS`.
 
-    Arguments:
-      raw: The encoded message.
-      kind: Type of the message, one of `CLOUDS`.
-      cdr: Whether it is encoded as ROS 2 does, with the encapsulation header, or as ROS 1.
-
-    Raises:
-      ValueError: If the message is damaged, or the cloud has no x, y and z.
+    Raises ValueError if the message is damaged, or the cloud has no x, y and z.
     """
     try:
-        header = RosMessage(raw, cdr=cdr).header()
+        header = RosMessage(raw, cdr=True).header()
         if kind == CLOUD:
-            decode = typestore().deserialize_cdr if cdr else ros1_typestore().deserialize_ros1
-            return header, read_point_cloud2(decode(raw, kind))
-        return header, read_custom_msg(RosMessage(raw, cdr=cdr))
+            return header, read_point_cloud2(typestore().deserialize_cdr(raw, kind))
+        return header, read_custom_msg(RosMessage(raw, cdr=True))
     except Exception as error:  # the sender defines the lengths, types and names of the fields
         raise ValueError(f"expected a cloud with points, found an invalid one ({in_short(error)})") from error
 

@@ -17,9 +17,8 @@ from sglpr_jax.data.formats.ros_messages import (
     tracks_of,
 )
 from sglpr_jax.data.poses import interpolate, interpolate_turns, poses_of
-from sglpr_jax.live.report import Report
-from sglpr_jax.live.ros_messages import TRANSFORMS
-from sglpr_jax.live.ros_wire import Received
+from sglpr_jax.live.messages import Report
+from sglpr_jax.live.ros_messages import TRANSFORMS, Received
 
 KINDS = (*POSES, TRANSFORMS)
 """Types of messages with odometry."""
@@ -47,7 +46,7 @@ class LiveOdometry:
 
     def receive(self, message: Received) -> None:
         """Add the poses of a message of odometry or tf."""
-        found = RosMessage(message.raw, cdr=message.cdr)
+        found = RosMessage(message.raw, cdr=True)
         poses = read_transforms(found) if message.kind == TRANSFORMS else [POSES[message.kind](found)]
         with self._changed:
             for pose in map(_plain, poses):
@@ -64,7 +63,7 @@ class LiveOdometry:
     def receive_static(self, message: Received) -> None:
         """Add the transforms of a message of /tf_static."""
         with self._changed:
-            for pose in map(_plain, read_transforms(RosMessage(message.raw, cdr=message.cdr))):
+            for pose in map(_plain, read_transforms(RosMessage(message.raw, cdr=True))):
                 self._static[pose.frame, pose.child] = pose
 
     def pose(self, time: float, lidar: str, *, wait_s: float) -> Float[np.ndarray, "4 4"] | None:

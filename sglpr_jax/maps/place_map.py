@@ -31,8 +31,7 @@ from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
 from sglpr_jax.registration.config import VerificationConfig
-from sglpr_jax.retrieval.index import Index
-from sglpr_jax.retrieval.index_rows import check_scale, check_weights
+from sglpr_jax.retrieval.index import Index, check_scale, check_weights
 from sglpr_jax.same_place import NEGATIVE_M
 from sglpr_jax.schema import Column, check_columns
 from sglpr_jax.se3 import ROTATION_TOLERANCE, inverse

@@ -13,7 +13,7 @@ from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.files import file_name
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL, NO_SEGMENTATION
 from sglpr_jax.reproduce.runs import Runs
-from sglpr_jax.retrieval.heat_maps import heat_maps
+from sglpr_jax.retrieval.image_maps import heat_maps
 
 if TYPE_CHECKING:
     import matplotlib.figure

@@ -1,12 +1,16 @@
 """Computes the descriptor file of a recording, with a model or with any function of images or points."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int32, Num
+from jaxtyping import Array, Bool, Float, Float32, Int32, Num, Shaped
 
+from sglpr_jax.bev import rotate_image
 from sglpr_jax.data.deskew import DESKEWED
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record, Recording
@@ -17,13 +21,13 @@ from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned.content import require_content
-from sglpr_jax.methods.method import DescribeFn, ImageMethod, Method, RecordMethod, ScanMethod
+from sglpr_jax.methods.learned.describe import check_descriptors
+from sglpr_jax.methods.method import ImageMethod, Method, RecordMethod, ScanMethod
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
-from sglpr_jax.retrieval.record_descriptors import record_descriptors
 
 SCANS_AHEAD = 8
 """Number of scans that are read ahead."""
@@ -60,116 +64,100 @@ def embed(
     """
     method = network(method) if isinstance(method, Params) else method
     _check(method, recording)
-    options = {"rotation_seed": rotation_seed, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    if isinstance(method, ScanMethod):
-        return embed_scans(method, recording, **options)
-    if isinstance(method, RecordMethod):
-        return embed_records(method, recording, batch=batch, **options)
-    return embed_images(method, recording, batch=batch, **options)
-
-
-def embed_images(
-    method: ImageMethod,
-    recording: Recording,
-    *,
-    rotation_seed: int | None = None,
-    batch: int = 8,
-    on_bad_scan: OnBadScan | None = None,
-    on_progress: Callable[[int], None] = lambda done: None,
-) -> DescriptorFile:
-    """Describe the image of every scan of a recording. The arguments are those of `embed`."""
     check_value(batch, Size, "batch")
-    batch = _batch_for(len(recording), batch)
-    angles = _angles(len(recording), rotation_seed)
-    rows, views = [], []
-    descriptors = _Descriptors()
-
-    def see(row: int, record: Record) -> View:
-        angle = None if angles is None else jnp.float32(angles[row])
-        found = view(record, method.grid, image=method.image, categories=method.categories, angle=angle)
-        _check_view(np.asarray(found.image), method.field, name=record.name)
-        return found
-
-    labels = bool(method.categories)
+    batch = 1 if isinstance(method, ScanMethod) else min(batch, 2 ** max(len(recording) - 1, 0).bit_length())
+    angles = None
+    if rotation_seed is not None:
+        angles = np.random.default_rng(rotation_seed).uniform(0, 2 * np.pi, len(recording))
+    prepare, describe, labels = _steps(method, angles, batch)
     options = {"labels": labels, "ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    for row, seen in scan_stream(recording, see, **options):
-        if seen is None:
-            continue
-        rows.append(row)
-        views.append(seen)
-        if len(views) == batch:
-            descriptors.add(_describe_padded(method.describe, views, batch))
-            views = []
-    if views:
-        descriptors.add(_describe_padded(method.describe, views, batch))
-    return _file(method, recording, rows, descriptors.all(), rotation_seed=rotation_seed)
+    rows, waiting, found = [], [], []
 
+    def describe_waiting() -> None:
+        names = [f"scan {recording.ids[row]} of sequence {recording.name}" for row in rows[-len(waiting) :]]
+        found.append(describe(waiting + [waiting[-1]] * (batch - len(waiting)), names))
+        found[-2:-1] = [np.asarray(one, np.float32) for one in found[-2:-1]]  # JAX computes the last batch meanwhile
+        waiting.clear()
 
-class _Descriptors:
-    """Descriptors of finished batches. JAX computes the last batch while the next images are read."""
-
-    def __init__(self):
-        self._done: list[Float32[np.ndarray, "b d"]] = []
-        self._computing: list[Num[Array | np.ndarray, "b d"]] = []
-
-    def add(self, batch: Num[Array | np.ndarray, "b d"]) -> None:
-        """Add a batch and wait for the previous one, so that at most two are in memory."""
-        self._done += [np.asarray(one, np.float32) for one in self._computing]
-        self._computing = [batch]
-
-    def all(self) -> list[Float32[np.ndarray, "b d"]]:
-        """Wait for the last batch and return all descriptors. The last rows are those of its padding."""
-        return [*self._done, *(np.asarray(one, np.float32) for one in self._computing)]
-
-
-def embed_scans(
-    method: ScanMethod,
-    recording: Recording,
-    *,
-    rotation_seed: int | None = None,
-    on_bad_scan: OnBadScan | None = None,
-    on_progress: Callable[[int], None] = lambda done: None,
-) -> DescriptorFile:
-    """Describe the finite points of every scan of a recording. The arguments are those of `embed`.
-
-    Equal rotation seeds give the same angles as in `embed_images`. If the method needs labels, a scan without labels
-    counts as unreadable.
-    """
-    angles = _angles(len(recording), rotation_seed)
-    rows, descriptors = [], []
-
-    def see(row: int, record: Record) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-        points, classes = _finite_points(record, labels=method.labels)
-        return points if angles is None else rotated(points, angles[row]), classes
-
-    options = {"labels": method.labels, "ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    for row, seen in scan_stream(recording, see, **options):
+    for row, seen in scan_stream(recording, prepare, **options):
         if seen is not None:
             rows.append(row)
-            descriptors.append(method.describe(*seen)[None])
-    return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
+            waiting.append(seen)
+            if len(waiting) == batch:
+                describe_waiting()
+    if waiting:
+        describe_waiting()
+    return _file(method, recording, rows, found, rotation_seed=rotation_seed)
 
 
-def embed_records(
-    method: RecordMethod,
-    recording: Recording,
-    *,
-    rotation_seed: int | None = None,
-    batch: int = 8,
-    on_bad_scan: OnBadScan | None = None,
-    on_progress: Callable[[int], None] = lambda done: None,
-) -> DescriptorFile:
-    """Describe every scan or image of a recording with a learned method of another publication.
+class _Steps(NamedTuple):
+    """How a method describes scans."""
 
-    The arguments are those of `embed`. Raises ValueError, with the method and the scan, if inputs or descriptors differ
-    in shape, or if a descriptor is not finite or contains only zeros.
-    """
-    check_value(batch, Size, "batch")
-    angles = _angles(len(recording), rotation_seed)
-    options = {"ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    found = list(record_descriptors(method, recording, angles, batch=_batch_for(len(recording), batch), **options))
-    rows, descriptors = [row for row, _ in found], [one[None] for _, one in found]
-    return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
+    prepare: Callable[[int, Record], Any]
+    """Input for the method, from the row and the record of a scan. Called in several threads."""
+    describe: Callable[[list[Any], list[str]], Num[Array | np.ndarray, "b d"]]
+    """Descriptors of a batch of inputs, which is padded, and the names of its scans, without padding."""
+    labels: bool
+    """Whether the labels of the scans are read, too."""
+
+
+def _steps(method: Method, angles: Float[np.ndarray, " n"] | None, batch: int) -> _Steps:
+    if isinstance(method, ImageMethod):
+        return _Steps(partial(_image_input, method, angles), partial(_describe_images, method), bool(method.categories))
+    if isinstance(method, RecordMethod):
+        labels = method.takes == "labelled points"
+        return _Steps(partial(_record_input, method, angles), partial(_describe_records, method), labels)
+    return _Steps(partial(_scan_input, method, angles), lambda seen, _: method.describe(*seen[0])[None], method.labels)
+
+
+def _image_input(method: ImageMethod, angles: Float[np.ndarray, " n"] | None, row: int, record: Record) -> View:
+    angle = None if angles is None else jnp.float32(angles[row])
+    found = view(record, method.grid, image=method.image, categories=method.categories, angle=angle)
+    _check_view(np.asarray(found.image), method.field, name=record.name)
+    return found
+
+
+def _describe_images(method: ImageMethod, views: list[View], names: list[str]) -> Num[Array | np.ndarray, "b d"]:
+    """Describe images in a call of constant shape, so that it compiles once. Does not wait for the result."""
+    stacked = jax.tree.map(lambda *each: np.stack(each), *views)
+    return method.describe(*(each for each in stacked if each is not None))
+
+
+def _scan_input(
+    method: ScanMethod, angles: Float[np.ndarray, " n"] | None, row: int, record: Record
+) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
+    """The finite points of a scan, and their classes if the method needs them."""
+    assert record.points is not None
+    finite = np.isfinite(record.points).all(axis=1)
+    points, classes = record.upright_points[finite], classes_of(record, 20)[finite] if method.labels else None
+    return points if angles is None else rotated(points, angles[row]), classes
+
+
+def _record_input(
+    method: RecordMethod, angles: Float[np.ndarray, " n"] | None, row: int, record: Record
+) -> Shaped[np.ndarray, "..."]:
+    return method.prepare(record if angles is None else rotated_record(record, float(angles[row])))
+
+
+def rotated_record(record: Record, angle: float) -> Record:
+    """Return a record whose scan or image is rotated by an angle in radians, counter-clockwise."""
+    if record.points is not None:
+        return replace(record, points=rotated(record.upright_points, angle), mounting=None)
+    assert record.image is not None
+    return replace(record, image=np.asarray(rotate_image(jnp.asarray(record.image), jnp.float32(angle))))
+
+
+def _describe_records(method: RecordMethod, inputs: list[np.ndarray], names: list[str]) -> Float32[np.ndarray, "n d"]:
+    """Describe inputs in a call of constant shape. Raises ValueError, with the method and the scan, if inputs differ in
+    shape, or if a descriptor is not finite or contains only zeros."""
+    name = method.about["method"]
+    for scan, one in zip(names, inputs, strict=False):
+        if one.shape != inputs[0].shape:
+            raise ValueError(
+                f"{name}: expected an input {inputs[0].shape} of {scan} as of {names[0]}, found {one.shape}"
+            )
+    described = np.asarray(method.describe(np.stack(inputs)))
+    return check_descriptors(name, described[: len(names)], names)
 
 
 def scan_image(
@@ -220,18 +208,17 @@ def _check(method: Method, recording: Recording) -> None:
         raise ValueError(f"{name} needs {beside}")
 
 
-def _angles(n: int, seed: int | None) -> Float[np.ndarray, " n"] | None:
-    return None if seed is None else np.random.default_rng(seed).uniform(0, 2 * np.pi, n)
-
-
 def _file(
-    method: Method, recording: Recording, rows: list[int], descriptors: list[np.ndarray], *, rotation_seed: int | None
+    method: Method, recording: Recording, rows: list[int], descriptors: list[Any], *, rotation_seed: int | None
 ) -> DescriptorFile:
     """Return the descriptor file of the given rows. Raises ValueError if there are no rows.
 
     `descriptors` may contain additional rows at the end, the padding of the last batch.
     """
     check_readable(recording, len(rows))
+    sizes = sorted({one.shape[1] for one in descriptors})
+    if len(sizes) > 1:
+        raise ValueError(f"{method.about['method']}: expected descriptors of one length, found {sizes}")
     sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
     skipped = sorted(set(range(len(recording))) - set(rows))  # needed to add poses of all scans later
     made = {name: value for name, value in recording.read_options.items() if name in (DESKEWED, SUBMAPS)}
@@ -242,33 +229,9 @@ def _file(
         ids=tuple(recording.ids[row] for row in rows),
         positions=None if recording.positions is None else recording.positions[rows],
         times=None if recording.times is None else recording.times[rows],
-        descriptors=np.concatenate(descriptors)[: len(rows)],
+        descriptors=np.concatenate([np.asarray(one, np.float32) for one in descriptors])[: len(rows)],
         pose_source=recording.pose_source,
         config={**config, SKIPPED: skipped} if skipped else config,
         weights_hash=method.weights_hash,
         distance="l2" if isinstance(method, ImageMethod) else method.distance,
     )
-
-
-def _finite_points(
-    record: Record, *, labels: bool
-) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """Return the finite points of one scan and, with `labels`, their classes."""
-    assert record.points is not None
-    finite = np.isfinite(record.points).all(axis=1)
-    return record.upright_points[finite], classes_of(record, 20)[finite] if labels else None
-
-
-def _batch_for(scans: int, batch: int) -> int:
-    """Return `batch` or, for fewer scans, the next power of two: few sizes are compiled, and little padding is
-    described."""
-    return min(batch, 2 ** max(scans - 1, 0).bit_length())
-
-
-def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Num[Array | np.ndarray, "b d"]:
-    """Describe up to `batch` images in a call of constant shape, so that it compiles once. Does not wait for the
-    result."""
-    padded = views + [views[-1]] * (batch - len(views))
-    stacked = jax.tree.map(lambda *each: np.stack(each), *padded)
-    inputs = [each for each in stacked if each is not None]
-    return describe(*inputs)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sglpr_jax.retrieval.index_rows import check_asked, checked_rows
+from sglpr_jax.retrieval.index import check_asked, checked_rows
 from sglpr_jax.retrieval.parquet import KEY, about_of, check_made_alike, usable
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class FleetIndex:
         if self.table is None:
             raise ValueError(f"{self.place}: expected an index with places, found none")
         asked = checked_rows(descriptors, self.table.schema.field("descriptor").type.list_size)
-        check_asked(k, None, queries=len(asked), places=k)
+        check_asked(k, queries=len(asked), places=k)
         with usable(self.place):
             search = self.table.search(list(asked) if len(asked) > 1 else asked[0], vector_column_name="descriptor")
             search = search.distance_type("l2").select([KEY, *columns, "_distance"]).limit(k)

@@ -9,11 +9,11 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
@@ -23,32 +23,33 @@ from sglpr_jax.files import in_short, naming, parse_json, replacing
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function, smallest
-from sglpr_jax.retrieval.index_rows import (
-    Found,
-    check_asked,
-    check_weights,
-    checked_rows,
-    given_flags,
-    nearest_of,
-    new_places,
-    places_of,
-)
 from sglpr_jax.revisits import are_recent
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
-from sglpr_jax.schema import check_about, check_columns, check_texts
+from sglpr_jax.schema import check_about, check_columns
 
 FORMAT = "sglpr-jax index 1"
 """Format in every file."""
 ABOUT = {"width": Size, "weights_hash": str, "distance": str, "scale": Scale, "ids": list}
 """JSON values in the header of every file. Older files have no scale, which is 1."""
-TYPES = ("F32", "F64", "U8", "I64")
-"""Types of arrays in every file, also of the additional arrays of `to_bytes`, in the terms of safetensors."""
 SPARE = 16
 """Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
 FEW = 4
 """If at most one of this many rows is allowed, only the allowed ones are compared."""
 BLOCK = 64
 """Number of queries compared with all rows at a time."""
+MOST = 2**20
+"""Maximum number of answers to a query, unless an index has more places."""
+MOST_ANSWERS = 2**26
+"""Maximum number of answers to all queries of a call: 1 GiB of rows and distances. A single query may have more."""
+
+
+class Found(NamedTuple):
+    """Nearest k places of each query, nearest first."""
+
+    rows: Int[np.ndarray, "*q k"]
+    """Row of each place; -1 if fewer than k places can be returned."""
+    distances: Float[np.ndarray, "*q k"]
+    """Descriptor distance of each place; infinite if fewer than k places can be returned."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -150,8 +151,22 @@ class Index:
             the places have other fields than the places before.
         """
         check_weights(self.weights_hash, weights_hash)
-        n, about = len(self), {"ids": ids, "times": times, "positions": positions}
-        names, new = new_places(descriptors, width=self.width, first=n, before=list(self._columns), **about)
+        rows = checked_rows(descriptors, self.width)
+        n = len(rows)
+        names = [f"{row:06d}" for row in range(len(self), len(self) + n)] if ids is None else ids
+        names = [names] if isinstance(names, str) else [str(name) for name in names]
+        if len(names) != n:
+            raise ValueError(f"expected {n} ids, one per descriptor, found {len(names)}")
+        new = {"descriptors": rows}
+        if times is not None:
+            new["times"] = _finite("times", np.reshape(times, -1), (n,))
+        if positions is not None:
+            new["positions"] = _finite("positions", np.reshape(positions, (-1, 3)), (n, 3))
+        if len(self) and set(new) != set(self._columns):
+            before, found = ", ".join(self._columns), ", ".join(new)
+            raise ValueError(f"expected places with {before}, like the existing places, found {found}")
+        if not n:  # a new column would require all later places to have it
+            return
         for name, values in new.items():
             self._columns.setdefault(name, GrowingArray(values[:0])).extend(values)
         self.ids += names
@@ -167,7 +182,11 @@ class Index:
 
     def add_file(self, file: DescriptorFile) -> None:
         """Add the places of a descriptor file. Raises ValueError if another model, method or scale made it."""
-        self.add(**places_of(file, distance=self.distance, scale=self.scale))
+        check_scale(self.scale, file.scale)
+        if file.distance != self.distance:
+            raise ValueError(f"expected descriptors compared by {self.distance}, found {file.distance}")
+        about = {"times": file.times, "positions": file.positions, "weights_hash": file.weights_hash}
+        self.add(file.descriptors, ids=file.ids, **about)
 
     def query(
         self,
@@ -195,9 +214,8 @@ class Index:
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
-        excluded = given_flags(exclude)
-        check_asked(k, excluded, queries=len(queries), places=len(self))
-        allowed = np.ones(len(self), bool) if excluded is None else ~excluded
+        check_asked(k, queries=len(queries), places=len(self))
+        allowed = ~self._excluded(exclude)
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
         there = min(k, int(allowed.sum()))
@@ -255,23 +273,31 @@ class Index:
             check_weights(index.weights_hash, weights_hash)
         return index, arrays
 
+    def _excluded(self, flags: ArrayLike | None) -> Bool[np.ndarray, " n"]:
+        """Convert the flags of excluded places to an array. Raises ValueError unless they are a boolean a place."""
+        excluded = np.zeros(len(self), bool) if flags is None else np.asarray(flags)
+        if excluded.dtype != bool and excluded.size:
+            raise ValueError(f"expected flags (True or False) of places to exclude, found {excluded.dtype}")
+        if excluded.shape != (len(self),):
+            raise ValueError(f"expected one flag for each of {len(self)} places to exclude, found {excluded.shape}")
+        return excluded.astype(bool)
+
     def _nearest(
         self, queries: Float[np.ndarray, "q d"], allowed: Bool[np.ndarray, " n"], k: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed."""
+        rows = np.flatnonzero(allowed)
         if self.distance != "l2":
-            rows = np.flatnonzero(allowed)
             every = distance_function(self.distance)(queries, self.descriptors[rows])
             order = smallest(every, k)
             return rows[order], np.take_along_axis(every, order, axis=1)
-        rows = np.flatnonzero(allowed)
         few = min(k + SPARE, len(rows))
         if len(rows) * FEW <= len(self):
             rough = self._squares()[rows] - 2 * queries @ self.descriptors[rows].T
             near = rows[np.argpartition(rough, few - 1, axis=1)[:, :few]]
         else:
             near = np.argpartition(np.where(allowed, self._rough(queries), np.inf), few - 1, axis=1)[:, :few]
-        found = [nearest_of(query, self.descriptors[row], row, k) for query, row in zip(queries, near, strict=True)]
+        found = [_nearest_of(query, self.descriptors[row], row, k) for query, row in zip(queries, near, strict=True)]
         return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
 
     def _rough(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
@@ -310,9 +336,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            _check_types({name: file.get_slice(name).get_dtype() for name in file.keys()})  # noqa: SIM118
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, ValueError) as error:
+    except Exception as error:  # also numpy's, for types that it lacks
         raise ValueError(f"{path}: expected an index, found an invalid safetensors file ({in_short(error)})") from error
     text = metadata.get("about", "")
     if metadata.get("sha256") != _checksum(text, arrays):
@@ -320,20 +345,63 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     about = parse_json(text, source=f"{path}, `about`")
     about = {"scale": 1, **about} if isinstance(about, dict) else about
     with naming(path):
-        _check_index(about, arrays)
+        check_about(about, ABOUT, format=FORMAT)
+        if not all(type(name) is str for name in about["ids"]):
+            raise ValueError(f"expected `ids` as a list of strings, found {about['ids']!r:.60}")
+        distance_function(about["distance"])
+        check_columns(arrays, COLUMNS, n=len(about["ids"]), width=about["width"])
     return about, arrays
 
 
-def _check_types(found: Mapping[str, str]) -> None:
-    """Raises ValueError if an array has a type that no index has. Numpy lacks some types of safetensors."""
-    for name, dtype in found.items():
-        if dtype not in TYPES:
-            raise ValueError(f"array {name!r:.60} of type {dtype}")
+def checked_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:
+    """Return one descriptor or several as float32 rows. Raises ValueError for a wrong width, NaN or infinity."""
+    try:
+        rows = np.atleast_2d(np.asarray(descriptors, np.float32))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected descriptors of {width} numbers, found others ({in_short(error)})") from error
+    return _finite("descriptors", rows, (len(rows), width)).astype(np.float32)
 
 
-def _check_index(about: Any, arrays: dict[str, np.ndarray]) -> None:
-    """Raise ValueError if the content is not that of an index."""
-    check_about(about, ABOUT, format=FORMAT)
-    check_texts(about["ids"], name="ids")
-    distance_function(about["distance"])
-    check_columns(arrays, COLUMNS, n=len(about["ids"]), width=about["width"])
+def check_asked(k: int, *, queries: int, places: int) -> None:
+    """Raise ValueError if k is below 1 or exceeds both `MOST` and `places`, or if the answers to several queries exceed
+    `MOST_ANSWERS`."""
+    if not 1 <= k <= max(MOST, places):
+        raise ValueError(f"expected k from 1 up to {max(MOST, places)}, found {k}")
+    if queries > 1 and queries * k > MOST_ANSWERS:
+        raise ValueError(f"expected at most {MOST_ANSWERS // k} queries at a time for k = {k}, found {queries}")
+
+
+def check_weights(expected: str, found: str | None) -> None:
+    """Raise ValueError if descriptors come from other weights. None skips the check."""
+    if found is not None and found != expected:
+        raise ValueError(
+            f"expected descriptors of the weights {expected[:12] or '(none)'}, "
+            f"found those of {found[:12] or '(none)'}: descriptors of different models are not comparable"
+        )
+
+
+def check_scale(expected: Scale, found: Scale) -> None:
+    """Raise ValueError if descriptors come from scans of another scale."""
+    if found != expected:
+        raise ValueError(
+            f"expected scale {expected}, found scale {found}: descriptors of scans with different scales are not "
+            "comparable"
+        )
+
+
+def _nearest_of(
+    query: Float[np.ndarray, " d"], descriptors: Float[np.ndarray, "n d"], rows: Int[np.ndarray, " n"], k: int
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return the nearest k of a few candidates by their distances in float64, ties in the order of their rows."""
+    apart = np.linalg.norm(query.astype(np.float64) - descriptors, axis=1)
+    order = np.lexsort((rows, apart))[:k]
+    return rows[order], apart[order]
+
+
+def _finite(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    values = np.asarray(values, np.float64 if name != "descriptors" else np.float32)
+    if values.shape != shape:
+        raise ValueError(f"expected {name} of shape {shape}, found {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"expected finite {name}, found NaN or infinity")
+    return values

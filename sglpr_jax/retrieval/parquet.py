@@ -136,10 +136,6 @@ def usable(address: str) -> Iterator[None]:
         raise ValueError(f"{address}: expected a store that can be read and written, found: {found}") from error
 
 
-if TYPE_CHECKING:
-    import pyarrow
-
-
 class Stored(NamedTuple):
     """Result of `embed_to_store`."""
 
@@ -176,10 +172,13 @@ def embed_to_store(
     name = file_name(f"{recording.name}-{fingerprint(recording, contents=True)}")
     folder = f"{store.rstrip('/')}/{file_name(method.about['method'])}-{hashed}"
     address = f"{folder}/{name}.parquet"
-    if _exists(address):
-        return Stored(address, None)
-    file = embed(method, recording, **options)
-    rows = place_rows(file, name, site=site, source=source, rotations=_rotations(file, recording))
+    with usable(address):
+        filesystem, path = _open(address)
+        if filesystem.exists(path):
+            return Stored(address, None)
+    file, poses = embed(method, recording, **options), recording.world_from_lidar
+    rotations = None if poses is None else poses[file.recorded][:, :3, :3]
+    rows = place_rows(file, name, site=site, source=source, rotations=rotations)
     _put(address, rows)
     return Stored(address, len(rows))
 
@@ -188,7 +187,8 @@ def stored_places(store: str) -> list[str]:
     """Return the addresses of all Parquet files of a store. Raises ValueError if it cannot be read."""
     with usable(store):
         filesystem, path = _open(store)
-        return [filesystem.unstrip_protocol(found) for found in sorted(filesystem.find(path)) if _is_places(found)]
+        names = [found for found in sorted(filesystem.find(path)) if not found.rpartition("/")[2].startswith(".")]
+        return [filesystem.unstrip_protocol(name) for name in names if name.endswith(".parquet")]
 
 
 def read_places(address: str) -> "pyarrow.Table":
@@ -200,16 +200,6 @@ def read_places(address: str) -> "pyarrow.Table":
         rows = pyarrow.parquet.read_table(io.BytesIO(filesystem.cat_file(path)))
     about_of(rows.schema, address)
     return rows
-
-
-def _is_places(path: str) -> bool:
-    return path.endswith(".parquet") and not path.rpartition("/")[2].startswith(".")
-
-
-def _exists(address: str) -> bool:
-    with usable(address):
-        filesystem, path = _open(address)
-        return filesystem.exists(path)
 
 
 def _put(address: str, rows: "pyarrow.Table") -> None:
@@ -233,8 +223,3 @@ def _open(address: str) -> tuple[Any, str]:
     import fsspec
 
     return fsspec.core.url_to_fs(address)
-
-
-def _rotations(file: DescriptorFile, recording: Recording) -> Float[np.ndarray, "n 3 3"] | None:
-    """Rotations of the described scans, if the recording has poses with rotations."""
-    return None if recording.world_from_lidar is None else recording.world_from_lidar[file.recorded][:, :3, :3]

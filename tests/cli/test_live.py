@@ -97,7 +97,7 @@ def test_wrong_sources_and_folders_are_one_line(tmp_path):
     (tmp_path / "scans").mkdir()
     out = ("--out", tmp_path / "map", "--weights", "circular")
     ended = run_command("live", "ros:1", *out)
-    assert_one_line_error(ended, "ros:1: expected one of the sources folder, bag, dds, zenoh, ros1, found ros")
+    assert_one_line_error(ended, "ros:1: expected one of the sources folder, bag, dds, zenoh, found ros")
     own = tmp_path / "map" / "trajectory.tum"
     ended = run_command("live", f"folder:{tmp_path / 'scans'}", *out, "--poses", own)
     assert_one_line_error(ended, "trajectory.tum: expected odometry that this run does not overwrite")

@@ -14,7 +14,7 @@ from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.methods.method import ScanMethod
-from sglpr_jax.retrieval.embed import embed_scans
+from sglpr_jax.retrieval.embed import embed
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_a_batch_and_an_embedding_open_each_file_once_a_place(recording, opened)
         name: 3 for name in ("000000.bin", "000000.label", "000003.bin", "000003.label")
     }
     opened.clear()
-    embed_scans(ScanMethod(lambda points, _: points[0], labels=False, distance="l2", about={}), recording)
+    embed(ScanMethod(lambda points, _: points[0], labels=False, distance="l2", about={"method": "first"}), recording)
     assert sum(opened.values()) == 3
 
 

@@ -1,13 +1,12 @@
 """A short simulated drive that comes back, and reports as a list."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.live.frame import LiveFrame
+from sglpr_jax.live.messages import LiveFrame
 from sglpr_jax.sim import recording
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.sensor import Sensor
@@ -41,6 +40,10 @@ class Said(list):
     def kinds(self) -> list[str]:
         return [kind for kind, _ in self]
 
+    def of(self, kind: str) -> list[str]:
+        """Texts of the events of a kind."""
+        return [text for one, text in self if one == kind]
+
 
 @pytest.fixture
 def said() -> Said:
@@ -52,11 +55,3 @@ def live_frame(drive, i: int, *, pose=None, time: float | None = None, received:
     record = dataclasses.replace(drive.record(i), name=f"scan {i}", mounting=None)
     time = BEGIN + float(drive.times[i]) if time is None else time
     return LiveFrame(record, time, pose, float(drive.times[i]) if received is None else received)
-
-
-def write_scan(folder: Path, drive, i: int) -> Path:
-    """Write a scan as KITTI's .bin, named by its time."""
-    points = drive.points(i)
-    path = folder / f"{BEGIN + drive.times[i]:.6f}.bin"
-    np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(path)
-    return path

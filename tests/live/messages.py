@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sglpr_jax.live.ros_wire import Received
+from sglpr_jax.live.ros_messages import Received
 from tests import bags
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -49,14 +49,3 @@ def transforms(seconds: float, found) -> bytes:
 
 def received(kind: str, cdr: bytes, *, publisher=1, at: float = 0.0) -> Received:
     return Received(kind, cdr, publisher, at)
-
-
-class Said(dict):
-    """Reports: the texts of each kind."""
-
-    def __call__(self, kind: str, text: str) -> None:
-        self.setdefault(kind, []).append(text)
-
-    @property
-    def lines(self) -> list[str]:
-        return [text for texts in self.values() for text in texts]

@@ -1,27 +1,44 @@
 """A map that is continued by another process is that of one process, whatever the odometry does meanwhile."""
 
 import dataclasses
+import itertools
 import os
+import shutil
+import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sglpr_jax.data.formats.pose_files import read_tum
-from sglpr_jax.live.corrected import CorrectedTrajectory
-from sglpr_jax.live.live_map import JOURNAL, LOOPS, LiveMap
-from sglpr_jax.live.results import write_results
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.frame_log import FrameLog
+from sglpr_jax.live.live_map import FRAMES, LOOPS, OLD, SETTINGS, LiveMap, LiveScan, from_bytes, to_bytes
+from sglpr_jax.live.results import CorrectedTrajectory, write_results
+from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.odometry.bev_odometry import Link
 from sglpr_jax.pose_graph.files import read_loops_jsonl
+from sglpr_jax.registration.bev_search import Peak
 from sglpr_jax.se3 import inverse
 from tests.live.conftest import SCANS, live_frame
 
 CONFIG = DetectorConfig(min_probability=0.5)
 HALF = 70
+DRAW = np.random.default_rng(0)
+FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(5, 2))))
+SEEN = Seen(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))
 
 
 def opened(params, folder, said, **more) -> LiveMap:
     return LiveMap(LoopDetector(params, config=CONFIG), folder, report=said, **more)
+
+
+def pairs(loops) -> list[tuple[int, int]]:
+    return [(one.query, one.match) for one in loops]
 
 
 @pytest.fixture(scope="module")
@@ -44,37 +61,53 @@ def test_edges_of_a_drive_are_true_and_on_disk(drive, whole):
         assert np.linalg.norm(drive.positions[edge.query] - drive.positions[edge.match]) < 12
         assert edge.query_time - edge.match_time == pytest.approx(drive.times[edge.query] - drive.times[edge.match])
         assert np.array_equal(edge.world_from_match, drive.poses.world_from_lidar[edge.match])
-    found = read_loops_jsonl(folder / LOOPS)
-    assert [(loop.query, loop.match) for loop in found] == [(edge.query, edge.match) for edge in edges]
+    assert pairs(read_loops_jsonl(folder / LOOPS)) == pairs(edges)
 
 
 @pytest.mark.slow
 def test_a_map_is_recalled_and_its_unfinished_end_removed(params, whole, tmp_path, said):
     folder, edges = whole
-    content, lines = (folder / JOURNAL).read_bytes(), (folder / LOOPS).read_bytes()
-    (tmp_path / JOURNAL).write_bytes(content[:-5])
+    shutil.copy(folder / SETTINGS, tmp_path)
+    content, lines = (folder / FRAMES).read_bytes(), (folder / LOOPS).read_bytes()
+    (tmp_path / FRAMES).write_bytes(content[:-5])
     kept = len(edges) - 4
     (tmp_path / LOOPS).write_bytes(b"".join(lines.splitlines(True)[:kept]) + lines[:9])  # the next line is cut
     live = opened(params, tmp_path, said)
     missed = live.recall()
     assert len(live) == SCANS - 1 and said.kinds == ["cut", "recall", "log"]
-    known = [(edge.query, edge.match) for edge in edges]
-    found = [(loop.query, loop.match) for loop in live.detector.loops]
-    assert kept < len(found) <= len(edges) and found == known[: len(found)]
-    assert [(edge.query, edge.match) for edge in missed] == found[kept:]
-    assert [(loop.query, loop.match) for loop in read_loops_jsonl(tmp_path / LOOPS)] == found
+    found = pairs(live.detector.loops)
+    assert kept < len(found) <= len(edges) and found == pairs(edges)[: len(found)]
+    assert pairs(missed) == found[kept:] and pairs(read_loops_jsonl(tmp_path / LOOPS)) == found
     assert live.names == {f"scan {i}" for i in range(SCANS - 1)}
     live.close()
-    assert (tmp_path / JOURNAL).stat().st_size < len(content) - 5
+    assert (tmp_path / FRAMES).stat().st_size < len(content) - 5
 
 
 @pytest.mark.slow
-def test_loops_to_scans_before_a_restart_are_found_though_the_odometry_began_again(drive, params, tmp_path, said):
-    poses = drive.poses.world_from_lidar
+def test_a_damaged_scan_costs_itself_alone(drive, params, whole, tmp_path, said):
+    folder, edges = whole
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    content = bytearray((folder / FRAMES).read_bytes())
+    content[content.index(b"\x93FR1", len(content) * 9 // 10) + 50] ^= 1
+    (tmp_path / FRAMES).write_bytes(content)
     live = opened(params, tmp_path, said)
-    for i in range(HALF):
-        assert live.add(live_frame(drive, i, pose=poses[i])) is not None
-    del live  # as if it was killed: nothing is closed
+    live.recall()
+    assert said.kinds[0] == "lost" and "1 damaged scans are left out" in said[0][1]
+    assert len(live) == SCANS and len(set(live.detector.finder.motion.segments.tolist())) == 1
+    lost = [i for i in range(SCANS) if f"scan {i}" not in live.names]
+    assert len(lost) == 1 and np.array_equal(live.stamps[lost[0]], live.stamps[lost[0] + 1])
+    assert len(set(pairs(live.detector.loops)) & set(pairs(edges))) > len(edges) // 2
+    live.close()
+
+
+@pytest.mark.slow
+def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(drive, params, whole, tmp_path, said):
+    poses = drive.poses.world_from_lidar
+    shutil.copy(whole[0] / SETTINGS, tmp_path)
+    log = FrameLog(tmp_path / FRAMES)
+    for number, record in itertools.islice(FrameLog(whole[0] / FRAMES).records(), HALF):
+        log.append(number, record)
+    log.close()
     live = opened(params, tmp_path, said)
     assert live.recall() == [] and len(live) == HALF
     edges, again = [], inverse(poses[HALF]) @ poses[HALF:]
@@ -103,14 +136,21 @@ def test_loops_to_scans_before_a_restart_are_found_though_the_odometry_began_aga
     live.close()
 
 
-def test_a_map_of_other_settings_is_not_continued(params, tmp_path, said):
+def test_a_map_of_other_settings_or_of_an_earlier_version_is_not_continued(params, tmp_path, said):
     opened(params, tmp_path, said).close()
-    with pytest.raises(ValueError, match=r"journal.bin: .*same settings, found another sensor_height; use the flags"):
+    with pytest.raises(ValueError, match=r"settings.json: .*same settings, found another sensor_height; use the flags"):
         opened(params, tmp_path, said, sensor_height=2.0)
+    (tmp_path / SETTINGS).write_text("{}")
+    with pytest.raises(ValueError, match=r"settings.json: expected the settings of a live map .* found others"):
+        opened(params, tmp_path, said)
+    (tmp_path / OLD).touch()
+    with pytest.raises(ValueError, match=r"expected a map of this version, found journal\.bin of an earlier one"):
+        opened(params, tmp_path, said)
 
 
 def test_scans_of_nothing_are_left_out_or_hold_no_place(drive, params, tmp_path, said):
     live = opened(params, tmp_path, said)
+    live.recall()
     frame = live_frame(drive, 0)
     nothing = dataclasses.replace(frame.record, points=np.full((5, 3), np.nan, np.float32))
     with pytest.raises(ValueError, match="scan 0: expected points, found none"):
@@ -123,8 +163,32 @@ def test_scans_of_nothing_are_left_out_or_hold_no_place(drive, params, tmp_path,
 def test_a_full_disk_is_reported_and_the_map_lives_on(drive, params, tmp_path, said, monkeypatch):
     live = opened(params, tmp_path, said)
     live.recall()
-    monkeypatch.setattr(os, "pwrite", lambda *given: (_ for _ in ()).throw(OSError(28, "No space left on device")))
-    for i in range(2):
-        assert live.add(live_frame(drive, i)) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", lambda *given: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        for i in range(2):
+            assert live.add(live_frame(drive, i)) == []
     assert len(live) == 2 and said.kinds == ["disk"] and "No space left" in said[0][1]
     live.close()
+
+
+def live_scan(fits: Fits, **more) -> LiveScan:
+    given = {"pose": np.eye(4), "part": 2, "name": "a", "stamp": 1.0, "time": 2.0, "wall": 3.0}
+    return LiveScan(SEEN, Compared(fits, Link(*DRAW.normal(size=6))), **given | more)
+
+
+@pytest.mark.parametrize("scan", [live_scan(FITS), live_scan(NO_FITS, pose=None)])
+def test_a_scan_comes_back_from_its_bytes(scan):
+    found = from_bytes(to_bytes(scan), 5, source=Path("frames.log"))
+    assert found.seen.mounting == scan.seen.mounting and found[3:] == scan[3:]
+    np.testing.assert_array_equal(found.seen.image, scan.seen.image)
+    np.testing.assert_array_equal(found.compared.fits.frames, scan.compared.fits.frames)
+    np.testing.assert_array_equal(np.stack(found.compared.fits.peaks), np.stack(scan.compared.fits.peaks))
+    np.testing.assert_array_equal(found.compared.link, scan.compared.link)
+    assert (found.pose is None) == (scan.pose is None)
+
+
+def test_fits_with_later_scans_and_damaged_bytes_are_refused():
+    content = to_bytes(live_scan(FITS))
+    for wrong, frame in ((content, 4), (content[:-9], 5), (zlib.compress(b"no scan"), 5)):
+        with pytest.raises(ValueError, match=rf"frames\.log: expected scan {frame} of a live map, found others"):
+            from_bytes(wrong, frame, source=Path("frames.log"))

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.recording import Record
-from sglpr_jax.live.frame import FrameStatus, LiveFrame, LoopEdge
+from sglpr_jax.live.endpoints import open_sink
 from sglpr_jax.live.live_map import LiveMap
+from sglpr_jax.live.messages import AGAIN_S, FrameStatus, Latest, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.node import Node
-from sglpr_jax.live.sinks import SinkOptions, open_sink
+from sglpr_jax.live.options import LiveOptions
 
 EDGE = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, np.eye(4), None, 0.01)
 
@@ -92,14 +93,27 @@ def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said):
     assert str(node).endswith("4 dropped, 2 left out, 1 loops; the map has 3 scans, 5 MB")
 
 
-def test_a_node_stops_when_it_is_asked(frame, said):
-    node = Node(FakeMap(), [], report=said, say=print)
-    node.run(Frames(frame), should_stop=lambda: True)
-    assert node.scans == 1
+def test_a_newer_item_replaces_one_that_waits():
+    latest = Latest()
+    assert latest.take(0.0) is None
+    for item in range(3):
+        latest.put(item)
+    assert latest.take(0.0) == 2 and latest.dropped == 2 and latest.take(0.0) is None
+
+
+def test_equal_kinds_share_a_line():
+    lines, now = [], [0.0]
+    report = Reports(lines.append, clock=lambda: now[0])
+    for i in range(5):
+        report("a", f"a{i}")
+        report("b", f"b{i}") if i == 3 else None
+    now[0] = AGAIN_S
+    report("a", "a5")
+    assert lines == ["a0", "b3", "a5 (4 more since the last line)"] and report.counts == {"a": 6, "b": 1}
 
 
 def test_results_are_lines_of_json(tmp_path, said):
-    sink = open_sink(f"json:{tmp_path}/lines", SinkOptions(), said)
+    sink = open_sink(f"json:{tmp_path}/lines", LiveOptions(), said)
     sink.frame(FrameStatus(3, 1e9 + 0.123456789, 0.0123456789, 0.02, 1, 4, 100))
     sink.loop(EDGE)
     frame, loop = map(json.loads, (tmp_path / "lines").read_text().splitlines())
@@ -108,7 +122,7 @@ def test_results_are_lines_of_json(tmp_path, said):
         loop["type"] == "loop" and loop["match_from_query"] == np.eye(4).tolist() and loop["world_from_match"] is None
     )
     sink.close()
-    again = open_sink(f"json:{tmp_path}/lines", SinkOptions(), said)
+    again = open_sink(f"json:{tmp_path}/lines", LiveOptions(), said)
     again.loop(EDGE)
     again.close()
     assert len((tmp_path / "lines").read_text().splitlines()) == 3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.live.frame import LoopEdge
+from sglpr_jax.live.messages import LoopEdge
 from sglpr_jax.live.ros_messages import (
     CLOUD,
     EDGE,
@@ -31,9 +31,8 @@ def edge(**changed) -> LoopEdge:
 
 
 @pytest.mark.parametrize("kind, message", [(CLOUD, cloud()), (LIVOX, livox())])
-@pytest.mark.parametrize("padding", [b"", b"\0\0\0"])
-def test_a_cloud_is_decoded(kind, message, padding):
-    header, records = decode_cloud(message + padding, kind)
+def test_a_cloud_is_decoded_and_padding_is_ignored(kind, message):
+    header, records = decode_cloud(message + b"\0\0\0", kind)
     assert header == (12.5, "lidar")
     np.testing.assert_array_equal(records.points, POINTS)
     assert records.lasers is not None and len(records.lasers) == len(POINTS)
@@ -53,30 +52,27 @@ def test_a_cloud_without_z_names_its_fields():
         decode_cloud(encode(two), CLOUD)
 
 
-def test_an_edge_has_the_times_of_both_scans_and_their_pose():
-    found = decoded(encode(edge_message(edge())), EDGE)
-    assert (found.header.stamp.sec, found.header.stamp.nanosec) == (1234, 500_000_000)
-    assert found.header.frame_id == "match/1000.250000000"
-    at, turned = found.pose.pose.position, found.pose.pose.orientation
-    np.testing.assert_allclose([at.x, at.y, at.z], POSE[:3, 3])
-    turn = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w]).as_matrix()
-    np.testing.assert_allclose(turn, POSE[:3, :3], atol=1e-12)
-
-
-def test_the_covariance_of_an_edge_is_about_the_axes_of_the_match():
+def test_an_edge_has_times_and_pose_and_its_covariance_is_about_the_axes_of_the_match():
     """Small motions of the query in its own frame, seen as those of its pose in the match's frame."""
     covariance = np.diag([0.4, 0.1, 0.05, 0.002, 0.001, 0.01]) ** 2
     motions = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, 20_000)
     turns = Rotation.from_matrix(POSE[:3, :3])
     moved = motions[:, :3] @ POSE[:3, :3].T
-    turned = (turns * Rotation.from_rotvec(motions[:, 3:]) * turns.inv()).as_rotvec()
-    expected = np.cov(np.concatenate([moved, turned], axis=1).T)
-    found = decoded(encode(edge_message(edge(covariance=covariance))), EDGE).pose.covariance.reshape(6, 6)
+    tilted = (turns * Rotation.from_rotvec(motions[:, 3:]) * turns.inv()).as_rotvec()
+    expected = np.cov(np.concatenate([moved, tilted], axis=1).T)
+    message = decoded(encode(edge_message(edge(covariance=covariance))), EDGE)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1234, 500_000_000)
+    assert message.header.frame_id == "match/1000.250000000"
+    at, turned = message.pose.pose.position, message.pose.pose.orientation
+    np.testing.assert_allclose([at.x, at.y, at.z], POSE[:3, 3])
+    turn = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w]).as_matrix()
+    np.testing.assert_allclose(turn, POSE[:3, :3], atol=1e-12)
+    found = message.pose.covariance.reshape(6, 6)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03)
 
 
-@pytest.mark.parametrize("time", [float("nan"), -3.0, 1e12])
+@pytest.mark.parametrize("time", [float("nan"), 1e12])
 def test_a_time_that_no_stamp_holds_becomes_zero(time):
     found = decoded(encode(edge_message(edge(query_time=time))), EDGE)
     assert (found.header.stamp.sec, found.header.stamp.nanosec) == (0, 0)

@@ -1,3 +1,5 @@
+"""A descriptor file comes back as it was saved, and a file that cannot be one is refused by name."""
+
 import dataclasses
 import json
 
@@ -40,33 +42,10 @@ def test_a_file_comes_back_as_it_was_saved(tmp_path, file, absent):
     assert [path.name for path in tmp_path.iterdir()] == ["08.npz"]
 
 
-def test_a_failed_save_leaves_the_older_file_and_nothing_else(tmp_path, file, monkeypatch):
-    path = tmp_path / "08.npz"
-    file.save(path)
-
-    def write_half(stream, **arrays):
-        stream.write(b"PK half a file")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(np, "savez", write_half)
-    with pytest.raises(OSError, match="disk full"):
-        dataclasses.replace(file, sequence="other").save(path)
-    assert_same(DescriptorFile.load(path), file)
-    assert [path.name for path in tmp_path.iterdir()] == ["08.npz"]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"ids": ("a", "b")}, r"expected descriptors as float32 \(2, 4\), found float32 \(3, 4\)"),
-        ({"positions": np.zeros((4, 3))}, r"expected positions as float64 \(3, 3\), found float64 \(4, 3\)"),
         ({"times": np.zeros(2)}, r"expected times as float64 \(3\), found float64 \(2,\)"),
-        ({"descriptors": np.zeros((3, 4))}, r"expected descriptors as float32 .* found float64"),
-        (
-            {"descriptors": np.array([[0, 1], [np.nan, 0], [0, np.inf]], np.float32)},
-            "expected finite descriptors, found NaN or infinity in 2 rows, first in row 1",
-        ),
-        ({"positions": np.full((3, 3), np.nan)}, "expected finite positions"),
         (
             {"ids": (), "positions": np.zeros((0, 3)), "times": None, "descriptors": np.zeros((0, 4), np.float32)},
             "expected at least one scan",
@@ -84,14 +63,11 @@ def test_what_does_not_fit_together_is_refused(file, change, message):
         dataclasses.replace(file, **change)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.npz: expected a descriptor file \(\.npz\), found no file"):
-        DescriptorFile.load(tmp_path / "none.npz")
-
-
-@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut"])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut"])
 def test_a_file_of_another_kind_is_named(tmp_path, content):
     path = tmp_path / "x.npz"
+    with pytest.raises(FileNotFoundError, match=r"x\.npz: expected a descriptor file \(\.npz\), found no file"):
+        DescriptorFile.load(path)
     path.write_bytes(content)
     with pytest.raises(ValueError, match=rf"x\.npz: expected a descriptor file \(\.npz\), found {len(content)} bytes"):
         DescriptorFile.load(path)
@@ -108,12 +84,6 @@ def test_a_damaged_file_is_named(tmp_path, file):
         DescriptorFile.load(path)
 
 
-def test_objects_are_never_unpickled(tmp_path):
-    np.savez(tmp_path / "evil.npz", about=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match=r"evil\.npz: .* broken"):
-        DescriptorFile.load(tmp_path / "evil.npz")
-
-
 def test_missing_arrays_are_listed(tmp_path):
     np.savez(tmp_path / "x.npz", descriptors=np.zeros((3, 4), np.float32))
     with pytest.raises(ValueError, match=r"x\.npz: expected arrays about, ids, descriptors; found descriptors"):
@@ -124,7 +94,6 @@ def test_missing_arrays_are_listed(tmp_path):
     ("about", "message"),
     [
         ("{}", "expected format 'sglpr-jax descriptors 2', found None"),
-        ("[1]", r"expected format 'sglpr-jax descriptors 2', found \[1\]"),
         ("{", "expected JSON, found invalid JSON"),
         ('{"format": "sglpr-jax descriptors 1"}', "expected `sequence`, `pose_source`, `config`, `weights_hash`"),
     ],
@@ -151,22 +120,12 @@ def test_a_file_of_format_1_is_compared_by_l2(tmp_path, file):
         DescriptorFile.load(path)
 
 
-def test_a_file_whose_arrays_disagree_is_named(tmp_path, file):
-    file.save(tmp_path / "08.npz")
-    with np.load(tmp_path / "08.npz") as archive:
-        arrays = dict(archive)
-    np.savez(tmp_path / "08.npz", **{**arrays, "positions": np.zeros((5, 3))})
-    with pytest.raises(ValueError, match=r"08\.npz: expected positions as float64 \(3, 3\), found float64 \(5, 3\)"):
-        DescriptorFile.load(tmp_path / "08.npz")
-
-
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"ids": np.array([["0", "1", "2"]])}, r"expected ids as an array \(n,\) of strings, found <U1 \(1, 3\)"),
-        ({"ids": np.array([0.0, np.nan, 2.0])}, r"expected ids as an array \(n,\) of strings, found float64 \(3,\)"),
-        ({"ids": np.array(["0", "1", "1"])}, "expected a unique id for each scan, found '1' 2 times"),
-        ({"descriptors": np.zeros((3, 0), np.float32)}, "expected descriptors with at least one number"),
+        ({"positions": np.zeros((5, 3))}, r"expected positions as float64 \(3, 3\), found float64 \(5, 3\)"),
+        ({"about": np.array([{"a": 1}], dtype=object)}, r".* broken"),
         ({"about": np.array(["{}", "{}"])}, r"expected JSON in `about`, found an array <U2 \(2,\)"),
     ],
 )
@@ -176,17 +135,6 @@ def test_arrays_that_cannot_be_are_refused(tmp_path, file, changed, message):
         arrays = dict(archive)
     np.savez(tmp_path / "08.npz", **{**arrays, **changed})
     with pytest.raises(ValueError, match=rf"08\.npz: {message}"):
-        DescriptorFile.load(tmp_path / "08.npz")
-
-
-@pytest.mark.parametrize(("name", "value"), [("sequence", 8), ("config", []), ("weights_hash", None), ("distance", {})])
-def test_what_stands_in_about_has_its_type(tmp_path, file, name, value):
-    file.save(tmp_path / "08.npz")
-    with np.load(tmp_path / "08.npz") as archive:
-        arrays = dict(archive)
-    about = {**json.loads(str(arrays["about"])), name: value}
-    np.savez(tmp_path / "08.npz", **{**arrays, "about": np.array(json.dumps(about))})
-    with pytest.raises(ValueError, match=rf"08\.npz: `{name}`: expected a value of type .*, found "):
         DescriptorFile.load(tmp_path / "08.npz")
 
 

@@ -6,19 +6,17 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
 from recordings import of_images, of_scans, with_points
 
-from sglpr_jax.bev import even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
+from sglpr_jax.bev import even_cells, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data.density_image import density_bev
-from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.views import view
+from sglpr_jax.data.views import rotated
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
-from sglpr_jax.methods.method import ImageMethod, ScanMethod
-from sglpr_jax.retrieval import embed
+from sglpr_jax.methods.method import ImageMethod, RecordMethod, ScanMethod
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.embed import embed
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 SCANS = 7  # 8 is the next power of two
@@ -33,15 +31,15 @@ def flatten(images):
 def embed_images(describe, recording, grid, *, config, rotation_seed=None, batch=8, on_bad_scan=None, **options):
     """The descriptor file of a method on images."""
     about = {name: options.pop(name) for name in ("weights_hash", "categories", "image", "field") if name in options}
-    method = ImageMethod(describe, grid, about=config, **about)
+    method = ImageMethod(describe, grid, about={"method": "pixels", **config}, **about)
     options |= {"rotation_seed": rotation_seed, "batch": batch, "on_bad_scan": on_bad_scan}
-    return embed.embed_images(method, recording, **options)
+    return embed(method, recording, **options)
 
 
 def embed_scans(describe, recording, *, config, distance, labels=False, **options):
     """The descriptor file of a method on points."""
-    method = ScanMethod(describe, labels=labels, distance=distance, about=config)
-    return embed.embed_scans(method, recording, **options)
+    method = ScanMethod(describe, labels=labels, distance=distance, about={"method": "mean", **config})
+    return embed(method, recording, **options)
 
 
 def clouds() -> list[np.ndarray]:
@@ -100,7 +98,7 @@ def test_each_scan_is_turned_by_its_own_angle(scans):
     for cloud, angle, descriptor in zip(clouds(), drawn_angles(3), found.descriptors, strict=True):
         turned = rotate_points(jnp.asarray(cloud), jnp.float32(angle))
         np.testing.assert_array_equal(descriptor, np.asarray(rasterize(turned, grid=GRID)).reshape(-1))
-    assert found.config == {"data": "08", "rotation_seed": 3}
+    assert found.config == {"data": "08", "method": "pixels", "rotation_seed": 3}
     other = embed_images(flatten, scans, GRID, config={}, rotation_seed=4)
     assert (other.descriptors != found.descriptors).any(axis=1).all()
 
@@ -117,17 +115,17 @@ def test_images_are_turned_whole_and_cropped_to_the_grid(pictures):
     assert turned.times is None
 
 
-@pytest.mark.parametrize(("batch", "size"), [(1, 1), (3, 3), (7, 7), (64, 8)])
+@pytest.mark.parametrize(("batch", "size"), [(1, 1), (3, 3), (64, 8)])
 def test_the_batches_do_not_show_and_are_all_of_one_shape(scans, batch, size):
-    shapes = set()
+    shapes, done = set(), []
 
     def describe(images):
         shapes.add(images.shape)
         return flatten(images)
 
-    found = embed_images(describe, scans, GRID, config={}, batch=batch)
+    found = embed_images(describe, scans, GRID, config={}, batch=batch, on_progress=done.append)
     np.testing.assert_array_equal(found.descriptors, embed_images(flatten, scans, GRID, config={}).descriptors)
-    assert shapes == {(size, GRID.height, GRID.width)}
+    assert shapes == {(size, GRID.height, GRID.width)} and done == [*range(1, SCANS + 1)]
 
 
 @pytest.mark.slow
@@ -144,13 +142,7 @@ def test_scans_become_density_images_of_the_turned_points(scans, seed):
         assert image.sum() > 0
 
 
-def test_ready_made_images_are_taken_as_they_are_by_any_model(pictures):
-    kinds = ("points", "density")
-    as_points, as_density = (embed_images(flatten, pictures, GRID, config={}, image=kind) for kind in kinds)
-    np.testing.assert_array_equal(as_points.descriptors, as_density.descriptors)
-
-
-@pytest.mark.parametrize(("scale", "shift"), [(25.5, 0.0), (1.0, -9.0), (np.nan, 0.0)])
+@pytest.mark.parametrize(("scale", "shift"), [(25.5, 0.0), (1.0, -9.0)])
 def test_ready_made_images_that_are_none_of_densities_are_refused_where_these_are_wanted(pictures, scale, shift):
     """Grey values, say, or counts of points: float values from 0 to 10 and hardly beyond are counts of voxels."""
     values = {path: pictures.image(row) * np.float32(scale) + np.float32(shift) for row, path in enumerate(PICTURES)}
@@ -163,31 +155,9 @@ def test_ready_made_images_that_are_none_of_densities_are_refused_where_these_ar
     assert len(reported) == SCANS
 
 
-def test_a_little_beyond_the_counts_is_what_resizing_makes(pictures):
-    resized = of_images({path: pictures.image(row) * np.float32(1.1) for row, path in enumerate(PICTURES)}, name="06")
-    assert len(embed_images(flatten, resized, GRID, config={}, image="density")) == SCANS
-
-
-@pytest.mark.parametrize("batch", [0, -1])
-def test_a_batch_has_at_least_one_image(pictures, batch):
-    with pytest.raises(ValueError, match=f"batch: expected a number from 1 .*found {batch}"):
-        embed_images(flatten, pictures, GRID, config={}, batch=batch)
-
-
-def test_only_cells_of_density_images_make_density_images(scans):
-    with pytest.raises(ValueError, match=r"151 x 151 cells of 0.4 m: expected .* found 16 x 16 cells of 1.0 m"):
-        embed_images(flatten, scans, GRID, config={}, image="density")
-
-
-def test_progress_counts_every_scan_whatever_the_batches(scans):
-    seen = []
-    embed_images(flatten, scans, GRID, config={}, batch=3, on_progress=seen.append)
-    assert seen == [*range(1, SCANS + 1)]
-
-
-def test_a_scan_that_cannot_be_read_raises_its_own_error(scans):
-    with pytest.raises(ValueError, match=r"000004\.bin: not a whole scan"):
-        embed_images(flatten, with_bad_scan(scans, 2), GRID, config={})
+def test_a_batch_has_at_least_one_image(pictures):
+    with pytest.raises(ValueError, match=r"batch: expected a number from 1 .*found 0"):
+        embed_images(flatten, pictures, GRID, config={}, batch=0)
 
 
 def test_bad_scans_are_reported_and_left_out_if_asked(scans):
@@ -210,23 +180,7 @@ def test_bad_scans_are_reported_and_left_out_if_asked(scans):
     np.testing.assert_array_equal(found.descriptors, everything.descriptors[kept])  # the others keep their angles
 
 
-def test_nothing_but_bad_scans_is_an_error(scans):
-    with pytest.raises(ValueError, match="sequence 08: expected at least one readable scan, found none"):
-        embed_images(flatten, with_bad_scan(scans, *range(SCANS)), GRID, config={}, on_bad_scan=lambda *_: None)
-
-
-def test_scans_without_a_grid_are_refused(scans):
-    with pytest.raises(ValueError, match="expected a grid"):
-        embed_images(flatten, scans, None, config={})
-
-
-def test_a_source_without_poses_can_be_embedded(scans):
-    bare = dataclasses.replace(scans, positions=None, times=None, pose_source=None)
-    found = embed_images(flatten, bare, GRID, config={})
-    assert found.positions is None and found.times is None and len(found) == SCANS
-
-
-def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(scans, pictures, tmp_path):
+def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(scans, tmp_path):
     raw = [np.resize(np.array([10, 50, 252], "<u4"), len(cloud)) for cloud in clouds()]
     paths = tuple(tmp_path / f"{i}.label" for i in range(SCANS))
     for path, ids in zip(paths, raw, strict=True):
@@ -244,23 +198,8 @@ def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(sc
         expected = rasterize_labels(turned, classes, grid=GRID)
         assert expected.max() == 25  # the moving car
         np.testing.assert_array_equal(descriptor, np.asarray(expected).reshape(-1))
-    with pytest.raises(ValueError, match="scan 000000 of sequence 08: expected labels, found none"):
+    with pytest.raises(ValueError, match="expected labels beside the scans, found none in sequence 08"):
         embed_images(maps, scans, GRID, config={}, categories=25)
-    with pytest.raises(ValueError, match="scan 000000 of sequence 06: expected labels, found none"):
-        embed_images(maps, pictures, GRID, config={}, categories=25)
-
-
-def test_images_come_with_their_maps_turned_by_the_same_angle(pictures, tmp_path):
-    paths = tuple(tmp_path / f"{i}.png" for i in range(SCANS))
-    for path, picture in zip(paths, map(pictures.image, range(SCANS)), strict=True):
-        Image.fromarray(label_image_pixels(np.where(picture > 5, 259, 40))).save(path)
-    labelled = dataclasses.replace(pictures, label_paths=paths)
-    angle, grid = jnp.float32(0.7), Grid(0.4, 16, 16)
-    image, classes = view(labelled.record(1), grid, categories=25, angle=angle)
-    np.testing.assert_array_equal(image, view(pictures.record(1), grid, angle=angle).image)
-    whole = jnp.asarray(np.where(pictures.image(1) > 5, 25, 11).astype(np.int32))
-    np.testing.assert_array_equal(classes, rotate_labels(whole, angle)[2:18, 4:20])
-    assert view(labelled.record(1), None, categories=25).classes.shape == (20, 24)
 
 
 def test_points_are_described_scan_by_scan(scans):
@@ -269,15 +208,6 @@ def test_points_are_described_scan_by_scan(scans):
     np.testing.assert_array_equal(found.descriptors, [cloud.mean(axis=0) for cloud in clouds()])
     assert (found.distance, found.weights_hash, found.ids, seen) == ("cosine", "", scans.ids, [*range(1, SCANS + 1)])
     assert found.config == {"data": "08", "method": "mean", "rotation_seed": None}
-
-
-def test_points_are_turned_as_images_are(scans):
-    found = embed_scans(mean_point, scans, config={}, distance="l2", rotation_seed=3)
-    expected = [
-        np.asarray(rotate_points(jnp.asarray(cloud), jnp.float32(angle))).mean(axis=0)
-        for cloud, angle in zip(clouds(), drawn_angles(3), strict=True)
-    ]
-    np.testing.assert_allclose(found.descriptors, expected, atol=1e-5)
 
 
 def test_points_that_are_not_finite_are_left_out_with_their_labels(scans, tmp_path):
@@ -304,3 +234,67 @@ def test_points_that_are_not_finite_are_left_out_with_their_labels(scans, tmp_pa
         mean_point, partly, config={}, distance="l2", labels=True, on_bad_scan=lambda name, _: reported.append(name)
     )
     assert reported == ["000004"] and len(kept) == SCANS - 1
+
+
+def mean_of(record):
+    return record.upright_points.mean(axis=0)
+
+
+def learned(prepare=mean_of, describe=lambda inputs: inputs, takes="points") -> RecordMethod:
+    return RecordMethod(prepare, describe, takes, "l2", {"method": "mine"}, "hash")
+
+
+@pytest.mark.parametrize("batch", [1, 4])
+def test_a_learned_method_describes_every_scan_for_itself(scans, batch):
+    sizes = []
+
+    def describe(inputs):
+        sizes.append(len(inputs))
+        return inputs
+
+    file = embed(learned(describe=describe), scans, batch=batch)
+    np.testing.assert_array_equal(file.descriptors, [cloud.mean(axis=0) for cloud in clouds()])
+    assert file.ids == scans.ids and file.weights_hash == "hash" and file.distance == "l2"
+    assert file.config["method"] == "mine" and set(sizes) == {batch}
+
+
+def test_scans_and_images_of_a_learned_method_are_rotated(scans, pictures):
+    file, angles = embed(learned(), scans, rotation_seed=3), drawn_angles(3)
+    expected = [rotated(cloud, float(angle)).mean(axis=0) for cloud, angle in zip(clouds(), angles, strict=True)]
+    np.testing.assert_allclose(file.descriptors, expected, atol=1e-5)
+    on_images = learned(prepare=lambda record: record.image.reshape(-1), takes="images")
+    found = embed(on_images, pictures, rotation_seed=3).descriptors
+    expected = [np.asarray(rotate_image(pictures.image(row), angle)) for row, angle in enumerate(angles)]
+    np.testing.assert_allclose(found, np.reshape(expected, (SCANS, -1)), atol=1e-4)
+
+
+@pytest.mark.parametrize(("value", "words"), [(np.nan, "values that are not finite"), (0, "only zeros")])
+def test_invalid_descriptors_are_one_line_errors(scans, value, words):
+    def prepare(record):
+        return np.full(3, value if "000006" in record.name else 1, np.float32)
+
+    with pytest.raises(ValueError, match=f"^mine: expected a descriptor of scan 000006 of sequence .*{words}$"):
+        embed(learned(prepare), scans)
+
+
+def test_other_lengths_from_scan_to_scan_are_errors(scans):
+    odd = learned(lambda record: np.ones(4 if "000006" in record.name else 3, np.float32))
+    with pytest.raises(ValueError, match=r"mine: expected an input \(3,\) of scan 000006 .*found \(4,\)"):
+        embed(odd, scans)
+    calls = []
+
+    def longer(inputs):
+        calls.append(1)
+        return np.ones((len(inputs), 3 + len(calls)), np.float32)
+
+    with pytest.raises(ValueError, match=r"mine: expected descriptors of one length, found \[4, 5\]"):
+        embed(learned(describe=longer), scans, batch=4)
+    with pytest.raises(ValueError, match="mine: expected 7 descriptors"):
+        embed(learned(describe=lambda inputs: np.ones((len(inputs), 2, 2))), scans)
+
+
+def test_missing_points_and_labels_are_errors(scans, pictures):
+    with pytest.raises(ValueError, match="mine needs points, found only images in sequence 06"):
+        embed(learned(), pictures)
+    with pytest.raises(ValueError, match="mine needs labels beside the scans, found none"):
+        embed(dataclasses.replace(learned(), takes="labelled points"), scans)

@@ -9,7 +9,6 @@ import pytest
 
 from sglpr_jax import FleetIndex, Index
 from sglpr_jax.retrieval.fleet_index import TABLE
-from sglpr_jax.retrieval.overlaps import overlaps
 from sglpr_jax.retrieval.parquet import FORMAT, place_rows
 
 from .places import draw, file_of
@@ -119,12 +118,6 @@ def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lancedb", None)
     with pytest.raises(ImportError, match=r"expected the extra `fleet`"):
         FleetIndex(tmp_path)
-
-
-def test_recordings_with_places_of_similar_descriptors_may_overlap(filled):
-    again = place_rows(file_of(30), "again")
-    assert [one[:2] for one in overlaps(filled, again, max_distance=0.01)] == [("again", "first")]
-    assert overlaps(filled, again, max_distance=0.01, where="site = 'south'") == []
 
 
 def test_a_table_that_another_process_is_about_to_create_has_no_places_yet(tmp_path):

@@ -30,7 +30,7 @@ OUT = "sglpr_map"
 
 def defaults() -> dict[str, Any]:
     """Names and default values of the parameters."""
-    usual = LiveCommand(source="ros2", out=Path(OUT))
+    usual = LiveCommand(source="ros2", sinks=("ros2",), out=Path(OUT))
     return {"out": OUT, **{name: EMPTY.get(name, getattr(usual, name)) for name in FLAGS}}
 
 
@@ -45,4 +45,6 @@ def command_of(values: dict[str, Any]) -> LiveCommand:
         height = height if height == "auto" else float(height)
     except ValueError as error:
         raise ValueError(f"sensor_height: expected metres or auto, found {height}") from error
-    return LiveCommand(source="ros2", out=Path(found.pop("out")).expanduser(), sensor_height=height, **found)
+    return LiveCommand(
+        source="ros2", sinks=("ros2",), out=Path(found.pop("out")).expanduser(), sensor_height=height, **found
+    )

@@ -14,8 +14,7 @@ from sglpr_jax.grid import Grid
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.heat_maps import heat_maps
-from sglpr_jax.retrieval.semantic_maps import semantic_map
+from sglpr_jax.retrieval.image_maps import heat_maps, semantic_map
 
 SHOWN = (1 / 3, 2 / 3)
 """Positions of the shown scans, as fractions of the recording."""

@@ -1,0 +1,95 @@
+"""A ROS bag, replayed at its own pace by the project's reader of bags."""
+
+import dataclasses
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.live.endpoints import WAIT_S, Taken
+from sglpr_jax.live.messages import Latest, LiveFrame, Report
+from sglpr_jax.live.options import LiveOptions
+
+
+class BagSource:
+    """Scans of a recording at the times of their headers. With `rate=0`, as fast as they are taken."""
+
+    def __init__(self, root: Path, recording: Recording, options: LiveOptions, report: Report, taken: Taken):
+        self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
+        self._posed = options.odometry_topic is not None
+        done = [row for row in range(len(recording)) if taken(self._name(row))]
+        self._rows = range(done[-1] + 1 if done else 0, len(recording))
+        self._latest: Latest[LiveFrame] = Latest()
+        self._stopped, self._ended = threading.Event(), threading.Event()
+
+    @property
+    def dropped(self) -> int:
+        """Number of scans that were replaced by newer ones before they were taken."""
+        return self._latest.dropped
+
+    def frames(self) -> Iterator[LiveFrame | None]:
+        """Yield the scans. Ends after the last one."""
+        if not self._rate:
+            for row in self._rows:
+                yield self._frame(row)
+            return
+        thread = threading.Thread(target=self._replay, daemon=True)
+        thread.start()
+        while (frame := self._latest.take(WAIT_S)) is not None or not self._ended.is_set():
+            yield frame
+        yield self._latest.take(0.0)
+
+    def close(self) -> None:
+        """Stop the replay."""
+        self._stopped.set()
+
+    def _replay(self) -> None:
+        """Put each scan at its time."""
+        times, begin = self._recording.times, time.monotonic()
+        try:
+            for row in self._rows:
+                frame = self._frame(row)
+                due = 0.0 if times is None else (times[row] - times[self._rows[0]]) / self._rate
+                if self._stopped.wait(max(0.0, begin + due - time.monotonic())):
+                    return
+                if frame is not None:
+                    self._latest.put(frame._replace(received=time.monotonic()))
+        finally:
+            self._ended.set()
+
+    def _frame(self, row: int) -> LiveFrame | None:
+        """Read a scan, or report that it cannot be read."""
+        try:
+            record = self._recording.record(row, labels=False)
+        except (ValueError, OSError) as error:
+            self._report("scan", f"a scan is left out: {error}")
+            return None
+        poses, times = self._recording.world_from_lidar, self._recording.times
+        pose = poses[row] if self._posed and poses is not None else None
+        record = dataclasses.replace(record, name=self._name(row))
+        return LiveFrame(record, 0.0 if times is None else float(times[row]), pose, time.monotonic())
+
+    def _name(self, row: int) -> str:
+        return f"{self._root}, scan {self._recording.ids[row]}"
+
+
+def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> BagSource:
+    """Open the bag `where`.
+
+    Raises:
+      FileNotFoundError: If there is no bag, or none of its topics is `options.topic`.
+      ValueError: If the bag is broken, or `options.odometry_topic` has no poses with rotations.
+      ImportError: If the extra `ros` is not installed.
+    """
+    root = Path(where)
+    names = recording_names(root)
+    wanted = None if options.topic is None else options.topic.strip("/").replace("/", "_")
+    name = wanted if wanted in names else None if len(names) == 1 else wanted
+    recording = open_recording(
+        root, name, pose_topic=options.odometry_topic, sensor_height=options.sensor_height, gravity="recording"
+    )
+    if options.odometry_topic is not None and recording.world_from_lidar is None:
+        raise ValueError(f"{root}: expected poses with rotations on {options.odometry_topic}, found none")
+    return BagSource(root, recording, options, report, taken)

@@ -1,0 +1,250 @@
+"""Connection to ROS 2 by DDS, without an installation of ROS (cyclonedds, extra `live`).
+
+A topic `/points` is `rt/points` on the wire, and types have names such as `sensor_msgs::msg::dds_::PointCloud2_`, as
+rmw_cyclonedds and rmw_fastrtps write them. Types are described with the fields of ROS 2 and are final, so that they fit
+the type information that newer releases of rmw_cyclonedds send. Messages stay CDR (XCDR1) here.
+"""
+
+import functools
+import os
+import threading
+import time
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import make_idl_struct, types
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from sglpr_jax.files import in_short
+from sglpr_jax.live.endpoints import Taken
+from sglpr_jax.live.messages import Report
+from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
+from sglpr_jax.live.ros_messages import Received, typestore
+
+PREFIX = "rt"
+"""Beginning of the names of ROS 2 topics on the wire. Services have others."""
+LOOK_S = 1.0
+"""Time between two looks at subscriptions and publishers with other settings, in seconds."""
+BUFFER = '<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max="16MB"/></Internal></Domain></CycloneDDS>'
+"""Setting of cyclonedds. A scan of 2 MB arrives as a burst of packets, and the usual buffer of 1 MB loses many of them.
+The system may set a lower limit (`net.core.rmem_max`)."""
+POLICIES = {2: "durability", 4: "deadline", 8: "liveliness", 10: "partition", 11: "reliability", 23: "representation"}
+"""Names of QoS policies, by their numbers in the standard."""
+TYPE = 24
+"""Number of the policy on types. It does not fit between the types of one topic, which the source reports itself."""
+_NUMBERS = {"bool": bool, "byte": types.uint8, "octet": types.uint8, "char": types.uint8, "string": str} | {
+    name: getattr(types, name)
+    for name in ("float32", "float64", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
+}
+
+
+class _Reader(NamedTuple):
+    """A reader of one type, and what to do with its messages."""
+
+    kind: str
+    reader: DataReader
+    condition: ReadCondition
+    receive: Receive
+    depth: int
+
+
+class DdsTransport:
+    """Participant of a DDS domain. A thread takes the messages. See `ros.Transport`."""
+
+    def __init__(self, domain: int, report: Report):
+        """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2.
+
+        Raises ValueError if cyclonedds cannot use the network or this configuration.
+        """
+        self._report = report
+        _configure(domain)
+        try:
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            found = os.environ.get("CYCLONEDDS_URI", "no CYCLONEDDS_URI")
+            raise ValueError(
+                f"dds:{domain}: expected a network and a valid CYCLONEDDS_URI, found {found} ({in_short(error)})"
+            ) from error
+        self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._waiting = WaitSet(self._participant)
+        self._topics: dict[tuple[str, str], Topic] = {}
+        self._readers: list[_Reader] = []
+        self._writers: dict[str, DataWriter] = {}
+        self._watched: list[tuple[str, Callable[[], Any]]] = []
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="dds", daemon=True)
+        self._thread.start()
+
+    def subscribe(
+        self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
+    ) -> None:
+        """Receive the messages of a topic that have one of these types."""
+        qos = _qos(depth, reliable=reliable, latched=latched)
+        asked = f"{topic}: expected a publisher with the QoS {_described(reliable, latched)}, found one without"
+        for kind in kinds:
+            reader = DataReader(self._participant, self._topic(topic, kind), qos=qos)
+            condition = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
+            self._readers.append(_Reader(kind, reader, condition, receive, depth))
+            self._waiting.attach(condition)
+        self._watched.append((asked, self._readers[-1].reader.get_requested_incompatible_qos_status))
+
+    def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
+        """Return a function that publishes messages of one type."""
+        qos = _qos(depth, reliable=True, latched=latched)
+        writer = DataWriter(self._participant, self._topic(topic, kind), qos=qos)
+        offered = f"{topic}: expected subscribers that accept the QoS {_described(True, latched)}, found one that asks"
+        self._watched.append((f"{offered} for more", writer.get_offered_incompatible_qos_status))
+        self._writers[topic] = writer
+        del writer  # held by the dictionary alone, so that `close` deletes it
+
+        def publish(cdr: bytes) -> None:
+            try:
+                self._writers[topic].write(_raw_type(kind)(cdr), timestamp=time.time_ns())
+            except DDSException as error:  # a slow subscriber
+                self._report(f"publish {topic}", f"{topic}: cannot publish a message ({in_short(error)})")
+
+        return publish
+
+    def published(self) -> dict[str, set[str]]:
+        """Topics with a publisher, and their types."""
+        found: dict[str, set[str]] = {}
+        for one in self._publications.read(N=10_000):
+            name, alive = one.topic_name, one.sample_info.instance_state == InstanceState.Alive
+            if alive and name is not None and one.type_name is not None and name.startswith(f"{PREFIX}/"):
+                found.setdefault(name.removeprefix(PREFIX), set()).add(ros_type(one.type_name))
+        return found
+
+    def close(self) -> None:
+        """Stop the thread and leave the domain."""
+        self._closed.set()
+        self._thread.join()
+        for held in (self._watched, self._readers, self._writers, self._topics):
+            held.clear()
+        del self._waiting, self._publications, self._participant
+
+    def _topic(self, topic: str, kind: str) -> Topic:
+        if (topic, kind) not in self._topics:
+            self._topics[topic, kind] = Topic(self._participant, f"{PREFIX}{topic}", _raw_type(kind))
+        return self._topics[topic, kind]
+
+    def _run(self) -> None:
+        looked = time.monotonic()
+        while not self._closed.is_set():
+            if self._readers:
+                self._waiting.wait(duration(milliseconds=100))
+            else:  # the wait of cyclonedds returns at once if nothing is attached, and this loop would use a core
+                self._closed.wait(0.1)
+            for one in tuple(self._readers):
+                self._take(one)
+            if time.monotonic() - looked > LOOK_S:
+                looked = time.monotonic()
+                self._look()
+
+    def _take(self, one: _Reader) -> None:
+        try:
+            for sample in one.reader.take(N=one.depth, condition=one.condition):
+                if sample.sample_info.valid_data:
+                    publisher = sample.sample_info.publication_handle
+                    one.receive(Received(one.kind, sample.cdr, publisher, time.monotonic()))
+        except Exception as error:  # the thread serves the other topics, too
+            self._report(f"message {one.kind}", f"{one.kind}: expected a valid message, found {in_short(error)}")
+
+    def _look(self) -> None:
+        """Report publishers and subscribers whose QoS does not fit, each once. The readers of all types count them."""
+        for text, status in tuple(self._watched):
+            found = status()
+            if found.total_count_change > 0 and found.last_policy_id != TYPE:
+                policy = POLICIES.get(found.last_policy_id, f"policy {found.last_policy_id}")
+                self._report(f"qos {text}", f"{text} ({policy}); they do not exchange messages")
+
+
+@functools.cache
+def _configure(domain: int) -> Domain | None:
+    """Configure a domain for this process, once. The settings of the environment come after ours and override them."""
+    try:
+        return Domain(domain, ",".join(filter(None, (BUFFER, os.environ.get("CYCLONEDDS_URI")))))
+    except DDSException:  # another part of the process uses the domain
+        return None
+
+
+def _qos(depth: int, *, reliable: bool, latched: bool) -> Qos:
+    return Qos(
+        Policy.Reliability.Reliable(duration(milliseconds=100)) if reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(depth),
+        Policy.DurabilityService(duration(seconds=0), Policy.History.KeepLast(depth), -1, -1, -1),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+    )
+
+
+def _described(reliable: bool, latched: bool) -> str:
+    return f"{'reliable' if reliable else 'best effort'}, {'transient local' if latched else 'volatile'}"
+
+
+class _Raw:
+    """Message that stays encoded, with the interface that cyclonedds expects of its own types."""
+
+    def __init__(self, cdr: bytes):
+        self.cdr = cdr
+
+    def serialize(self, **_: Any) -> bytes:
+        return self.cdr
+
+    @classmethod
+    def deserialize(cls, data: bytes) -> Any:
+        return cls(data)
+
+    @classmethod
+    def deserialize_key(cls, data: bytes) -> Any:
+        """A notice that a publisher has ended: it holds no message."""
+        return cls(data)
+
+
+@functools.cache
+def _raw_type(kind: str) -> Any:
+    """Type of messages that stay encoded. Others see the fields of ROS 2."""
+    found = make_idl_struct(*_names(kind), _fields(kind), dataclassify=False)
+    for name in ("__init__", "serialize", "deserialize", "deserialize_key"):
+        setattr(found, name, vars(_Raw)[name])
+    return found
+
+
+@functools.cache
+def _inner_type(kind: str) -> Any:
+    return make_idl_struct(*_names(kind), _fields(kind), dataclassify=False)
+
+
+def _names(kind: str) -> tuple[str, str]:
+    name = wire_type(kind).replace("::", ".")
+    return name.rpartition(".")[2], name
+
+
+def _fields(kind: str) -> dict[str, Any]:
+    return {name: _field(*of) for name, of in typestore().fielddefs[kind][1]}
+
+
+def _field(node: Any, of: Any) -> Any:
+    """Type of a field, from its definition by rosbags."""
+    if node.name == "BASE":
+        return _NUMBERS[of[0]]
+    if node.name == "NAME":
+        return _inner_type(of)
+    (inner, count) = of
+    return types.array[_field(*inner), count] if node.name == "ARRAY" else types.sequence[_field(*inner)]
+
+
+def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> RosSource:
+    """Open the source `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
+    return RosSource(DdsTransport(domain_of(where, source="dds"), report), options, report)
+
+
+def open_sink(where: str, options: LiveOptions, report: Report) -> RosSink:
+    """Open the sink `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
+    return RosSink(DdsTransport(domain_of(where, source="dds"), report), options)

@@ -1,0 +1,95 @@
+"""Sources of scans and sinks of loops, by name. The module of a name is imported when it is asked for.
+
+The module `live/NAME.py` has `open_source(where, options, report, taken)`, `open_sink(where, options, report)` or both.
+To support another source or sink, add a module and its name.
+"""
+
+import importlib
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import Protocol, runtime_checkable
+
+from sglpr_jax.live.messages import FrameStatus, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.options import LiveOptions
+
+SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
+SINKS = {"json": None, "dds": "live", "zenoh": "live", "rerun": "view"}
+"""Names of sources and sinks, with the extra that each needs."""
+WAIT_S = 0.2
+"""Maximum time that `Source.frames` blocks before it yields None, in seconds."""
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Source of scans."""
+
+    def frames(self) -> Iterator[LiveFrame | None]:
+        """Yield scans as they arrive. Yields None after at most `WAIT_S` seconds without a scan, so that the node can
+        react to signals. Ends if no more scans can come."""
+        ...
+
+    def close(self) -> None:
+        """Release threads and connections."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """Number of scans that were replaced by newer ones before they were taken."""
+        ...
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """Receiver of results. A sink that raises an error is reported once and left out."""
+
+    def frame(self, status: FrameStatus) -> None:
+        """Receive the status after a scan."""
+        ...
+
+    def loop(self, edge: LoopEdge) -> None:
+        """Receive a loop. It is on disk before."""
+        ...
+
+    def close(self) -> None:
+        """Release files and connections."""
+        ...
+
+
+Taken = Callable[[str], bool]
+"""Whether a scan with this `Record.name` is in the map already."""
+
+
+def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken = lambda name: False) -> Source:
+    """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
+
+    `report` takes trouble with single scans and messages. Scans of files that are `taken` do not come again. Raises
+    ValueError if no source has this name, and ImportError if its extra is not installed.
+    """
+    name, where = check_name(text, SOURCES, kind="sources")
+    return _module(name, SOURCES[name]).open_source(where, options, report, taken)
+
+
+def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
+    """Open the sink that a text names, such as `json:loops.jsonl`, as `open_source` does."""
+    name, where = check_name(text, SINKS, kind="sinks")
+    return _module(name, SINKS[name]).open_sink(where, options, report)
+
+
+def check_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str]:
+    """Split `NAME:WHERE`. Raises ValueError if the name is not known. `kind` is "sources" or "sinks"."""
+    name, _, where = text.partition(":")
+    if name not in known:
+        raise ValueError(f"{text}: expected one of the {kind} {', '.join(known)}, found {name or 'nothing'}")
+    return name, where
+
+
+def _module(name: str, extra: str | None) -> ModuleType:
+    """Import the module of a source or sink. Raises ImportError, which names the extra, if a package is missing."""
+    try:
+        return importlib.import_module(f"sglpr_jax.live.{name}")
+    except ModuleNotFoundError as error:
+        if error.name is not None and error.name.startswith("sglpr_jax"):
+            raise
+        raise ImportError(
+            f"{name}: expected the package {error.name}, found none; pip install 'sglpr-jax[{extra}]'"
+        ) from error

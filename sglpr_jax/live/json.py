@@ -1,0 +1,54 @@
+"""Results as JSON, one object a line: on standard output, or appended to a file.
+
+Each object has a `type`: `frame` (`FrameStatus`) or `loop` (`LoopEdge`).
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from sglpr_jax.files import writing
+from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.options import LiveOptions
+
+
+class JsonLines:
+    """Writes a line for each scan and each loop, and flushes it."""
+
+    def __init__(self, file: IO[str]):
+        self._file = file
+
+    def frame(self, status: FrameStatus) -> None:
+        """Write the status after a scan."""
+        self._line("frame", status)
+
+    def loop(self, edge: LoopEdge) -> None:
+        """Write a loop."""
+        self._line("loop", edge)
+
+    def close(self) -> None:
+        """Close the file, unless it is standard output."""
+        if self._file is not sys.stdout:
+            self._file.close()
+
+    def _line(self, kind: str, value: FrameStatus | LoopEdge) -> None:
+        found = {name: _plain(one) for name, one in value._asdict().items()}
+        self._file.write(json.dumps({"type": kind, **found}) + "\n")
+        self._file.flush()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return round(value, 6) if isinstance(value, float) and abs(value) < 1e6 else value
+
+
+def open_sink(where: str, options: LiveOptions, report: Report) -> JsonLines:
+    """Open standard output, or the file `where` for appending. Raises WriteError if the file cannot be written."""
+    if not where:
+        return JsonLines(sys.stdout)
+    with writing(Path(where)):
+        return JsonLines(Path(where).open("a", encoding="utf-8"))

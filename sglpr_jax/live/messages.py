@@ -1,0 +1,139 @@
+"""Values that pass through the live node: scans, status, loop edges, and reports of trouble."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.recording import Record
+
+AGAIN_S = 30.0
+"""Minimum time between two lines of the same kind, in seconds."""
+Report = Callable[[str, str], None]
+"""Function of the kind of an event and its description. Equal kinds share a line every `AGAIN_S` seconds."""
+T = TypeVar("T")
+
+
+class LiveFrame(NamedTuple):
+    """A scan as it arrives."""
+
+    record: Record
+    """Points in the LiDAR frame, with the mounting if it is known. The name of a scan from a file is unique; a scan
+    whose name is in the map already is not taken again. Scans without a name are always taken."""
+    time: float
+    """Time of the message's header, in seconds. 0 or not finite if the header has none."""
+    odometry: Float[np.ndarray, "4 4"] | None
+    """Pose of the LiDAR by odometry (`world_from_lidar`), or None if it is unknown."""
+    received: float
+    """Time at which the scan arrived, by `time.monotonic()`, in seconds."""
+
+
+class FrameStatus(NamedTuple):
+    """Status after a scan was processed."""
+
+    frame: int
+    """Number of the scan in the map, from 0."""
+    time: float
+    """Time of the scan's header, in seconds."""
+    seconds: float
+    """Time for processing the scan, in seconds."""
+    latency_s: float
+    """Time from the arrival of the scan to the end of its processing, in seconds."""
+    dropped: int
+    """Number of scans that were replaced by newer ones before the node took them."""
+    places: int
+    """Number of stored scans."""
+    nbytes: int
+    """Memory of the stored scans, in bytes."""
+    map_from_world: Float[np.ndarray, "4 4"] | None = None
+    """Correction of the odometry by all loops so far. None without odometry or gtsam, and while no loop connects the
+    odometry with that before a restart."""
+
+
+class LoopEdge(NamedTuple):
+    """A loop closure for a pose graph."""
+
+    query: int
+    match: int
+    """Frame numbers in the map, from 0. The match is the earlier frame."""
+    query_time: float
+    match_time: float
+    """Times of the headers of both scans, in seconds."""
+    match_from_query: Float[np.ndarray, "4 4"]
+    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations in radians."""
+    probability: float
+    """Probability that both scans show one place."""
+    world_from_query: Float[np.ndarray, "4 4"] | None
+    world_from_match: Float[np.ndarray, "4 4"] | None
+    """Poses by odometry, in its present frame. None without odometry, and for scans of another odometry frame, such as
+    those before a restart."""
+    latency_s: float
+    """Time from the arrival of the latest scan to the loop, in seconds. A loop may belong to a scan before it."""
+
+
+class Latest(Generic[T]):
+    """The newest item. `put` replaces an item that waits and counts it as dropped.
+
+    Example:
+      latest = Latest()
+      latest.put(frame)              # in the receiving thread
+      frame = latest.take(0.2)       # in the node: None after 0.2 s without an item
+    """
+
+    def __init__(self):
+        self._item: T | None = None
+        self._dropped = 0
+        self._changed = threading.Condition()
+
+    @property
+    def dropped(self) -> int:
+        """Number of items that were replaced before they were taken."""
+        return self._dropped
+
+    def put(self, item: T) -> None:
+        """Make this the newest item."""
+        with self._changed:
+            self._dropped += self._item is not None
+            self._item = item
+            self._changed.notify()
+
+    def take(self, timeout: float) -> T | None:
+        """Remove and return the newest item, or return None after `timeout` seconds without one."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._item is not None, timeout)
+            item, self._item = self._item, None
+            return item
+
+
+class Reports:
+    """Prints the first event of each kind at once. Later ones are counted and printed every `AGAIN_S` seconds.
+
+    An instance is a `Report`. It may be called from several threads.
+    """
+
+    def __init__(self, write: Callable[[str], object] | None = None, *, clock: Callable[[], float] = time.monotonic):
+        self.counts: dict[str, int] = {}
+        """Number of events of each kind."""
+        self._write, self._clock = write or _to_stderr, clock
+        self._said: dict[str, tuple[float, int]] = {}
+
+    def __call__(self, kind: str, text: str) -> None:
+        """Count an event and print it, unless its kind was printed in the last `AGAIN_S` seconds."""
+        count = self.counts[kind] = self.counts.get(kind, 0) + 1
+        at, before = self._said.get(kind, (-AGAIN_S, 0))
+        now = self._clock()
+        if before and now - at < AGAIN_S:
+            return
+        self._said[kind] = now, count
+        more = count - before - 1
+        self._write(f"{text} ({more} more since the last line)" if more else text)
+
+
+def _to_stderr(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,232 @@
+"""ROS topics as source of scans and odometry and as sink of loops, for every transport (DDS, zenoh, rclpy)."""
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from sglpr_jax.data.recording import found_record
+from sglpr_jax.live.endpoints import WAIT_S
+from sglpr_jax.live.messages import FrameStatus, Latest, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.ros_messages import (
+    CLOUDS,
+    EDGE,
+    MARKERS,
+    TRANSFORMS,
+    Received,
+    decode_cloud,
+    edge_message,
+    encode,
+    marker_message,
+    transform_message,
+)
+from sglpr_jax.live.ros_odometry import KINDS, LiveOdometry
+
+CLOUD_TOPIC = "/points"
+STATIC_TOPIC = "/tf_static"
+MISSING_S = 5.0
+"""Time without scans after which the existing topics are reported, in seconds. It is also the time between reports."""
+TAKEN_OVER_S = 2.0
+"""Time after which another publisher may take the place of one that is silent, in seconds."""
+POSES_KEPT = 100
+"""Number of messages with poses that wait for the thread of the connection."""
+EDGES_KEPT = 1000
+"""Number of edges that a subscriber receives that begins late."""
+LINES = 500
+"""Number of the last loops that are drawn."""
+Receive = Callable[[Received], None]
+"""Function that takes a message, in a thread of the connection. It must return at once."""
+
+
+@runtime_checkable
+class Transport(Protocol):
+    """A connection to ROS. Topics and types have the names that `ros2 topic list -t` prints."""
+
+    def subscribe(
+        self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
+    ) -> None:
+        """Receive the messages of a topic that have one of these types.
+
+        Arguments:
+          topic: Name of the topic.
+          kinds: Types of the messages.
+          receive: Function that takes a message.
+          depth: Number of messages that wait for `receive`. Older ones are dropped.
+          reliable: Whether lost messages are requested again.
+          latched: Whether messages of before the subscription are requested.
+        """
+        ...
+
+    def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
+        """Return a function that publishes messages of one type, given as CDR. With `latched`, later subscribers
+        receive the last `depth` messages."""
+        ...
+
+    def published(self) -> dict[str, set[str]]:
+        """Topics with a publisher, and their types."""
+        ...
+
+    def close(self) -> None:
+        """Release threads and connections."""
+        ...
+
+
+class RosSource:
+    """Source of the scans of a topic. See `sources.Source`."""
+
+    def __init__(self, transport: Transport, options: LiveOptions, report: Report, *, missing_s: float = MISSING_S):
+        """Subscribe to the topics.
+
+        Arguments:
+          transport: Open connection. `close` closes it.
+          options: Topics, and whether lost scans are requested again.
+          report: Function for trouble with single messages.
+          missing_s: Time without scans after which the existing topics are reported, in seconds.
+        """
+        self.topic = full_name(options.topic or CLOUD_TOPIC)
+        self._transport, self._report, self._missing_s = transport, report, missing_s
+        self._latest: Latest[Received] = Latest()
+        self._publisher = None
+        self._heard = self._reported = time.monotonic()
+        self._closed = threading.Event()
+        transport.subscribe(self.topic, CLOUDS, self._receive, depth=1, reliable=options.reliable, latched=False)
+        self._odometry = self._subscribed(options.odometry_topic)
+
+    def _subscribed(self, topic: str | None) -> LiveOdometry | None:
+        if topic is None:
+            return None
+        odometry = LiveOdometry(full_name(topic), self._report)
+        many = {"depth": POSES_KEPT, "reliable": False}
+        self._transport.subscribe(odometry.topic, KINDS, odometry.receive, **many, latched=False)
+        fixed = {"depth": POSES_KEPT, "reliable": True}
+        self._transport.subscribe(STATIC_TOPIC, (TRANSFORMS,), odometry.receive_static, **fixed, latched=True)
+        return odometry
+
+    def frames(self) -> Iterator[LiveFrame | None]:
+        """Yield scans as they arrive, and None after each `WAIT_S` seconds without a scan."""
+        while not self._closed.is_set():
+            message = self._latest.take(WAIT_S)
+            if message is None:
+                self._look()
+            yield None if message is None else self._frame(message)
+
+    def close(self) -> None:
+        """End the connection."""
+        self._closed.set()
+        self._transport.close()
+
+    @property
+    def dropped(self) -> int:
+        """Number of scans that were replaced by newer ones before they were taken."""
+        return self._latest.dropped
+
+    def _receive(self, message: Received) -> None:
+        """Keep the scan, if it is of the publisher in use."""
+        if message.publisher != self._publisher:
+            if self._publisher is not None and message.at - self._heard < TAKEN_OVER_S:
+                found = "found several; the scans of the first are used"
+                self._report("publishers", f"{self.topic}: expected one publisher, {found}")
+                return
+            self._publisher = message.publisher
+        self._heard = message.at
+        self._latest.put(message)
+
+    def _frame(self, message: Received) -> LiveFrame | None:
+        """Decode a scan and find its pose. Returns None, with a report, for an invalid scan."""
+        try:
+            header, records = decode_cloud(message.raw, message.kind)
+        except ValueError as error:
+            self._report("cloud", f"{self.topic}: {error}")
+            return None
+        pose = None
+        if self._odometry is not None:
+            pose = self._odometry.pose(header.time, header.frame.strip("/"), wait_s=WAIT_S)
+        return LiveFrame(found_record(records, lasers=False, time=header.time), header.time, pose, message.at)
+
+    def _look(self) -> None:
+        """Report which topics exist if no scans arrive."""
+        now = time.monotonic()
+        if now - max(self._heard, self._reported) < self._missing_s:
+            return
+        self._reported = now
+        found = self._transport.published()
+        kinds = found.get(self.topic, set())
+        wanted = f"{self.topic}: expected {' or '.join(CLOUDS)}"
+        if kinds & set(CLOUDS):
+            self._report("silent", f"{wanted}, found a publisher but no message for {now - self._heard:.0f} s; waiting")
+        elif kinds:
+            self._report("type", f"{wanted}, found {', '.join(sorted(kinds))}; waiting")
+        else:
+            others = ", ".join(f"{topic} ({' '.join(sorted(kinds))})" for topic, kinds in sorted(found.items()))
+            self._report("missing", f"{wanted}, found no such topic; existing topics: {others or 'none'}; waiting")
+
+
+class RosSink:
+    """Publishes loops. See `sinks.Sink`.
+
+    The topics are `PREFIX/loops` (`ros_messages.edge_message`), `PREFIX/loop_markers` and `/tf`. The transform from map
+    to odometry is that of the corrected trajectory (`FrameStatus.map_from_world`).
+    """
+
+    def __init__(self, transport: Transport, options: LiveOptions):
+        """Advertise the topics. `close` closes the connection."""
+        self._transport, self._options = transport, options
+        prefix = full_name(options.topic_prefix)
+        self._edges = transport.advertise(f"{prefix}/loops", EDGE, depth=EDGES_KEPT, latched=True)
+        self._markers = transport.advertise(f"{prefix}/loop_markers", MARKERS, depth=1, latched=True)
+        self._transforms = transport.advertise("/tf", TRANSFORMS, depth=100, latched=False)
+        self._lines: deque[np.ndarray] = deque(maxlen=LINES)
+
+    def frame(self, status: FrameStatus) -> None:
+        """Publish the transform from map to odometry at the time of the scan, or now if the scan has no time."""
+        if status.map_from_world is None:
+            return
+        at = status.time if np.isfinite(status.time) and status.time > 0 else time.time()
+        frames = {"frame": self._options.map_frame, "child": self._options.odometry_frame}
+        self._transforms(encode(transform_message(status.map_from_world, time=at, **frames)))
+
+    def loop(self, edge: LoopEdge) -> None:
+        """Publish an edge. With odometry of both scans, draw it."""
+        self._edges(encode(edge_message(edge)))
+        query, match = edge.world_from_query, edge.world_from_match
+        if query is None or match is None:
+            return
+        self._lines.append(np.stack([match[:3, 3], query[:3, 3]]))
+        drawn = marker_message(list(self._lines), time=edge.query_time, frame=self._options.odometry_frame)
+        self._markers(encode(drawn))
+
+    def close(self) -> None:
+        """End the connection."""
+        self._transport.close()
+
+
+def full_name(topic: str) -> str:
+    """Name of a topic with a slash at its beginning."""
+    return f"/{topic.strip('/')}"
+
+
+def domain_of(where: str, *, source: str) -> int:
+    """Number of a ROS 2 domain: `where`, or else the environment variable ROS_DOMAIN_ID, or else 0.
+
+    Raises ValueError if it is not from 0 to 232.
+    """
+    text = where or os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not (text.isdecimal() and int(text) <= 232):
+        raise ValueError(f"{source}: expected a ROS 2 domain from 0 to 232, found {text}")
+    return int(text)
+
+
+def wire_type(kind: str) -> str:
+    """Name of a type on the wire: `sensor_msgs::msg::dds_::PointCloud2_` of `sensor_msgs/msg/PointCloud2`."""
+    package, folder, name = kind.split("/")
+    return f"{package}::{folder}::dds_::{name}_"
+
+
+def ros_type(name: str) -> str:
+    """Name of a type in ROS 2, from its name on the wire."""
+    return name.removesuffix("_").replace("::dds_::", "::").replace("::", "/")

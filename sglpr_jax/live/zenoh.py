@@ -1,0 +1,167 @@
+"""Connection to ROS 2 by zenoh, without an installation of ROS (eclipse-zenoh, extra `live`).
+
+Keys, attachments and liveliness tokens follow rmw_zenoh from its release for Jazzy 0.2.4:
+
+* A message of `/points` in domain 0 has the key `0/points/sensor_msgs::msg::dds_::PointCloud2_/RIHS01_...`. The last
+  part is a hash of the type (REP 2011). rosbags computes it. Subscriptions accept any hash, publishers need the
+  subscriber's. Humble has the text `TypeHashNotSupported` there, so its nodes do not receive our messages.
+* The attachment is sequence number and time in nanoseconds (int64), and 16 bytes that identify the publisher.
+* A token `@ros2_lv/DOMAIN/SESSION/NODE/ID/MP/...` exists while a publisher lives.
+
+The hashes of PointCloud2 and TFMessage were compared with published ones.
+"""
+
+import json
+import os
+import secrets
+import time
+from collections.abc import Callable, Collection
+from typing import Any
+
+import zenoh
+from zenoh.ext import (
+    CacheConfig,
+    HistoryConfig,
+    Int64,
+    declare_advanced_publisher,
+    declare_advanced_subscriber,
+    z_serialize,
+)
+
+from sglpr_jax.files import in_short
+from sglpr_jax.live.endpoints import Taken
+from sglpr_jax.live.messages import Report
+from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
+from sglpr_jax.live.ros_messages import Received, typestore
+
+ROUTER = "tcp/localhost:7447"
+"""Endpoint of rmw_zenoh's router."""
+NODE = "sglpr"
+"""Name of this node in ROS 2."""
+GID_BYTES = 16
+"""Length of the identifier of a publisher, at the end of an attachment."""
+ANSWER_S = 1.0
+"""Maximum time for answers about publishers, in seconds."""
+
+
+class ZenohTransport:
+    """Session of zenoh. See `ros.Transport`."""
+
+    def __init__(self, endpoint: str, domain: int, report: Report):
+        """Open a session.
+
+        Arguments:
+          endpoint: Endpoint of a router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that
+            ZENOH_SESSION_CONFIG_URI names configures the session, or else it uses rmw_zenoh's router on this computer.
+          domain: Number of the ROS 2 domain.
+          report: Function for trouble with single messages.
+
+        Raises:
+          ValueError: If the endpoint or the configuration is invalid.
+        """
+        self._domain, self._report = domain, report
+        try:
+            self._session = zenoh.open(_config(endpoint))
+        except (zenoh.ZError, OSError) as error:
+            where = endpoint or os.environ.get("ZENOH_SESSION_CONFIG_URI") or ROUTER
+            raise ValueError(
+                f"zenoh: expected a valid endpoint or configuration, found {where} ({in_short(error)})"
+            ) from error
+        self._declared: list[Any] = [self._token("NN", 0)]
+
+    def subscribe(
+        self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
+    ) -> None:
+        """Receive the messages of a topic that have one of these types. zenoh has no settings that do not fit."""
+
+        def take(sample: zenoh.Sample) -> None:
+            try:
+                kind = ros_type(str(sample.key_expr).split("/")[-2])
+                if kind in kinds and sample.kind == zenoh.SampleKind.PUT:
+                    publisher = b"" if sample.attachment is None else sample.attachment.to_bytes()[-GID_BYTES:]
+                    receive(Received(kind, sample.payload.to_bytes(), publisher, time.monotonic()))
+            except Exception as error:  # zenoh would print it and go on
+                self._report(f"message {topic}", f"{topic}: expected a valid message, found {in_short(error)}")
+
+        key = f"{self._domain}{topic}/*/*"
+        if latched:
+            history = HistoryConfig(detect_late_publishers=True, max_samples=depth)
+            self._declared.append(declare_advanced_subscriber(self._session, key, take, history=history))
+        else:
+            self._declared.append(self._session.declare_subscriber(key, take))
+
+    def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
+        """Return a function that publishes messages of one type."""
+        type_hash = typestore().hash_rihs01(kind)
+        key = f"{self._domain}{topic}/{wire_type(kind)}/{type_hash}"
+        drop = zenoh.CongestionControl.DROP
+        if latched:
+            publisher: Any = declare_advanced_publisher(
+                self._session, key, congestion_control=drop, cache=CacheConfig(depth), publisher_detection=True
+            )
+        else:
+            publisher = self._session.declare_publisher(key, congestion_control=drop)
+        name = topic.replace("/", "%")
+        qos = f":{1 if latched else ''}:,{depth}:,:,:,,"
+        token = self._token("MP", len(self._declared), f"/{name}/{wire_type(kind)}/{type_hash}/{qos}")
+        self._declared += [publisher, token]
+        gid, sent = secrets.token_bytes(GID_BYTES), 0
+
+        def publish(cdr: bytes) -> None:
+            nonlocal sent
+            sent += 1
+            publisher.put(cdr, attachment=z_serialize((Int64(sent), Int64(time.time_ns()), gid)))
+
+        return publish
+
+    def published(self) -> dict[str, set[str]]:
+        """Topics with a publisher, and their types, by the tokens of rmw_zenoh."""
+        found: dict[str, set[str]] = {}
+        for reply in self._session.liveliness().get(f"@ros2_lv/{self._domain}/*/*/*/MP/**", timeout=ANSWER_S):
+            if reply.ok is not None:
+                *_, topic, kind, _, _ = str(reply.ok.key_expr).split("/")
+                found.setdefault(topic.replace("%", "/"), set()).add(ros_type(kind))
+        return found
+
+    def close(self) -> None:
+        """Close the session."""
+        for one in self._declared:
+            one.undeclare()
+        self._session.close()
+
+    def _token(self, entity: str, number: int, topic: str = "") -> Any:
+        """Declare a liveliness token of the node (NN) or of a publisher (MP)."""
+        key = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{number}/{entity}/%/%/{NODE}{topic}"
+        return self._session.liveliness().declare_token(key)
+
+
+def _config(endpoint: str) -> zenoh.Config:
+    """Configuration of a peer that finds others by a router, as rmw_zenoh's."""
+    given = "" if endpoint else os.environ.get("ZENOH_SESSION_CONFIG_URI")
+    config = zenoh.Config.from_file(given) if given else zenoh.Config()
+    settings: dict[str, Any] = (
+        {}
+        if given
+        else {
+            "mode": "peer",
+            "connect/endpoints": [endpoint or ROUTER],
+            "listen/endpoints": ["tcp/localhost:0"],
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": True,
+        }
+    )
+    settings["timestamping/enabled"] = True  # needed by publishers with a cache
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> RosSource:
+    """Open the source `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
+    return RosSource(ZenohTransport(where, domain_of("", source="zenoh"), report), options, report)
+
+
+def open_sink(where: str, options: LiveOptions, report: Report) -> RosSink:
+    """Open the sink `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
+    return RosSink(ZenohTransport(where, domain_of("", source="zenoh"), report), options)

@@ -1,0 +1,156 @@
+"""Maps on the grid of the image: classes that the segmentation head predicts, and the strength of features."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Num
+from PIL import Image
+
+from sglpr_jax.bev import uncropped
+from sglpr_jax.data.formats.png import label_image_pixels
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.views import view
+from sglpr_jax.files import replacing
+from sglpr_jax.labels import UNLABELLED, to_raw
+from sglpr_jax.models.input_image import field_of_view, from_polar
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import forward, segment
+
+
+class SemanticMap(NamedTuple):
+    """Point counts and classes of the cells of a scan (h, w)."""
+
+    counts: Float[np.ndarray, "h w"]
+    predicted: Int[np.ndarray, "h w"]
+    """Predicted class ids; 0 for cells that are empty, outside the field of view, or uncertain."""
+    truth: Int[np.ndarray, "h w"]
+    """Class of the last point in each cell; 0 for cells that are empty, outside the field of view, or without a
+    label."""
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "h w"]:
+        """Cells that have a predicted class."""
+        return self.predicted != UNLABELLED
+
+
+def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0) -> SemanticMap:
+    """Predict the class of every occupied cell of a scan or a ready-made image.
+
+    The probabilities are the mean over the image and its mirror image.
+
+    Arguments:
+      params: Weights of the model.
+      record: Scan, or ready-made image that is cropped to the model's grid. Cells above 0 are occupied. Labels of the
+        record become the true map.
+      min_confidence: Minimum probability of the most probable class. Cells below it stay unlabelled.
+
+    Example:
+      found = semantic_map(params, recording.record(0))
+    """
+    config = params.config
+    categories = 0 if record.labels is None else config.categories
+    counts, truth = view(record, config.grid, image=config.image, categories=categories)
+    truth = jnp.zeros(counts.shape, jnp.int32) if truth is None else truth
+    return SemanticMap(*jax.device_get((counts, *_predict(params, counts, truth, jnp.float32(min_confidence)))))
+
+
+def semantic_maps(
+    params: Params,
+    recording: Recording,
+    rows: Sequence[int] | None = None,
+    *,
+    min_confidence: float = 0.0,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Iterator[tuple[int, Record, SemanticMap]]:
+    """Yield the row, the record and the semantic map of every scan of a recording, or of the given rows.
+
+    Arguments:
+      params: Weights of the model.
+      recording: Scans or ready-made images.
+      rows: Rows of the recording, or None for all.
+      min_confidence: See `semantic_map`.
+      on_progress: Called with the number of finished scans.
+    """
+    for done, row in enumerate(range(len(recording)) if rows is None else rows):
+        record = recording.record(row)
+        yield row, record, semantic_map(params, record, min_confidence=min_confidence)
+        on_progress(done + 1)
+
+
+def save_map(path: Path, found: SemanticMap, record: Record, *, categories: int) -> None:
+    """Write the class ids of a map as a PNG. For a ready-made image, write its label image, with 0 outside the grid."""
+    if record.image is None:
+        pixels = found.predicted.astype(np.uint8)
+    else:
+        raw = to_raw(found.predicted, categories=categories)
+        pixels = label_image_pixels(uncropped(raw, shape=record.image.shape))
+    with replacing(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")
+
+
+@jax.jit
+def _predict(
+    params: Params, counts: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
+) -> tuple[Int[Array, "h w"], Int[Array, "h w"]]:
+    seen = (counts > 0) & field_of_view(params.config)[0]
+    probability = _class_probabilities(params, counts)
+    predicted = probability.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
+    sure = probability.max(-1) >= min_confidence
+    return jnp.where(seen & sure, predicted, UNLABELLED), jnp.where(seen, truth, UNLABELLED)
+
+
+def _class_probabilities(params: Params, counts: Float[Array, "h w"]) -> Float[Array, "h w known"]:
+    """Return the mean probabilities over the image and its mirror image, of all classes except unlabelled.
+
+    The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds
+    information.
+    """
+    logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
+    as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])
+    return (as_it_is + mirrored[:, ::-1]) / 2
+
+
+def heat_maps(
+    params: Params, bev: Num[Array | np.ndarray, "h w"], labels: Int[Array | np.ndarray, "h w"] | None = None
+) -> Mapping[str, Float[np.ndarray, "h w"]]:
+    """Compute the root mean square over the channels of some feature maps, scaled from 0 to 1.
+
+    The model selects the feature maps (`config.pictures`): those of its backbone, and the first of its place head.
+
+    Arguments:
+      params: Weights of the model.
+      bev: One image of point counts.
+      labels: Map of classes, if `describe` needs it.
+
+    Returns:
+      Maps by title, with NaN outside the field of view of the model.
+    """
+    found = jax.device_get(_strengths(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
+    return {title: _scaled(found[name]) for title, name in params.config.pictures.items()}
+
+
+def _scaled(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    low, high = np.nanmin(values), np.nanmax(values)
+    return (values - low) / max(high - low, 1e-9)
+
+
+@jax.jit
+def _strengths(
+    params: Params, bev: Num[Array, "h w"], labels: Int[Array, "h w"] | None
+) -> dict[str, Float[Array, "h w"]]:
+    config, grid = params.config, params.config.grid
+    outputs = forward(params, bev, labels, segment=0)
+
+    def on_grid(features: Float[Array, "1 p q c"]) -> Float[Array, "h w"]:
+        strength = jnp.sqrt(jnp.mean(features.astype(jnp.float32) ** 2, axis=-1, keepdims=True))
+        if config.polar:
+            whole = from_polar(strength, grid)[0, ..., 0]
+        else:
+            whole = jax.image.resize(strength[0, ..., 0], (grid.height, grid.width), "linear")
+        return jnp.where(field_of_view(config)[0], whole, jnp.nan)
+
+    return {name: on_grid(outputs.intermediates[name]) for name in config.pictures.values()}

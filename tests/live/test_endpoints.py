@@ -1,0 +1,26 @@
+"""Sources and sinks are found by name, and each error names the source or sink that is wrong."""
+
+import pytest
+
+from sglpr_jax.live.endpoints import open_sink, open_source
+from sglpr_jax.live.options import LiveOptions
+
+
+@pytest.mark.parametrize("text", ["", "ros"])
+def test_an_unknown_source_or_sink_is_refused(text, said):
+    with pytest.raises(ValueError, match="expected one of the sources folder, bag, dds, zenoh, found"):
+        open_source(text, LiveOptions(), said)
+    with pytest.raises(ValueError, match="expected one of the sinks json, dds, zenoh, rerun, found"):
+        open_sink(text, LiveOptions(), said)
+
+
+def test_a_missing_folder_and_extra_are_named(tmp_path, said, monkeypatch):
+    with pytest.raises(FileNotFoundError, match=r"folder:.*: expected a folder"):
+        open_source(f"folder:{tmp_path}/none", LiveOptions(), said)
+    monkeypatch.setattr("sglpr_jax.live.endpoints.importlib.import_module", missing)
+    with pytest.raises(ImportError, match=r"dds: expected the package cyclonedds, found none; pip install .*\[live\]"):
+        open_source("dds", LiveOptions(), said)
+
+
+def missing(name: str):
+    raise ModuleNotFoundError("No module named 'cyclonedds'", name="cyclonedds")

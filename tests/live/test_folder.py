@@ -1,0 +1,113 @@
+"""Scans come from a growing folder once each, in order, with their times and poses."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sglpr_jax.live import folder
+from sglpr_jax.live.endpoints import open_source
+from sglpr_jax.live.folder import GrowingPoses
+from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.se3 import transform
+
+POINTS = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+STAMP = 1_700_000_000.0
+
+
+def scan(path: Path, points: int = 300) -> Path:
+    np.pad(POINTS[:points], ((0, 0), (0, 1))).astype("<f4").tofile(path)
+    return path
+
+
+def taken(source, count: int, timeout_s: float = 10.0) -> list:
+    """The next scans of a source, without the pauses."""
+    found, end = [], time.monotonic() + timeout_s
+    for frame in source.frames():
+        found += [] if frame is None else [frame]
+        if len(found) >= count or time.monotonic() > end:
+            break
+    return found
+
+
+def looked(source, seconds: float) -> list:
+    """The scans that come within a time."""
+    return taken(source, 10**9, seconds)
+
+
+@pytest.fixture
+def incoming(tmp_path):
+    path = tmp_path / "incoming"
+    path.mkdir()
+    return path
+
+
+def test_scans_of_a_folder_come_in_order_once_they_are_complete(incoming, said):
+    source = open_source(f"folder:{incoming}", LiveOptions(), said)
+    assert looked(source, 0.1) == []
+    for i in (10, 9):
+        scan(incoming / f"{STAMP + i}.bin")
+    first, second = taken(source, 2)
+    assert (first.time, second.time) == (STAMP + 9, STAMP + 10) and first.record.name.endswith("09.0.bin")
+    np.testing.assert_array_equal(first.record.points, POINTS)
+    assert first.odometry is None and source.dropped == 0
+    with (incoming / "1700000011.0.bin").open("wb") as file:
+        content = (incoming / "1700000010.0.bin").read_bytes()
+        for start in range(0, len(content), 800):
+            file.write(content[start : start + 800])
+            file.flush()
+            assert looked(source, folder.LOOK_S / 2) == [] or start + 800 >= len(content)
+    assert [frame.time for frame in taken(source, 1)] == [STAMP + 11] and not said
+
+
+def test_a_folder_is_continued_after_the_last_scan_of_the_map(incoming, said):
+    paths = [scan(incoming / f"{i}.bin") for i in range(4)]
+    known = {str(paths[1].resolve())}
+    source = open_source(f"folder:{incoming}", LiveOptions(), said, taken=known.__contains__)
+    assert [Path(frame.record.name).name for frame in looked(source, 0.5)] == ["2.bin", "3.bin"]
+
+
+def test_a_scan_that_cannot_be_read_is_reported_and_the_others_come(incoming, said):
+    scan(incoming / "0.bin")
+    (incoming / "1.bin").write_bytes(b"12345")
+    scan(incoming / "2.bin")
+    (incoming / "3.bin").touch()
+    for path in incoming.iterdir():
+        os.utime(path, (STAMP, STAMP))
+    source = open_source(f"folder:{incoming}", LiveOptions(), said)
+    assert [Path(frame.record.name).name for frame in looked(source, 1.0)] == ["0.bin", "2.bin"]
+    assert said.kinds == ["scan", "scan"] and "1.bin" in said[0][1]
+
+
+def test_poses_of_a_folder_are_those_of_their_line_or_time(incoming, tmp_path, said):
+    poses = np.stack([transform(float(i), 0.0, 0.1 * i) for i in range(4)])
+    write_tum(tmp_path / "poses.tum", poses, STAMP + np.arange(4.0))
+    for i in (0.5, 2.0):
+        scan(incoming / f"{STAMP + i}.bin")
+    options = LiveOptions(poses=tmp_path / "poses.tum")
+    first, second = taken(open_source(f"folder:{incoming}", options, said), 2)
+    np.testing.assert_allclose(first.odometry, transform(0.5, 0.0, 0.05), atol=1e-6)
+    np.testing.assert_allclose(second.odometry, poses[2], atol=1e-6)
+
+
+def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
+    path = tmp_path / "poses.txt"
+    found = GrowingPoses(path, "lidar", "auto")
+    found.look()
+    assert found.of(0, None) is None
+    row = np.eye(4)[:3].reshape(-1)
+    with path.open("w") as file:
+        for i in range(3):
+            row[3] = i
+            file.write("# comment\n" * (i == 0) + ("broken" if i == 1 else " ".join(map(str, row))) + "\n")
+        file.write("1 0 0")  # not whole yet
+    with pytest.raises(ValueError, match=r"poses.txt, line 3: expected 12 numbers, found 1"):
+        found.look()
+    found.look()
+    assert found.of(1, None) is None and found.of(3, None) is None
+    assert found.of(2, None)[0, 3] == 2 and found.of(0, None)[0, 3] == 0
+    with pytest.raises(ValueError, match="pass --pose-format kitti or lidar"):
+        GrowingPoses(path, "auto", "auto").look()

@@ -1,0 +1,95 @@
+"""Times of a live map never go back, odometry continues only if it can, and the mounting is that of the first scans."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.live.odometry_input import HOLD_S, SCANS, WAIT_S, Clock, Continuity, FirstScans
+from sglpr_jax.se3 import transform
+
+
+def at(x: float, y: float = 0.0) -> np.ndarray:
+    return transform(float(x), float(y), 0.0)
+
+
+def times(clock: Clock, stamps, received=None) -> list[float]:
+    received = np.arange(len(stamps)) * 0.1 + 50 if received is None else received
+    return [clock.time(stamp, at) for stamp, at in zip(stamps, received, strict=True)]
+
+
+@pytest.mark.parametrize("other", [1e9 - 3600, 1e9 + 365 * 86400])
+def test_a_clock_that_jumps_is_followed(said, other):
+    stamps = [1e9, 1e9 + 0.1, other, other + 0.1, other + 0.2, 1e9 + 0.5]
+    np.testing.assert_allclose(np.diff(times(Clock(said), stamps)), 0.1, atol=1e-6)
+    assert said.kinds == ["clock", "clock"]
+
+
+@pytest.mark.parametrize("missing", [0.0, np.nan])
+def test_scans_without_a_time_get_that_of_their_arrival(said, missing):
+    found = times(Clock(said), [1e9, missing, 1e9 + 0.2, missing])
+    np.testing.assert_allclose(found, 1e9 + np.arange(4) * 0.1)
+    assert said.kinds == ["time", "time"]
+
+
+def test_a_clock_continues_after_a_restart(said):
+    clock = Clock(said)
+    clock.resume(1e9 + 7, 1e9, received=40.0)
+    assert clock.time(1e9 + 10, 50.0) == 1e9 + 17 and not said
+
+
+def placed(continuity: Continuity, given) -> list[bool | None]:
+    """Whether each scan continues; None: left out."""
+    found = [continuity.placed(pose, time) for time, pose in given]
+    return [None if one is None else one.continues for one in found]
+
+
+def test_odometry_that_jumps_or_is_reset_begins_anew(said):
+    drive = [(0.0, at(0)), (0.1, at(1)), (0.2, at(90)), (0.3, at(91)), (0.4, at(97)), (0.5, at(5)), (0.6, at(0))]
+    found = placed(Continuity(said, expected=True), drive)
+    assert found == [True, True, False, True, True, False, False]
+    assert said.kinds == ["jump"] * 3
+
+
+def test_odometry_that_stops_holds_scans_back_for_a_while(said):
+    given = [(0.0, at(0)), (HOLD_S - 0.1, None), (HOLD_S, None), (HOLD_S + 0.1, None), (HOLD_S + 0.2, at(1))]
+    continuity = Continuity(said, expected=True)
+    assert placed(continuity, given) == [True, None, False, False, False]
+    assert placed(continuity, [(HOLD_S + 0.3, at(1.1)), (HOLD_S + 0.5, None), (HOLD_S + 0.6, at(1.2))]) == [
+        True,
+        None,
+        True,
+    ]
+    assert said.kinds == ["hold", "stopped", "stopped", "jump", "hold"]
+
+
+def test_the_first_scans_wait_for_odometry(said):
+    continuity = Continuity(said, expected=True)
+    assert placed(continuity, [(5.0, None), (6.0, at(0))]) == [None, True]
+    late = Continuity(said, expected=True)
+    assert placed(late, [(5.0, None), (5.0 + WAIT_S, None), (16.0, at(0))]) == [None, True, True]
+    assert late.placed(at(0), 17.0).pose is None
+    assert said.kinds == ["wait", "wait", "wait over", "odometry", "odometry"]
+
+
+@pytest.mark.parametrize(
+    ("last", "pose", "seconds", "continues"),
+    [
+        (at(40), at(43), 5.0, True),
+        (at(40), at(0), 5.0, False),  # it was reset
+        (at(40), at(43), 3600.0, False),
+        (at(40), at(1e4), 5.0, False),
+        (None, None, 5.0, False),
+    ],
+)
+def test_after_a_restart_the_way_is_known_only_if_the_odometry_continues(said, last, pose, seconds, continues):
+    continuity = Continuity(said, expected=False)
+    continuity.resume(last, 100.0)
+    first = continuity.placed(pose, 100.0 + seconds)
+    assert first.continues == continues and said.kinds == ["restart"]
+    assert continuity.placed(pose, 100.1 + seconds).continues
+
+
+def test_the_mounting_is_that_of_the_first_scans(drive):
+    first = FirstScans()
+    found = [first.see(drive.points(i)) for i in range(SCANS + 1)]
+    assert found[-1] == found[-2] and abs(found[-1].height_m - 1.73) < 0.15
+    assert FirstScans(2.5).see(drive.points(0)).height_m == 2.5

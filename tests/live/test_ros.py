@@ -1,0 +1,145 @@
+"""Source and sink of ROS 2 topics, with a connection in memory."""
+
+import itertools
+import time as clock
+
+import numpy as np
+import pytest
+
+from sglpr_jax.live.messages import FrameStatus, LoopEdge
+from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.ros import TAKEN_OVER_S, RosSink, RosSource, domain_of
+from sglpr_jax.live.ros_messages import CLOUD, MARKERS, TRANSFORMS
+from tests.live.messages import LIVOX, ODOMETRY, POINTS, cloud, decoded, odometry, received
+
+
+class Memory:
+    """A `Transport` without a network."""
+
+    def __init__(self):
+        self.topics: dict[str, set[str]] = {}
+        self.receive, self.sent, self.closed = {}, [], False
+
+    def subscribe(self, topic, kinds, receive, **_):
+        self.receive[topic] = receive
+
+    def advertise(self, topic, kind, **_):
+        return lambda cdr: self.sent.append((topic, kind, decoded(cdr, kind)))
+
+    def published(self):
+        return self.topics
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def transport() -> Memory:
+    return Memory()
+
+
+@pytest.fixture
+def source(transport, said) -> RosSource:
+    return RosSource(transport, LiveOptions(topic="points", odometry_topic="/odom"), said, missing_s=0.0)
+
+
+def test_a_scan_has_points_time_and_pose(transport, source, said):
+    for seconds in (12.4, 12.6):
+        message = odometry(seconds, (seconds, 0, 0), child="lidar")
+        transport.receive["/odom"](received(ODOMETRY, message, at=clock.monotonic()))
+    transport.receive["/points"](received(CLOUD, cloud(12.5), at=3.0))
+    frame = next(source.frames())
+    np.testing.assert_array_equal(frame.record.points, POINTS)
+    assert (frame.time, frame.received, frame.record.name) == (12.5, 3.0, "")
+    np.testing.assert_allclose(frame.odometry[:3, 3], [12.5, 0, 0])
+    assert not said
+
+
+def test_an_invalid_cloud_is_reported_and_the_next_one_taken(transport, source, said):
+    transport.receive["/points"](received(CLOUD, cloud()[:50]))
+    frames = source.frames()
+    assert next(frames) is None
+    assert said.of("cloud")[0].startswith("/points: expected a cloud with points, found an invalid one (")
+    transport.receive["/points"](received(CLOUD, cloud()))
+    assert next(frames) is not None
+
+
+def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(transport, source, said):
+    frames = source.frames()
+    for publisher, at, taken in (
+        ("a", 1.0, True),
+        ("b", 1.1, False),
+        ("a", 1.2, True),
+        ("b", 1.3 + TAKEN_OVER_S, True),
+    ):
+        transport.receive["/points"](received(CLOUD, cloud(at), publisher=publisher, at=at))
+        assert (next(frames) is not None) == taken
+    assert said.of("publishers") == ["/points: expected one publisher, found several; the scans of the first are used"]
+
+
+@pytest.mark.parametrize(
+    "topics, kind, found",
+    [
+        ({}, "missing", "found no such topic; existing topics: none; waiting"),
+        ({"/points": {"std_msgs/msg/String"}}, "type", "found std_msgs/msg/String; waiting"),
+        ({"/points": {CLOUD}}, "silent", "found a publisher but no message for 0 s; waiting"),
+    ],
+)
+def test_a_topic_that_does_not_come_is_reported(transport, source, said, topics, kind, found):
+    transport.topics = topics
+    assert list(itertools.islice(source.frames(), 1)) == [None]
+    assert said.of(kind)[0].startswith(f"/points: expected {CLOUD} or {LIVOX}, ") and found in said.of(kind)[0]
+
+
+def moved(x: float, y: float = 0.0) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, 3] = x, y
+    return pose
+
+
+def edge(query: int, match: int, world_from_query, world_from_match, match_from_query) -> LoopEdge:
+    return LoopEdge(
+        query, match, 50.0, 10.0, match_from_query, np.eye(6), 0.9, world_from_query, world_from_match, 0.01
+    )
+
+
+def status(time: float = 50.0, map_from_world: np.ndarray | None = None) -> FrameStatus:
+    return FrameStatus(4, time, 0.01, 0.02, 0, 5, 100, map_from_world)
+
+
+def sent(transport: Memory, kind: str) -> list:
+    return [message for _, one, message in transport.sent if one == kind]
+
+
+def test_an_edge_is_published_and_drawn(transport):
+    sink = RosSink(transport, LiveOptions())
+    sink.loop(edge(80, 2, moved(9, 1), moved(0), moved(0.5)))
+    assert {topic for topic, *_ in transport.sent} == {"/sglpr/loops", "/sglpr/loop_markers"}
+    ends = sent(transport, MARKERS)[-1].markers[0].points
+    assert [(one.x, one.y) for one in ends] == [(0, 0), (9, 1)]
+
+
+def test_the_correction_of_the_odometry_is_published(transport):
+    sink = RosSink(transport, LiveOptions())
+    sink.frame(status())
+    assert transport.sent == []
+    sink.frame(status(map_from_world=moved(-8.5, -1)))
+    found = sent(transport, TRANSFORMS)[-1].transforms[0]
+    assert (found.header.frame_id, found.child_frame_id, found.header.stamp.sec) == ("map", "odom", 50)
+    assert (found.transform.translation.x, found.transform.translation.y) == (-8.5, -1)
+
+
+@pytest.mark.parametrize("time", [float("nan")])
+def test_the_transform_of_a_scan_without_time_has_the_present_one(transport, time):
+    RosSink(transport, LiveOptions()).frame(status(time, np.eye(4)))
+    assert sent(transport, TRANSFORMS)[0].transforms[0].header.stamp.sec > 1e9
+
+
+def test_the_domain_comes_from_the_text_or_the_environment(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    assert (domain_of("3", source="dds"), domain_of("", source="dds")) == (3, 7)
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    assert domain_of("", source="dds") == 0
+    for wrong in ("x", "-1", "233"):
+        with pytest.raises(ValueError, match=f"dds: expected a ROS 2 domain from 0 to 232, found {wrong}"):
+            domain_of(wrong, source="dds")
