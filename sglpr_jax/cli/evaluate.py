@@ -118,7 +118,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
 
 def _check_options(command: EvaluateCommand) -> None:
     """Raise ValueError if options exclude each other."""
-    from sglpr_jax.evaluation.protocols.choice import check_names
+    from sglpr_jax.evaluation.protocols import check_names
 
     if command.database is not None:
         silent = ("poses", "times", "distance", "compare", "data", "weights")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.evaluation.protocols import Decision, Result
+from sglpr_jax.evaluation.protocols.protocol import Decision, Result
 
 APART = 10
 """Minimum gap between the queries of two shown mistakes, in frames. Neighbouring frames make the same mistake."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int, Num
 
-from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.files import MOST_SHOWN, printable, replacing
 from sglpr_jax.labels import Taxonomy, taxonomy
 from sglpr_jax.metrics import PrecisionRecallCurve

@@ -9,7 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures, report
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.scoring import score
 from sglpr_jax.evaluation.semantic_score import SemanticScore, score_semantics
 from sglpr_jax.files import write_json

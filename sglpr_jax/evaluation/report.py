@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 
 from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1
 from sglpr_jax.files import printable
 from sglpr_jax.metrics import PrecisionRecallCurve

@@ -19,8 +19,9 @@ from sglpr_jax.evaluation.inputs import Input, read_input
 from sglpr_jax.evaluation.inputs.agreement import check_agreement
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
 from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
-from sglpr_jax.evaluation.protocols.choice import chosen_protocols
+from sglpr_jax.evaluation.protocols import chosen_protocols, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.protocol import Result
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK, kind_of
 from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function

@@ -11,8 +11,8 @@ from rich.console import Console, ConsoleOptions
 
 from sglpr_jax.evaluation.inputs.own_file import read_own_file
 from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.protocols import Result, protocol_named, protocols_taking
-from sglpr_jax.evaluation.protocols.choice import ALL
+from sglpr_jax.evaluation.protocols import ALL, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
 from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_json

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.report import PrintsItself, format_score, to_json
 
 

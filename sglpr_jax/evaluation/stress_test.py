@@ -10,8 +10,8 @@ import numpy as np
 from sglpr_jax.data.corruption import CLEAN, ROTATION, Corruption, chosen_corruptions, corrupted
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.protocols import Result, protocol_named, protocols_taking
-from sglpr_jax.evaluation.protocols.choice import ALL, check_names
+from sglpr_jax.evaluation.protocols import ALL, check_names, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.scoring import score
 from sglpr_jax.evaluation.stress_table import StressRow, StressTest, changes_by_kind
 from sglpr_jax.files import write_json

@@ -9,7 +9,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page.recording_pictures import semantic_picture
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.files import file_name
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL, NO_SEGMENTATION
 from sglpr_jax.reproduce.runs import Runs

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.evaluation.protocols import PROTOCOLS, Result
-from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
+from sglpr_jax.evaluation.protocols import PROTOCOLS
+from sglpr_jax.evaluation.protocols.protocol import Result
+from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL
 from sglpr_jax.evaluation.published import TABLES
 from sglpr_jax.evaluation.published import Row as PublishedRow
 from sglpr_jax.reproduce.compared import content_of
@@ -61,7 +62,7 @@ def across_sessions_rows(
     ours = []
     for method, label in methods_of(name, fitting, trained=trained).items():
         there = runs.descriptors(method, seq, of=database)
-        found = {q.name: bevplace_nclt_recall(there, runs.descriptors(method, seq, of=q)).score for q in queries}
+        found = {q.name: BEVPLACE_NCLT_RECALL(there, runs.descriptors(method, seq, of=q)).score for q in queries}
         ours.append(Row(label, OURS, {name: score_or_none(score) for name, score in found.items()}))
     columns = [query.name for query in queries]
     return columns, [*ours, *published_rows(name, columns)]

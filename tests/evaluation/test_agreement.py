@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.inputs.agreement import check_agreement
-from sglpr_jax.evaluation.protocols import ScoredPairs, TopK
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
 from sglpr_jax.evaluation.scoring import evaluate_methods
 
 

@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.false_positives import worst_false_positives
-from sglpr_jax.evaluation.protocols import Decision
-from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
-from sglpr_jax.evaluation.protocols.overlap_transformer_f1max import overlap_transformer_f1max
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.evaluation.protocols.protocol import Decision
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_RECALL_AT_1
+from sglpr_jax.evaluation.protocols.top1 import OVERLAP_TRANSFORMER_F1MAX, TOP1_F1MAX
 
 
 @pytest.fixture
@@ -18,7 +17,7 @@ def mistaken(make_file, two_laps):
     return make_file(two_laps, descriptors)
 
 
-@pytest.mark.parametrize("protocol", [top1_f1max, overlap_transformer_f1max])
+@pytest.mark.parametrize("protocol", [TOP1_F1MAX, OVERLAP_TRANSFORMER_F1MAX])
 def test_the_surest_mistakes_come_first_and_neighbours_once(mistaken, protocol):
     result = protocol(mistaken)
     assert np.sum(result.decisions == Decision.FALSE_POSITIVE) == 3
@@ -32,18 +31,18 @@ def test_the_surest_mistakes_come_first_and_neighbours_once(mistaken, protocol):
 
 def test_metres_have_the_dimensions_of_the_protocol(mistaken):
     hills = mistaken.positions + np.arange(800)[:, None] * [0, 0, 1.0]
-    flat = overlap_transformer_f1max(mistaken)
+    flat = OVERLAP_TRANSFORMER_F1MAX(mistaken)
     assert flat.dimensions == 2
     assert worst_false_positives(flat, hills) == worst_false_positives(flat, mistaken.positions)
 
 
 def test_a_recall_accepts_nothing_and_a_perfect_method_nothing_wrong(mistaken, make_file, two_laps):
-    assert worst_false_positives(bevplace_recall_at_1(mistaken), mistaken.positions) == []
-    assert worst_false_positives(top1_f1max(make_file(two_laps, two_laps)), two_laps) == []
+    assert worst_false_positives(BEVPLACE_RECALL_AT_1(mistaken), mistaken.positions) == []
+    assert worst_false_positives(TOP1_F1MAX(make_file(two_laps, two_laps)), two_laps) == []
 
 
 def test_every_query_has_its_answer_in_the_result(mistaken):
-    result = top1_f1max(mistaken)
+    result = TOP1_F1MAX(mistaken)
     assert result.answers.shape == result.answer_distances.shape == (800,)
     queries = result.decisions != Decision.NOT_A_QUERY
     assert np.all(result.answers[~queries] == -1) and np.all(np.isinf(result.answer_distances[~queries]))

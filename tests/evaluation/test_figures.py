@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.labels import CATEGORIES, taxonomy
 from sglpr_jax.metrics import classification_curve
 

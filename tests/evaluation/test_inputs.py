@@ -9,9 +9,9 @@ from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs import read_input
 from sglpr_jax.evaluation.inputs.agreement import check_agreement
 from sglpr_jax.evaluation.inputs.methods import read_methods
-from sglpr_jax.evaluation.protocols import ScoredPairs, TopK, protocols_taking
-from sglpr_jax.evaluation.protocols.choice import check_names, chosen_protocols
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.evaluation.protocols import check_names, chosen_protocols, protocols_taking
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
+from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_matrix_is_scored_as_the_file_it_would_make(read, make_file, two_laps,
     assert (found.sequence, found.distance, found.pose_source) == ("town", "l2", "laps.csv (csv)")
     assert found.config == {"method": "mine"} and found.ids[:2] == ("000000", "000001")
     times = np.arange(800) * 0.5
-    assert top1_f1max(found).score == top1_f1max(make_file(two_laps, rows, times=times)).score
+    assert TOP1_F1MAX(found).score == TOP1_F1MAX(make_file(two_laps, rows, times=times)).score
     assert read("mine.npy", rows, distance="cosine").distance == "cosine"
 
 
@@ -127,7 +127,7 @@ def test_a_top_k_list_with_scores(read):
     np.testing.assert_array_equal(found.queries, [400, 401, 402])
     np.testing.assert_array_equal(found.nearest, [[0, 7], [-1, -1], [2, -1]])
     np.testing.assert_array_equal(found.scores, [[0.9, -0.5], [0, 0], [0.25, 0]])
-    assert top1_f1max(found).counts["queries"] > 0
+    assert TOP1_F1MAX(found).counts["queries"] > 0
 
 
 def test_a_top_k_list_without_scores(read):

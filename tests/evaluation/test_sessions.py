@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.page.across_sessions import sessions_page
-from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
-from sglpr_jax.evaluation.protocols.pointnetvlad_recall import pointnetvlad_recall
+from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL, POINTNETVLAD_RECALL
 from sglpr_jax.evaluation.published import NCLT, TABLE_3
 from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, check_one_world, evaluate_sessions, published_rows
 
@@ -29,8 +28,8 @@ def session(make_file):
 def test_columns_are_the_protocols_scores_and_their_mean(session):
     database, queries = session(MAP), [session(NCLT[0]), session(NCLT[1])]
     found = evaluate_sessions(database, queries)
-    nclt = [bevplace_nclt_recall(database, file).score for file in queries]
-    runs = [pointnetvlad_recall(database, file).score for file in queries]
+    nclt = [BEVPLACE_NCLT_RECALL(database, file).score for file in queries]
+    runs = [POINTNETVLAD_RECALL(database, file).score for file in queries]
     assert 0 < min(nclt) < 1 and found.columns == ("", NCLT[0], NCLT[1], "mean")
     assert found.rows() == [
         ("bevplace-nclt-recall", *(f"{score:.3f}" for score in (*nclt, np.mean(nclt)))),

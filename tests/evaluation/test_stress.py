@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.stress_table import StressRow, changes_by_kind, score_changes, stress_json, stress_table
 
 

@@ -14,7 +14,7 @@ from sglpr_jax.evaluation.inputs.matrix import read_matrix
 from sglpr_jax.evaluation.inputs.own_file import read_own_file
 from sglpr_jax.evaluation.inputs.pair_list import read_pair_list
 from sglpr_jax.evaluation.inputs.top_k_list import is_top_k_list, read_top_k_list
-from sglpr_jax.evaluation.protocols import ScoredPairs, Source
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, Source
 from sglpr_jax.retrieval.distances import distance_function
 
 Input = Source | ScoredPairs

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sglpr_jax.evaluation.inputs import Input
-from sglpr_jax.evaluation.protocols import ScoredPairs
+from sglpr_jax.evaluation.protocols.source import ScoredPairs
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 NEAR_M = 0.01

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs import Input, read_input
-from sglpr_jax.evaluation.protocols import ScoredPairs
+from sglpr_jax.evaluation.protocols.source import ScoredPairs
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 

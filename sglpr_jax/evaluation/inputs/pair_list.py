@@ -10,7 +10,7 @@ import numpy as np
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.evaluation.inputs.text_list import as_frame, as_score, check_rows, read_lines
-from sglpr_jax.evaluation.protocols import ScoredPairs
+from sglpr_jax.evaluation.protocols.source import ScoredPairs
 
 LABELS = {"0": False, "1": True}
 

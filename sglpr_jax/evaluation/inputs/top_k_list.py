@@ -11,7 +11,7 @@ import numpy as np
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.evaluation.inputs.text_list import as_frame, as_score, check_rows, padded, read_lines
-from sglpr_jax.evaluation.protocols import TopK
+from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.files import naming
 
 Answer = tuple[int, float | None]

@@ -10,7 +10,7 @@ from sglpr_jax.evaluation.false_positives import FalsePositive
 from sglpr_jax.evaluation.page.document import Section, bev_html, figure_html, html_table, missing
 from sglpr_jax.evaluation.page.pictures import HeatPicture, SemanticPicture
 from sglpr_jax.evaluation.page.plots import Plots
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.report import (
     COLUMNS,
     PUBLISHED_COLUMNS,

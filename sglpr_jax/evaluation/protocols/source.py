@@ -1,6 +1,7 @@
 """Inputs of protocols: descriptors, retrieved frames or scored pairs."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -105,6 +106,18 @@ class ScoredPairs:
 
 
 Source = DescriptorFile | TopK
+Kind = Literal["descriptors", "top-k list", "scored top-k list", "scored pairs", "sessions"]
+"""Kind of input: a descriptor file, retrieved frames without or with scores, pairs of frames with scores, or descriptor
+files of several sessions. The first session is the database."""
+
+
+def kind_of(source: Source | ScoredPairs) -> Kind:
+    """Return the kind of `source`."""
+    if isinstance(source, ScoredPairs):
+        return "scored pairs"
+    if isinstance(source, TopK):
+        return "top-k list" if source.scores is None else "scored top-k list"
+    return "descriptors"
 
 
 def positions_of(source: Source, dimensions: int = 3) -> Float[np.ndarray, "n {dimensions}"]:
@@ -121,8 +134,3 @@ def check_frames(what: str, frames: Int[np.ndarray, "..."], first: int, n: int) 
         row = outside[0, 0]
         found = frames[tuple(outside[0])]
         raise ValueError(f"expected {what} frames from {first} to {n - 1}, found {found} in row {row}")
-
-
-def pose_sources(*files: DescriptorFile) -> str | None:
-    """Return the distinct pose sources of the files, separated by commas, or None if no file names a source."""
-    return ", ".join(dict.fromkeys(file.pose_source for file in files if file.pose_source)) or None
