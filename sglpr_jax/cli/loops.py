@@ -186,7 +186,7 @@ def _is_trajectory(path: Path, out: Path) -> bool:
 
 
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
-    from sglpr_jax.evaluation.page.of_loops import PAGE, loops_page
+    from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.loops.closure import why_rejected

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) -> int:
     """Search several recordings and write the results. Returns the exit status. `command` is a `LoopsCommand`."""
-    from sglpr_jax.evaluation.page.of_loops import PAGE
-    from sglpr_jax.evaluation.page.of_recordings import recordings_page
+    from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.loops.search_between import find_loops_between
     from sglpr_jax.models.weights_file import load
@@ -52,7 +51,7 @@ def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) 
     if command.degenerate == "drop":
         found = found.without_degenerate()
     corrected = optimize_recordings(found) if command.optimize else None
-    page = {PAGE: recordings_page(found, optimized=corrected)}
+    page = {PAGE: loops_page(found, optimized=corrected)}
     paths = write_several(found, command.out, optimized=corrected, texts=page)
     paths.append(record_command(dataclasses.replace(command, scale=scale), command.out))
     _report(found)

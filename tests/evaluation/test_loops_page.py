@@ -1,4 +1,4 @@
-"""The page of loops stands alone and shows what was found, also where there is little to show."""
+"""The page of loops of one or several recordings stands alone and shows what was found."""
 
 import dataclasses
 
@@ -7,15 +7,17 @@ import pytest
 from recordings import of_images
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.page.of_loops import loops_page
+from sglpr_jax.evaluation.loops_page import loops_page
 from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.frame_alignment import FrameAlignment
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.search import FoundLoops
-from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
+from sglpr_jax.loops.search_between import AlignedParts, FoundBetween, FoundRecordings, Part
+from sglpr_jax.pose_graph.optimize import OptimizedRecordings, OptimizedTrajectory
 from sglpr_jax.se3 import transform
 
-from .test_page import Parsed
+from .test_evaluation_page import Parsed
 
 
 @pytest.fixture
@@ -35,7 +37,6 @@ def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_
     assert "0.9950" in table and "000005" in table and "17.2" in table
 
 
-@pytest.mark.slow
 def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert len(Parsed(loops_page(dataclasses.replace(found, odometry=None))).images) == 2
     none = dataclasses.replace(found, loops=())
@@ -45,7 +46,6 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert "No scan was processed." in loops_page(dataclasses.replace(none, frames=0))
 
 
-@pytest.mark.slow
 def test_rejected_pairs_are_counted_by_reason(found):
     assert "No pair was rejected." in Parsed(loops_page(found)).texts["Rejected"]
     pair = found.loops[0]
@@ -56,7 +56,6 @@ def test_rejected_pairs_are_counted_by_reason(found):
     assert "Rejected pairs are grey." in page.texts["Trajectory"]
 
 
-@pytest.mark.slow
 def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(found, known):
     page = Parsed(loops_page(known))
     assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Trajectory"]
@@ -85,7 +84,6 @@ def known(found) -> FoundLoops:
     return dataclasses.replace(found, recording=recording, candidates=candidates, model=model)
 
 
-@pytest.mark.slow
 def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known, monkeypatch):
     page = Parsed(loops_page(known))
     assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs", "Reliability"]
@@ -97,7 +95,6 @@ def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known
     assert "0.99 to 1" in Parsed(loops_page(known)).texts["Reliability"]
 
 
-@pytest.mark.slow
 def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, monkeypatch):
     optimized = OptimizedTrajectory(known.odometry + 0.0, np.array([True, True, False]))
     optimized.poses[:, :3, 3] = known.recording.positions
@@ -114,3 +111,28 @@ def test_without_matplotlib_there_is_a_table(found, monkeypatch):
     monkeypatch.setattr(figures, "can_draw", lambda: False)
     page = loops_page(found)
     assert "sglpr-jax[viz]" in page and "0.9950" in page and not Parsed(page).images
+
+
+@pytest.fixture
+def several(found) -> FoundRecordings:
+    part, loop = Part(0, 7, True), Loop(2, 3, transform(1.0, 2.0, 0.3), np.eye(6), 0.995)
+    alignment = FrameAlignment(transform(10.0, 0.0, 0.5), 0.01 * np.eye(6))
+    pair = FoundBetween(0, 1, (loop,), (), (AlignedParts(part, part, alignment, 1),), 8)
+    return FoundRecordings((found, found), (pair,))
+
+
+def test_transforms_pairs_and_recordings_are_shown(several):
+    page = Parsed(loops_page(several))
+    assert "28.65" in page.texts["Transforms"] and "10.00" in page.texts["Transforms"]
+    assert {"Together", "08 and 08~2", "08: Trajectory", "08~2: Rejected"} <= set(page.texts)
+    assert "in the frame of 08" in page.texts["Together"]
+    poses = tuple(one.odometry for one in several.recordings)
+    said = OptimizedTrajectory(np.zeros((0, 4, 4)), np.ones(1, bool))
+    corrected = Parsed(loops_page(several, optimized=OptimizedRecordings(poses, ((0, 1),), (said,))))
+    assert "corrected by 1 of 1 loops" in corrected.texts["Together"]
+
+
+def test_no_common_place_is_said(several):
+    none = dataclasses.replace(several.between[0], loops=(), aligned=())
+    page = Parsed(loops_page(dataclasses.replace(several, between=(none,))))
+    assert "no common place found" in page.texts["Transforms"] and "Together" not in page.texts

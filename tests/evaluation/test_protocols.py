@@ -315,7 +315,7 @@ def test_blocks_leave_no_seam(make_file, monkeypatch):
     positions, descriptors, times = random_drive(3)
     file = make_file(positions, descriptors, times=times)
     whole = [protocol(file) for protocol in DESCRIPTORS.values()]
-    for block in ("nearest.BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
+    for block in ("source.BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
         monkeypatch.setattr(f"sglpr_jax.evaluation.protocols.{block}", 7)
     monkeypatch.setattr("sglpr_jax.revisits.BLOCK", 7)
     for one, other in zip(whole, [protocol(file) for protocol in DESCRIPTORS.values()], strict=True):

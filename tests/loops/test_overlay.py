@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sglpr_jax.evaluation.overlay import overlaid
+from sglpr_jax.evaluation.loop_figures import overlaid
 from sglpr_jax.se3 import transform
 
 from .scenes import place, relative, seen_from

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.evaluation.protocols.bootstrap import interval, resampled_means
-from sglpr_jax.evaluation.protocols.nearest import first_hits, nearest_frames
 from sglpr_jax.evaluation.protocols.protocol import RETRIEVAL, Decision, Protocol, Result
-from sglpr_jax.evaluation.protocols.source import Kind, Source, TopK, positions_of
+from sglpr_jax.evaluation.protocols.source import Kind, Source, TopK, first_hits, nearest_frames, positions_of
 from sglpr_jax.revisits import has_near
 
 FRAMES = {"00": 4541, "02": 4661, "05": 2761, "06": 1101, "08": 4071}

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from sglpr_jax.evaluation.protocols.bootstrap import interval, resampled_means
-from sglpr_jax.evaluation.protocols.nearest import first_hits, nearest_descriptors
 from sglpr_jax.evaluation.protocols.protocol import Protocol, Result
 from sglpr_jax.evaluation.protocols.recall import POSITIVE_M, closer_than_5_m, recall_at, score_recall
-from sglpr_jax.evaluation.protocols.source import Kind, positions_of
+from sglpr_jax.evaluation.protocols.source import Kind, first_hits, nearest_descriptors, positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 from sglpr_jax.revisits import Near, has_near
 

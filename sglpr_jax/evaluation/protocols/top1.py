@@ -7,11 +7,18 @@ from jaxtyping import Bool, Float, Int, Int8
 
 from sglpr_jax import metrics
 from sglpr_jax.evaluation.protocols.bootstrap import f1_max_interval
-from sglpr_jax.evaluation.protocols.nearest import first_true, nearest_frames
 from sglpr_jax.evaluation.protocols.pairs import frame_pairs
 from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Decision, Protocol, Result
 from sglpr_jax.evaluation.protocols.recall import recall_at
-from sglpr_jax.evaluation.protocols.source import Kind, Source, TopK, check_frames, positions_of
+from sglpr_jax.evaluation.protocols.source import (
+    Kind,
+    Source,
+    TopK,
+    check_frames,
+    first_true,
+    nearest_frames,
+    positions_of,
+)
 from sglpr_jax.revisits import Near, database_end, has_near
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
