@@ -70,7 +70,7 @@ def test_methods_are_compared_on_one_page(score, laps):
     assert list(report["compared"]) == ["blind", "topk"]
     assert report["compared"]["blind"][0]["score"] < 0.5 < report["results"][0]["score"]
     text = (folder / "report.html").read_text()
-    assert "Methods side by side" in text and "<th>blind</th>" in text
+    assert "Methods side by side" in text and "<td>blind</td>" in text
     assert (folder / "precision-recall-top-1-f1max.png").is_file()
     ended, _ = score("mine.npy", "--poses", laps / "tum.txt", "--compare", laps / "topk.txt")
     assert_one_line_error(ended, "topk", "for a top-k list", "found pairs-f1max")
