@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from rich.console import Console
 from rich.table import Table
+from sglpr_jax.sim.scenery import SCENERIES
 
 import sglpr_jax
 from benchmarks.drives import Case, odometry_of
@@ -21,7 +22,8 @@ from benchmarks.timing import run_command
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Record
-from sglpr_jax.evaluation.protocols import TopK, protocol_named
+from sglpr_jax.evaluation.protocols import protocol_named
+from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.candidates import CandidateFinder
@@ -36,7 +38,6 @@ from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import SimulatedRecording
-from sglpr_jax.sim.scenery import SCENERIES
 
 PEERS = Path(__file__).resolve().parent / "peers"
 KEPT, NO_LOOP = 1000.0, -100.0
