@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from recordings import kitti_trajectory
 
-from sglpr_jax.evaluation.protocols.pairs import LISTED_PAIRS_F1MAX, score_listed_pairs
+from sglpr_jax.evaluation.protocols.pairs import LISTED_PAIRS_F1MAX, frame_pairs, is_revisit, score_listed_pairs
 from sglpr_jax.evaluation.protocols.recall import SSC_RECALL
 from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.evaluation.protocols.top1 import CONTOUR_CONTEXT_F1MAX, TOP1_F1MAX
