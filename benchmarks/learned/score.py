@@ -22,12 +22,11 @@ from benchmarks.learned.data import TEST, folders
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
-from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
-from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
-from sglpr_jax.evaluation.protocols.nearest import nearest_frames
-from sglpr_jax.evaluation.protocols.pairs_f1max import PAIRS_F1MAX
-from sglpr_jax.evaluation.protocols.source import Source, TopK
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.evaluation.protocols.pairs import PAIRS_F1MAX
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_RECALL_AT_1
+from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL
+from sglpr_jax.evaluation.protocols.source import Source, TopK, nearest_frames
+from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
@@ -37,7 +36,7 @@ from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.registration.bev_alignment import align_all
-from sglpr_jax.reproduce.compared import content_of
+from sglpr_jax.reproduce.runs import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.revisits import database_end, has_near
@@ -182,7 +181,7 @@ def _result(contender: Entry, test: Test, folder: Path, *, verify: bool) -> Mapp
         return known
     file = _described(contender, test.recording, rotated=test.rotated)
     if test.database is not None:
-        scores = {"recall": bevplace_nclt_recall(_described(contender, test.database), file).score}
+        scores = {"recall": BEVPLACE_NCLT_RECALL(_described(contender, test.database), file).score}
     else:
         scores = _scores(file, split=test.name.startswith("kitti-") and test.name.split("-")[1] in SPLIT)
     if wanted:
@@ -210,13 +209,13 @@ def _images(recording: Recording) -> Float32[np.ndarray, "n h w"]:
 
 def _scores(source: Source, *, split: bool = False) -> dict[str, float]:
     """Return top-1 F1max, F1max of pairs, Recall@1 within 5 m and, for a split sequence, that of BEVPlace++."""
-    top1 = top1_f1max(source)
+    top1 = TOP1_F1MAX(source)
     found = {"top1": top1.score}
     if not isinstance(source, TopK):
         found["pairs"] = PAIRS_F1MAX(source).score
     found["recall"] = _recall(source, top1.answers)
     if split and not isinstance(source, TopK):
-        found["split recall"] = bevplace_recall_at_1(source).score
+        found["split recall"] = BEVPLACE_RECALL_AT_1(source).score
     return found
 
 

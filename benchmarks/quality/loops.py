@@ -21,7 +21,8 @@ from benchmarks.timing import run_command
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Record
-from sglpr_jax.evaluation.protocols import TopK, protocol_named
+from sglpr_jax.evaluation.protocols import protocol_named
+from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.candidates import CandidateFinder

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.names import NETWORK
 from sglpr_jax.methods.registry import method_named
@@ -72,7 +72,7 @@ def _score(name: str, recording: Recording, seed: int | None) -> Score:
     start = time.perf_counter()
     file = embed(method_named(name, None, recording), recording, rotation_seed=seed)
     seconds = time.perf_counter() - start
-    result = top1_f1max(file)
+    result = TOP1_F1MAX(file)
     return Score(file, result.score, result.recalls[1], seconds / len(file))
 
 

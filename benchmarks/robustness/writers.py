@@ -97,9 +97,6 @@ WRITERS = {
         ),
         Writer("segment", f"--weights sglpr --data {TOWN} --seq 08 --out {OUT}/maps"),
         Writer(
-            "stress", f"--method solid --data {TOWN} --seq 08 --out {OUT}/stress --corruption rotation occlusion-45"
-        ),
-        Writer(
             "train",
             f"{TRAINED} --out {OUT}/run --cache {OUT}/packs",
             varies=RUN_FILES,

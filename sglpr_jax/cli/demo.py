@@ -41,8 +41,8 @@ class DemoCommand:
 def demo(command: DemoCommand) -> Path:
     """Run the command. Returns the output folder."""
     from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
-    from sglpr_jax.evaluation.page.of_loops import PAGE as LOOPS_PAGE
-    from sglpr_jax.evaluation.page.writing import PAGE
+    from sglpr_jax.evaluation.evaluation_page import PAGE
+    from sglpr_jax.evaluation.loops_page import PAGE as LOOPS_PAGE
 
     out, town = command.out, command.out / "town"
     simulate(town, scans=command.scans, azimuth_steps=AZIMUTH_STEPS, seed=0)

@@ -29,6 +29,7 @@ class EmbedCommand:
       bin/embed --data my_scans/ --submap-m 10 --odometry odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
       bin/embed --method rinet --weights runs/rinet/weights-8000 --data KITTI --seq 08 --out rinet.npz
+      bin/embed --data KITTI --seq 08 --corruption occlusion-90 --out 08-occlusion-90.npz
       bin/embed --data my_scans/ --site berlin --out s3://bucket/places
     """
 
@@ -51,8 +52,11 @@ class EmbedCommand:
     rooms. `auto` is 4 if most points are less than 8 m away, otherwise 1."""
     rotate: bool = False
     """Rotate every scan about z by its own random angle."""
+    corruption: str | None = None
+    """Corrupt every scan for a stress test: occlusion-DEGREES, beams-NUMBER, noise-METRES, dropout-SHARE,
+    offset-METRES, or rotation (as --rotate)."""
     seed: CountOrNone = 0
-    """Seed of the angles of --rotate."""
+    """Seed of --rotate and --corruption. The seed and the scan's number determine the corruption of a scan."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
     site: str = ""
@@ -63,21 +67,27 @@ class EmbedCommand:
 
 def embed_recording(command: EmbedCommand) -> str:
     """Run the command. Returns the path of the descriptor file, or the address of the file in the store."""
-    from sglpr_jax.data.scaled import scaled  # slow imports, not needed for --help
+    from sglpr_jax.data.corruption import ROTATION, corrupted, corruption_named  # slow imports, not needed for --help
+    from sglpr_jax.data.scaled import scaled
     from sglpr_jax.retrieval.embed import embed
     from sglpr_jax.retrieval.parquet import embed_to_store
 
     _check_weights(command)
+    corruption = None if command.corruption is None else corruption_named(command.corruption)
     in_store = "://" in command.out or command.out.endswith("/")
     if not in_store:
         _check_file(command)
+    elif corruption is not None:
+        raise ValueError(f"{command.out}: expected a descriptor file with --corruption, found a store")
     make = _method(command)
     recording = command.submap.open(command.source, command.data)
+    if corruption not in (None, ROTATION):
+        recording = corrupted(recording, corruption, seed=command.seed)
     recording = scaled(recording, resolved_scale(command.scale, recording))
     method = make(recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         options = {
-            "rotation_seed": command.seed if command.rotate else None,
+            "rotation_seed": command.seed if command.rotate or corruption == ROTATION else None,
             "batch": command.batch,
             "on_bad_scan": report_bad_scan if command.skip_bad else None,
             "on_progress": show,

@@ -63,7 +63,7 @@ class EvaluateCommand:
 
 def evaluate_file(command: EvaluateCommand) -> Path:
     """Run the command. Returns the output folder."""
-    from sglpr_jax.evaluation.page.writing import NUMBERS, write_sessions  # slow imports, not needed for --help
+    from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_sessions  # slow imports, not needed for --help
     from sglpr_jax.evaluation.sessions import evaluate_session_files
     from sglpr_jax.files import check_writable
 
@@ -86,9 +86,9 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     """Score the methods, print the table and write the results. Returns the paths written."""
     from sglpr_jax.data.formats.pose_files import read_trajectory
     from sglpr_jax.evaluation import figures
-    from sglpr_jax.evaluation.inputs.methods import read_methods
-    from sglpr_jax.evaluation.page.recording_pictures import check_same_frames, poses_of, take_pictures
-    from sglpr_jax.evaluation.page.writing import write_evaluation
+    from sglpr_jax.evaluation.evaluation_page import write_evaluation
+    from sglpr_jax.evaluation.inputs import read_methods
+    from sglpr_jax.evaluation.scan_pictures import poses_of, recording_rows, take_pictures
     from sglpr_jax.evaluation.scoring import evaluate_methods
     from sglpr_jax.models.weights_file import load
 
@@ -107,7 +107,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     )
     source = next(iter(methods.values()))
     if recording is not None:
-        check_same_frames(recording, source)
+        recording_rows(recording, source)  # raises an error before scoring if the frames differ
     found = evaluate_methods(methods, command.protocol, published=command.published, file=command.file)
     console().print(found)
     if not figures.can_draw():
@@ -118,7 +118,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
 
 def _check_options(command: EvaluateCommand) -> None:
     """Raise ValueError if options exclude each other."""
-    from sglpr_jax.evaluation.protocols.choice import check_names
+    from sglpr_jax.evaluation.protocols import check_names
 
     if command.database is not None:
         silent = ("poses", "times", "distance", "compare", "data", "weights")

@@ -185,8 +185,7 @@ def _is_trajectory(path: Path, out: Path) -> bool:
 
 
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
-    from sglpr_jax.evaluation.page.of_loops import PAGE
-    from sglpr_jax.evaluation.page.of_recordings import recordings_page
+    from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.loops.closure import why_rejected
@@ -223,7 +222,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     if command.degenerate == "drop":
         found = found.without_degenerate()
     corrected = optimize_trajectory(found) if command.optimize else None
-    page = {PAGE: recordings_page(found, optimized=corrected)}
+    page = {PAGE: loops_page(found, optimized=corrected)}
     paths = write_found(found, command.out, optimized=corrected, texts=page)
     paths.append(record_command(dataclasses.replace(command, scale=scale), command.out))
     if command.rerun is not None:

@@ -77,12 +77,10 @@ def reproduce(command: ReproduceCommand) -> Path:
     """Run the command. Returns the output folder."""
     from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
     from sglpr_jax.data.readers import recording_names
-    from sglpr_jax.reproduce.check import check
-    from sglpr_jax.reproduce.plan import make_plan, time_a_step
-    from sglpr_jax.reproduce.reproduction import chosen_experiments
+    from sglpr_jax.reproduce.plan import check, make_plan, time_a_step
     from sglpr_jax.reproduce.runs import Runs
 
-    names = chosen_experiments(command.what)
+    names = list(EXPERIMENTS if "all" in command.what else dict.fromkeys(command.what))
     root = dataset_root(command.data, write=not command.plan)
     runs = Runs(command.out, root, command.preset, command.config, command.pose_source, progress_bar)
     seqs = command.seq or tuple(seq for seq in PAPER_SEQUENCES if seq in recording_names(runs.data))
@@ -111,18 +109,19 @@ def _train(runs: "Runs", plan: "Plan") -> None:
 def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tuple[str, ...]) -> None:
     """Compute, write and print the tables and figures of finished runs."""
     from sglpr_jax.cli.datasets import cached_sessions
-    from sglpr_jax.reproduce.reproduction import Reproduction, write_experiment
-    from sglpr_jax.reproduce.tables import PaperTable
+    from sglpr_jax.reproduce.figures import write_figures
+    from sglpr_jax.reproduce.tables import Reproduction, write_tables
 
     record_command(command, command.out)
     compared = (*command.weights, *command.method)
     found = Reproduction(runs, seqs, compared, lambda: command.nclt or cached_sessions(), trained=command.train)
     for name in names:
-        for made in write_experiment(name, found, command.out):
-            if isinstance(made, PaperTable):
-                console().print(made)
-            else:
-                print(f"written: {made}")
+        if EXPERIMENTS[name].kind == "figure":
+            for path in write_figures(name, found, command.out):
+                print(f"written: {path}")
+        else:
+            for table in write_tables(name, found, command.out):
+                console().print(table)
 
 
 def main() -> None:

@@ -42,8 +42,7 @@ def segment_recording(command: SegmentCommand) -> Path:
     """Run the command. Returns the output folder."""
     import numpy as np  # slow imports, not needed for --help
 
-    from sglpr_jax.evaluation.segmentation import map_confusion
-    from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
+    from sglpr_jax.evaluation.segmentation import draw_segmentation, map_confusion, score_confusion, title_of
     from sglpr_jax.files import check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.image_maps import save_map, semantic_maps
@@ -64,8 +63,8 @@ def segment_recording(command: SegmentCommand) -> Path:
             labelled, cells = labelled + found.seen.sum(), cells + (found.counts > 0).sum()
     print(f"{command.out}: {len(recording)} semantic maps of {labelled / max(cells, 1):.0%} of the cells with points")
     if recording.has_labels:
-        scores = semantic_score(confusion, recording, categories=categories)
-        draw_semantics(params, recording, command.out, min_confidence=least)
+        scores = score_confusion(confusion, categories=categories, title=title_of(recording))
+        draw_segmentation(params, recording, command.out, min_confidence=least)
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())
     record_command(command, command.out)

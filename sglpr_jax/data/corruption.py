@@ -3,7 +3,7 @@
 import dataclasses
 import difflib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -116,9 +116,7 @@ class Kind:
     """Function of the scan and the strength. It returns a mask of the remaining points, or all points at new
     positions."""
     strengths: tuple[float, ...]
-    """Strengths that `bin/stress` uses, from weak to strong."""
-    unit: str = ""
-    """Unit of the strength."""
+    """Usual strengths, from weak to strong. Only 0 for a kind without a strength."""
     limits: tuple[float, float] = (0.0, np.inf)
     """Minimum and maximum strength."""
     needs_lasers: bool = False
@@ -166,11 +164,11 @@ def rotate_elsewhere(scan: Scan, strength: float) -> Cloud:
 KINDS: dict[str, Kind] = {
     "clean": Kind(lambda scan, strength: scan.points, strengths=()),
     "rotation": Kind(rotate_elsewhere, strengths=(0.0,)),
-    "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), unit="°", limits=(0.0, 360.0)),
+    "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), limits=(0.0, 360.0)),
     "beams": Kind(fewer_beams, strengths=(32.0, 16.0), limits=(1.0, np.inf), needs_lasers=True),
-    "noise": Kind(add_noise, strengths=(0.05, 0.1, 0.2), unit=" m"),
+    "noise": Kind(add_noise, strengths=(0.05, 0.1, 0.2)),
     "dropout": Kind(drop_out, strengths=(0.5, 0.9), limits=(0.0, 1.0)),
-    "offset": Kind(offset, strengths=(0.5, 1.0, 2.0), unit=" m"),
+    "offset": Kind(offset, strengths=(0.5, 1.0, 2.0)),
 }
 """All kinds by name."""
 
@@ -198,11 +196,6 @@ class Corruption:
         return f"{self.kind}-{self.strength:g}" if self.strength else self.kind
 
     @property
-    def label(self) -> str:
-        """Strength with its unit, or the name of the kind if it has no strength."""
-        return f"{self.strength:g}{KINDS[self.kind].unit}" if self.strength else self.kind
-
-    @property
     def needs_lasers(self) -> bool:
         """Whether `corrupt` needs the laser of each point."""
         return KINDS[self.kind].needs_lasers
@@ -211,25 +204,24 @@ class Corruption:
 CLEAN = Corruption("clean")
 ROTATION = Corruption("rotation")
 CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() for strength in kind.strengths)
-"""All corruptions of `bin/stress`."""
+"""All kinds with their usual strengths."""
 
 
-def chosen_corruptions(names: Sequence[str]) -> tuple[Corruption, ...]:
-    """Return the corruptions with the given names. A kind selects all its strengths. Without names, all corruptions are
-    returned.
+def corruption_named(name: str) -> Corruption:
+    """Return the corruption of this name: a kind and, except for rotation, any strength, such as "occlusion-60".
 
     Raises:
-      ValueError: If a name is unknown. The message contains the nearest name.
+      ValueError: If the name is unknown or the strength is outside its limits.
     """
-    known = {corruption.name: corruption for corruption in CORRUPTIONS}
-    kinds = {corruption.kind for corruption in CORRUPTIONS}
-    for name in names:
-        if name not in known and name not in kinds:
-            nearest = difflib.get_close_matches(name, [*known, *kinds], n=1, cutoff=0)[0]
-            raise ValueError(
-                f"expected a corruption, found {name!r}; did you mean {nearest!r}? Available: {', '.join(known)}"
-            )
-    return tuple(each for each in CORRUPTIONS if not names or each.name in names or each.kind in names)
+    kind, _, strength = name.partition("-")
+    if kind not in KINDS or bool(strength) != any(KINDS[kind].strengths):
+        known = [corruption.name for corruption in CORRUPTIONS]
+        nearest = difflib.get_close_matches(name, known, n=1, cutoff=0)[0]
+        raise ValueError(f"expected a corruption such as {', '.join(known)}, found {name!r}; did you mean {nearest!r}?")
+    try:
+        return Corruption(kind, float(strength or 0))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def corrupt(

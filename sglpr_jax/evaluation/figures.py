@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int, Num
 
-from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.files import MOST_SHOWN, printable, replacing
 from sglpr_jax.labels import Taxonomy, taxonomy
 from sglpr_jax.metrics import PrecisionRecallCurve
@@ -84,44 +84,19 @@ def trajectory(
     positions: Float[np.ndarray, "n 3"], decisions: Int[np.ndarray, " n"], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
     """Draw the position of every frame from above, coloured by its `Decision` (figure 6)."""
-    figure = figure_from_above(positions)
-    axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
+    figure, axes = axes_from_above(positions, title=title)
     for decision, (name, colour, size) in DECISIONS.items():
         x, y = positions[decisions == decision, :2].T
         if len(x):
             axes.scatter(x, y, s=size, color=colour, linewidths=0, label=f"{name} ({len(x)})")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
     dots, names = axes.get_legend_handles_labels()
     figure.legend(dots, names, loc="outside lower center", ncols=3, markerscale=2.5, frameon=False)
     return figure
 
 
-def learning_curve(
-    curves: Mapping[str, Sequence[tuple[int, float]]],
-    *,
-    ylabel: str,
-    xlabel: str = "step",
-    references: Mapping[str, float] | None = None,
-    title: str = "",
+def learning_curves(
+    panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]]]], *, xlabel: str = "step"
 ) -> "matplotlib.figure.Figure":
-    """Draw named curves of (step, value), with named reference values as dashed lines."""
-    figure = new_figure(6.4, 4.2)
-    axes = figure.add_subplot(title=title, xlabel=xlabel, ylabel=ylabel)
-    for name, points in curves.items():
-        steps, values = np.array(points, dtype=np.float64).reshape(-1, 2).T
-        axes.plot(steps, values, "o-", markersize=3.5, linewidth=1.8, label=name)
-    references = references or {}
-    greys = np.linspace(0.2, 0.65, len(references))
-    for grey, (name, value) in zip(greys, references.items(), strict=True):
-        axes.axhline(value, color=str(grey), linestyle="--", linewidth=1.2, label=f"{name} {value:.3f}")
-    axes.grid(color="0.92")
-    axes.legend(loc="best", framealpha=0.95)
-    return figure
-
-
-def learning_curves(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]]]]) -> "matplotlib.figure.Figure":
     """Draw named curves of (step, value) in stacked panels, one for each title, with a common axis of steps."""
     figure = new_figure(6.4, 0.8 + 2.2 * len(panels))
     rows = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
@@ -132,35 +107,7 @@ def learning_curves(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]
         axes.grid(color="0.92")
         if len(curves) > 1:
             axes.legend(loc="best", framealpha=0.95)
-    rows[-1].set_xlabel("step")
-    return figure
-
-
-def stress(
-    changes: Mapping[tuple[str, str], Mapping[str, Sequence[tuple[str, float]]]], *, title: str = ""
-) -> "matplotlib.figure.Figure":
-    """Draw the change of each method's score over the strength of a corruption, one row of panels for each protocol.
-
-    Arguments:
-      changes: For each (protocol, kind of corruption) and each method, the labels of the strengths and the changes.
-      title: Title of the figure.
-    """
-    protocols, kinds = (list(dict.fromkeys(names)) for names in zip(*changes, strict=True))
-    figure = new_figure(max(1.6 + 1.9 * len(kinds), 4.0), 1.0 + 2.4 * len(protocols))
-    figure.suptitle(title)
-    panels = figure.subplots(len(protocols), len(kinds), sharey="row", squeeze=False)
-    for (protocol, kind), methods in changes.items():
-        row, column = protocols.index(protocol), kinds.index(kind)
-        axes = panels[row, column]
-        for method, points in methods.items():
-            labels, values = zip(("clean", 0.0), *points, strict=True)
-            axes.plot(range(len(values)), values, "o-", markersize=3.5, linewidth=1.6, label=method)
-        axes.set_xticks(range(len(labels)), labels, fontsize=8)
-        axes.set(title=kind if row == 0 else "", ylabel=f"{protocol}: change" if column == 0 else "")
-        axes.axhline(0, color="0.6", linewidth=0.8, zorder=0)
-        axes.grid(axis="y", color="0.92")
-    lines, names = panels[0, 0].get_legend_handles_labels()
-    figure.legend(lines, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
+    rows[-1].set_xlabel(xlabel)
     return figure
 
 
@@ -230,10 +177,17 @@ def new_figure(width: float, height: float) -> "matplotlib.figure.Figure":
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def figure_from_above(positions: Float[np.ndarray, "n 3"]) -> "matplotlib.figure.Figure":
-    """Return an empty figure for a drive seen from above. It is flat for a long street."""
+def axes_from_above(
+    positions: Float[np.ndarray, "n 3"], *, title: str = ""
+) -> "tuple[matplotlib.figure.Figure, matplotlib.axes.Axes]":
+    """Return an empty figure for a drive seen from above, and its axes. The figure is flat for a long street."""
     across, along = np.ptp(positions[:, :2], axis=0)
-    return new_figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
+    figure = new_figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
+    axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    return figure, axes
 
 
 def _draw_equal_f1(axes: "matplotlib.axes.Axes") -> None:

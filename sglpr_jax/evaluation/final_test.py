@@ -9,9 +9,9 @@ from rich.console import Console, ConsoleOptions, RenderableType
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures, report
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.scoring import score
-from sglpr_jax.evaluation.semantic_score import SemanticScore, score_semantics
+from sglpr_jax.evaluation.segmentation import SegmentationScore, score_segmentation
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.names import BESIDE, NETWORK
@@ -30,7 +30,7 @@ class FinalTest(report.PrintsItself):
     sequence: str
     results: Mapping[str, Mapping[str, Sequence[Result]]]
     """Results for `raw` and `rotated` scans, by the name of the method."""
-    semantics: SemanticScore | None
+    semantics: SegmentationScore | None
     """Score of the segmentation head. None without such a head or without labels."""
 
     def to_json(self) -> dict[str, Any]:
@@ -45,7 +45,7 @@ class FinalTest(report.PrintsItself):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         for name, methods in self.results.items():
             title = f"sequence {self.sequence}, {name}"
-            yield report.table(methods[NETWORK], title=f"{title}: {NETWORK}")
+            yield report.results_table(methods[NETWORK], title=f"{title}: {NETWORK}")
             yield report.comparison(methods, title=title)
         if self.semantics is not None:
             yield self.semantics
@@ -88,7 +88,7 @@ def final_test(
             _draw(results[title], recording, folder, title)
     semantics = None
     if params.config.segments and recording.has_labels:
-        semantics = score_semantics(params, recording, folder=folder, progress=progress)
+        semantics = score_segmentation(params, recording, folder=folder, progress=progress)
     found = FinalTest(recording.name, results, semantics)
     write_json(folder / "results.json", found.to_json())
     return found

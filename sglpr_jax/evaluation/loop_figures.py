@@ -4,9 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
+from scipy.ndimage import map_coordinates
 
-from sglpr_jax.evaluation.figures import figure_from_above, new_figure
+from sglpr_jax.data.density_grid import RESOLUTION_M
+from sglpr_jax.evaluation.figures import axes_from_above, new_figure
+from sglpr_jax.se3 import inverse
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -24,8 +27,7 @@ def loops(
       pairs: Query and match of each loop, except those known to be wrong.
       wrong: Query and match of each loop known to be wrong, drawn in red.
     """
-    figure = figure_from_above(positions)
-    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    figure, axes = axes_from_above(positions)
     axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
     for name, some, colour, layer in (("loops", pairs, LOOP_COLOUR, 3), ("wrong", wrong, WRONG_COLOUR, 4)):
         if name == "wrong" and not some:
@@ -34,23 +36,16 @@ def loops(
             axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
         seen = positions[[query for query, _ in some], :2]
         axes.scatter(*seen.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(some)})", zorder=layer)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
     axes.legend(loc="best", framealpha=0.95)
     return figure
 
 
 def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
     """Draw named trajectories from above. The first trajectory is grey. A dot marks the end of each trajectory."""
-    figure = figure_from_above(np.concatenate(list(named.values())))
-    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    figure, axes = axes_from_above(np.concatenate(list(named.values())))
     for (name, positions), colour in zip(named.items(), ("0.6", "#2b5fc4", "#d62728"), strict=False):
         axes.plot(*positions[:, :2].T, color=colour, linewidth=1.2, label=name)
         axes.plot(*positions[-1, :2], "o", color=colour, markersize=4)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
     axes.legend(loc="best", framealpha=0.95)
     return figure
 
@@ -64,15 +59,11 @@ def loops_between(
       named: Positions of each recording, in metres, by its name.
       pairs: Positions of query and match of each loop between two recordings, in metres.
     """
-    figure = figure_from_above(np.concatenate(list(named.values())))
-    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    figure, axes = axes_from_above(np.concatenate(list(named.values())))
     for name, positions in named.items():
         axes.plot(*positions[:, :2].T, linewidth=1.2, label=name)
     for ends in pairs:
         axes.plot(*np.array(ends)[:, :2].T, color="0.4", linewidth=0.8, zorder=3)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
     axes.legend(loc="best", framealpha=0.95)
     return figure
 
@@ -138,3 +129,29 @@ def overlays(pictures: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.
         axes.imshow(picture, interpolation="nearest")
         axes.set_title(title, fontsize=9)
     return figure
+
+
+def overlaid(
+    query: Num[np.ndarray, "n n"],
+    match: Num[np.ndarray, "n n"],
+    match_from_query: Float[np.ndarray, "4 4"],
+    *,
+    resolution_m: float = RESOLUTION_M,
+) -> Float[np.ndarray, "n n 3"]:
+    """Overlay a query on its match, as RGB colours from 0 to 1.
+
+    The match is red. The query, transformed to the frame of the match, is cyan. Cells occupied in both are white.
+    """
+    size = len(match)
+    down, right = np.mgrid[:size, :size] - (size - 1) / 2
+    query_from_match = inverse(match_from_query)
+    x, y = right * resolution_m, -down * resolution_m
+    at_x = query_from_match[0, 0] * x + query_from_match[0, 1] * y + query_from_match[0, 3]
+    at_y = query_from_match[1, 0] * x + query_from_match[1, 1] * y + query_from_match[1, 3]
+    cells = [-at_y / resolution_m + (size - 1) / 2, at_x / resolution_m + (size - 1) / 2]
+    moved = map_coordinates(np.asarray(query, np.float64), cells, order=1, mode="grid-constant")
+    return np.stack([_bright(match), _bright(moved), _bright(moved)], axis=-1)
+
+
+def _bright(image: Num[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    return np.sqrt(np.asarray(image, np.float64) / max(float(image.max()), 1e-9))

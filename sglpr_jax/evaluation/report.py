@@ -2,58 +2,98 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1
 from sglpr_jax.files import printable
 from sglpr_jax.metrics import PrecisionRecallCurve
 
 WIDTH = 140
 """Width of printed results, in characters."""
+MOST_IN_CELL = 300
+"""Maximum number of characters of a line of a cell."""
 MOST_COLUMNS = 6
 """Maximum number of protocols side by side. More do not fit a terminal."""
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
 PRECISIONS = (0.99, 1.0)
 """Precisions for which results state a threshold."""
-THRESHOLD_COLUMNS = ("protocol", "threshold for", "descriptor distance", "precision", "recall")
-PUBLISHED_COLUMNS = ("method", "published F1max", "numbers from")
 PUBLISHED_NOTE = (
     f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
     "protocol: rows from RINet's paper use pairs-f1max, the others top1-f1max as far as is known."
 )
 
 
-def table(results: Sequence[Result], *, title: str = "") -> PlainTable:
-    """Return a table with one row per protocol: rule, score, interval, counts, distance and poses."""
-    rows = PlainTable(*COLUMNS, title=title)
-    for result in results:
-        rows.add_row(*cells(result))
-    return rows
+class PrintsItself:
+    """Base class of results that rich renders in `print`. Subclasses define `__rich__` or `__rich_console__`."""
+
+    def __str__(self) -> str:
+        console = Console(width=WIDTH, highlight=False, color_system=None)
+        with console.capture() as capture:
+            console.print(self)
+        return capture.get()
+
+    __repr__ = __str__
 
 
-def cells(result: Result) -> tuple[str, ...]:
+@dataclass(frozen=True)
+class TextTable:
+    """Table of plain text, for the terminal and for pages.
+
+    In the terminal, control characters are escaped and very long lines are shortened.
+    """
+
+    kind: ClassVar = "table"
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    numbers: Sequence[str] = ()
+    """Columns of numbers, which are typeset differently."""
+    title: str = ""
+    caption: str = ""
+
+    def __rich__(self) -> Table:
+        table = Table(title=_plain(self.title, style="table.title"), caption=self.caption or None)
+        for name in self.header:
+            table.add_column(_plain(name), justify="right" if name in self.numbers else "left")
+        for row in self.rows:
+            table.add_row(*map(_plain, row))
+        return table
+
+
+def _plain(text: str, *, style: str = "") -> Text:
+    # rich would interpret names with brackets as styles, or reject them.
+    return Text("\n".join(printable(line, most=MOST_IN_CELL) for line in text.split("\n")), style=style)
+
+
+def results_table(results: Sequence[Result], *, title: str = "", published_on: bool = False) -> TextTable:
+    """Return a table with one row per protocol: rule, score, interval, counts, distance and poses.
+
+    With `published_on`, it has a column with the poses of the published numbers.
+    """
+    rows = [(*_cells(result), *([result.published_on] if published_on else [])) for result in results]
+    header = (*COLUMNS, "published on") if published_on else COLUMNS
+    return TextTable(header, rows, ("score", "95 %", "rests on"), title)
+
+
+def _cells(result: Result) -> tuple[str, ...]:
     """Return the cells of one result, in the order of `COLUMNS`."""
     counts = "\n".join(f"{count} {name}" for name, count in result.counts.items())
     distance = "as given" if result.dimensions is None else f"{result.dimensions}-D"
-    poses = result.pose_source or ""
-    return result.name, result.rule, format_score(result), _format_interval(result), counts, distance, poses
+    interval = "" if result.interval is None else "{:.3f} to {:.3f}".format(*result.interval)
+    return result.name, result.rule, format_score(result), interval, counts, distance, result.pose_source or ""
 
 
-def threshold_table(results: Sequence[Result]) -> PlainTable:
-    """Return a table of descriptor distances up to which answers or pairs are accepted (`threshold_rows`)."""
-    rows = PlainTable(*THRESHOLD_COLUMNS)
-    for row in threshold_rows(results):
-        rows.add_row(*row)
-    return rows
+def threshold_table(results: Sequence[Result]) -> TextTable:
+    """Return the descriptor distances up to which answers or pairs are accepted.
 
-
-def threshold_rows(results: Sequence[Result]) -> list[tuple[str, ...]]:
-    """Return the rows of `threshold_table`: for each result with a curve, the highest F1 and each of `PRECISIONS`."""
-    return [
+    Each result with a curve has a row for the highest F1 and for each of `PRECISIONS`.
+    """
+    rows = [
         (
             result.name,
             goal,
@@ -63,9 +103,11 @@ def threshold_rows(results: Sequence[Result]) -> list[tuple[str, ...]]:
         if result.curve is not None
         for goal, point in {"highest F1": _at_f1max(result), **_at_precisions(result, "precision {:g}")}.items()
     ]
+    header = ("protocol", "threshold for", "descriptor distance", "precision", "recall")
+    return TextTable(header, rows, header[2:])
 
 
-def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> PlainTable:
+def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> TextTable:
     """Return a table of scores with one row per method and one column per protocol.
 
     If there are more than `MOST_COLUMNS` protocols, rows and columns are exchanged. All methods are scored on the same
@@ -74,14 +116,10 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> P
     names = [result.name for result in next(iter(methods.values()))]
     scores = [[format_score(result) for result in results] for results in methods.values()]
     if len(names) <= MOST_COLUMNS:
-        rows = PlainTable("method", *names, title=title)
-        lines = zip(methods, scores, strict=True)
-    else:
-        rows = PlainTable("protocol", *map(printable, methods), title=title)
-        lines = zip(names, zip(*scores, strict=True), strict=True)
-    for name, line in lines:
-        rows.add_row(printable(name), *line)
-    return rows
+        rows = [(name, *line) for name, line in zip(methods, scores, strict=True)]
+        return TextTable(("method", *names), rows, names, title)
+    rows = [(name, *line) for name, line in zip(names, zip(*scores, strict=True), strict=True)]
+    return TextTable(("protocol", *methods), rows, list(methods), title)
 
 
 def published_rows(sequence: str) -> list[tuple[str, ...]]:
@@ -96,39 +134,15 @@ def published_rows(sequence: str) -> list[tuple[str, ...]]:
     return [(method, f"{score:.3f}", sources[method]) for method, score in scores.items()]
 
 
-def published_table(rows: Sequence[tuple[str, ...]]) -> PlainTable:
-    """Return `published_rows` as a table. Print `PUBLISHED_NOTE` below it."""
-    table = PlainTable(*PUBLISHED_COLUMNS)
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-def as_text(found: Any, *, width: int) -> str:
-    """Return the text that a console of `width` characters would show."""
-    console = Console(width=width, highlight=False, color_system=None)
-    with console.capture() as capture:
-        console.print(found)
-    return capture.get()
-
-
-class PrintsItself:
-    """Base class of results that rich renders in `print`. Subclasses define `__rich__` or `__rich_console__`."""
-
-    def __str__(self) -> str:
-        return as_text(self, width=WIDTH)
-
-    __repr__ = __str__
+def published_table(rows: Sequence[tuple[str, ...]]) -> TextTable:
+    """Return `published_rows` as a table. `PUBLISHED_NOTE` belongs below it."""
+    header = ("method", "published F1max", "numbers from")
+    return TextTable(header, rows, header[1:2])
 
 
 def format_score(result: Result) -> str:
     """Return the score with three decimals, or "no revisit" if it is NaN."""
     return "no revisit" if math.isnan(result.score) else f"{result.score:.3f}"
-
-
-def _format_interval(result: Result) -> str:
-    """Return the bootstrap interval with three decimals, or an empty string if the result has no interval."""
-    return "" if result.interval is None else "{:.3f} to {:.3f}".format(*result.interval)
 
 
 def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.evaluation.page.of_loops import overlay_of, wrong_loops
+from sglpr_jax.evaluation.loops_page import overlay_of, wrong_loops
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.probability import Evidence
@@ -135,7 +135,7 @@ def _log_loops(rerun: Any, stream: Any, found: FoundLoops, poses: Float[np.ndarr
                 f"map/loops/{loop.query}",
                 rerun.LineStrips3D([ends], colors=[colour], labels=[_said(loop)], show_labels=False),
             )
-        image = (255 * np.clip(overlay_of(found, loop), 0, 1)).astype(np.uint8)
+        image = (255 * np.clip(overlay_of(found.recording, found.recording, loop), 0, 1)).astype(np.uint8)
         stream.log("pair", rerun.Image(image).compress(jpeg_quality=90))
         stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {_said(loop)}"))
 

@@ -14,16 +14,28 @@ from rich.console import Console, ConsoleOptions
 
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation import report
-from sglpr_jax.evaluation.false_positives import FalsePositive, worst_false_positives
-from sglpr_jax.evaluation.inputs import Input, read_input
-from sglpr_jax.evaluation.inputs.agreement import check_agreement
-from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
-from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
-from sglpr_jax.evaluation.protocols.choice import chosen_protocols
+from sglpr_jax.evaluation.inputs import Input, as_descriptors, check_agreement, read_input
+from sglpr_jax.evaluation.protocols import chosen_protocols, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.protocol import Decision, Result
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK, kind_of
 from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
+
+APART = 10
+"""Minimum gap between the queries of two shown mistakes, in frames. Neighbouring frames make the same mistake."""
+
+
+@dataclass(frozen=True)
+class FalsePositive:
+    """Answer that is accepted at the threshold of F1max but shows another place."""
+
+    query: int
+    answer: int
+    metres: float
+    """Distance between the positions of the two frames, in metres and in the dimensions of the protocol."""
+    distance: float
+    """Distance between the two descriptors."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,8 +82,8 @@ class Evaluation(report.PrintsItself):
             "published": self.published,
         }
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[PlainTable | str]:
-        yield report.table(self.results, title=self.title)
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[report.TextTable | str]:
+        yield report.results_table(self.results, title=self.title)
         if any(result.curve is not None for result in self.results):
             yield report.threshold_table(self.results)
         if len(self.methods) > 1:
@@ -109,7 +121,9 @@ def evaluate(
       print(sglpr_jax.evaluate("08.npz"))
     """
     clock = None if times is None else np.asarray(times, np.float64)
-    given = as_trajectory(None if positions is None else np.asarray(positions, np.float64), clock)
+    given = None
+    if positions is not None:
+        given = Trajectory(np.asarray(positions, np.float64), clock, "positions given as an array", by_row=True)
     if isinstance(source, str | Path):
         path = Path(source)
         read = read_input(path, given, sequence=path.stem, distance=distance)
@@ -187,6 +201,24 @@ def score(source: Input, protocols: Sequence[str] = ()) -> list[Result]:
     """
     known = protocols_taking(kind_of(source))
     return [protocol_named(name, known)(source) for name in protocols or chosen_protocols(source, ())]
+
+
+def worst_false_positives(result: Result, positions: Float[np.ndarray, "n 3"], *, most: int = 6) -> list[FalsePositive]:
+    """Return up to `most` false positives, in order of descriptor distance.
+
+    The list is empty if the protocol applies no threshold to answers.
+    """
+    if result.answers is None or result.answer_distances is None or result.decisions is None:
+        return []
+    positions = positions[:, : result.dimensions or 3]
+    wrong = np.flatnonzero(result.decisions == Decision.FALSE_POSITIVE)
+    worst: list[FalsePositive] = []
+    for query in wrong[np.argsort(result.answer_distances[wrong], kind="stable")].tolist():
+        if len(worst) < most and all(abs(query - other.query) >= APART for other in worst):
+            answer = int(result.answers[query])
+            metres = float(np.linalg.norm(positions[query] - positions[answer]))
+            worst.append(FalsePositive(query, answer, metres, float(result.answer_distances[query])))
+    return worst
 
 
 def _title(source: Input, file: Path | None) -> str:

@@ -1,25 +1,35 @@
-"""Intersection over union (IoU) of semantic maps, and the IoU of predicting the most frequent class everywhere."""
+"""Score of the segmentation head: intersection over union (IoU) of semantic maps, beside predicting one class."""
 
-from dataclasses import dataclass
+import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.evaluation.plain_table import PlainTable
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
-from sglpr_jax.retrieval.image_maps import SemanticMap
+from sglpr_jax.models.params import Params
+from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.retrieval.image_maps import SemanticMap, semantic_map, semantic_maps
+
+PICTURE = "segmentation.png"
 
 
-@dataclass(frozen=True, eq=False)
-class SegmentationResult:
-    """Segmentation scores over all counted cells."""
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class SegmentationScore(PrintsItself):
+    """Segmentation scores over all counted cells. Prints itself as a table."""
 
     iou: Float[np.ndarray, " k"]
     """Intersection over union of each class, NaN for a class without cells."""
     shares: Float[np.ndarray, " k"]
     """Fraction of the cells that belong to each class."""
     cells: int
+    categories: int = 20
+    """Number of categories in the taxonomy of the classes (`labels.taxonomy`)."""
+    title: str = ""
 
     @property
     def mean_iou(self) -> float:
@@ -41,6 +51,86 @@ class SegmentationResult:
         """Mean IoU of predicting the most frequent class everywhere."""
         return float(self.shares.max() / self.present)
 
+    def to_json(self) -> dict[str, Any]:
+        """Return values for `json.dump`. The score of a class that does not occur is null."""
+        names = taxonomy(self.categories).names
+
+        def by_name(values: np.ndarray) -> dict[str, float | None]:
+            return {name: None if np.isnan(x) else float(x) for name, x in zip(names, values, strict=True)}
+
+        return {
+            "mean_iou": self.mean_iou,
+            "majority": names[self.majority],
+            "majority_mean_iou": self.majority_mean_iou,
+            "cells": self.cells,
+            "iou": by_name(self.iou),
+            "shares": by_name(self.shares),
+        }
+
+    def __rich__(self) -> TextTable:
+        names, header = taxonomy(self.categories).names, ("class", "share of the cells", "IoU")
+        rows = [
+            (name, f"{share:.2%}", f"{iou:.3f}")
+            for name, share, iou in zip(names, self.shares, self.iou, strict=True)
+            if share
+        ]
+        rows.append((f"mean of {self.present} classes", "", f"{self.mean_iou:.3f}"))
+        rows.append((f"{names[self.majority]} everywhere", "", f"{self.majority_mean_iou:.3f}"))
+        return TextTable(header, rows, header[1:], self.title, f"{self.cells} cells with points and a label")
+
+
+def score_segmentation(
+    params: Params, recording: Recording, *, folder: Path, progress: Progress = no_progress
+) -> SegmentationScore:
+    """Score the segmentation head on every labelled scan of a recording, and draw one scan into `folder`.
+
+    Arguments:
+      params: Parameters of a network with a segmentation head.
+      recording: Recording with labels.
+      folder: Folder for a figure of one scan (`draw_segmentation`).
+      progress: Reports the progress.
+
+    Raises:
+      ValueError: If no cell is counted.
+    """
+    rows, config = _labelled_rows(recording), params.config
+    confusion = np.zeros((config.classes, config.classes), np.int64)
+    with progress(f"segment {recording.name}", len(rows)) as show:
+        for _, _, found in semantic_maps(params, recording, rows, on_progress=show):
+            confusion += map_confusion(found, categories=config.categories)
+    score = score_confusion(confusion, categories=config.categories, title=title_of(recording))
+    draw_segmentation(params, recording, folder)
+    return score
+
+
+def title_of(recording: Recording) -> str:
+    """Return the title of the score of a recording."""
+    return f"segmentation of {len(_labelled_rows(recording))} scans of {recording.name}"
+
+
+def draw_segmentation(params: Params, recording: Recording, folder: Path, *, min_confidence: float = 0.0) -> None:
+    """Draw input, truth and prediction of the middle labelled scan into `folder`. Does nothing without matplotlib."""
+    if not figures.can_draw():
+        return
+    rows = _labelled_rows(recording)
+    found = semantic_map(params, recording.record(rows[len(rows) // 2]), min_confidence=min_confidence)
+    about = {"resolution_m": params.config.grid.resolution_m, "categories": params.config.categories}
+    panel = figures.segmentation_panel(found.counts, found.truth, found.predicted, **about)
+    figures.save(panel, folder / PICTURE)
+
+
+def _labelled_rows(recording: Recording) -> list[int]:
+    return [row for row, labelled in enumerate(recording.labelled) if labelled]
+
+
+def map_confusion(found: SemanticMap, *, categories: int) -> Int[np.ndarray, "k k"]:
+    """Return the confusion matrix of one semantic map, over the cells that have a prediction and a label.
+
+    It is all zeros for a scan without labels.
+    """
+    classes = len(taxonomy(categories).names)
+    return confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
+
 
 def confusion_matrix(
     truth: Int[np.ndarray, "*b h w"],
@@ -58,7 +148,7 @@ def confusion_matrix(
     return np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
 
 
-def score_confusion(confusion: Int[np.ndarray, "k k"]) -> SegmentationResult:
+def score_confusion(confusion: Int[np.ndarray, "k k"], *, categories: int = 20, title: str = "") -> SegmentationScore:
     """Return the scores of a confusion matrix. Raises ValueError if no cell was counted."""
     cells_of_class = confusion.sum(1)
     cells = int(cells_of_class.sum())
@@ -66,45 +156,4 @@ def score_confusion(confusion: Int[np.ndarray, "k k"]) -> SegmentationResult:
         raise ValueError("expected cells with points and labels, found none")
     union = cells_of_class + confusion.sum(0) - np.diag(confusion)
     iou = np.where(cells_of_class > 0, np.diag(confusion) / np.maximum(union, 1), np.nan)
-    return SegmentationResult(iou=iou, shares=cells_of_class / cells, cells=cells)
-
-
-def map_confusion(found: SemanticMap, *, categories: int) -> Int[np.ndarray, "k k"]:
-    """Return the confusion matrix of one semantic map, over the cells that have a prediction and a label.
-
-    It is all zeros for a scan without labels.
-    """
-    classes = len(taxonomy(categories).names)
-    return confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
-
-
-def segmentation_table(result: SegmentationResult, *, categories: int, title: str = "") -> PlainTable:
-    """Return a table with a row for each class that occurs, and rows for the means."""
-    names = taxonomy(categories).names
-    table = PlainTable(title=title, caption=f"{result.cells} cells with points and a label")
-    for column in ("class", "share of the cells", "IoU"):
-        table.add_column(column, justify="left" if column == "class" else "right")
-    for name, share, iou in zip(names, result.shares, result.iou, strict=True):
-        if share:
-            table.add_row(name, f"{share:.2%}", f"{iou:.3f}")
-    table.add_section()
-    table.add_row(f"mean of {result.present} classes", "", f"{result.mean_iou:.3f}")
-    table.add_row(f"{names[result.majority]} everywhere", "", f"{result.majority_mean_iou:.3f}")
-    return table
-
-
-def segmentation_json(result: SegmentationResult, *, categories: int) -> dict[str, Any]:
-    """Return values for `json.dump`. The score of a class that does not occur is null."""
-    names = taxonomy(categories).names
-
-    def by_name(values: np.ndarray) -> dict[str, float | None]:
-        return {name: None if np.isnan(x) else float(x) for name, x in zip(names, values, strict=True)}
-
-    return {
-        "mean_iou": result.mean_iou,
-        "majority": names[result.majority],
-        "majority_mean_iou": result.majority_mean_iou,
-        "cells": result.cells,
-        "iou": by_name(result.iou),
-        "shares": by_name(result.shares),
-    }
+    return SegmentationScore(iou, cells_of_class / cells, cells, categories, title)

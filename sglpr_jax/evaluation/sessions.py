@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from rich.console import Console, ConsoleOptions
 
-from sglpr_jax.evaluation.inputs.own_file import read_own_file
-from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.protocols import Result, protocol_named, protocols_taking
-from sglpr_jax.evaluation.protocols.choice import ALL
+from sglpr_jax.evaluation.inputs import read_descriptor_file
+from sglpr_jax.evaluation.protocols import ALL, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
-from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_json
+from sglpr_jax.evaluation.report import PrintsItself, TextTable, format_score, results_table, to_json
 from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
@@ -61,6 +60,10 @@ class AcrossSessions(PrintsItself):
             (name, *map(format_score, results), _text(mean_score(results))) for name, results in self.protocols.items()
         ]
 
+    def table(self) -> TextTable:
+        """Return `rows` and the published rows as a table."""
+        return TextTable(self.columns, [*self.rows(), *self.published], self.columns[1:], self.title)
+
     def to_json(self) -> dict[str, Any]:
         """Return values for `json.dump`."""
         results = {
@@ -74,15 +77,9 @@ class AcrossSessions(PrintsItself):
         beside = {"published": published} if self.published else {}
         return {**self.made_with, "database_session": self.database, "results": results, **beside}
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[PlainTable | str]:
-        yield table(self.results)
-        rows = PlainTable(*self.columns, title=self.title)
-        for row in self.rows():
-            rows.add_row(*row)
-        rows.add_section()
-        for row in self.published:
-            rows.add_row(*row)
-        yield rows
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[TextTable | str]:
+        yield results_table(self.results)
+        yield self.table()
         if self.published:
             yield PUBLISHED_NOTE
 
@@ -113,7 +110,7 @@ def evaluate_sessions(
         found = f"database {database.sequence}, queries {', '.join(sessions)}"
         raise ValueError(f"expected different sessions, found {found}")
     for file in queries:
-        check_one_world(database, file)
+        _check_one_world(database, file)
     return AcrossSessions(
         database.sequence,
         sessions,
@@ -139,7 +136,7 @@ def evaluate_session_files(
 def _read(path: Path) -> DescriptorFile:
     if path.suffix != ".npz":
         raise ValueError(f"{path}: expected descriptor files of bin/embed (.npz) for an evaluation across sessions")
-    return read_own_file(path, None)
+    return read_descriptor_file(path)
 
 
 def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]]:
@@ -164,7 +161,7 @@ def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ..
     return rows
 
 
-def check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
+def _check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
     """Raise ValueError if the areas of the two sessions do not overlap. Their positions then have different frames."""
     corners = [(places.min(axis=0), places.max(axis=0)) for places in map(_plane, (database, queries))]
     (low, high), (low_q, high_q) = corners

@@ -12,7 +12,9 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.learning_curves import LearningCurves
 from sglpr_jax.files import file_name, read_json, write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.method import Method
+from sglpr_jax.methods.learned import LEARNED
+from sglpr_jax.methods.learned.weights_file import method_of
+from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights_file import load
@@ -138,3 +140,11 @@ class Runs:
 
     def _folder(self, variant: str, seq: str) -> Path:
         return self.folder / variant / file_name(seq)
+
+
+def content_of(method: str) -> Takes:
+    """Return what a handcrafted method or weights need in a recording. `method` is a name or a folder of weights."""
+    if method in HANDCRAFTED:
+        return HANDCRAFTED[method].takes
+    learned = method_of(Path(method))
+    return LEARNED[learned].takes if learned in LEARNED else "images"

@@ -1,12 +1,21 @@
 """Tables 1 to 7 with the reproduced and the published numbers, for the terminal, as JSON and as Markdown."""
 
+import functools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from sglpr_jax.evaluation.plain_table import PlainTable
-from sglpr_jax.evaluation.report import PrintsItself
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.evaluation.protocols import PROTOCOLS
+from sglpr_jax.evaluation.protocols.protocol import Result
+from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL
+from sglpr_jax.evaluation.published import TABLES
+from sglpr_jax.evaluation.report import PrintsItself, TextTable
+from sglpr_jax.files import write_json, write_text
+from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1
+from sglpr_jax.reproduce.runs import Runs, content_of
 
 OURS, PUBLISHED = "here", "published"
 NONE, NO_REVISITS = "-", "no revisits"
@@ -39,13 +48,9 @@ class PaperTable(PrintsItself):
     columns: Sequence[str]
     caption: str
 
-    def __rich__(self) -> PlainTable:
-        table = PlainTable(title=self.title, caption=self.caption)
-        for name in self._head():
-            table.add_column(name, justify="left" if name in ("method", "source") else "right")
-        for row in self.rows:
-            table.add_row(*self._cells(row), style="dim" if row.source == PUBLISHED else None)
-        return table
+    def __rich__(self) -> TextTable:
+        head = self._head()
+        return TextTable(head, list(map(self._cells, self.rows)), head[2:], self.title, self.caption)
 
     def markdown(self) -> str:
         """Return the table as Markdown."""
@@ -81,9 +86,133 @@ class PaperTable(PrintsItself):
         return [row.label, row.source, *scores, _text(row.mean(self.columns)), *([change] if self._has_change else [])]
 
 
-def score_or_none(score: float) -> float | None:
-    """Return a protocol's score, or None for NaN, the score of a recording without revisits."""
-    return None if math.isnan(score) else score
+@dataclass(frozen=True)
+class Reproduction:
+    """Finished runs, test recordings and compared methods: the input of tables and figures."""
+
+    runs: Runs
+    seqs: tuple[str, ...]
+    """Test recordings."""
+    methods: tuple[str, ...]
+    """Handcrafted methods and weights for comparison."""
+    sessions: Callable[[], Path]
+    """Returns the folder of sessions in NCLT's layout. Called only by experiments that need sessions."""
+    trained: bool = True
+    """Whether there are runs of the variants."""
+
+    def tables(self, name: str) -> dict[str, PaperTable]:
+        """Return the tables with the reproduced numbers and the paper's, one for each protocol, by file name."""
+        if EXPERIMENTS[name].across_sessions:
+            return {name: self._across_sessions(name)}
+        return {
+            name if protocol == TOP1 else f"{name}-{protocol}": self._of_protocol(name, protocol)
+            for protocol in EXPERIMENTS[name].protocols
+        }
+
+    def labels(self, name: str) -> Mapping[str, str]:
+        """Return the label of each variant of a table or figure by its name, and of the methods compared with them."""
+        experiment = EXPERIMENTS[name]
+        variants = experiment.names() if self.trained else {}
+        return variants | ({other: other for other in self.methods} if experiment.beside_handcrafted else {})
+
+    def _of_protocol(self, name: str, protocol: str) -> PaperTable:
+        """Return table 1, 2, 4, 5, 6 or 7 by one protocol, the reproduced rows first."""
+        experiment = EXPERIMENTS[name]
+        rows = [self._row(method, label, protocol, experiment.rotated) for method, label in self.labels(name).items()]
+        published = protocol if len(experiment.protocols) > 1 else None
+        poses = dict.fromkeys(self.runs.recording(seq).pose_source for seq in self.seqs)
+        caption = [f"{protocol} ({PROTOCOLS[protocol].rule})", f"poses: {', '.join(map(str, poses))}"]
+        return self._table(name, self.seqs, rows, "leave-one-out", caption, protocol=published)
+
+    def _row(self, method: str, label: str, protocol: str, rotated: bool) -> Row:
+        """Return the scores of a method, and with rotated scans their change."""
+
+        def row(rotated: bool) -> Row:
+            results = {seq: scored(self.runs, method, seq, protocol=protocol, rotated=rotated) for seq in self.seqs}
+            return Row(label, OURS, {seq: _score_or_none(result) for seq, result in results.items()})
+
+        if not rotated:
+            return row(False)
+        turned, after, before = row(True), row(True).mean(self.seqs), row(False).mean(self.seqs)
+        return turned if after is None or before is None else replace(turned, change=after - before)
+
+    def _across_sessions(self, name: str) -> PaperTable:
+        """Return Recall@1 of each later session in the first one.
+
+        The model was trained without the first test recording and has seen none of the sessions. Methods that need
+        labels are omitted if the sessions have no labels.
+        """
+        root, seq = self.sessions(), self.seqs[0]
+        database, *queries = (open_recording(root, session) for session in recording_names(root))
+        ours = []
+        for method, label in self.labels(name).items():
+            if method in self.methods and content_of(method) == "labelled points" and not database.has_labels:
+                continue
+            there = self.runs.descriptors(method, seq, of=database)
+            found = {q.name: BEVPLACE_NCLT_RECALL(there, self.runs.descriptors(method, seq, of=q)) for q in queries}
+            ours.append(Row(label, OURS, {name: _score_or_none(result) for name, result in found.items()}))
+        columns = [query.name for query in queries]
+        return self._table(name, columns, ours, f"without recording {seq}", ["Recall@1 within 5 m"])
+
+    def _table(
+        self,
+        name: str,
+        columns: Sequence[str],
+        ours: Sequence[Row],
+        split: str,
+        caption: Sequence[str],
+        *,
+        protocol: str | None = None,
+    ) -> PaperTable:
+        """Return the reproduced rows and then the published ones, of one protocol if it is given."""
+        published = published_rows(name, columns, protocol=protocol)
+        steps = f"here: preset {Path(self.runs.preset).stem}, {self.runs.config.steps} steps, {split}"
+        caption = [*([steps] if self.trained else []), *caption]
+        if published:
+            caption.append("published: the paper's numbers, on the real dataset")
+        title = f"{name}: {EXPERIMENTS[name].title}"
+        return PaperTable(title, [*ours, *published], list(columns), "; ".join(caption))
+
+
+def published_rows(name: str, columns: Sequence[str], *, protocol: str | None = None) -> list[Row]:
+    """Return the paper's rows of a table, if it has any of these columns.
+
+    With a protocol, only the rows that were scored by it are returned. The source that the paper names then stands
+    beside each method.
+    """
+    return [
+        Row(
+            row.method if protocol is None else f"{row.method} ({row.source})",
+            PUBLISHED,
+            dict(zip(table.columns, row.scores, strict=True)),
+        )
+        for table in TABLES
+        if name == f"table{table.number}" and set(columns) & set(table.columns)
+        for row in table.rows
+        if protocol in (None, row.f1max_protocol)
+    ]
+
+
+@functools.cache
+def scored(runs: Runs, method: str, seq: str, *, protocol: str = TOP1, rotated: bool = False) -> Result:
+    """Return the result of a variant, a handcrafted method or weights. The default protocol is that of the paper: F1max
+    of top-1 retrieval, 3 m / 20 m."""
+    return PROTOCOLS[protocol](runs.descriptors(method, seq, rotated=rotated))
+
+
+def write_tables(name: str, found: Reproduction, folder: Path) -> list[PaperTable]:
+    """Compute the tables of an experiment and write them as JSON and as Markdown. Returns the tables."""
+    tables = found.tables(name)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, table in tables.items():
+        write_text(folder / f"{file}.md", table.markdown())
+        write_json(folder / f"{file}.json", table.to_json())
+    return list(tables.values())
+
+
+def _score_or_none(result: Result) -> float | None:
+    """Return the score, or None for a recording without revisits."""
+    return None if math.isnan(result.score) else result.score
 
 
 def _text(score: float | None, missing: str = NONE) -> str:

@@ -41,7 +41,6 @@ LINES = {
     "reproduce": ("table1", "figure5", "--preset", "paper", "--seq", "00", "07", "--loss.margin", "0.25"),
     "segment": ("--data", "scans", "--out", "maps", "--min-confidence", "1", "--seq", "null"),
     "simulate": ("--out", "towns", "--seq", "00", "05", "--sensor", "vlp16", "--rate-hz", "5"),
-    "stress": ("--data", "scans", "--out", "stress", "--method", "solid", "random", "--batch", "2"),
     "train": ("--seq", "07", "--preset", "circular", "--model.head.cbam", "True", "--optimizer.clip-norm", "None"),
 }
 """A command line of each command, with texts that YAML or a careless reader takes for other values."""
@@ -142,7 +141,7 @@ def test_the_file_may_name_the_preset_and_overrides_it(name, file):
         ),
         ("loops", {"motion-drift.yaw-deg": -1}, ["motion-drift: expected yaw_deg > 0, found -1"]),
         ("embed", {"batch": 0}, ["batch: expected a number from 1 up to 1048576, found 0"]),
-        ("stress", {"method": "solid"}, ["method: expected a list, found 'solid'"]),
+        ("evaluate", {"protocol": "all"}, ["protocol: expected a list, found 'all'"]),
         ("train", {"chunk": 7}, ["chunk must divide the"]),
         ("train", {"preset": "smal"}, ["preset: no preset 'smal': expected a .py file or one of"]),
         ("train", {"model.backbone.kind": "swin"}, ["model.backbone.kind: expected one of 'sglpr', found 'swin'"]),

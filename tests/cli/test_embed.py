@@ -151,6 +151,29 @@ def test_semantic_scan_context_needs_labels(embed, scans):
     assert_one_line_error(ended, "ssc needs labels", "found none in sequence my_scans")
 
 
+@pytest.mark.slow
+def test_corrupted_scans_have_other_descriptors_and_the_same_poses(embed, command, town, images, tmp_path):
+    options = ("--data", town, "--seq", "08", "--method", "solid", "--seed", 3)
+    files = {}
+    for name, more in {
+        "clean": (),
+        "rotate": ("--rotate",),
+        "rotation": ("--corruption", "rotation"),
+        "dropped": ("--corruption", "dropout-0.9"),
+    }.items():
+        ended, path = embed(*options, *more, out=f"{name}.npz")
+        assert ended.status == 0, ended.error
+        files[name] = load(path)
+    np.testing.assert_array_equal(files["rotation"].descriptors, files["rotate"].descriptors)
+    assert (files["clean"].descriptors != files["dropped"].descriptors).any(axis=1).all()
+    np.testing.assert_array_equal(files["clean"].positions, files["dropped"].positions)
+    assert_one_line_error(embed(*options, "--corruption", "beams")[0], "expected a corruption", "mean 'beams-32'")
+    in_store = command("embed", *options, "--corruption", "beams-4", "--out", f"{tmp_path}/places/")
+    assert_one_line_error(in_store, "expected a descriptor file with --corruption")
+    of_images = ("--data", images, "--seq", "06", "--method", "thumbnail", "--corruption", "beams-16")
+    assert_one_line_error(embed(*of_images)[0], "beams-16 needs points, found only images in sequence 06")
+
+
 def test_what_was_found_is_said(embed, scans):
     ended, _ = embed("--method", "thumbnail", "--data", scans)
     said = ended.error.splitlines()

@@ -57,14 +57,6 @@ def test_every_protocol_is_printed_written_and_drawn(command, recording, tmp_pat
 
 
 @pytest.mark.slow
-def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, recording, tmp_path):
-    dataclasses.replace(recording, times=None).save(tmp_path / "08.npz")
-    ended = command("evaluate", tmp_path / "08.npz", "--out", tmp_path / "a" / "b")
-    assert ended.status == 0 and (tmp_path / "a" / "b" / "results.json").is_file()
-    assert "290 frames" in ended.out
-
-
-@pytest.mark.slow
 def test_the_record_beside_the_results_repeats_them(command, recording, tmp_path):
     recording.save(tmp_path / "08.npz")
     out = tmp_path / "out"
@@ -74,16 +66,6 @@ def test_the_record_beside_the_results_repeats_them(command, recording, tmp_path
     assert command("evaluate", "--config", tmp_path / "first" / "command.json").status == 0
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     assert len(json.loads(before["results.json"])["results"]) == 1
-
-
-def test_a_drive_without_revisits_says_so(command, recording, tmp_path):
-    straight = np.arange(800.0)[:, None] * [[6.0, 0.0, 0.0]]  # farther apart than any "same place"
-    dataclasses.replace(recording, positions=straight).save(tmp_path / "08.npz")
-    ended = command("evaluate", tmp_path / "08.npz")
-    assert ended.status == 0, ended.error
-    assert ended.out.count("no revisit") == 3
-    assert [x["score"] for x in json.loads((tmp_path / "08" / "results.json").read_text())["results"]] == [None] * 3
-    assert not (tmp_path / "08" / "precision-recall.png").exists()
 
 
 def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(command, recording, tmp_path, monkeypatch):

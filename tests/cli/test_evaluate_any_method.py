@@ -23,9 +23,7 @@ def laps(tmp_path_factory):
     np.save(folder / "blind.npy", np.random.default_rng(0).normal(size=(FRAMES, 8)))
     zeros, ones = np.zeros(FRAMES), np.ones(FRAMES)
     lidar = np.stack([ones, zeros, zeros, x, zeros, ones, zeros, y, zeros, zeros, ones, zeros], axis=1)
-    camera = np.stack([ones, zeros, zeros, -y, zeros, ones, zeros, zeros, zeros, zeros, ones, x], axis=1)
     np.savetxt(folder / "lidar.txt", lidar)
-    np.savetxt(folder / "camera.txt", camera)
     np.savetxt(folder / "times.txt", times)
     np.savetxt(folder / "tum.txt", np.stack([times, x, y, zeros, zeros, zeros, zeros, ones], axis=1))
     header, rows = "t,x,y,z", np.stack([times, x, y, zeros], axis=1)
@@ -52,37 +50,6 @@ def results(folder):
 
 
 @pytest.mark.slow
-def test_poses_of_every_format_give_the_same_scores(score, laps):
-    found = {}
-    for name, options in {
-        "lidar.txt": ("--pose-format", "lidar", "--times", laps / "times.txt"),
-        "camera.txt": ("--pose-format", "kitti", "--times", laps / "times.txt"),
-        "tum.txt": (),
-        "poses.csv": (),
-    }.items():
-        ended, folder = score("mine.npy", "--poses", laps / name, *options, "--protocol", "top1-f1max", "ssc-recall")
-        assert ended.status == 0, ended.error
-        assert "last 30 s excluded" in ended.out and "2-D" in ended.out
-        found[name] = {title: (entry["score"], entry["counts"]) for title, entry in results(folder).items()}
-        assert name in results(folder)["top-1 F1max"]["poses"]
-    assert found["lidar.txt"]["top-1 F1max"][1]["revisits"] == 200
-    assert 0.9 < found["lidar.txt"]["top-1 F1max"][0] < 1
-    assert all(scores == found["lidar.txt"] for scores in found.values())
-
-
-@pytest.mark.slow
-def test_the_mistake_is_on_the_page_with_its_distances(score, laps):
-    ended, folder = score("mine.npy", "--poses", laps / "poses.csv", "--distance", "cosine")
-    assert ended.status == 0, ended.error
-    report = json.loads((folder / "results.json").read_text())
-    mistake = report["false_positives"][0]
-    assert (mistake["query"], mistake["answer"], report["distance"]) == (250, 10, "cosine")
-    text = (folder / "report.html").read_text()
-    assert f'<td class="number">{mistake["metres"]:.1f}</td>' in text and "compared by cosine" in text
-    assert "add --data" in text and "add --weights and --data" in text
-
-
-@pytest.mark.slow
 def test_a_top_k_list_and_scored_pairs(score, laps):
     ended, folder = score("topk.txt", "--poses", laps / "poses.csv")
     assert ended.status == 0, ended.error
@@ -103,17 +70,10 @@ def test_methods_are_compared_on_one_page(score, laps):
     assert list(report["compared"]) == ["blind", "topk"]
     assert report["compared"]["blind"][0]["score"] < 0.5 < report["results"][0]["score"]
     text = (folder / "report.html").read_text()
-    assert "Methods side by side" in text and "<th>blind</th>" in text
+    assert "Methods side by side" in text and "<td>blind</td>" in text
     assert (folder / "precision-recall-top-1-f1max.png").is_file()
     ended, _ = score("mine.npy", "--poses", laps / "tum.txt", "--compare", laps / "topk.txt")
     assert_one_line_error(ended, "topk", "for a top-k list", "found pairs-f1max")
-
-
-@pytest.mark.slow
-def test_all_protocols(score, laps):
-    ended, folder = score("mine.npy", "--poses", laps / "tum.txt", "--protocol", "all")
-    assert ended.status == 0, ended.error
-    assert len(results(folder)) == 13
 
 
 @pytest.mark.parametrize(
@@ -125,12 +85,9 @@ def test_all_protocols(score, laps):
             ("mine.npy", "--poses", "tum.txt", "--protocol", "top1"),
             ("expected a protocol, found 'top1'", "'top1-f1max'"),
         ),
-        (("mine.npy", "--poses", "tum.txt", "--distance", "cos"), ("expected a distance among l2, cosine", "'cos'")),
-        (("mine.npy", "--poses", "pairs.txt"), ("pairs.txt", "found 4")),
         (("mine.npy", "--times", "times.txt"), ("times.txt", "expected --poses with --times")),
         (("mine.npy", "--poses", "tum.txt", "--weights", "run"), ("run", "expected --data with --weights")),
         (("pairs.txt", "--poses", "one.csv"), ("pairs.txt, line 1", "expected frames from 0 to 0", "found 200")),
-        (("topk.txt", "--poses", "tum.txt", "--protocol", "pairs-f1max"), ("for a top-k list", "pairs-f1max")),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(score, laps, arguments, words):
@@ -138,12 +95,6 @@ def test_bad_input_is_one_line_and_nothing_is_written(score, laps, arguments, wo
     ended, folder = score(*(laps / word if re.search(r"\.(txt|csv)$", word) else word for word in arguments))
     assert_one_line_error(ended, *words)
     assert not folder.exists()
-
-
-def test_an_unknown_pose_format_is_answered_with_those_there_are(score, laps):
-    ended, _ = score("mine.npy", "--poses", laps / "tum.txt", "--pose-format", "ros")
-    assert ended.status != 0 and "Traceback" not in ended.error
-    assert "ros" in ended.error and "tum" in ended.error
 
 
 def test_a_list_without_an_ending_gets_a_folder_of_another_name(command, laps, tmp_path):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from sglpr_jax import DescriptorFile, model_preset, open_recording, save
+from sglpr_jax import DescriptorFile
 
 from .conftest import Ended, assert_one_line_error, run_command
 
@@ -45,38 +45,6 @@ def files(folder):
     return [*(folder / f"{day}.npz" for day in DAYS), "--database", folder / f"{MAP}.npz"]
 
 
-def test_days_are_simulated_in_nclts_layout(days):
-    assert days.ended.status == 0, days.ended.error
-    assert "simulating 3 recordings of 12 scans, about 0 MB" in days.ended.error
-    assert days.ended.out == f"{days.root}: recordings {MAP}, {DAYS[0]}, {DAYS[1]}\n"
-    for day in (MAP, *DAYS):
-        session = open_recording(days.root, day)
-        assert len(session) == SCANS and len(session.points(0)) > 100
-    again = run_command("simulate", "--out", days.root, "--sessions", MAP, *DAYS, *THIN)
-    assert again.status == 0 and "simulating" not in again.error
-
-
-@pytest.mark.parametrize("method", ["polar-fft", "solid", "m2dp"])
-def test_methods_on_images_and_on_points_read_a_session(days, command, tmp_path, method):
-    out = tmp_path / "day.npz"
-    ended = command("embed", "--method", method, "--data", days.root, "--seq", DAYS[0], "--out", out)
-    assert ended.status == 0, ended.error
-    file = DescriptorFile.load(out)
-    assert file.sequence == DAYS[0] and file.pose_source == f"groundtruth_{DAYS[0]}.csv"
-    np.testing.assert_array_equal(file.positions, open_recording(days.root, DAYS[0]).positions)
-
-
-@pytest.mark.slow
-def test_a_network_reads_a_session_whatever_its_sensor(days, random_params, command, tmp_path):
-    save(random_params(model_preset("tiny")), tmp_path / "weights")
-    out = tmp_path / "day.npz"
-    ended = command("embed", "--weights", tmp_path / "weights", "--data", days.root, "--seq", MAP, "--out", out)
-    assert ended.status == 0, ended.error
-    norms = np.linalg.norm(DescriptorFile.load(out).descriptors, axis=1)
-    assert norms.shape == (SCANS,)
-    np.testing.assert_allclose(norms, 1, rtol=1e-5)
-
-
 def test_a_table_has_a_column_for_each_session(embedded, command, tmp_path):
     ended = command("evaluate", *files(embedded), "--out", tmp_path / "out")
     assert ended.status == 0, ended.error
@@ -106,18 +74,9 @@ def test_published_numbers_stand_apart_and_are_of_the_real_dataset(embedded, com
 
 
 def test_published_numbers_of_one_sequence_are_those_of_learned_methods(command, tmp_path):
-    angle = np.arange(800) * (2 * np.pi / 400)
-    place = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    file = DescriptorFile(
-        sequence="08",
-        ids=tuple(f"{i:06d}" for i in range(800)),
-        positions=np.pad(200 * place, ((0, 0), (0, 1))),
-        times=np.arange(800) * 0.5,
-        descriptors=place.astype(np.float32),
-        pose_source="made up",
-        config={},
-        weights_hash="",
-    )
+    place = np.stack([np.arange(60.0), np.zeros(60), np.zeros(60)], axis=1)
+    ids = tuple(f"{i:06d}" for i in range(60))
+    file = DescriptorFile("08", ids, place, None, place.astype(np.float32), "made up", {}, "")
     file.save(tmp_path / "08.npz")
     ended = command("evaluate", tmp_path / "08.npz", "--published")
     assert ended.status == 0, ended.error

@@ -67,7 +67,7 @@ def test_an_image_that_does_not_fit_the_grid_is_refused(command, weights, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("tool", ["embed", "segment", "stress", "evaluate", "export"])
+@pytest.mark.parametrize("tool", ["embed", "segment", "evaluate", "export"])
 def test_an_unknown_name_lists_those_there_are(command, exported, town, tmp_path, tool):
     file = (tmp_path / "08.npy",) if tool == "evaluate" else ()
     data = () if tool == "export" else ("--data", town, "--seq", "08")

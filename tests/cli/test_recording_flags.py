@@ -11,11 +11,9 @@ from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.map import MapCommand
 from sglpr_jax.cli.recording import PosedRecordingOptions, RecordingOptions
 from sglpr_jax.cli.segment import SegmentCommand
-from sglpr_jax.cli.stress import StressCommand
 
 POSED = {
     EmbedCommand: ("--data", "scans", "--out", "a.npz"),
-    StressCommand: ("--data", "scans", "--out", "a"),
     LoopsCommand: ("scans", "--out", "a"),
 }
 UNPOSED = {

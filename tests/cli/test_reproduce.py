@@ -5,15 +5,12 @@ import shutil
 
 import pytest
 
-from sglpr_jax.evaluation.published import KITTI, TABLES
 from sglpr_jax.methods.learned.disco import DISCO
 from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
 from sglpr_jax.reproduce import plan
-from sglpr_jax.reproduce import runs as runs_module
-from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS, variant_config
+from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
 from sglpr_jax.reproduce.plan import make_plan
 from sglpr_jax.reproduce.runs import Runs
-from sglpr_jax.reproduce.scores import published_rows
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.training.metrics_log import read_metrics
@@ -142,24 +139,6 @@ def test_a_stopped_reproduction_says_how_it_goes_on(town, preset, random_params,
     assert "--resume" not in ended.error
 
 
-def test_a_run_killed_before_its_settings_were_written_is_begun_anew(
-    town, preset, random_params, tmp_path, monkeypatch
-):
-    runs, asked = Runs(tmp_path, town, str(preset), load_preset(str(preset))), []
-
-    def begin(config, recordings, *, resume, **_):
-        asked.append(resume)
-        return TrainResult(random_params(config.model), tmp_path, 1, config, None)
-
-    monkeypatch.setattr(runs_module, "train", begin)
-    (tmp_path / "full" / "08").mkdir(parents=True)
-    assert not runs.is_trained("full", "08")
-    runs.train("full", "08")
-    (tmp_path / "full" / "08" / "config.json").write_text("{}")
-    runs.train("full", "08")
-    assert asked == [False, True]
-
-
 def test_sessions_are_looked_at_before_anything_is_trained(town, preset, tmp_path, command):
     options = ("--data", town, "--seq", "08", "--method", "polar-fft", "--preset", preset, "--out", tmp_path / "out")
     none, one = tmp_path / "none", tmp_path / "one"
@@ -189,32 +168,11 @@ def test_every_variant_differs_from_the_preset_and_from_every_other(preset_name)
     assert configs["full"] == config and len(set(configs.values())) == len(VARIANTS)
 
 
-def test_every_table_of_the_paper_has_its_rows_here_in_the_same_order():
-    for table in TABLES[3:]:
-        assert len(EXPERIMENTS[f"table{table.number}"].variants) == len(table.rows)
-        assert [row.scores["08"] for row in published_rows(f"table{table.number}", KITTI)] == [
-            row.scores[-1] for row in table.rows
-        ]
-    assert published_rows("table1", ["town"]) == []
-
-
 def test_a_mean_needs_every_column():
     rows = [Row("whole", OURS, {"00": 0.5, "08": 0.75}), Row("part", OURS, {"00": 0.5, "08": None})]
     table = PaperTable("title", rows, ("00", "08"), caption="")
     assert [row["mean"] for row in table.to_json()] == [0.625, None]
     assert "| part | here | 0.500 | no revisits | - |" in table.markdown()
-
-
-def test_no_cell_is_left_blank():
-    """Neither where a recording never comes back nor where nothing was published."""
-    rows = [Row("ours", OURS, {"04": None}), Row("theirs", PUBLISHED, {"08": 0.5, "04": None})]
-    rows.append(Row("turned", OURS, {"04": 0.5, "town": 0.25}, change=-0.125))
-    lines = PaperTable("title", rows, ("04", "town"), caption="").markdown().splitlines()[4:7]
-    assert lines == [
-        "| ours | here | no revisits | no revisits | - | - |",
-        "| theirs | published | - | - | - | - |",
-        "| turned | here | 0.500 | 0.250 | 0.375 | -0.125 |",
-    ]
 
 
 def test_the_plan_tells_the_recordings_that_never_come_back(town, images, preset, tmp_path):

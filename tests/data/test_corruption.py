@@ -12,8 +12,8 @@ from sglpr_jax.data.corruption import (
     CORRUPTIONS,
     ROTATION,
     Corruption,
-    chosen_corruptions,
     corrupt,
+    corruption_named,
     keep_rings,
     ring_numbers,
 )
@@ -88,11 +88,13 @@ def test_rotation_is_left_to_embedding():
         corrupt(np.zeros((1, 3), np.float32), ROTATION, rng=np.random.default_rng(0))
 
 
-def test_a_kind_stands_for_all_its_strengths():
-    assert chosen_corruptions(()) == CORRUPTIONS
-    assert [d.name for d in chosen_corruptions(("beams-16", "rotation", "noise", "noise-0.1"))] == [
-        *("rotation", "beams-16", "noise-0.05", "noise-0.1", "noise-0.2")
-    ]
+def test_names_say_kind_and_strength():
+    assert [corruption_named(corruption.name) for corruption in CORRUPTIONS] == list(CORRUPTIONS)
+    assert corruption_named("occlusion-60") == Corruption("occlusion", 60.0)
+    with pytest.raises(ValueError, match=r"a corruption such as rotation, .*, found 'beams'; did you mean 'beams-"):
+        corruption_named("beams")
+    with pytest.raises(ValueError, match="noise-loud: could not convert"):
+        corruption_named("noise-loud")
 
 
 @pytest.mark.parametrize(

@@ -24,29 +24,61 @@ def f1_max(thresholds, count):
     return max((2 * tp / (2 * tp + fp + fn) if tp else 0.0) for tp, fp, fn in map(count, thresholds))
 
 
+def within(file: DescriptorFile, metres: float, dimensions: int, *, closed: bool = False) -> Callable[[int, int], bool]:
+    positions = file.positions[:, :dimensions]
+
+    def right(i, j):
+        apart = distance(positions[i], positions[j])
+        return apart <= metres if closed else apart < metres
+
+    return right
+
+
 def ranked(file: DescriptorFile, query: int, database: Iterable[int]) -> list[int]:
     """The database, the nearest descriptor first."""
     return sorted(database, key=lambda i: distance(file.descriptors[query], file.descriptors[i]))
 
 
 def top1(
-    file: DescriptorFile, databases: dict[int, range], right: Callable[[int, int], bool]
+    file: DescriptorFile,
+    databases: dict[int, range],
+    right: Callable[[int, int], bool],
+    wrong: Callable[[int, int], bool] | None = None,
 ) -> tuple[float, int, float]:
-    """F1max, revisits and Recall@1 where every accepted answer that is not right is false."""
+    """F1max, revisits and Recall@1; without `wrong`, every accepted answer that is not right is false."""
     answers = []
     for query, database in databases.items():
         best = ranked(file, query, database)[0]
         score = distance(file.descriptors[query], file.descriptors[best])
-        answers.append((score, right(query, best), any(right(query, i) for i in database)))
+        hit = right(query, best)
+        false = wrong(query, best) if wrong else not hit
+        answers.append((score, hit, false, any(right(query, i) for i in database)))
 
     def count(threshold):
-        accepted = [hit for score, hit, _ in answers if score <= threshold]
-        missed = [revisit for score, _, revisit in answers if score > threshold]
-        return sum(accepted), len(accepted) - sum(accepted), sum(missed)
+        accepted = [(hit, false) for score, hit, false, _ in answers if score <= threshold]
+        missed = [revisit for score, _, _, revisit in answers if score > threshold]
+        return sum(hit for hit, _ in accepted), sum(false for _, false in accepted), sum(missed)
 
-    revisits = sum(revisit for _, _, revisit in answers)
-    found = sum(hit and revisit for _, hit, revisit in answers)
-    return f1_max([score for score, _, _ in answers], count), revisits, found / revisits
+    revisits = sum(revisit for *_, revisit in answers)
+    found = sum(hit and revisit for _, hit, _, revisit in answers)
+    return f1_max([score for score, *_ in answers], count), revisits, found / revisits if revisits else np.nan
+
+
+def pairs(
+    file: DescriptorFile, positive: Callable[[float, int], bool], first_gap: int = 1
+) -> tuple[float, dict[str, int]]:
+    """F1max over pairs with every negative beyond 20 m, and the numbers of pairs."""
+    p, d = file.positions[:, :2], file.descriptors
+    every = [(i, j) for i in range(len(file)) for j in range(i + 1 - first_gap)]
+    right = [distance(d[i], d[j]) for i, j in every if positive(distance(p[i], p[j]), i - j)]
+    wrong = [distance(d[i], d[j]) for i, j in every if distance(p[i], p[j]) > 20]
+
+    def count(threshold):
+        tp = sum(x <= threshold for x in right)
+        return tp, sum(x <= threshold for x in wrong), len(right) - tp
+
+    counts = {"positive pairs": len(right), "negative pairs": len(wrong)}
+    return f1_max(right, count) if right else np.nan, counts
 
 
 def recall(file: DescriptorFile, databases: dict[int, range], right: Callable[[int, int], bool], n: int) -> float:
@@ -56,3 +88,14 @@ def recall(file: DescriptorFile, databases: dict[int, range], right: Callable[[i
         if any(right(query, i) for i in database):
             found.append(any(right(query, i) for i in ranked(file, query, database)[:n]))
     return sum(found) / len(found)
+
+
+def recall_across(database: DescriptorFile, queries: DescriptorFile, metres: float, n: int) -> tuple[float, int]:
+    """Recall@n across two sessions, and how many queries have something to find."""
+    found = []
+    for position, descriptor in zip(queries.positions, queries.descriptors, strict=True):
+        near = [distance(position[:2], p[:2]) < metres for p in database.positions]
+        order = np.argsort([distance(descriptor, d) for d in database.descriptors])
+        if any(near):
+            found.append(any(near[i] for i in order[:n]))
+    return np.mean(found), len(found)

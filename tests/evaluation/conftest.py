@@ -25,14 +25,14 @@ def make_file() -> Callable[..., DescriptorFile]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def two_laps() -> np.ndarray:
     """Return positions (800, 3) of two equal laps around a circle of 200 m radius, at KITTI's 3 m to a frame."""
     angle = np.arange(800) * (2 * np.pi / 400)
     return np.stack([200 * np.cos(angle), 200 * np.sin(angle), np.zeros(800)], axis=1)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def straight() -> np.ndarray:
     """Return positions (800, 3) of a recording that never comes back."""
     return np.arange(800.0)[:, None] * [1.0, 0.0, 0.0]

@@ -62,31 +62,11 @@ def test_pairs_of_one_query_are_worth_less_than_pairs_of_many(pairs):
     assert lumps > 2 * singles  # twenty copies of twenty pairs tell no more than twenty pairs
 
 
-def test_frames_may_have_any_number(pairs):
-    scores, positive, query = pairs
-    assert f1_interval(scores, positive, query + 2**60) == f1_interval(scores, positive, query)
-
-
 def test_a_share_is_resampled_as_drawing_does():
     found = np.arange(200) < 150
     low, high = interval(resampled_means(found, np.random.default_rng(0)))
     spread = 1.96 * np.sqrt(0.75 * 0.25 / 200)
     assert (low, high) == pytest.approx((0.75 - spread, 0.75 + spread), abs=0.01)
-
-
-def test_the_seed_is_all_that_decides(pairs):
-    assert f1_interval(*pairs) == f1_interval(*pairs) != f1_interval(*pairs, seed=1)
-
-
-@pytest.mark.parametrize(("right", "expected"), [(True, (1.0, 1.0)), (False, (0.0, 0.0))])
-def test_one_query(right, expected):
-    scores, nothing = np.array([0.5]), np.array([False])
-    flags = {
-        "true_if_accepted": np.array([right]),
-        "false_if_accepted": nothing,
-        "missed_if_rejected": np.array([True]),
-    }
-    assert f1_max_interval(scores, **flags, query=np.array([7]), seed=0) == expected
 
 
 def test_ties_and_answers_never_given():

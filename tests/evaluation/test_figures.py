@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.labels import CATEGORIES, taxonomy
 from sglpr_jax.metrics import classification_curve
 
@@ -64,18 +64,6 @@ def test_learning_curves_have_a_panel_each_over_the_same_steps(tmp_path):
     assert pixels(figure, tmp_path / "curves.png").std() > 10
 
 
-def test_a_learning_curve_stands_beside_its_references(tmp_path):
-    figure = figures.learning_curve(
-        {"raw": [(0, 0.1), (100, 0.6)], "rotated": [(0, 0.1), (100, 0.5)]},
-        ylabel="top-1 F1max",
-        references={"polar-FFT": 0.92},
-    )
-    assert legend(figure) == ["raw", "rotated", "polar-FFT 0.920"]
-    line = figure.axes[0].get_lines()[0]
-    np.testing.assert_array_equal(line.get_xydata(), [(0, 0.1), (100, 0.6)])
-    assert pixels(figure, tmp_path / "learning.png").std() > 10
-
-
 def test_a_segmentation_panel_is_in_metres_and_in_the_classes_colours(tmp_path):
     bev = np.zeros((20, 40), np.int32)
     bev[:, :20] = 3
@@ -102,28 +90,7 @@ def test_a_segmentation_panel_has_the_names_and_colours_of_its_categories(tmp_pa
     assert shows(pixels(figure, tmp_path / "moving.png"), taxonomy(25).colors[moving])
 
 
-def test_an_empty_image_can_be_drawn(tmp_path):
-    nothing = np.zeros((8, 8), np.int32)
-    pixels(figures.segmentation_panel(nothing, nothing, nothing, resolution_m=1.0), tmp_path / "empty.png")
-
-
 def test_without_matplotlib_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[viz\]'"):
-        figures.learning_curve({"raw": [(0, 0.1)]}, ylabel="loss")
-
-
-def test_a_failed_save_leaves_the_older_picture(tmp_path, monkeypatch):
-    figure = figures.learning_curve({"raw": [(0, 0.1), (1, 0.2)]}, ylabel="loss")
-    figures.save(figure, tmp_path / "loss.png")
-    before = (tmp_path / "loss.png").read_bytes()
-
-    def write_half(path, **_):
-        path.write_bytes(b"half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(figure, "savefig", write_half)
-    with pytest.raises(OSError, match="disk full"):
-        figures.save(figure, tmp_path / "loss.png")
-    assert [path.name for path in tmp_path.iterdir()] == ["loss.png"]
-    assert (tmp_path / "loss.png").read_bytes() == before
+        figures.learning_curves({"loss": {"raw": [(0, 0.1)]}})

@@ -1,4 +1,4 @@
-"""The page of loops stands alone and shows what was found, also where there is little to show."""
+"""The page of loops of one or several recordings stands alone and shows what was found."""
 
 import dataclasses
 
@@ -7,15 +7,16 @@ import pytest
 from recordings import of_images
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.page.of_loops import loops_page
+from sglpr_jax.evaluation.loops_page import loops_page
 from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.frame_alignment import AlignedParts, FrameAlignment, Part
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.search import FoundLoops, Session
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transform
 
-from .test_page import Parsed
+from .test_evaluation_page import Parsed
 
 
 @pytest.fixture
@@ -39,7 +40,6 @@ def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_
     assert "0.9950" in table and "000005" in table and "17.2" in table
 
 
-@pytest.mark.slow
 def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert len(Parsed(loops_page(with_session(found, odometry=None))).images) == 2
     none = dataclasses.replace(found, loops=())
@@ -49,7 +49,6 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert "No scan was processed." in loops_page(with_session(none, frames=0))
 
 
-@pytest.mark.slow
 def test_rejected_pairs_are_counted_by_reason(found):
     assert "No pair was rejected." in Parsed(loops_page(found)).texts["Rejected"]
     pair = found.loops[0]
@@ -60,7 +59,6 @@ def test_rejected_pairs_are_counted_by_reason(found):
     assert "Rejected pairs are grey." in page.texts["Trajectory"]
 
 
-@pytest.mark.slow
 def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(found, known):
     page = Parsed(loops_page(known))
     assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Trajectory"]
@@ -89,7 +87,6 @@ def known(found) -> FoundLoops:
     return with_session(dataclasses.replace(found, model=model), recording=recording, candidates=candidates)
 
 
-@pytest.mark.slow
 def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known, monkeypatch):
     page = Parsed(loops_page(known))
     assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs", "Reliability"]
@@ -101,7 +98,6 @@ def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known
     assert "0.99 to 1" in Parsed(loops_page(known)).texts["Reliability"]
 
 
-@pytest.mark.slow
 def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, monkeypatch):
     optimized = OptimizedTrajectory(known.odometry + 0.0, np.array([True, True, False]))
     optimized.poses[:, :3, 3] = known.recording.positions
@@ -118,3 +114,27 @@ def test_without_matplotlib_there_is_a_table(found, monkeypatch):
     monkeypatch.setattr(figures, "can_draw", lambda: False)
     page = loops_page(found)
     assert "sglpr-jax[viz]" in page and "0.9950" in page and not Parsed(page).images
+
+
+@pytest.fixture
+def several(found) -> FoundLoops:
+    loop = Loop(2, 3, transform(1.0, 2.0, 0.3), np.eye(6), 0.995, query_session=1)
+    second = (dataclasses.replace(one, query_session=1, match_session=1) for one in found.loops)
+    alignment = FrameAlignment(transform(10.0, 0.0, 0.5), 0.01 * np.eye(6))
+    transforms = (AlignedParts(Part(0, 0, 7, True), Part(1, 0, 7, True), alignment, 1),)
+    return FoundLoops(2 * found.sessions, (*found.loops, *second, loop), transforms=transforms)
+
+
+def test_transforms_pairs_and_recordings_are_shown(several):
+    page = Parsed(loops_page(several))
+    assert "28.65" in page.texts["Transforms"] and "10.00" in page.texts["Transforms"]
+    assert {"Together", "08 and 08~2", "08: Trajectory", "08~2: Rejected"} <= set(page.texts)
+    assert "in the frame of 08" in page.texts["Together"]
+    poses = np.concatenate([one.odometry for one in several.sessions])
+    corrected = OptimizedTrajectory(poses, np.ones(len(several.loops), bool))
+    assert "corrected by 7 of 7 loops" in Parsed(loops_page(several, optimized=corrected)).texts["Together"]
+
+
+def test_no_common_place_is_said(several):
+    page = Parsed(loops_page(dataclasses.replace(several, loops=several.loops[:-1], transforms=())))
+    assert "no common place found" in page.texts["Transforms"] and "Together" not in page.texts

@@ -3,7 +3,7 @@
 import numpy as np
 from scenes import place, relative, seen_from
 
-from sglpr_jax.evaluation.overlay import overlaid
+from sglpr_jax.evaluation.loop_figures import overlaid
 from sglpr_jax.se3 import transform
 
 

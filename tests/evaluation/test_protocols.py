@@ -1,3 +1,5 @@
+"""Each protocol against its rule in plain loops, and what all protocols have in common."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -5,38 +7,48 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.evaluation.protocols import PROTOCOLS, Decision, protocols_taking
-from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
-from sglpr_jax.evaluation.protocols.pairs_f1max import pairs_f1max
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.evaluation.protocols import PROTOCOLS, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.pairs import (
+    PAIRS_F1MAX,
+    SGPR_PAIRS_F1MAX,
+    are_apart,
+    drawn_frame_pairs,
+    frame_pairs,
+)
+from sglpr_jax.evaluation.protocols.protocol import Decision
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_RECALL_AT_1, BEVPLACE_V1_RECALL, SSC_RECALL
+from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL, POINTNETVLAD_RECALL
+from sglpr_jax.evaluation.protocols.top1 import (
+    CONTOUR_CONTEXT_F1MAX,
+    OVERLAP_TRANSFORMER_F1MAX,
+    SCAN_CONTEXT_F1MAX,
+    TOP1_F1MAX,
+)
 
-from .by_the_letter import distance, f1_max, random_drive
+from .by_the_letter import pairs, random_drive, recall, recall_across, top1, within
 
 DESCRIPTORS = protocols_taking("descriptors")
-
 UNPUBLISHED = "5 m, no published split: database is the first 60% of the frames, queries begin 20 m from its end"
 
 
-def top1_by_the_letter(file: DescriptorFile) -> tuple[float, int]:
-    """LoGG3D-Net's rule in loops: F1max and the number of revisits."""
-    t, p, d = file.times, file.positions, file.descriptors
-    answers = []
-    for query in range(len(file)):
-        if t[query] - t[0] < 30:
-            continue
-        first_younger = next(i for i in range(len(file)) if t[i] > t[query] - 30)
-        database = range(min(first_younger + 1, query))
-        best = min(database, key=lambda i: distance(d[query], d[i]))
-        revisit = any(distance(p[query], p[i]) <= 3 for i in database)
-        answers.append((distance(d[query], d[best]), distance(p[query], p[best]), revisit))
+@pytest.fixture(scope="module")
+def recording(make_file):
+    """A random recording of 230 frames without times, long enough for a gap of 150 frames."""
+    positions, descriptors, _ = random_drive(0, n=230)
+    return make_file(positions, descriptors)
 
-    def count(threshold):
-        accepted = [apart for score, apart, _ in answers if score <= threshold]
-        rejected = [revisit for score, _, revisit in answers if score > threshold]
-        return sum(apart <= 3 for apart in accepted), sum(apart > 20 for apart in accepted), sum(rejected)
 
-    return f1_max([score for score, _, _ in answers], count), sum(revisit for _, _, revisit in answers)
+@pytest.fixture(scope="module")
+def noisy_laps(make_file, two_laps):
+    noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
+    return make_file(two_laps, two_laps / 200 + noise)
+
+
+def assert_is_top1(result, expected):
+    score, revisits, recall_at_1 = expected
+    assert result.score == pytest.approx(score)
+    assert result.counts["revisits"] == revisits
+    assert result.recalls[1] == pytest.approx(recall_at_1)
 
 
 @given(st.integers(0, 10_000))
@@ -44,82 +56,56 @@ def top1_by_the_letter(file: DescriptorFile) -> tuple[float, int]:
 def test_top1_follows_the_rule_to_the_letter(make_file, seed):
     positions, descriptors, times = random_drive(seed)
     file = make_file(positions, descriptors, times=times)
-    expected, revisits = top1_by_the_letter(file)
-    result = top1_f1max(file)
-    assert result.counts["revisits"] == revisits
-    if revisits:
-        assert result.score == pytest.approx(expected)
+    databases = {}
+    for query in np.flatnonzero(times - times[0] >= 30):
+        first_younger = np.flatnonzero(times > times[query] - 30)[0]
+        databases[query] = range(min(first_younger + 1, query))
+    near = within(file, 20, 3, closed=True)
+    expected = top1(file, databases, within(file, 3, 3, closed=True), lambda i, j: not near(i, j))
+    result = TOP1_F1MAX(file)
+    if expected[1]:
+        assert_is_top1(result, expected)
     else:
-        assert np.isnan(result.score)
+        assert np.isnan(result.score) and result.counts["revisits"] == 0
 
 
-def pairs_by_the_letter(file: DescriptorFile) -> tuple[float, int, int]:
-    """RINet's rule in loops with every negative: F1max, positive pairs, negative pairs."""
-    p, d = file.positions[:, :2], file.descriptors
-    pairs = [(i, j) for i in range(len(file)) for j in range(i)]
-    positive = [distance(d[i], d[j]) for i, j in pairs if distance(p[i], p[j]) < 3 and i - j > 50]
-    negative = [distance(d[i], d[j]) for i, j in pairs if distance(p[i], p[j]) > 20]
-
-    def count(threshold):
-        tp = sum(x <= threshold for x in positive)
-        return tp, sum(x <= threshold for x in negative), len(positive) - tp
-
-    return f1_max(positive, count) if positive else np.nan, len(positive), len(negative)
+def test_scan_context_leaves_out_the_last_49_frames_and_the_last_query(recording):
+    databases = {i: range(i - 48) for i in range(49, 229)}
+    result = SCAN_CONTEXT_F1MAX(recording)
+    assert result.counts["queries"] == 180
+    assert_is_top1(result, top1(recording, databases, within(recording, 5, 2)))
 
 
-@given(st.integers(0, 10_000))
-@settings(deadline=None, max_examples=10)
-def test_pairs_follow_the_rule_to_the_letter(make_file, seed):
-    positions, descriptors, _ = random_drive(seed, n=70)
-    file = make_file(positions, descriptors)
-    expected, positives, negatives = pairs_by_the_letter(file)
-    result = pairs_f1max(file, negatives_per_positive=10_000)
-    assert result.counts == {"positive pairs": positives, "negative pairs": negatives if positives else 0}
-    assert result.score == pytest.approx(expected, nan_ok=True)
+def test_contour_context_leaves_out_150_frames(recording):
+    databases = {i: range(i - 150) for i in range(151, 230)}
+    result = CONTOUR_CONTEXT_F1MAX(recording)
+    assert result.counts["queries"] == 79
+    assert_is_top1(result, top1(recording, databases, within(recording, 5, 3)))
 
 
-@pytest.mark.parametrize("name", DESCRIPTORS)
-def test_descriptors_that_know_the_place_score_one(make_file, two_laps, name):
-    result = PROTOCOLS[name](make_file(two_laps, two_laps / 200))
-    assert result.score == 1.0
-    assert result.interval == (1.0, 1.0)
-    assert result.pose_source == "made up"
-    assert result.published_on
-    rule = PROTOCOLS[name].rule  # says in which plane, where it says so
-    assert result.dimensions in ((3,) if "3-D" in rule else (2,) if "x and y" in rule else (2, 3))
-    assert sum(result.counts.values()) > 0
+def test_overlap_transformer_starts_f1max_at_150_and_recall_at_101(recording):
+    rng = np.random.default_rng(0)
+    listed = np.argwhere(rng.random((230, 230)) < 0.02)
+    overlaps = {(i, j) for i, j in listed.tolist()}
+    result = OVERLAP_TRANSFORMER_F1MAX(recording, listed)
+    databases = {i: range(i - 100) for i in range(101, 229)}
+    late = {i: database for i, database in databases.items() if i >= 150}
+    score, revisits, _ = top1(recording, late, lambda i, j: (i, j) in overlaps)
+    assert result.score == pytest.approx(score)
+    assert result.counts == {"queries": 79, "revisits": revisits}
+    assert sorted(result.recalls) == [1, 2, 5, 10, 20]  # 1 % of 230 frames is 2
+    for n, value in result.recalls.items():
+        assert value == pytest.approx(recall(recording, databases, lambda i, j: (i, j) in overlaps, n))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", DESCRIPTORS)
-def test_the_interval_holds_the_score_and_every_result_has_another_name(make_file, two_laps, name):
-    noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
-    file = make_file(two_laps, two_laps / 200 + noise)
-    result, again, other = (PROTOCOLS[name](file, seed=seed) for seed in (0, 0, 1))
-    low, high = result.interval
-    assert 0 < low <= result.score <= high <= 1
-    assert high - low < 0.25
-    assert again.interval == result.interval
-    if 0 < result.score < 1:
-        assert other.interval != result.interval
-    assert [PROTOCOLS[other](file).name for other in DESCRIPTORS].count(result.name) == 1
-
-
-# SGPR's positive pairs are mostly neighbours: it has a score on any recording.
-@pytest.mark.parametrize("protocol", [PROTOCOLS[name] for name in DESCRIPTORS if name != "sgpr-pairs-f1max"])
-def test_without_a_revisit_there_is_no_score(make_file, straight, protocol):
-    result = protocol(make_file(straight, np.ones((800, 4))))
-    assert np.isnan(result.score)
-    assert result.curve is None
-    assert result.interval is None
-    assert result.counts.get("revisits", result.counts.get("positive pairs")) == 0
-
-
-def test_a_drive_shorter_than_the_excluded_time_has_no_query(make_file, two_laps):
-    result = top1_f1max(make_file(two_laps[:280], two_laps[:280]))
-    assert result.counts == {"queries": 0, "revisits": 0}
-    assert np.isnan(result.score)
-    assert np.all(result.decisions == Decision.NOT_A_QUERY)
+def test_overlap_transformer_takes_15_m_where_no_overlaps_are_given(recording):
+    near = within(recording, 15, 2)
+    listed = np.array([(i, j) for i in range(230) for j in range(i) if near(i, j)])
+    stand_in, given = OVERLAP_TRANSFORMER_F1MAX(recording), OVERLAP_TRANSFORMER_F1MAX(recording, listed)
+    assert (stand_in.score, stand_in.recalls) == (given.score, given.recalls)
+    assert stand_in.rule == "15 m in place of overlaps, gap 100 frames"
+    assert given.rule == "overlap above 0.3, gap 100 frames"
+    assert (stand_in.dimensions, given.dimensions) == (2, None)
 
 
 def test_top1_decides_every_frame(make_file, two_laps):
@@ -128,7 +114,7 @@ def test_top1_decides_every_frame(make_file, two_laps):
     descriptors[500] = descriptors[0]  # a revisit answered with a place 100 frames away
     descriptors[510] += [0, 0, 0, 9]  # a revisit that looks like nothing: rejected
     positions[520] += [0, 0, 10]  # no revisit, answered with a frame 10 m away
-    result = top1_f1max(make_file(positions, descriptors))
+    result = TOP1_F1MAX(make_file(positions, descriptors))
     # Frames 290 to 399 are queries in the first lap, with nothing to find and nothing that looks alike.
     assert result.counts == {"queries": 510, "revisits": 399}
     decisions = result.decisions
@@ -140,61 +126,100 @@ def test_top1_decides_every_frame(make_file, two_laps):
     assert np.sum(decisions == Decision.TRUE_POSITIVE) == 398 - 1
     # The frame 500 is no false negative, however wrong its answer: it was not rejected.
     assert result.score == pytest.approx(2 * 397 / (2 * 397 + 1 + 1))
+    queries = decisions != Decision.NOT_A_QUERY
+    assert np.all(result.answers[~queries] == -1) and np.all(np.isinf(result.answer_distances[~queries]))
+    assert np.all(result.answers[queries] < np.flatnonzero(queries))
 
 
 def test_times_replace_the_290_frames(make_file, two_laps):
-    slow = top1_f1max(make_file(two_laps, two_laps, times=np.arange(800) * 1.0))
+    slow = TOP1_F1MAX(make_file(two_laps, two_laps, times=np.arange(800) * 1.0))
     assert slow.counts["queries"] == 770
     assert slow.rule == "3 m / 20 m, last 30 s excluded"
-    assert top1_f1max(make_file(two_laps, two_laps)).rule == "3 m / 20 m, last 290 frames excluded"
+    assert TOP1_F1MAX(make_file(two_laps, two_laps)).rule == "3 m / 20 m, last 290 frames excluded"
+    short = TOP1_F1MAX(make_file(two_laps[:280], two_laps[:280]))
+    assert (short.counts, np.isnan(short.score)) == ({"queries": 0, "revisits": 0}, True)
 
 
-def test_top1_looks_at_height_and_pairs_do_not(make_file, two_laps):
-    bridge = two_laps + np.where(np.arange(800) >= 400, 6.0, 0.0)[:, None] * [0, 0, 1]
-    file = make_file(bridge, two_laps)
-    assert top1_f1max(file).counts["revisits"] == 0
-    assert bevplace_recall_at_1(file).counts["revisits"] == 1  # the last frame, of the first one of its lap
-    assert pairs_f1max(file).score == 1.0
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=10)
+def test_pairs_follow_the_rule_to_the_letter(make_file, seed):
+    positions, descriptors, _ = random_drive(seed, n=70)
+    file = make_file(positions * 1.5, descriptors)
+    expected, counts = pairs(file, lambda apart, gap: apart < 3 and gap > 50)
+    every, plenty, few = (replace(PAIRS_F1MAX, negatives_per_positive=ratio)(file) for ratio in (None, 10_000, 2))
+    assert every.counts == counts and every.score == pytest.approx(expected, nan_ok=True)
+    if counts["positive pairs"]:
+        assert (plenty.counts, plenty.score) == (every.counts, every.score)
+    assert few.counts["negative pairs"] == 2 * few.counts["positive pairs"]
 
 
-def test_negative_pairs_are_drawn_by_the_seed(make_file, two_laps):
-    rng = np.random.default_rng(0)
-    file = make_file(two_laps, two_laps / 200 + rng.normal(scale=0.2, size=(800, 3)))
-    first, again, other = (pairs_f1max(file, seed=seed) for seed in (0, 0, 1))
+@pytest.mark.parametrize("seed", [0, 1])
+def test_sgpr_pairs_have_no_gap_and_few_negatives(make_file, two_laps, seed):
+    positions, descriptors, _ = random_drive(seed, n=70)
+    file = make_file(positions, descriptors)
+    expected, counts = pairs(file, lambda apart, gap: apart <= 3, first_gap=0)
+    result = replace(SGPR_PAIRS_F1MAX, negatives_share=1.0)(file)
+    assert result.counts == counts and result.score == pytest.approx(expected)
+    laps = SGPR_PAIRS_F1MAX(make_file(two_laps, two_laps))
+    assert laps.counts["positive pairs"] == 800 + 400  # each frame with itself, and with the same of the other lap
+    assert laps.counts["negative pairs"] == pytest.approx(0.005 * 800 * 799 / 2, rel=0.1)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0, 1, 150, 6000, 10**6]))
+@settings(deadline=None, max_examples=15)
+def test_drawn_pairs_are_those_that_are_drawn_from_a_list_of_all(seed, most):
+    positions = 4 * random_drive(seed, n=200)[0][:, :2]  # most pairs are more than 20 m apart
+    every = frame_pairs(positions, are_apart)
+    expected = np.random.default_rng(seed).choice(every, min(most, len(every)), replace=False)
+    found = drawn_frame_pairs(positions, are_apart, most=most, rng=np.random.default_rng(seed))
+    np.testing.assert_array_equal(found, np.sort(expected))
+
+
+def test_negative_pairs_are_drawn_by_the_seed(noisy_laps):
+    first, again, other = (PAIRS_F1MAX(noisy_laps, seed=seed) for seed in (0, 0, 1))
     assert first.counts == {"positive pairs": 400, "negative pairs": 40_000}
     assert first.score == again.score != other.score
     assert abs(first.score - other.score) < 0.05
-    fewer = pairs_f1max(file, negatives_per_positive=1)
-    assert fewer.counts["negative pairs"] == 400
-    assert fewer.score > first.score
+
+
+def test_ssc_recall_asks_every_frame_that_has_something_to_find(recording):
+    databases = {i: range(i - 50) for i in range(51, 230)}
+    right = within(recording, 5, 2, closed=True)
+    result = SSC_RECALL(recording)
+    queries = sum(any(right(i, j) for j in database) for i, database in databases.items())
+    assert result.counts == {"queries": queries, "revisits": queries}
+    assert list(result.recalls) == list(range(1, 26))
+    for n in (1, 3, 25):
+        assert result.recalls[n] == pytest.approx(recall(recording, databases, right, n))
 
 
 @pytest.mark.parametrize(
-    ("sequence", "frames", "queries", "rule"),
+    ("protocol", "sequence", "frames", "queries", "rule"),
     [
-        ("06", 1101, 301, "5 m, BEVPlace++ split: database 0 to 599, queries 800 to 1100"),
-        ("06", 1100, 421, UNPUBLISHED),
-        ("town", 1101, 422, UNPUBLISHED),
+        (BEVPLACE_RECALL_AT_1, "06", 1101, 301, "5 m, BEVPlace++ split: database 0 to 599, queries 800 to 1100"),
+        (BEVPLACE_RECALL_AT_1, "06", 1100, 421, UNPUBLISHED),
+        (BEVPLACE_RECALL_AT_1, "town", 1101, 422, UNPUBLISHED),
+        (BEVPLACE_V1_RECALL, "05", 2761, 1551, "5 m, BEVPlace split: database 0 to 999, queries 1200 to 2750"),
     ],
 )
-def test_bevplaces_split_is_used_for_kittis_sequences_alone(make_file, sequence, frames, queries, rule):
+def test_bevplaces_split_is_used_for_kittis_sequences_alone(make_file, protocol, sequence, frames, queries, rule):
     there_and_back = np.abs(np.arange(frames) - frames // 2)[:, None] * [1.0, 0.0, 0.0]
-    result = bevplace_recall_at_1(make_file(there_and_back, there_and_back, sequence=sequence))
+    result = protocol(make_file(there_and_back, there_and_back, sequence=sequence))
     assert result.rule == rule
-    assert result.counts == {"queries": queries, "revisits": queries}
-    assert result.score == 1.0
+    assert result.counts["queries"] == queries
+    assert list(result.recalls) == list(protocol.numbers) and set(result.recalls.values()) == {1.0}
 
 
 def test_neighbours_across_the_seam_are_no_revisits(make_file):
     """Up a street and back by another one, 30 m away; at the end the robot stands still where it has been before."""
     up = np.arange(60.0)[:, None] * [1.0, 0, 0]
     back = up[::-1][:40] + np.array([0, 30, 0])
-    alone = bevplace_recall_at_1(make_file(np.vstack([up, back]), np.ones((100, 4))))
+    alone = BEVPLACE_RECALL_AT_1(make_file(np.vstack([up, back]), np.ones((100, 4))))
     assert (alone.counts, np.isnan(alone.score)) == ({"queries": 40, "revisits": 0}, True)
-    crawl = bevplace_recall_at_1(make_file(up[:50] * 0.1, np.ones((50, 4))))
+    crawl = BEVPLACE_RECALL_AT_1(make_file(up[:50] * 0.1, np.ones((50, 4))))
     assert (crawl.counts, np.isnan(crawl.score)) == ({"queries": 0, "revisits": 0}, True)
     again = np.vstack([up, back[:30], np.repeat(up[:1], 10, axis=0)])
-    found = bevplace_recall_at_1(make_file(again, again))
+    found = BEVPLACE_RECALL_AT_1(make_file(again, again))
     assert (found.counts, found.score) == ({"queries": 40, "revisits": 10}, 1.0)
 
 
@@ -202,22 +227,95 @@ def test_recall_counts_only_queries_that_have_an_answer(make_file):
     map_part = np.arange(6.0)[:, None] * [100, 0, 0]
     query_part = np.array([[0, 4.9, 0], [100, 4.9, 0], [200, 5.0, 0], [900, 0, 0]])
     descriptors = np.vstack([np.eye(6), np.eye(6)[[0, 2, 2, 3]]])
-    result = bevplace_recall_at_1(make_file(np.vstack([map_part, query_part]), descriptors))
-    assert result.counts == {"queries": 4, "revisits": 2}
-    assert result.score == 0.5
-    assert result.decisions[6:].tolist() == [
-        Decision.TRUE_POSITIVE,
-        Decision.FALSE_NEGATIVE,
-        Decision.UNCOUNTED,
-        Decision.UNCOUNTED,
-    ]
+    result = BEVPLACE_RECALL_AT_1(make_file(np.vstack([map_part, query_part]), descriptors))
+    assert (result.counts, result.score) == ({"queries": 4, "revisits": 2}, 0.5)
+    expected = (Decision.TRUE_POSITIVE, Decision.FALSE_NEGATIVE, Decision.UNCOUNTED, Decision.UNCOUNTED)
+    assert result.decisions[6:].tolist() == list(expected)
+
+
+@pytest.fixture(scope="module")
+def sessions(make_file):
+    """Three sessions over the same ground, of 150, 60 and 90 frames."""
+    files = []
+    for seed, n in enumerate((150, 60, 90)):
+        positions, _, _ = random_drive(seed, n=n)
+        descriptors = (positions + np.random.default_rng(seed).normal(scale=4, size=(n, 3))) / 20
+        files.append(make_file(positions * 5, descriptors, sequence=f"session {seed}"))
+    return files
+
+
+def test_nclt_recall_is_asked_across_two_sessions(sessions):
+    database, queries, _ = sessions
+    result = BEVPLACE_NCLT_RECALL(database, queries)
+    expected, revisits = recall_across(database, queries, 5, 1)
+    assert 0 < expected < 1
+    assert result.score == pytest.approx(expected)
+    assert result.counts == {"queries": 60, "revisits": revisits}
+    assert result.rule == "5 m, database session 0, queries session 1"
+    assert result.interval[0] < expected < result.interval[1]
+
+
+def test_pointnetvlad_recall_is_the_mean_over_ordered_pairs_of_runs(make_file, sessions):
+    result = POINTNETVLAD_RECALL(*sessions)
+    ordered = [(a, b) for a in sessions for b in sessions if a is not b]
+    one_percent = {150: 2, 60: 1, 90: 1}
+    expected = [recall_across(a, b, 25, one_percent[len(a)]) for a, b in ordered]
+    assert result.score == pytest.approx(np.mean([score for score, _ in expected]))
+    assert result.recalls[5] == pytest.approx(np.mean([recall_across(a, b, 25, 5)[0] for a, b in ordered]))
+    assert list(result.recalls) == list(range(1, 26))
+    revisits = sum(revisits for _, revisits in expected)
+    assert result.counts == {"session pairs": 6, "queries": 600, "revisits": revisits}
+    assert result.interval[0] < result.score < result.interval[1]
+    elsewhere = make_file(sessions[1].positions + 1e4, sessions[1].descriptors)
+    alone, joined = POINTNETVLAD_RECALL(*sessions[::2]), POINTNETVLAD_RECALL(*sessions[::2], elsewhere)
+    assert joined.score == alone.score and joined.counts["session pairs"] == alone.counts["session pairs"] == 2
+    assert np.isnan(POINTNETVLAD_RECALL(sessions[0], elsewhere).score)
+    with pytest.raises(ValueError, match="expected at least two sessions, found 1"):
+        POINTNETVLAD_RECALL(sessions[0])
+
+
+@pytest.mark.parametrize("name", protocols_taking("sessions"))
+def test_sessions_must_be_described_alike(make_file, two_laps, name):
+    database, queries = make_file(two_laps, np.ones((800, 4))), make_file(two_laps, np.ones((800, 5)), sequence="later")
+    with pytest.raises(ValueError, match="descriptors of later to be made as those of town, with numbers 4, found 5"):
+        PROTOCOLS[name](database, queries)
+    with pytest.raises(ValueError, match="expected positions to score sequence town"):
+        PROTOCOLS[name](replace(database, positions=None), database)
+
+
+@pytest.mark.parametrize("name", DESCRIPTORS)
+def test_descriptors_that_know_the_place_score_one(make_file, two_laps, straight, name):
+    protocol, file = PROTOCOLS[name], make_file(two_laps, two_laps / 200)
+    result = protocol(file)
+    assert (result.score, result.interval, result.pose_source) == (1.0, (1.0, 1.0), "made up")
+    assert result.published_on
+    assert result.dimensions == (3 if "3-D" in protocol.rule else 2)  # the rule says in which plane
+    if name != "sgpr-pairs-f1max":  # its positive pairs are mostly neighbours, so it has a score on any recording
+        nothing = protocol(make_file(straight, np.ones((800, 4))))
+        assert np.isnan(nothing.score) and nothing.curve is None and nothing.interval is None
+    alike = protocol(make_file(two_laps, np.ones((800, 4))))
+    assert 0 <= alike.interval[0] <= alike.score <= alike.interval[1] <= 1
+    assert alike.curve is None or len(alike.curve.thresholds) == 1
+    two_frames = protocol(make_file(np.array([[0.0, 0, 0], [100, 0, 0]]), np.ones((2, 4))))
+    assert np.isnan(two_frames.score) or name == "sgpr-pairs-f1max"
+    with pytest.raises(ValueError, match="expected positions to score sequence town against, found none"):
+        protocol(replace(file, positions=None))
+
+
+@pytest.mark.parametrize("name", DESCRIPTORS)
+def test_the_interval_holds_the_score_and_every_result_has_another_name(noisy_laps, name):
+    result, other = (PROTOCOLS[name](noisy_laps, seed=seed) for seed in (0, 1))
+    low, high = result.interval
+    assert 0 < low <= result.score <= high <= 1 and high - low < 0.25
+    assert result.score == 1 or other.interval != result.interval
+    assert [protocol.title for protocol in PROTOCOLS.values()].count(result.name) == 1
 
 
 def test_blocks_leave_no_seam(make_file, monkeypatch):
     positions, descriptors, times = random_drive(3)
     file = make_file(positions, descriptors, times=times)
     whole = [protocol(file) for protocol in DESCRIPTORS.values()]
-    for block in ("nearest.BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
+    for block in ("source.BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
         monkeypatch.setattr(f"sglpr_jax.evaluation.protocols.{block}", 7)
     monkeypatch.setattr("sglpr_jax.revisits.BLOCK", 7)
     for one, other in zip(whole, [protocol(file) for protocol in DESCRIPTORS.values()], strict=True):
@@ -225,8 +323,8 @@ def test_blocks_leave_no_seam(make_file, monkeypatch):
         assert one.counts == other.counts
 
 
-@pytest.mark.parametrize("protocol", DESCRIPTORS.values())
-def test_positions_are_needed(make_file, two_laps, protocol):
-    file = replace(make_file(two_laps, two_laps), positions=None)
-    with pytest.raises(ValueError, match="expected positions to score sequence town against, found none"):
-        protocol(file)
+def test_an_unknown_protocol_names_the_nearest():
+    with pytest.raises(
+        ValueError, match=r"expected a protocol, found 'SSC-recall'; did you mean 'ssc-recall'.*sgpr-pairs-f1max"
+    ):
+        protocol_named("SSC-recall")

@@ -5,8 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from sglpr_jax.evaluation import published
-from sglpr_jax.evaluation.published import KITTI, LEARNED, NCLT, TABLE_1, TABLE_2, TABLE_3, TABLES
+from sglpr_jax.evaluation.published import KITTI, LEARNED, NCLT, TABLE_1, TABLE_3, TABLES
 
 ROUNDING = 0.0005 + 1e-9
 ODD_MEANS = {(1, "SC_LPR"): 0.8533, (2, "SC_LPR"): 0.8533}
@@ -24,12 +23,6 @@ def test_every_row_is_whole_and_its_mean_as_printed(table):
     assert len({row.method for row in table.rows}) == len(table.rows)
 
 
-def test_the_odd_means_are_odd():
-    means = {(table.number, row.method): (row.mean, np.mean(row.scores)) for table in TABLES for row in table.rows}
-    odd = {name for name, (printed, mean) in means.items() if abs(printed - mean) > 2 * ROUNDING}
-    assert odd == set(ODD_MEANS)
-
-
 def test_the_complete_model_has_one_row_in_all_ablations():
     ours = {row.method: row for row in TABLE_1.rows}["SG-LPR"]
     assert [len(table.rows) for table in TABLES] == [14, 12, 8, 3, 2, 4, 4]
@@ -45,16 +38,6 @@ def test_a_column_is_one_sequence_of_all_methods_or_of_one_kind():
     assert set(TABLE_1.column("08")) - set(learned) == {"M2DP", "Scan Context", "LiDAR Iris", "SSC"}
     assert TABLE_3.column("2013-02-23")["SG-LPR"] == 0.913
     assert TABLE_1.column("01") == {}
-
-
-def test_the_sources_are_those_that_the_paper_names():
-    of = {row.method: row.source for row in TABLE_1.rows}
-    from_rinet = {method for method, source in of.items() if source == published.RINET}
-    assert from_rinet == {"M2DP", "Scan Context", "LiDAR Iris", "PointNetVLAD", "SSC", "SGPR", "RINet"}
-    assert {method for method, source in of.items() if source == published.OWN_RUN} == {
-        "OverlapTransformer", "BEVPlace", "SG-LPR",
-    }  # fmt: skip
-    assert {row.method for row in TABLE_2.rows if row.source != published.RINET} == {"BEVPlace", "SG-LPR"}
 
 
 def test_the_numbers_are_the_papers(shared):

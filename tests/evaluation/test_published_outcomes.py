@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from recordings import kitti_trajectory
 
-from sglpr_jax.evaluation.protocols import TopK
-from sglpr_jax.evaluation.protocols.contour_context_f1max import contour_context_f1max
-from sglpr_jax.evaluation.protocols.listed_pairs_f1max import listed_pairs_f1max, score_listed_pairs
-from sglpr_jax.evaluation.protocols.pairs_f1max import positive_pairs
-from sglpr_jax.evaluation.protocols.ssc_recall import ssc_recall
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.evaluation.protocols.pairs import LISTED_PAIRS_F1MAX, frame_pairs, is_revisit, score_listed_pairs
+from sglpr_jax.evaluation.protocols.recall import SSC_RECALL
+from sglpr_jax.evaluation.protocols.source import TopK
+from sglpr_jax.evaluation.protocols.top1 import CONTOUR_CONTEXT_F1MAX, TOP1_F1MAX
 
 
 @pytest.mark.parametrize(
@@ -26,7 +24,7 @@ from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 def test_sscs_lists_give_its_recall(shared, sequence, rows, recall):
     positions, times, source = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     listed = np.loadtxt(shared / f"data/protocol/ssc_top25_{sequence}.txt", dtype=np.int64)
-    result = ssc_recall(TopK(sequence, positions, times, source, listed[:, 0], listed[:, 1:]))
+    result = SSC_RECALL(TopK(sequence, positions, times, source, listed[:, 0], listed[:, 1:]))
     assert round(result.score, 4) == recall
     assert result.counts["queries"] == rows
     assert result.recalls[1] <= result.recalls[25] <= 1
@@ -46,7 +44,7 @@ def test_contour_contexts_outcome_gives_its_f1max(shared):
         nearest=np.array([[-1 if answer == "x" else int(answer)] for _, answer in pairs]),
         scores=np.array([[float(field[2])] for field in fields]),
     )
-    result = contour_context_f1max(outcome)
+    result = CONTOUR_CONTEXT_F1MAX(outcome)
     best = result.curve.best
     assert len(outcome) == 4071
     assert result.counts["revisits"] == 347
@@ -62,7 +60,7 @@ def test_contour_contexts_outcome_gives_its_f1max(shared):
 )
 def test_revisits_are_logg3ds(shared, make_file, sequence, revisits):
     positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
-    result = top1_f1max(make_file(positions, positions, times=times, sequence=sequence))
+    result = TOP1_F1MAX(make_file(positions, positions, times=times, sequence=sequence))
     assert result.counts["revisits"] == revisits
 
 
@@ -79,7 +77,7 @@ def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
     found = {}
     for poses in ("kitti", "semantickitti"):
         positions, _, _ = kitti_trajectory(shared / "data/kitti_odometry", "07", pose_source=poses)
-        found[poses] = set(zip(*np.divmod(positive_pairs(positions[:, :2]), len(positions)), strict=True))
+        found[poses] = set(zip(*np.divmod(frame_pairs(positions[:, :2], is_revisit), len(positions)), strict=True))
     assert found["kitti"] == published
     assert len(published) == 1833
     assert found["semantickitti"] != published
@@ -90,8 +88,8 @@ def test_rinets_list_scores_descriptors(shared, make_file, neg_100):
     positions, _, _ = kitti_trajectory(shared / "data/kitti_odometry", "07", pose_source="kitti")
     noise = np.random.default_rng(0).normal(scale=10, size=positions.shape)
     file = make_file(positions, positions + noise, sequence="07")
-    by_label = listed_pairs_f1max(score_listed_pairs(file, pairs, positive))
-    by_position = listed_pairs_f1max(score_listed_pairs(file, pairs))
+    by_label = LISTED_PAIRS_F1MAX(score_listed_pairs(file, pairs, positive))
+    by_position = LISTED_PAIRS_F1MAX(score_listed_pairs(file, pairs))
     assert by_label.counts == by_position.counts == {"positive pairs": 1833, "negative pairs": 183_300}
     assert by_label.score == by_position.score
     assert 0 < by_label.interval[0] < by_label.score < by_label.interval[1] < 1

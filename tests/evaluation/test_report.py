@@ -30,7 +30,7 @@ def render(table):
 
 def test_every_protocol_is_reported_with_what_it_rests_on(found):
     assert [result.name for result in found] == ["top-1 F1max", "pairs F1max", "Recall@1"]
-    text = render(report.table(found, title="Sequence 06"))
+    text = render(report.results_table(found, title="Sequence 06"))
     for word in ("Sequence 06", "top-1 F1max", "pairs F1max", "Recall@1", "made up", "2-D", "3-D"):
         assert word in text
     for count in ("510 queries", "400 revisits", "400 positive pairs", "40000 negative pairs", "314 queries"):
@@ -43,26 +43,15 @@ def test_every_protocol_is_reported_with_what_it_rests_on(found):
         assert f"{result.interval[0]:.3f} to {result.interval[1]:.3f}" in text
 
 
-def test_other_protocols_are_reported_where_they_are_named(make_file, two_laps):
-    file = make_file(two_laps, two_laps / 200)
-    results = score(file, ["ssc-recall", "scan-context-f1max"])
-    assert [result.name for result in results] == ["SSC Recall@1", "Scan Context F1max"]
-    recall, top1 = report.to_json(results)
-    assert list(recall["recall_at"].values()) == [1.0] * 25 and recall["average_precision"] is None
-    assert list(top1["recall_at"]) == ["1"] and top1["average_precision"] == 1.0
-    with pytest.raises(ValueError, match="did you mean 'ssc-recall'"):
-        score(file, ["ssc-recal"])
-
-
 def test_a_sequence_without_revisits_says_so(nothing_to_find):
-    text = render(report.table(nothing_to_find))
+    text = render(report.results_table(nothing_to_find))
     assert text.count("no revisit") == 3
     assert "nan" not in text
 
 
 def test_an_interval_has_as_many_places_as_the_score(found):
     one = dataclasses.replace(found[0], score=0.0712, interval=(0.05, 0.1234567))
-    assert report.cells(one)[2:4] == ("0.071", "0.050 to 0.123")
+    assert report.results_table([one]).rows[0][2:4] == ("0.071", "0.050 to 0.123")
 
 
 def test_methods_stand_side_by_side(found, nothing_to_find):
@@ -98,7 +87,7 @@ def test_json_says_the_same(found, nothing_to_find):
     assert best["distance"] > 0
     assert recall["at_f1max"] is None and recall["at_precision"] == {}
     assert pairs["at_precision"].keys() == {"0.99", "1"}
-    rows = report.threshold_rows(found)
+    rows = report.threshold_table(found).rows
     assert [row[:2] for row in rows[:3]] == [
         (found[0].name, "highest F1"),
         (found[0].name, "precision 0.99"),

@@ -65,9 +65,3 @@ def test_an_existing_file_is_replaced_whole_or_not_at_all(found, tmp_path, monke
     with pytest.raises(ZeroDivisionError):
         write_rerun(found, path)
     assert path.read_text() == "before" and list(tmp_path.glob("*.tmp")) == []
-
-
-def test_what_is_missing_is_named_with_the_command(monkeypatch):
-    monkeypatch.setattr(rerun_file.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[view\]'"):
-        rerun_file.check_installed()

@@ -1,16 +1,16 @@
-"""One call scores a descriptor file, a path or arrays, and its result prints itself."""
+"""One call scores a descriptor file, a path or arrays; its result prints itself and has the worst mistakes."""
 
 import dataclasses
 import json
-from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.evaluation.protocols import PROTOCOLS, Kind, ScoredPairs, TopK, protocols_taking
-from sglpr_jax.evaluation.scoring import evaluate, score
-from sglpr_jax.evaluation.sessions import evaluate_session_files
+from sglpr_jax.evaluation.protocols.protocol import Decision
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
+from sglpr_jax.evaluation.protocols.top1 import OVERLAP_TRANSFORMER_F1MAX, TOP1_F1MAX
+from sglpr_jax.evaluation.scoring import evaluate, score, worst_false_positives
 
 
 @pytest.fixture
@@ -97,23 +97,30 @@ def test_what_is_missing_is_said(file, tmp_path):
         evaluate(tmp_path / "none.npz")
 
 
-def test_every_protocol_says_its_rule_its_source_and_what_it_takes():
-    for name, protocol in PROTOCOLS.items():
-        assert protocol.name == name and protocol.rule and protocol.source and protocol.takes
-        assert {kind for kind in get_args(Kind) if name in protocols_taking(kind)} == set(protocol.takes)
-    assert [name for name, protocol in PROTOCOLS.items() if protocol.headline] == [
-        "top1-f1max",
-        "pairs-f1max",
-        "bevplace-recall-at-1",
-    ]
-    recalls = protocols_taking("top-k list")
-    assert recalls and all(protocol.returns == "recall" for protocol in recalls.values())
+@pytest.fixture
+def mistaken(make_file, two_laps):
+    """Two laps of which frames 500 and 501 look like 10 and 11, and 600 almost like 20; 700 meets its own place."""
+    descriptors = two_laps / 200
+    descriptors[[500, 501]] = descriptors[[10, 11]]
+    descriptors[600] = descriptors[20] + [0.001, 0, 0]
+    descriptors[700] += [0.01, 0, 0]
+    return make_file(two_laps, descriptors)
 
 
-def test_sessions_of_any_name_are_scored_and_print_themselves(make_file, two_laps, tmp_path):
-    for name in ("monday", "tuesday"):
-        make_file(two_laps, two_laps / 200, sequence=name).save(tmp_path / f"{name}.npz")
-    found = evaluate_session_files(tmp_path / "monday.npz", [tmp_path / "tuesday.npz"])
-    assert "published" not in found.to_json() and found.to_json()["database_session"] == "monday"
-    for words in ("database monday", "tuesday", "bevplace-nclt-recall", "1.000"):
-        assert words in str(found)
+@pytest.mark.parametrize("protocol", [TOP1_F1MAX, OVERLAP_TRANSFORMER_F1MAX])
+def test_the_surest_mistakes_come_first_and_neighbours_once(mistaken, protocol):
+    result = protocol(mistaken)
+    assert np.sum(result.decisions == Decision.FALSE_POSITIVE) == 3
+    first, second = worst_false_positives(result, mistaken.positions)
+    assert (first.query, first.answer, first.distance) == (500, 10, 0)
+    assert (second.query, second.answer) == (600, 20)
+    assert second.distance == pytest.approx(0.001, rel=1e-3)
+    assert second.metres == pytest.approx(np.linalg.norm(mistaken.positions[600] - mistaken.positions[20]))
+    assert worst_false_positives(result, mistaken.positions, most=1) == [first]
+
+
+def test_metres_have_the_dimensions_of_the_protocol(mistaken):
+    hills = mistaken.positions + np.arange(800)[:, None] * [0, 0, 1.0]
+    flat = OVERLAP_TRANSFORMER_F1MAX(mistaken)
+    assert flat.dimensions == 2
+    assert worst_false_positives(flat, hills) == worst_false_positives(flat, mistaken.positions)

@@ -4,14 +4,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sglpr_jax.evaluation.segmentation import SegmentationResult, confusion_matrix, score_confusion
+from sglpr_jax.evaluation.segmentation import SegmentationScore, confusion_matrix, score_confusion
 
 CLASSES = 5
 SHAPE = (2, 4, 4)
 maps = arrays(np.int32, SHAPE, elements=st.integers(0, CLASSES - 1))
 
 
-def score(truth, prediction, counted) -> SegmentationResult:
+def score(truth, prediction, counted) -> SegmentationScore:
     return score_confusion(confusion_matrix(truth, prediction, counted=counted, classes=CLASSES))
 
 

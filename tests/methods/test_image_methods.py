@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.methods.handcrafted.polar_fft import polar_fft
 from sglpr_jax.methods.handcrafted.thumbnail import thumbnail
 
@@ -104,7 +104,7 @@ def test_rotated_real_scans_leave_polar_fft_and_break_the_thumbnail(shared):
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, len(images)).astype(np.float32)
     turned = rotate(images, angles)
     score = {
-        method: [top1_f1max(replace(file, descriptors=method(x))).score for x in (images, turned)]
+        method: [TOP1_F1MAX(replace(file, descriptors=method(x))).score for x in (images, turned)]
         for method in (lambda x: polar_fft(x, radius=KITTI_BEV_RADIUS), thumbnail)
     }
     (polar, polar_turned), (thumb, thumb_turned) = score.values()

@@ -1,28 +1,30 @@
 """Protocols: published rules that compute one score from the output of a method on a recording.
 
 The same descriptors score very differently under different protocols. Every result therefore has its rule and counts.
-To add a protocol, add a file to this package and its name to `PROTOCOLS`.
+To add a protocol, add it to the file of its kind (`top1`, `pairs`, `recall`, `sessions`) and to `PROTOCOLS`.
 """
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import BEVPLACE_NCLT_RECALL
-from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import BEVPLACE_RECALL_AT_1
-from sglpr_jax.evaluation.protocols.bevplace_v1_recall import BEVPLACE_V1_RECALL
-from sglpr_jax.evaluation.protocols.contour_context_f1max import CONTOUR_CONTEXT_F1MAX
-from sglpr_jax.evaluation.protocols.listed_pairs_f1max import LISTED_PAIRS_F1MAX
-from sglpr_jax.evaluation.protocols.overlap_transformer_f1max import OVERLAP_TRANSFORMER_F1MAX
-from sglpr_jax.evaluation.protocols.pairs_f1max import PAIRS_1_F1MAX, PAIRS_10_F1MAX, PAIRS_ALL_F1MAX, PAIRS_F1MAX
-from sglpr_jax.evaluation.protocols.pointnetvlad_recall import POINTNETVLAD_RECALL
-from sglpr_jax.evaluation.protocols.protocol import Kind, Protocol, kind_of
-from sglpr_jax.evaluation.protocols.result import Decision, Result
-from sglpr_jax.evaluation.protocols.scan_context_f1max import SCAN_CONTEXT_F1MAX
-from sglpr_jax.evaluation.protocols.sgpr_pairs_f1max import SGPR_PAIRS_F1MAX
-from sglpr_jax.evaluation.protocols.source import ScoredPairs, Source, TopK
-from sglpr_jax.evaluation.protocols.ssc_recall import SSC_RECALL
-from sglpr_jax.evaluation.protocols.top1_f1max import TOP1_F1MAX
-from sglpr_jax.evaluation.protocols.top1_strict_f1max import TOP1_STRICT_F1MAX
+from sglpr_jax.evaluation.protocols.pairs import (
+    LISTED_PAIRS_F1MAX,
+    PAIRS_1_F1MAX,
+    PAIRS_10_F1MAX,
+    PAIRS_ALL_F1MAX,
+    PAIRS_F1MAX,
+    SGPR_PAIRS_F1MAX,
+)
+from sglpr_jax.evaluation.protocols.protocol import Protocol
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_RECALL_AT_1, BEVPLACE_V1_RECALL, SSC_RECALL
+from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL, POINTNETVLAD_RECALL
+from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, Source, kind_of
+from sglpr_jax.evaluation.protocols.top1 import (
+    CONTOUR_CONTEXT_F1MAX,
+    OVERLAP_TRANSFORMER_F1MAX,
+    SCAN_CONTEXT_F1MAX,
+    TOP1_F1MAX,
+)
 
 PROTOCOLS: Mapping[str, Protocol] = {
     protocol.name: protocol
@@ -30,7 +32,6 @@ PROTOCOLS: Mapping[str, Protocol] = {
         TOP1_F1MAX,
         PAIRS_F1MAX,
         BEVPLACE_RECALL_AT_1,
-        TOP1_STRICT_F1MAX,
         SCAN_CONTEXT_F1MAX,
         CONTOUR_CONTEXT_F1MAX,
         OVERLAP_TRANSFORMER_F1MAX,
@@ -46,6 +47,12 @@ PROTOCOLS: Mapping[str, Protocol] = {
     )
 }
 """All protocols by their names on the command line, in the order of tables."""
+ALL = "all"
+"""Name that selects every protocol that fits."""
+_IN_WORDS: dict[Kind, str] = {
+    "top-k list": "a top-k list without scores",
+    "scored top-k list": "a top-k list",
+}
 
 
 def protocols_taking(kind: Kind) -> dict[str, Protocol]:
@@ -63,16 +70,30 @@ def protocol_named(name: str, among: Mapping[str, Protocol] = PROTOCOLS) -> Prot
     return among[name]
 
 
-__all__ = [
-    "PROTOCOLS",
-    "Decision",
-    "Kind",
-    "Protocol",
-    "Result",
-    "ScoredPairs",
-    "Source",
-    "TopK",
-    "kind_of",
-    "protocol_named",
-    "protocols_taking",
-]
+def check_names(names: Sequence[str]) -> None:
+    """Raise ValueError if a name is neither a protocol of one recording nor `all`. The message has the nearest name."""
+    across_sessions = protocols_taking("sessions")
+    for name in names:
+        if name in across_sessions:
+            raise ValueError(f"expected --database with a descriptor file for protocol {name}, found none")
+        if name != ALL:
+            protocol_named(name, {other: PROTOCOLS[other] for other in PROTOCOLS if other not in across_sessions})
+
+
+def chosen_protocols(source: Source | ScoredPairs, names: Sequence[str]) -> list[str]:
+    """Return the names of the protocols that score `source`.
+
+    Without names, the default protocols (`Protocol.headline`) that fit are returned. If none of them fits, or for the
+    name `all`, every protocol that fits is returned. Raises ValueError if a named protocol does not fit.
+    """
+    kind = kind_of(source)
+    known = protocols_taking(kind)
+    if not names:
+        return [name for name, protocol in known.items() if protocol.headline] or list(known)
+    if ALL in names:
+        return list(known)
+    unfit = [name for name in names if name not in known]
+    if unfit:
+        kind_in_words = _IN_WORDS.get(kind, kind)
+        raise ValueError(f"expected protocols for {kind_in_words}, which are {', '.join(known)}; found {unfit[0]}")
+    return list(dict.fromkeys(names))

@@ -1,18 +1,24 @@
-"""Positive and negative pairs of frames, drawn from a sequence or listed with scores."""
+"""Protocols of pairs: a threshold classifies pairs of frames, drawn from a sequence or listed with scores."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax import metrics
 from sglpr_jax.evaluation.protocols.bootstrap import f1_max_interval
-from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.evaluation.protocols.protocol import Protocol, Result
+from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, check_frames, positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.se3 import distances
 
+POSITIVE_M, NEGATIVE_M = 3.0, 20.0
+"""Distances of pairs of one place and of two places, in metres."""
+GAP = 50
+"""Frames at most this number of frames apart are neighbours, not revisits, in SSC's lists."""
 BLOCK = 32
 """Number of frames compared with all others at a time."""
 PAIR_BLOCK = 1 << 10
@@ -24,33 +30,127 @@ Keep = Callable[[Float[np.ndarray, "i j"], Int[np.ndarray, "i j"]], Bool[np.ndar
 """Selects pairs of frames (i, j), given their distance in metres and the number of frames i - j between them."""
 
 
-def score_pairs(
-    result: Result,
-    pairs: Int[np.ndarray, "2 pairs"],
-    scores: Float[np.ndarray, " pairs"],
-    positive: Bool[np.ndarray, " pairs"],
-    *,
-    seed: int,
-) -> Result:
-    """Complete `result` with counts and, if a pair is positive, with F1max, its curve and interval.
+def is_revisit(apart: Float[np.ndarray, "..."], gap: Int[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
+    """Return which pairs (i, j) are positive in SSC's lists: less than 3 m apart and i - j > 50."""
+    return (apart < POSITIVE_M) & (gap > GAP)
 
-    The interval resamples the first frames. The pairs of a first frame are drawn or omitted together.
+
+def are_apart(apart: Float[np.ndarray, "..."], gap: Int[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
+    """Return which pairs (i, j) show different places. Only pairs with i > j are selected, so each pair occurs once."""
+    return (apart > NEGATIVE_M) & (gap > 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnPairs(Protocol):
+    """F1max over pairs of frames less than 3 m (positive) or more than 20 m (negative) apart.
+
+    The interval resamples the later frames of the pairs and does not redraw the negatives.
     """
-    counts = {"positive pairs": int(positive.sum()), "negative pairs": int((~positive).sum())}
-    result = replace(result, counts=counts)
-    if not positive.any():
-        return result
-    # Between the scores of two positive pairs only precision falls, so the millions of negative scores are not needed.
-    curve = metrics.classification_curve(scores, positive, thresholds=np.unique(scores[positive]))
-    interval = f1_max_interval(
-        scores,
-        true_if_accepted=positive,
-        false_if_accepted=~positive,
-        missed_if_rejected=positive,
-        query=pairs[0],
-        seed=seed,
-    )
-    return replace(result, score=curve.f1_max, curve=curve, interval=interval)
+
+    source: str = "SSC, script/gen_pairs.py; RINet"
+    published_on: str = "KITTI's own poses"
+    dimensions: Literal[2, 3] = 2
+    takes: tuple[Kind, ...] = ("descriptors",)
+    positive: Keep = is_revisit
+    """Selects positive pairs."""
+    negatives_per_positive: int | None = None
+    """Negative pairs for each positive pair, drawn without replacement. None or too few negatives: all of them."""
+    negatives_share: float | None = None
+    """Probability of each negative pair to be kept, instead of a number."""
+
+    def __call__(self, source: DescriptorFile, *, seed: int = 0) -> Result:
+        """Score a descriptor file. `seed` draws the negatives and the resamples."""
+        positions, rng = positions_of(source, self.dimensions), np.random.default_rng(seed)
+        positive = frame_pairs(positions, self.positive)
+        if self.negatives_per_positive is not None:
+            most = self.negatives_per_positive * len(positive)
+            negative = drawn_frame_pairs(positions, are_apart, most=most, rng=rng)
+            drawn = f"{self.negatives_per_positive} negatives per positive, seed {seed}"
+        else:
+            negative, drawn = frame_pairs(positions, are_apart), "all negatives"
+        if self.negatives_share is not None:
+            negative = negative[rng.random(len(negative)) < self.negatives_share]
+            drawn = f"no gap, {self.negatives_share:.1%} of the negatives, seed {seed}"
+        result = self.result(f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m, {drawn}", source)
+        pairs = np.stack(np.divmod(np.concatenate([positive, negative]), len(source)))
+        is_positive = np.arange(pairs.shape[1]) < len(positive)
+        scores = -pair_distances(source, pairs) if len(positive) else np.zeros(pairs.shape[1])
+        return _score(result, pairs, scores, is_positive, seed=seed)
+
+
+_RULE = "pairs of frames more than 50 apart: same place below 3 m, different beyond 20 m, in x and y; "
+PAIRS_F1MAX = DrawnPairs(
+    name="pairs-f1max",
+    title="pairs F1max",
+    rule=_RULE + "100 negatives drawn for each positive",
+    negatives_per_positive=100,
+    headline=True,
+)
+"""The published lists (lilin-hitcrt/SSC, `neg_100`) have 1, 10, 20, 50 and 100 negatives for each positive, and the
+tables use 100. The seed of these lists is unknown. Another seed changes the score by 0.001 to 0.004."""
+PAIRS_10_F1MAX = DrawnPairs(
+    name="pairs-10-f1max",
+    title="pairs F1max 1:10",
+    rule=_RULE + "10 negatives for each",
+    negatives_per_positive=10,
+)
+PAIRS_1_F1MAX = DrawnPairs(
+    name="pairs-1-f1max", title="pairs F1max 1:1", rule=_RULE + "1 negative for each", negatives_per_positive=1
+)
+PAIRS_ALL_F1MAX = DrawnPairs(name="pairs-all-f1max", title="pairs F1max 1:all", rule=_RULE + "all negatives")
+
+SGPR_PAIRS_F1MAX = DrawnPairs(
+    name="sgpr-pairs-f1max",
+    title="SGPR pairs F1max",
+    rule="pairs of frames: same place up to 3 m, different beyond 20 m, in x and y; 0.5 % of the negatives",
+    source="SGPR, data_process/gen_sem_kitti_graph_pairs.py",
+    positive=lambda apart, gap: (apart <= POSITIVE_M) & (gap >= 0),
+    negatives_share=0.005,
+)
+"""Neighbouring frames and each frame with itself are positive, too. Most positive pairs are therefore easy, and even a
+recording without a revisit has a score. The published code (kxhit/SG_PR) skips scans with few objects; here all scans
+are used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedPairs(Protocol):
+    """F1max over listed pairs with scores, for published lists and for methods without descriptors.
+
+    SSC's lists (`neg_100`) give the scores in the tables of SSC and RINet. Pairs without labels are labelled as in
+    `PAIRS_F1MAX`; pairs that are neither positive nor negative are ignored. The interval resamples the first frames.
+    """
+
+    def __call__(self, source: ScoredPairs, *, seed: int = 0) -> Result:
+        """Score listed pairs."""
+        if source.labels is not None:
+            labelled = replace(self.result("labels as listed"), dimensions=None)
+            return _score(labelled, source.pairs.T, source.scores, source.labels, seed=seed)
+        assert source.positions is not None  # checked by `ScoredPairs`
+        i, j = source.pairs.T
+        apart = np.linalg.norm((source.positions[i] - source.positions[j])[:, : self.dimensions], axis=1)
+        positive = is_revisit(apart, np.abs(i - j))
+        counted = positive | (apart > NEGATIVE_M)
+        result = self.result(f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m, pairs as listed", source)
+        return _score(result, source.pairs[counted].T, source.scores[counted], positive[counted], seed=seed)
+
+
+LISTED_PAIRS_F1MAX = ListedPairs(
+    name="listed-pairs-f1max",
+    title="listed pairs F1max",
+    rule="pairs of frames as listed; without labels: same place below 3 m, different beyond 20 m, in x and y",
+    source="SSC, RINet: the lists that they publish",
+    published_on="KITTI's own poses",
+    dimensions=2,
+    takes=("scored pairs",),
+)
+
+
+def score_listed_pairs(
+    file: DescriptorFile, pairs: Int[np.ndarray, "p 2"], labels: Bool[np.ndarray, " p"] | None = None
+) -> ScoredPairs:
+    """Score pairs of rows of a descriptor file by the negated distances of their descriptors."""
+    check_frames("pairs of", pairs, 0, len(file))
+    return ScoredPairs(pairs, -pair_distances(file, pairs.T), labels, file.positions, file.pose_source)
 
 
 def frame_pairs(positions: Float[np.ndarray, "n d"], keep: Keep) -> Int[np.ndarray, " pairs"]:
@@ -106,16 +206,30 @@ def _distances_by_row(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -
     return apart
 
 
-def score_drawn_pairs(
-    file: DescriptorFile,
+def _score(
     result: Result,
-    positive: Int[np.ndarray, " positives"],
-    negative: Int[np.ndarray, " negatives"],
+    pairs: Int[np.ndarray, "2 pairs"],
+    scores: Float[np.ndarray, " pairs"],
+    positive: Bool[np.ndarray, " pairs"],
     *,
     seed: int,
 ) -> Result:
-    """Complete `result` with pairs from `frame_pairs`, scored by the descriptors of the file."""
-    pairs = np.stack(np.divmod(np.concatenate([positive, negative]), len(file)))
-    is_positive = np.arange(pairs.shape[1]) < len(positive)
-    scores = -pair_distances(file, pairs) if len(positive) else np.zeros(pairs.shape[1])
-    return score_pairs(result, pairs, scores, is_positive, seed=seed)
+    """Complete `result` with counts and, if a pair is positive, with F1max, its curve and interval.
+
+    The interval resamples the first frames. The pairs of a first frame are drawn or omitted together.
+    """
+    counts = {"positive pairs": int(positive.sum()), "negative pairs": int((~positive).sum())}
+    result = replace(result, counts=counts)
+    if not positive.any():
+        return result
+    # Between the scores of two positive pairs only precision falls, so the millions of negative scores are not needed.
+    curve = metrics.classification_curve(scores, positive, thresholds=np.unique(scores[positive]))
+    interval = f1_max_interval(
+        scores,
+        true_if_accepted=positive,
+        false_if_accepted=~positive,
+        missed_if_rejected=positive,
+        query=pairs[0],
+        seed=seed,
+    )
+    return replace(result, score=curve.f1_max, curve=curve, interval=interval)

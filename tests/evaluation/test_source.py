@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sglpr_jax.evaluation.protocols import PROTOCOLS, Decision, ScoredPairs, TopK, protocol_named, protocols_taking
-from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
-from sglpr_jax.evaluation.protocols.listed_pairs_f1max import listed_pairs_f1max, score_listed_pairs
-from sglpr_jax.evaluation.protocols.overlap_transformer_f1max import overlap_transformer_f1max
-from sglpr_jax.evaluation.protocols.pointnetvlad_recall import pointnetvlad_recall
-from sglpr_jax.evaluation.protocols.scan_context_f1max import scan_context_f1max
-from sglpr_jax.evaluation.protocols.ssc_recall import ssc_recall
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.evaluation.protocols import PROTOCOLS, protocols_taking
+from sglpr_jax.evaluation.protocols.pairs import LISTED_PAIRS_F1MAX, pair_distances, score_listed_pairs
+from sglpr_jax.evaluation.protocols.protocol import Decision
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_RECALL_AT_1, SSC_RECALL
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK, nearest_descriptors
+from sglpr_jax.evaluation.protocols.top1 import OVERLAP_TRANSFORMER_F1MAX, SCAN_CONTEXT_F1MAX, TOP1_F1MAX
+from sglpr_jax.retrieval.distances import distance_function
+
+from .by_the_letter import random_drive
 
 
 @pytest.fixture
@@ -44,21 +45,21 @@ def test_a_list_scores_as_the_descriptors_it_was_made_of(file, listed, protocol)
 
 
 def test_ssc_counts_every_row_of_a_list(file, listed):
-    asked = ssc_recall(file)
+    asked = SSC_RECALL(file)
     queries = np.flatnonzero(asked.decisions)
     rows = replace(listed, queries=queries, nearest=listed.nearest[queries], scores=None)
-    assert ssc_recall(rows).recalls == asked.recalls
+    assert SSC_RECALL(rows).recalls == asked.recalls
     more = np.append(queries, 100)  # a frame of the first lap, with nothing to find
-    result = ssc_recall(replace(listed, queries=more, nearest=listed.nearest[more], scores=None))
+    result = SSC_RECALL(replace(listed, queries=more, nearest=listed.nearest[more], scores=None))
     assert result.counts == {"queries": len(more), "revisits": len(queries)}
     assert result.recalls[25] == pytest.approx(asked.recalls[25] * len(queries) / len(more))
 
 
 def test_a_frame_that_is_not_listed_is_missed(listed):
-    whole = top1_f1max(listed)
+    whole = TOP1_F1MAX(listed)
     found = np.flatnonzero(whole.decisions == Decision.TRUE_POSITIVE)
     rows = np.setdiff1d(np.arange(800), found[::2])
-    half = top1_f1max(replace(listed, queries=rows, nearest=listed.nearest[rows], scores=listed.scores[rows]))
+    half = TOP1_F1MAX(replace(listed, queries=rows, nearest=listed.nearest[rows], scores=listed.scores[rows]))
     assert half.counts == whole.counts
     assert np.all(half.decisions[found[::2]] == Decision.FALSE_NEGATIVE)
     assert half.score < whole.score
@@ -66,7 +67,7 @@ def test_a_frame_that_is_not_listed_is_missed(listed):
 
 def test_a_list_without_answers_scores_nothing(listed):
     empty = replace(listed, nearest=np.full((800, 1), -1), scores=np.zeros((800, 1)))
-    for protocol in (top1_f1max, scan_context_f1max, bevplace_recall_at_1):
+    for protocol in (TOP1_F1MAX, SCAN_CONTEXT_F1MAX, BEVPLACE_RECALL_AT_1):
         result = protocol(empty)
         assert (result.score, result.interval) == (0.0, (0.0, 0.0))
         assert not np.any(result.decisions == Decision.TRUE_POSITIVE)
@@ -74,19 +75,19 @@ def test_a_list_without_answers_scores_nothing(listed):
 
 def test_a_threshold_needs_scores(listed):
     with pytest.raises(ValueError, match="top-1 F1max: expected a list with scores"):
-        top1_f1max(replace(listed, scores=None))
-    assert bevplace_recall_at_1(replace(listed, scores=None)).score == bevplace_recall_at_1(listed).score
+        TOP1_F1MAX(replace(listed, scores=None))
+    assert BEVPLACE_RECALL_AT_1(replace(listed, scores=None)).score == BEVPLACE_RECALL_AT_1(listed).score
 
 
 def test_pairs_without_labels_are_labelled_by_position(file):
     pairs = np.array([[400, 0], [401, 0], [405, 0], [100, 0], [1, 0], [700, 300]])  # 0, 3.1, 16, 200, 3.1, 0 m
     labels = np.array([True, False, True])
-    given = listed_pairs_f1max(score_listed_pairs(file, pairs[[0, 3, 5]], labels))
-    told = listed_pairs_f1max(score_listed_pairs(file, pairs))
+    given = LISTED_PAIRS_F1MAX(score_listed_pairs(file, pairs[[0, 3, 5]], labels))
+    told = LISTED_PAIRS_F1MAX(score_listed_pairs(file, pairs))
     assert told.counts == given.counts == {"positive pairs": 2, "negative pairs": 1}
     assert told.score == given.score == 1.0
     assert (told.dimensions, given.dimensions) == (2, None)
-    assert np.isnan(listed_pairs_f1max(ScoredPairs(pairs, np.zeros(6), np.zeros(6, dtype=bool))).score)
+    assert np.isnan(LISTED_PAIRS_F1MAX(ScoredPairs(pairs, np.zeros(6), np.zeros(6, dtype=bool))).score)
 
 
 @pytest.mark.parametrize("frame", [-1, 800])
@@ -97,7 +98,7 @@ def test_pairs_out_of_range_are_refused(file, frame):
     with pytest.raises(ValueError, match=f"found {frame} in row 1"):
         ScoredPairs(pairs, np.zeros(2), positions=file.positions)
     with pytest.raises(ValueError, match=f"expected overlapping frames from 0 to 799, found {frame} in row 1"):
-        overlap_transformer_f1max(file, pairs)
+        OVERLAP_TRANSFORMER_F1MAX(file, pairs)
 
 
 @pytest.mark.parametrize(
@@ -119,15 +120,12 @@ def test_scored_pairs_must_fit(change, error):
     ("change", "error"),
     [
         ({"queries": np.zeros(0, dtype=np.int64)}, "at least one query, found none"),
-        ({"queries": np.array([3, 4])}, r"expected 2 rows of retrieved frames, found \(800, 800\)"),
         ({"nearest": np.zeros((800, 0), dtype=np.int64)}, r"expected 800 rows of retrieved frames, found \(800, 0\)"),
-        ({"positions": np.full((800, 3), np.nan)}, "expected finite positions"),
         ({"times": np.zeros(3)}, "expected 800 times"),
         ({"queries": np.arange(800) // 2}, "found one listed twice"),
         ({"queries": np.arange(1, 801)}, "expected query frames from 0 to 799, found 800 in row 799"),
         ({"nearest": np.full((800, 800), 800)}, "expected retrieved frames from -1 to 799, found 800 in row 0"),
         ({"scores": np.full((800, 800), np.nan)}, "expected a finite score"),
-        ({"scores": np.zeros((800, 1))}, "expected a finite score"),
     ],
 )
 def test_a_list_must_fit(listed, change, error):
@@ -135,64 +133,42 @@ def test_a_list_must_fit(listed, change, error):
         replace(listed, **change)
 
 
-def test_nan_descriptors_are_refused(make_file, two_laps):
-    descriptors = np.ones((800, 4))
-    descriptors[17, 2] = np.nan
-    with pytest.raises(ValueError, match="expected finite descriptors, found NaN or infinity in 1 rows, first in row"):
-        make_file(two_laps, descriptors)
+@pytest.mark.parametrize("name", [*protocols_taking("descriptors"), *protocols_taking("sessions")])
+def test_cosine_is_l2_of_unit_length(make_file, name):
+    positions, descriptors, times = random_drive(0, n=230)
+    lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    by_cosine = replace(make_file(positions, descriptors, times=times), distance="cosine")
+    of_unit_length = replace(by_cosine, descriptors=descriptors / lengths, distance="l2")
+
+    def scored(file):
+        if "sessions" not in PROTOCOLS[name].takes:
+            return PROTOCOLS[name](file).score
+        other = replace(file, descriptors=file.descriptors[::-1], positions=file.positions[::-1] + 2.0)
+        return PROTOCOLS[name](file, other).score
+
+    expected = scored(of_unit_length)
+    assert scored(by_cosine) == pytest.approx(expected, abs=1e-6)
+    assert expected > 0.05
 
 
-def test_an_empty_sequence_is_refused(make_file):
-    with pytest.raises(ValueError, match="expected at least one scan, found none"):
-        make_file(np.zeros((0, 3)), np.zeros((0, 4)))
+@pytest.mark.slow
+def test_a_distance_between_sets_serves_for_pairs_and_for_neighbours(make_file):
+    rng = np.random.default_rng(0)
+    rows = rng.uniform(size=(90, 1200)).astype(np.float32)
+    file = replace(make_file(np.zeros((90, 3)), rows), distance="scan-context")
+    table = distance_function("scan-context")(rows, rows)
+    pairs = rng.integers(90, size=(2, 700))
+    np.testing.assert_allclose(pair_distances(file, pairs), table[pairs[0], pairs[1]], atol=1e-6)
+    ends = np.arange(1, 91)
+    nearest, best = nearest_descriptors(rows, rows, ends, k=3, distance="scan-context")
+    for i in range(3, 90):
+        np.testing.assert_array_equal(nearest[i], np.argsort(table[i, : i + 1])[:3])
+    np.testing.assert_allclose(best, table[np.arange(90), nearest[:, 0]], atol=1e-6)
 
 
-def test_as_many_descriptors_as_poses_are_needed(make_file, two_laps):
-    with pytest.raises(ValueError, match=r"expected positions as float64 \(700, 3\), found float64 \(800, 3\)"):
-        make_file(two_laps, np.ones((700, 4)))
-
-
-@pytest.mark.parametrize(
-    ("name", "nearest"),
-    [("top1-f1mx", "top1-f1max"), ("contour", "contour-context-f1max"), ("SSC-recall", "ssc-recall"), ("", "top1")],
-)
-def test_an_unknown_protocol_names_the_nearest(name, nearest):
-    with pytest.raises(
-        ValueError, match=f"expected a protocol, found '{name}'; did you mean '{nearest}.*Available: .*sgpr-pairs-f1max"
-    ):
-        protocol_named(name)
-
-
-def test_protocols_go_by_their_name():
-    assert protocol_named("ssc-recall").score is ssc_recall
-    assert protocol_named("pointnetvlad-recall", protocols_taking("sessions")).score is pointnetvlad_recall
-
-
-@pytest.mark.parametrize("name", protocols_taking("sessions"))
-def test_sessions_must_be_described_alike(make_file, two_laps, name):
-    database, queries = make_file(two_laps, np.ones((800, 4))), make_file(two_laps, np.ones((800, 5)), sequence="later")
-    with pytest.raises(ValueError, match="descriptors of later to be made as those of town, with numbers 4, found 5"):
-        PROTOCOLS[name](database, queries)
-    with pytest.raises(ValueError, match="with distance l2, found cosine"):
-        PROTOCOLS[name](database, replace(database, distance="cosine"))
-    with pytest.raises(ValueError, match="expected positions to score sequence town"):
-        PROTOCOLS[name](replace(database, positions=None), database)
-
-
-def test_one_run_is_not_enough(file):
-    with pytest.raises(ValueError, match="expected at least two sessions, found 1"):
-        pointnetvlad_recall(file)
-
-
-@pytest.mark.parametrize("name", protocols_taking("descriptors"))
-def test_two_frames_are_too_few_to_find_anything_but_no_error(make_file, name):
-    result = PROTOCOLS[name](make_file(np.array([[0.0, 0, 0], [100, 0, 0]]), np.ones((2, 4))))
-    assert np.isnan(result.score) or name == "sgpr-pairs-f1max"
-
-
-@pytest.mark.parametrize("name", protocols_taking("descriptors"))
-def test_descriptors_that_are_all_alike_make_one_threshold(make_file, two_laps, name):
-    result = PROTOCOLS[name](make_file(two_laps, np.ones((800, 4))))
-    assert 0 <= result.interval[0] <= result.score <= result.interval[1] <= 1
-    if result.curve is not None:
-        assert len(result.curve.thresholds) == 1
+def test_far_from_zero_the_nearest_are_still_found():
+    rng = np.random.default_rng(0)
+    rows = (1000 + rng.normal(size=(300, 64))).astype(np.float32)
+    nearest, _ = nearest_descriptors(rows[150:], rows, np.full(150, 150), k=3)
+    apart = np.linalg.norm(rows[150:, None].astype(np.float64) - rows[None, :150], axis=2)
+    np.testing.assert_array_equal(nearest, np.argsort(apart, axis=1)[:, :3])

@@ -1,23 +1,38 @@
-"""Images for a page from a dataset and a model: scans, semantic maps and feature heat maps."""
+"""Pictures for the page of an evaluation, from a dataset and a model: scans, semantic maps and feature heat maps."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Num
 
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
-from sglpr_jax.evaluation.false_positives import FalsePositive
+from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.inputs import Input
-from sglpr_jax.evaluation.page import HeatPicture, Pictures, SemanticPicture
-from sglpr_jax.grid import Grid
+from sglpr_jax.evaluation.scoring import FalsePositive
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.image_maps import heat_maps, semantic_map
 
+if TYPE_CHECKING:
+    import matplotlib.figure
+
 SHOWN = (1 / 3, 2 / 3)
 """Positions of the shown scans, as fractions of the recording."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Pictures of a page, by frame. A string instead of figures says what adds them."""
+
+    images: Mapping[int, Num[np.ndarray, "_ _"]] = field(default_factory=dict)
+    """Point counts of the queries and answers of false positives, by frame number."""
+    semantic: "Mapping[str, matplotlib.figure.Figure] | str" = "Semantic maps: add --weights and --data."
+    heat: "Mapping[str, matplotlib.figure.Figure] | str" = "Feature heat maps: add --weights and --data."
 
 
 def take_pictures(
@@ -28,21 +43,21 @@ def take_pictures(
     Raises ValueError if `source` and the recording have different frames.
     """
     rows = recording_rows(recording, source)
-    frames = sorted({frame for found in worst for frame in (found.query, found.answer)})
-    images = {frame: _image(recording, rows[frame], model_preset("sglpr").grid) for frame in frames}
+    grid = None if recording.has_images else model_preset("sglpr").grid  # ready-made images are not cropped
+    images = {
+        frame: np.asarray(view(recording.record(rows[frame], labels=False), grid).image)
+        for frame in sorted({frame for found in worst for frame in (found.query, found.answer)})
+    }
     if params is None:
         needs = "maps: add --weights beside --data."
         return Pictures(images, f"Semantic {needs}", f"Feature heat {needs}")
+    if not figures.can_draw():
+        return Pictures(images)
     shown = sorted({int(part * len(recording)) for part in SHOWN})
-    heat = {recording.ids[row]: _heat(recording, params, row) for row in shown}
+    heat = {recording.ids[row]: _heat_figure(recording, params, row) for row in shown}
     if not params.config.segments:
         return Pictures(images, "Semantic maps: add --weights that have a segmentation head; these have none.", heat)
-    return Pictures(images, {recording.ids[row]: semantic_picture(recording, params, row) for row in shown}, heat)
-
-
-def check_same_frames(recording: Recording, source: Input) -> None:
-    """Raise ValueError if `source` and the recording have different frames."""
-    recording_rows(recording, source)
+    return Pictures(images, {recording.ids[row]: semantic_figure(recording, params, row) for row in shown}, heat)
 
 
 def poses_of(recording: Recording) -> Trajectory | None:
@@ -68,20 +83,22 @@ def recording_rows(recording: Recording, source: Input) -> Mapping[int, int]:
     return {frame: frame for frame in range(n)}
 
 
-def _image(recording: Recording, row: int, grid: Grid) -> np.ndarray:
-    """Return the image of a scan, rasterised on `grid`. Ready-made images are not cropped."""
-    return np.asarray(view(recording.record(row, labels=False), None if recording.has_images else grid).image)
+def semantic_figure(recording: Recording, params: Params, row: int, *, title: str = "") -> "matplotlib.figure.Figure":
+    """Draw point counts and predicted semantic map of a scan, and the true map if the scan has labels (figure 7)."""
+    config, found = params.config, semantic_map(params, recording.record(row))
+    return figures.segmentation_panel(
+        found.counts,
+        found.truth if recording.labelled[row] else None,
+        found.predicted,
+        resolution_m=config.grid.resolution_m,
+        categories=config.categories,
+        title=title,
+    )
 
 
-def _heat(recording: Recording, params: Params, row: int) -> HeatPicture:
+def _heat_figure(recording: Recording, params: Params, row: int) -> "matplotlib.figure.Figure":
+    """Draw the activation of each layer of a network for a scan (figure 8)."""
     config = params.config
     record = recording.record(row, labels=bool(config.categories_read))
     seen = view(record, config.grid, categories=config.categories_read, image=config.image)
-    return HeatPicture(np.asarray(seen.image), heat_maps(params, *seen))
-
-
-def semantic_picture(recording: Recording, params: Params, row: int) -> SemanticPicture:
-    """Return point counts and predicted semantic map of a scan, and the true map if the scan has labels."""
-    config, found = params.config, semantic_map(params, recording.record(row))
-    truth = found.truth if recording.labelled[row] else None
-    return SemanticPicture(found.counts, truth, found.predicted, config.grid.resolution_m, config.categories)
+    return figures.heat_maps(np.asarray(seen.image), heat_maps(params, *seen))

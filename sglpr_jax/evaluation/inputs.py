@@ -1,0 +1,334 @@
+"""Inputs of an evaluation: descriptors, a top-k list or scored pairs of any method.
+
+    .npz   a descriptor file (`DescriptorFile`)
+    .npy   a matrix of descriptors, one row per frame
+    text   a top-k list has lines `query: frame frame ...` or `query: frame=score ...`, best first (`query:` without an
+           answer), a list of scored pairs `i j score [label]` with label 1 for the same place, 0 for different places
+
+Frames are numbered from 0, in the order of the poses. Higher scores mean closer. In texts, empty lines and lines that
+start with # are ignored.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+
+from sglpr_jax.data.formats.pose_files import Trajectory
+from sglpr_jax.data.poses import poses_at_scans, poses_of
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, Source, TopK
+from sglpr_jax.files import in_short, naming
+from sglpr_jax.numpy_files import read_array
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.distances import distance_function
+
+Input = Source | ScoredPairs
+LABELS = {"0": False, "1": True}
+NEAR_M = 0.01
+"""Largest difference of equal positions, in metres. Programs round the numbers in their files."""
+NEAR_S = 0.001
+"""Largest difference of equal times, in seconds."""
+
+
+def read_input(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str | None = None) -> Input:
+    """Read an input file of any kind.
+
+    Arguments:
+      path: File to read.
+      trajectory: Positions and times of the frames. If None, only those in the file are used.
+      sequence: Name of the sequence, for files that do not contain it.
+      distance: Name of the distance between the descriptors of a .npy file, L2 by default. Other files define their
+        own distance.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is invalid or does not fit the other arguments. The message names the file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a descriptor file, .npy, top-k list or scored pairs, found none")
+    if distance is not None:
+        distance_function(distance)
+    if path.suffix == ".npy":
+        return _read_matrix(path, trajectory, sequence=sequence, distance=distance or "l2")
+    if distance is not None:
+        raise ValueError(f"{path}: expected a .npy beside --distance, found a file that defines its own distance")
+    if path.suffix == ".npz":
+        return read_descriptor_file(path, trajectory)
+    if ":" in next((line for _, line in _lines(path)), ""):
+        return _read_top_k_list(path, trajectory, sequence=sequence)
+    return _read_pair_list(path, trajectory)
+
+
+def read_methods(
+    paths: Sequence[Path],
+    *,
+    poses: Trajectory | None = None,
+    dataset: Trajectory | None = None,
+    sequence: str | None = None,
+    distance: str | None = None,
+) -> dict[str, Input]:
+    """Read the file of every method and return the inputs by method name, which is the name of the file.
+
+    Arguments:
+      paths: Files of the methods.
+      poses: Positions that replace those of every file. If they have no times, the times of the first file with times
+        are used for all files.
+      dataset: Positions for files without positions, if the first file has no positions either.
+      sequence: Name of the sequence. By default the name of each file.
+      distance: Name of the distance between descriptors, for the first file and for every .npy file.
+
+    Raises:
+      FileNotFoundError: As `read_input`.
+      ValueError: As `read_input`.
+    """
+    methods: dict[str, Input] = {}
+    for path in paths:
+        trajectory = poses if path.suffix == ".npz" else _of_first(methods) or poses or dataset
+        compared_by = distance if path == paths[0] or path.suffix == ".npy" else None
+        name = path.stem if sum(other.stem == path.stem for other in paths) == 1 else str(path)
+        methods[name] = read_input(path, trajectory, sequence=sequence or path.stem, distance=compared_by)
+    return methods if poses is None else _timed(methods)
+
+
+def _of_first(methods: Mapping[str, Input]) -> Trajectory | None:
+    """Return the positions and times in the file of the first method, or None if it has no positions."""
+    first = next(iter(methods.values()), None)
+    if not isinstance(first, DescriptorFile) or first.positions is None:
+        return None
+    return Trajectory(first.positions, first.times, first.pose_source or first.sequence, by_row=True)
+
+
+def _timed(methods: Mapping[str, Input]) -> dict[str, Input]:
+    """Give methods without times the times of the first method with times. All have the same poses."""
+    retrieved = [method for method in methods.values() if not isinstance(method, ScoredPairs)]
+    times = next((method.times for method in retrieved if method.times is not None), None)
+    return {
+        name: method if isinstance(method, ScoredPairs) or method.times is not None else replace(method, times=times)
+        for name, method in methods.items()
+    }
+
+
+def as_descriptors(
+    rows: Num[np.ndarray, "n d"], trajectory: Trajectory, *, sequence: str, method: str, distance: str
+) -> DescriptorFile:
+    """Return descriptors from an array of real numbers. Row i belongs to pose i.
+
+    Raises ValueError if a row is not finite.
+    """
+    with np.errstate(over="ignore"):  # numbers too large for float32 become infinite, which `DescriptorFile` rejects
+        descriptors = np.array(rows, dtype=np.float32)
+    return DescriptorFile(
+        sequence=sequence,
+        ids=tuple(f"{row:06d}" for row in range(len(rows))),
+        positions=trajectory.positions,
+        times=trajectory.times,
+        descriptors=descriptors,
+        pose_source=trajectory.source,
+        config={"method": method},
+        weights_hash="",
+        distance=distance,
+    )
+
+
+def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> DescriptorFile:
+    """Read a descriptor file, optionally with the positions of another trajectory.
+
+    A trajectory replaces the positions of the file. Its times replace those of the file if the file has no times, or if
+    they were given for the frames (`Trajectory.by_row`). If `bin/embed` skipped scans, the trajectory may have a pose
+    for every scan of the recording. If the times of the trajectory and the file differ, positions are interpolated
+    (`poses_at_scans`) and frames without a pose are dropped.
+
+    Raises ValueError if the trajectory does not fit or if there are no positions.
+    """
+    file = DescriptorFile.load(path)
+    if trajectory is not None:
+        with naming(path):
+            file = _placed(file, trajectory, path.name)
+    if file.positions is None:
+        raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
+    return file
+
+
+def _placed(file: DescriptorFile, trajectory: Trajectory, name: str) -> DescriptorFile:
+    """Return the frames of a file that have a pose, with the positions of the trajectory."""
+    poses, times = trajectory.positions, trajectory.times
+    recorded = file.recorded
+    if len(poses) == len(recorded) != len(file):
+        poses, times = poses[recorded], None if times is None else times[recorded]
+    stamps = None if trajectory.by_row else times
+    found = poses_at_scans(
+        trajectory.source, poses_of(poses), stamps, file.times, scans=len(file), of=f"frame of {name}"
+    )
+    keeps_times = times is None or (file.times is not None and not trajectory.by_row)
+    source = f"{trajectory.source}, {found.said}" if found.said else trajectory.source
+    placed = replace(file if found.kept.all() else file.only(found.kept), pose_source=source)
+    return replace(placed, positions=found.poses[:, :3, 3], times=placed.times if keeps_times else times)
+
+
+def _read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str) -> DescriptorFile:
+    """Read descriptors (n, d) of any real type. Files that need pickle are rejected."""
+    expected = f"{path}: expected descriptors (n, d) as numbers"
+    try:
+        with path.open("rb") as stream:
+            rows = read_array(stream, size=path.stat().st_size)
+    except MemoryError as error:
+        raise ValueError(f"{expected}, found an array larger than the memory") from error
+    except Exception as error:  # numpy parses the header as Python, which can raise any exception
+        raise ValueError(f"{expected}, found no valid .npy file ({in_short(error)})") from error
+    if rows.ndim != 2 or rows.dtype.kind not in "fiub" or rows.size == 0:
+        raise ValueError(f"{expected}, found {rows.dtype} {rows.shape}")
+    trajectory = _needed(path, trajectory)
+    if len(rows) != (poses := len(trajectory.positions)):
+        raise ValueError(
+            f"{path}: expected {poses} descriptors, one for each pose of {trajectory.source}, found {len(rows)}"
+        )
+    with naming(path):
+        return as_descriptors(rows, trajectory, sequence=sequence, method=path.stem, distance=distance)
+
+
+def _read_top_k_list(path: Path, trajectory: Trajectory | None, *, sequence: str) -> TopK:
+    """Read the frames retrieved for each query. Either all frames have a score or none has."""
+    trajectory = _needed(path, trajectory)
+    where, lines = zip(*_lines(path), strict=True)
+    queries, answers = zip(*map(_answers, where, lines), strict=True)
+    nearest = _padded([[frame for frame, _ in row] for row in answers], fill=-1).astype(np.int64)
+    frames = np.column_stack([queries, nearest])
+    _check_rows(where, frames, trajectory)
+    scores = [[score for _, score in row] for row in answers]
+    retrieved, missing = sum(map(len, scores)), sum(score is None for row in scores for score in row)
+    if 0 < missing < retrieved:
+        raise ValueError(
+            f"{path}: expected a score for every retrieved frame or for none, found {missing} without a score"
+        )
+    with naming(path):
+        return TopK(
+            sequence=sequence,
+            positions=trajectory.positions,
+            times=trajectory.times,
+            pose_source=trajectory.source,
+            queries=frames[:, 0],
+            nearest=nearest,
+            scores=None if missing == retrieved else _padded([[score or 0.0 for score in row] for row in scores], 0.0),
+        )
+
+
+def _answers(where: str, line: str) -> tuple[int, list[tuple[int, float | None]]]:
+    """Return the query of a line, and its answers as (frame, score or None)."""
+    query, colon, retrieved = line.partition(":")
+    if not colon:
+        raise ValueError(f"{where}: expected `query: frame frame ...`, found {line.strip()[:80]!r}")
+    words = [word.partition("=") for word in retrieved.split()]
+    answers = [(_frame(frame, where), _score(score, where) if equals else None) for frame, equals, score in words]
+    return _frame(query.strip(), where), answers
+
+
+def _read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
+    """Read pairs of frames, the query first. Pairs without a label are labelled by their positions."""
+    rows = [(where, line.split()) for where, line in _lines(path)]
+    if not rows:
+        raise ValueError(f"{path}: expected lines `i j score [label]` or `query: frame frame ...`, found none")
+    columns = len(rows[0][1])
+    for where, words in rows:
+        if len(words) != columns or columns not in (3, 4):
+            expected = columns if columns in (3, 4) else "3 or 4"
+            raise ValueError(
+                f"{where}: expected {expected} numbers `i j score [label]`, found {' '.join(words)[:80]!r}"
+            )
+    pairs = np.array([[_frame(word, where) for word in words[:2]] for where, words in rows])
+    scores = np.array([_score(words[2], where) for where, words in rows])
+    labels = np.array([_label(words[3], where) for where, words in rows]) if columns == 4 else None
+    if trajectory is None and labels is not None:
+        return ScoredPairs(pairs, scores, labels)
+    trajectory = _needed(path, trajectory)
+    _check_rows([where for where, _ in rows], pairs, trajectory)
+    return ScoredPairs(pairs, scores, labels, trajectory.positions, trajectory.source)
+
+
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield location (for error messages) and text of every line that is not empty or a comment."""
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        if line.strip() and not line.startswith("#"):
+            yield f"{path}, line {number}", line
+
+
+def _frame(word: str, where: str) -> int:
+    if not (word.isascii() and word.isdigit() and len(word) < 10):
+        raise ValueError(f"{where}: expected a frame number, found {word!r}")
+    return int(word)
+
+
+def _score(word: str, where: str) -> float:
+    try:
+        score = float(word if word.isascii() and "_" not in word else "")  # Python reads 1_0 as 10
+    except ValueError as error:
+        raise ValueError(f"{where}: expected a score, found {word!r}") from error
+    if not np.isfinite(score):
+        raise ValueError(f"{where}: expected a finite score, found {word!r}")
+    return score
+
+
+def _label(word: str, where: str) -> bool:
+    if word not in LABELS:
+        raise ValueError(f"{where}: expected a label 0 or 1, found {word!r}")
+    return LABELS[word]
+
+
+def _check_rows(where: Sequence[str], frames: Int[np.ndarray, "rows _"], trajectory: Trajectory) -> None:
+    """Raise ValueError if a frame has no pose. The message names the first such line."""
+    n = len(trajectory.positions)
+    outside = np.argwhere(frames >= n)
+    if outside.size:
+        row, column = outside[0]
+        expected = f"expected frames from 0 to {n - 1} ({trajectory.source})"
+        raise ValueError(f"{where[row]}: {expected}, found {frames[row, column]}")
+
+
+def _padded(rows: Sequence[Sequence[int | float]], fill: int | float) -> Float[np.ndarray, "rows columns"]:
+    """Return rows of different lengths as one array with at least one column, padded with `fill`."""
+    columns = max([1, *map(len, rows)])
+    return np.array([[*row, *[fill] * (columns - len(row))] for row in rows], dtype=np.float64)
+
+
+def _needed(path: Path, trajectory: Trajectory | None) -> Trajectory:
+    if trajectory is None:
+        raise ValueError(f"{path}: expected positions to score against (--poses, or --data with poses), found none")
+    return trajectory
+
+
+def check_agreement(first: Input, other: Input) -> None:
+    """Raise ValueError if `other` has other frames, positions or times than `first`. The message names a frame.
+
+    Scores on different recordings cannot be compared.
+    """
+    if isinstance(first, DescriptorFile) and isinstance(other, DescriptorFile) and first.ids != other.ids:
+        raise ValueError(f"expected the frames of the first file, {_ids(first, other)}, found {_ids(other, first)}")
+    _check_equal("positions", first.positions, other.positions, NEAR_M)
+    if not isinstance(first, ScoredPairs) and not isinstance(other, ScoredPairs):
+        if (first.times is None) != (other.times is None):
+            has, has_not = ("times", "none") if first.times is not None else ("none", "times")
+            raise ValueError(
+                f"expected times in both files or in neither, found {has} in the first and {has_not} in this one"
+            )
+        _check_equal("times", first.times, other.times, NEAR_S)
+
+
+def _check_equal(what: str, first: np.ndarray | None, other: np.ndarray | None, near: float) -> None:
+    if first is None or other is None:
+        return
+    if len(first) != len(other):
+        raise ValueError(f"expected {len(first)} {what}, as in the first file, found {len(other)}")
+    apart = np.abs(first - other).reshape(len(first), -1).max(axis=1)
+    row = int(apart.argmax())
+    if apart[row] > near:
+        raise ValueError(
+            f"expected the {what} of the first file, {first[row].tolist()} in row {row}, found {other[row].tolist()}"
+        )
+
+
+def _ids(file: DescriptorFile, beside: DescriptorFile) -> str:
+    """Return the number of frames and the first id that differs."""
+    pairs = zip(file.ids, [*beside.ids, *[None] * len(file)], strict=False)
+    strange = next((name for name, other in pairs if name != other), "none more")
+    return f"{len(file)} with {strange!r}"

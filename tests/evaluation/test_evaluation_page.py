@@ -1,0 +1,177 @@
+"""The folder of an evaluation: the page stands alone and says what was found; other files in the folder stay."""
+
+import base64
+import dataclasses
+import io
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.evaluation_page import (
+    draw_curves,
+    draw_trajectory,
+    evaluation_page,
+    write_evaluation,
+    write_sessions,
+)
+from sglpr_jax.evaluation.scan_pictures import Pictures
+from sglpr_jax.evaluation.scoring import Evaluation, evaluate_methods, score
+from sglpr_jax.evaluation.sessions import evaluate_sessions
+from sglpr_jax.files import WriteError, printable
+
+VOID = {"meta", "img", "br"}
+NAMES = ["top1-f1max", "pairs-10-f1max"]
+
+
+class Parsed(HTMLParser):
+    """A page as a browser would see it: its texts by headline, its pictures, and whether tags close in order."""
+
+    def __init__(self, html: str):
+        super().__init__()
+        self.open, self.images, self.texts, self.headline, self.addresses = [], [], {}, "", []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [value for name, value in attrs if name in ("src", "href", "action", "data", "srcset")]
+        if tag == "img":
+            data = dict(attrs)["src"].removeprefix("data:image/png;base64,")
+            with Image.open(io.BytesIO(base64.b64decode(data, validate=True))) as image:
+                self.images.append((self.headline, image.size))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] == ["h2"]:
+            self.headline = data
+        if self.open[-1:] != ["style"]:
+            self.texts[self.headline] = self.texts.get(self.headline, "") + data
+
+
+@pytest.fixture(scope="module")
+def file(make_file, two_laps):
+    """Two laps in which frame 500 is answered with frame 10."""
+    descriptors = two_laps / 200
+    descriptors[500] = descriptors[10]
+    return make_file(two_laps, descriptors, sequence="monday")
+
+
+@pytest.fixture(scope="module")
+def found(file):
+    return Evaluation("<town> & co", "about it", {"mine": score(file, ["top1-f1max", "ssc-recall"])}, file.positions)
+
+
+@pytest.fixture(scope="module")
+def sessions(file):
+    return evaluate_sessions(file, [dataclasses.replace(file, sequence="tuesday")])
+
+
+def render(found, pictures=None):
+    curves, trajectory = draw_curves(found), draw_trajectory(found)
+    html = evaluation_page(found, curves=curves, trajectory=trajectory, pictures=pictures or Pictures())
+    return html, Parsed(html)
+
+
+def test_the_page_says_what_the_results_say_and_stands_alone(found):
+    html, seen = render(found)
+    assert "<title>&lt;town&gt; &amp; co</title>" in html and "<script" not in html and "url(" not in html
+    assert all(address.startswith("data:") for address in seen.addresses)
+    for word in ("top-1 F1max", "3 m / 20 m", "400 revisits", "510 queries", "3-D", "made up", "SemanticKITTI's poses"):
+        assert word in seen.texts["Results"]
+    result = found.results[0]
+    assert f"{result.score:.3f}" in seen.texts["Results"]
+    assert "{:.3f} to {:.3f}".format(*result.interval) in seen.texts["Results"]
+    assert [headline for headline, _ in seen.images] == ["Precision and recall", "Trajectory"]
+    assert "Methods side by side" not in seen.texts
+    assert "500" in seen.texts["Worst false positives"] and "add --data" in seen.texts["Worst false positives"]
+    for headline in ("Semantic maps", "Feature heat maps"):
+        assert "--weights" in seen.texts[headline] and "--data" in seen.texts[headline]
+
+
+def test_what_is_missing_is_said_with_its_option(found, make_file, two_laps):
+    _, seen = render(Evaluation("", "", {"mine": found.results[1:]}, None))
+    assert "no protocol" in seen.texts["Precision and recall"].lower()
+    assert "--poses" in seen.texts["Trajectory"]
+    assert "--protocol top1-f1max" in seen.texts["Worst false positives"]
+    assert seen.images == []
+    perfect = Evaluation("", "", {"mine": score(make_file(two_laps, two_laps), ["top1-f1max"])}, two_laps)
+    assert "none at the threshold" in render(perfect)[1].texts["Worst false positives"]
+
+
+def test_pictures_stand_where_they_belong(found):
+    (mistake,) = found.worst
+    assert (mistake.query, mistake.answer) == (500, 10)
+    counts = np.arange(24 * 20).reshape(24, 20)
+    maps = figures.segmentation_panel(counts, None, counts % 20, resolution_m=0.5)
+    pictures = Pictures({500: counts, 10: counts}, semantic={"a": maps, "b": maps}, heat={"a": maps})
+    _, seen = render(found, pictures)
+    sizes = {headline: [size for where, size in seen.images if where == headline] for headline, _ in seen.images}
+    assert sizes["Worst false positives"] == [(20, 24)] * 2
+    assert len(sizes["Semantic maps"]) == 2 and len(sizes["Feature heat maps"]) == 1
+    said = seen.texts["Worst false positives"]
+    assert f"frame 500 answered with 10: {mistake.metres:.1f} m apart" in said and "descriptor distance 0" in said
+
+
+def test_methods_stand_side_by_side(found, make_file, two_laps):
+    blind = score(make_file(two_laps, np.ones((800, 2))), ["top1-f1max", "ssc-recall"])
+    both = Evaluation("town", "", {**found.methods, "blind": blind}, two_laps)
+    _, seen = render(both)
+    for word in ("mine", "blind", f"{blind[0].score:.3f}"):
+        assert word in seen.texts["Methods side by side"]
+    assert list(draw_curves(both)) == ["precision-recall-top-1-f1max.png"]
+
+
+def names_in(folder) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_plots_of_an_earlier_evaluation_go_and_other_files_stay(found, sessions, tmp_path):
+    two = dataclasses.replace(found, methods={"mine": found.results, "same": found.results})
+    mine = tmp_path / "precision-recall-raw.png"
+    mine.write_bytes(b"not of this command")
+    for write, results in ((write_evaluation, two), (write_evaluation, found), (write_sessions, sessions)):
+        written = write(results, tmp_path)
+        assert names_in(tmp_path) == {mine.name, *(path.name for path in written)}
+    assert len(written) == 2
+
+
+@pytest.mark.parametrize("numbers", ["{", '{"sequence": "08", "raw": {}}', '{"results": [{"protocol": 3}]}', None])
+def test_where_no_evaluation_was_nothing_is_removed(sessions, tmp_path, numbers):
+    (tmp_path / "trajectory.png").write_bytes(b"not of this command")
+    if numbers is not None:
+        (tmp_path / "results.json").write_text(numbers)
+    write_sessions(sessions, tmp_path)
+    assert names_in(tmp_path) == {"trajectory.png", "results.json", "report.html"}
+
+
+def test_a_full_disk_leaves_the_earlier_evaluation_as_it_was(found, sessions, tmp_path, small_files):
+    write_sessions(sessions, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with (
+        small_files(len(before["results.json"]) * 4),
+        pytest.raises(WriteError, match=r"(precision-recall\.png|report\.html): cannot be written: File too large"),
+    ):
+        write_evaluation(found, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["[/red]<b>", "$x_{$\udcff\nb\x1b[2J", "x" * 2**20])
+def test_a_name_with_markup_is_printed_drawn_and_written_as_it_is(file, tmp_path, name):
+    file = dataclasses.replace(file, sequence=name)
+    other = dataclasses.replace(file, descriptors=file.descriptors[:, ::-1].copy())
+    found = evaluate_methods({name: file, "other": other}, NAMES, file=tmp_path / "a.npz")
+    across = evaluate_sessions(file, [dataclasses.replace(file, sequence=f"{name}2")])
+    shown = printable(name)
+    write_evaluation(found, tmp_path / "one")
+    write_sessions(across, tmp_path / "sessions")
+    for result, folder in ((found, "one"), (across, "sessions")):
+        assert shown in str(result) or len(shown) > 20
+        page = (tmp_path / folder / "report.html").read_text(encoding="utf-8")
+        assert "<b>" not in page and "</red>" not in page and page.count("<h1>") == 1
