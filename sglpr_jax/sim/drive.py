@@ -86,7 +86,7 @@ def plan_path(
 
 
 def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps: float, poses: int) -> PlanarPath:
-    """Returns the drive along `line`, with a pose about every 0.1 s. The number of poses is a multiple of `se3`.
+    """Returns the drive along `line`, with a pose about every 0.1 s. The number of poses is a multiple of `poses`.
 
     `free_mps` is the mean speed on free streets, in m/s. The vehicle is slower in corners.
     """
@@ -123,7 +123,7 @@ def read_path(file: Path) -> PlanarPath:
 
 
 def name_of_path(file: Path) -> str:
-    """Name of the drive along a pose file: the stem of the file, or the name of its folder for a `se3.txt`."""
+    """Name of the drive along a pose file: the stem of the file, or the name of its folder for a `poses.txt`."""
     return file.resolve().parent.name if file.name == "poses.txt" else file.stem
 
 
@@ -286,7 +286,7 @@ class Carrier:
     def halted(self, rng: np.random.Generator, path: PlanarPath, *, poses: int) -> PlanarPath:
         """Inserts the halts into the drive along `path`, which must not stand.
 
-        The number of poses is a multiple of `se3`. The heading stays that of the path where the carrier reverses.
+        The number of poses is a multiple of `poses`. The heading stays that of the path where the carrier reverses.
         """
         if self.halt_every_s is None:
             return path

@@ -38,7 +38,7 @@ def describe_inputs(
 
 
 def check_descriptors(method: str, descriptors: np.ndarray, names: Sequence[str]) -> Float32[np.ndarray, "n d"]:
-    """Return the descriptors of the scans called `files` as float32.
+    """Return the descriptors of the scans called `names` as float32.
 
     Raises ValueError, with the method and the scan, if there is not one vector for each scan, or if one has values that
     are not finite or only zeros.
