@@ -14,8 +14,8 @@ from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.styles import SCENERIES
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
+from sglpr_jax.sim.styles import SCENERIES
 
 Odometry = Literal["none", "exact", "drifting"]
 ROUTES = {"none": ("01", "04"), "same": ("06", "00"), "opposite": ("08",)}

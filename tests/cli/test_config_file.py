@@ -41,7 +41,7 @@ LINES = {
     "reproduce": ("table1", "figure5", "--preset", "paper", "--seq", "00", "07", "--loss.margin", "0.25"),
     "segment": ("--data", "scans", "--out", "maps", "--min-confidence", "1", "--seq", "null"),
     "simulate": ("--out", "towns", "--seq", "00", "05", "--sensor", "vlp16", "--rate-hz", "5"),
-    "stress": ("--data", "scans", "--out", "stress", "--method", "solid", "random", "--batch", "2"),
+    "stress": ("--data", "scans", "--out", "stress", "--method", "solid", "ring", "--batch", "2"),
     "train": ("--seq", "07", "--preset", "circular", "--model.head.cbam", "True", "--optimizer.clip-norm", "None"),
 }
 """A command line of each command, with texts that YAML or a careless reader takes for other values."""

@@ -116,14 +116,14 @@ def test_descriptors_of_other_settings_are_never_taken(stress, rings, trained, r
 
 
 def test_ready_made_images_can_only_be_turned(stress, images):
-    options = ("--data", images, "--seq", "06", "--method", "thumbnail")
+    options = ("--data", images, "--seq", "06", "--method", "polar-fft")
     ended, out = stress(*options, "--corruption", "beams-16")
     assert_one_line_error(ended, "beams-16 needs points, found only images in sequence 06", "rotation")
     assert not out.exists()
 
 
 def test_a_drive_that_never_comes_back_has_nothing_to_lose(stress, images):
-    ended, out = stress("--data", images, "--seq", "06", "--method", "thumbnail")
+    ended, out = stress("--data", images, "--seq", "06", "--method", "polar-fft")
     assert "only images, which can only be rotated" in ended.error
     assert_one_line_error(ended, "sequence 06", "visited twice", "top1-f1max, pairs-f1max")
     assert not (out / "results.json").exists()
