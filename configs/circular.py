@@ -11,7 +11,7 @@ preset take less than half an hour.
 Command: bin/train --seq 06 --data KITTI_BEV --preset circular
 """
 
-from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

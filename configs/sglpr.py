@@ -10,7 +10,7 @@ sglpr_jax/weights/sglpr/README.md.
 Command: bin/train --seq 08 --data TOWNS --preset sglpr
 """
 
-from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

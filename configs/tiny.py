@@ -7,7 +7,7 @@ Expect: 4 steps of 8 images, which train nothing useful.
 Command: bin/train --seq 08 --preset tiny
 """
 
-from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import OptimizerConfig, TrainConfig
 

@@ -6,9 +6,9 @@ from typing import Literal
 
 import pytest
 
-from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.fields import Bounds, Positive, Share, Sizes, check_fields
 from sglpr_jax.grid import Grid
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, SglprConfig, SwinConfig
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

@@ -21,14 +21,14 @@ from sglpr_jax.models.weights_file import save
 from sglpr_jax.sim.dataset import Simulated
 from sglpr_jax.sim.dataset import simulate as simulate_dataset
 from sglpr_jax.sim.layouts import LAYOUTS
+from sglpr_jax.training.callbacks import ProgressBar
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.loop import METRICS_FILE
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
-from sglpr_jax.training.progress_bar import ProgressBar
 from sglpr_jax.training.recipe import TrainResult
 from sglpr_jax.training.recipe import train as train_network
 from sglpr_jax.training.run_folder import CONFIG_FILE
+from sglpr_jax.training.trainer import METRICS_FILE
 
 Row = dict[str, Any]
 MOST_FILES = 8

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 
 from sglpr_jax.data.density_grid import SIZE
-from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
+from sglpr_jax.training.batches import Batch
 from sglpr_jax.training.config import TrainConfig
 
 CLOUD_SPREAD = 0.29

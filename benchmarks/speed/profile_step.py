@@ -18,8 +18,8 @@ from benchmarks.speed.inputs import random_batch
 from benchmarks.speed.training import product_job, step_flops
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.presets import load_preset
-from sglpr_jax.training.state import new_state
 from sglpr_jax.training.step import train_step
 
 WRAPPER = re.compile(r"^\w+\((.*)\)$")
@@ -62,8 +62,9 @@ def profile(*, preset: tuple[str, ...] = ("circular", "sglpr"), steps: int = 3) 
 
 def _profiled(config: TrainConfig, batch: Any, steps: int) -> tuple[Counter[tuple[str, bool]], float]:
     """Milliseconds a step by part and direction, and those of a whole step."""
-    state = new_state(config)
-    program = train_step.lower(state, batch, config=config).compile()
+    network = ImageNetwork(config)
+    state = network.new_state()
+    program = train_step.lower(state, batch, network=network).compile()
     for _ in range(WARM_UP):
         state, _ = program(state, batch)
     jax.block_until_ready(state)  # or they would be measured too

@@ -16,12 +16,12 @@ from rich.table import Table
 
 from benchmarks.speed.inputs import random_batch, random_images
 from benchmarks.timing import SPREAD, Job, about, clocked, in_turn, peak_mb
-from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.files import in_short
 from sglpr_jax.models.sglpr import describe, init
+from sglpr_jax.training.batches import Batch
 from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.presets import load_preset
-from sglpr_jax.training.state import new_state
 from sglpr_jax.training.step import train_step
 
 PRODUCTS = 4
@@ -81,8 +81,8 @@ def _of_convolution(equation: Any) -> int:
 
 def step_flops(config: TrainConfig, batch: Batch) -> int:
     """Operations of a step in one piece: a step in chunks goes forward twice, which is no work of the model's."""
-    whole = dataclasses.replace(config, chunk=0)
-    return count_flops(train_step.trace(jax.eval_shape(lambda: new_state(whole)), batch, config=whole).jaxpr)
+    whole = ImageNetwork(dataclasses.replace(config, chunk=0))
+    return count_flops(train_step.trace(jax.eval_shape(whole.new_state), batch, network=whole).jaxpr)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,19 +115,19 @@ class StepJob:
     """A job: training steps, one after another."""
 
     def __init__(self, config: TrainConfig, batch: Batch, steps: int):
-        self._config, self._batch, self._steps = config, batch, steps
-        self._state = new_state(config)
+        self._network, self._batch, self._steps = ImageNetwork(config), batch, steps
+        self._state = self._network.new_state()
 
     def __call__(self) -> None:
         """Make the steps. Raises FloatingPointError if the loss is no longer finite."""
         for _ in range(self._steps):
-            self._state, metrics = train_step(self._state, self._batch, config=self._config)
+            self._state, metrics = train_step(self._state, self._batch, network=self._network)
         if not np.isfinite(metrics["loss"]):
             raise FloatingPointError(f"the loss is {metrics['loss']}: what was timed is no training")
 
     def program(self) -> jax.stages.Compiled:
         """The compiled step."""
-        return train_step.lower(self._state, self._batch, config=self._config).compile()
+        return train_step.lower(self._state, self._batch, network=self._network).compile()
 
 
 def step_work(config: TrainConfig, calls: int, *, labels: bool = True) -> Work:

@@ -11,13 +11,13 @@ import numpy as np
 
 from benchmarks.speed.inputs import comparable_model, random_batch, random_images, random_params
 from benchmarks.timing import Contender, Job, check_equal, in_turn, report, warn_if_busy
-from sglpr_jax.data.sampling.batch import Batch, views
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe as describe_images
+from sglpr_jax.training.batches import Batch, views
 from sglpr_jax.training.config import LossConfig, TrainConfig
-from sglpr_jax.training.state import new_state
+from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.step import train_step
 
 Preset = Literal["circular", "sglpr"]
@@ -128,11 +128,12 @@ def seen_images(batch: Batch, config: TrainConfig) -> tuple[np.ndarray, np.ndarr
 
 def _jax_trains(params: Params, batch: Batch, config: TrainConfig) -> Job:
     """Our `train_step`, from step to step."""
-    state, batch = new_state(config, params=jax.device_put(params)), jax.device_put(batch)
+    network = ImageNetwork(config)
+    state, batch = network.new_state(jax.device_put(params)), jax.device_put(batch)
 
     def job() -> np.ndarray:
         nonlocal state
-        state, metrics = jax.block_until_ready(train_step(state, batch, config=config))
+        state, metrics = jax.block_until_ready(train_step(state, batch, network=network))
         return np.array([metrics["loss"], metrics["gradient_norm"]])
 
     return job

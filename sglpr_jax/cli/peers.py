@@ -14,8 +14,8 @@ from sglpr_jax.methods.names import LearnedName
 
 if TYPE_CHECKING:
     from sglpr_jax.methods.learned.method import LearnedMethod
-    from sglpr_jax.training.learned.inputs import Prepared
-    from sglpr_jax.training.learned.score import ScoreFn
+    from sglpr_jax.training.peer_inputs import Prepared
+    from sglpr_jax.training.peers import ScoreFn
 
 
 RATES = "rates"
@@ -73,8 +73,7 @@ def run_peers(command: PeersCommand) -> None:
 def train_peer(command: PeersCommand) -> Path:
     """Train a method. Returns the folder of the run. If the training is asked to stop, saves its state and exits."""
     from sglpr_jax.methods.learned import LEARNED  # slow imports, not needed for --help
-    from sglpr_jax.training.learned.run import train_learned
-    from sglpr_jax.training.learned.run_files import RunSettings
+    from sglpr_jax.training.peers import RunSettings, train_learned
 
     if command.method is None or not command.data or command.out is None:
         raise ValueError("expected bin/peers train METHOD DATA... --out RUN, found no METHOD, DATA or --out")
@@ -109,8 +108,9 @@ def _has_run(out: Path, *, resume: bool) -> bool:
 def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[Prepared, ScoreFn | None]":
     """Prepare the training recordings and the held-out ones. Raises ValueError if one of them does not fit."""
     from sglpr_jax.cli.datasets import all_recordings
-    from sglpr_jax.training.learned.inputs import prepared
-    from sglpr_jax.training.learned.score import held_out_score, require_revisits
+    from sglpr_jax.training.peer_inputs import prepared
+    from sglpr_jax.training.peers import held_out_score
+    from sglpr_jax.training.validation import require_revisits
 
     cache = command.cache or cache_folder() / "peers"
     if command.held_out is not None and command.held_out.resolve() in {path.resolve() for path in command.data}:
@@ -133,7 +133,7 @@ def _learning_rate(
     stopped: StopRequest,
 ) -> float:
     """Return the stated learning rate, the best of a search, or the published one."""
-    from sglpr_jax.training.learned.rate_search import Stopped, best_rate
+    from sglpr_jax.training.peers import Stopped, best_rate
 
     if command.learning_rate is not None:
         return command.learning_rate

@@ -53,7 +53,7 @@ class ReproduceCommand:
     out: Path = Path("runs/reproduce")
     """Folder for the runs, tables and pictures."""
     method: tuple[str, ...] = ("m2dp", "scan-context", "lidar-iris", "ssc", "solid", "polar-fft")
-    """Handcrafted methods in tables 1 to 3 and figure 5. On ready-made images, only polar-fft and thumbnail work."""
+    """Handcrafted methods in tables 1 to 3 and figure 5. On ready-made images, only polar-fft works."""
     weights: tuple[str, ...] = ()
     """Further weights in tables 1 to 3 and figure 5: names of shipped weights, or folders of bin/train or bin/peers.
     They may have been trained on the tested recordings; this is not checked."""

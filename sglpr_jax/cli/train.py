@@ -107,7 +107,7 @@ def parse(arguments: list[str] | None = None) -> TrainCommand:
 def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
     """Run the command. Returns the folder of the run. `go_on` is printed as advice if the training is stopped."""
     from sglpr_jax.evaluation.final_test import final_test  # slow imports, not needed for --help
-    from sglpr_jax.training.hosts import connected, is_first_host
+    from sglpr_jax.training.devices import connected, is_first_host
 
     folder = run_folder(command)
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
@@ -142,11 +142,9 @@ def _train(
 ) -> "TrainResult":
     """Train. If the training is asked to stop, save its state and exit."""
     from sglpr_jax.evaluation.learning_curves import LearningCurves
-    from sglpr_jax.training.callbacks import Callbacks
-    from sglpr_jax.training.hosts import is_first_host
-    from sglpr_jax.training.progress_bar import ProgressBar
+    from sglpr_jax.training.callbacks import EVENTS, Callbacks, EventFiles, ProgressBar
+    from sglpr_jax.training.devices import is_first_host
     from sglpr_jax.training.recipe import train
-    from sglpr_jax.training.tensorboard import EVENTS, EventFiles
 
     folder = run_folder(command)
     watched = [EventFiles(folder / EVENTS)] if command.tensorboard else []

@@ -5,9 +5,9 @@ from typing import Any
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.loop import METRICS_FILE
 from sglpr_jax.training.loss import TERM_NAMES
 from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.trainer import METRICS_FILE
 
 PICTURE = "learning-curves.png"
 _PANELS = {

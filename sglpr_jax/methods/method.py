@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.grid import Grid, ImageKind
 
 Takes = Literal["images", "points", "labelled points"]
@@ -91,3 +91,28 @@ class RecordMethod:
 
 Method = ImageMethod | ScanMethod | RecordMethod
 """A method that `retrieval.embed` accepts."""
+
+
+def require_content(name: str, takes: Takes, recording: Recording, *, every_label: bool = False) -> None:
+    """Raise ValueError, in one line, if a recording lacks the points or labels of the method called `name`.
+
+    Arguments:
+      name: Name of the method.
+      takes: Input of the method. Methods on images also accept scans.
+      recording: Recording to check.
+      every_label: Whether every scan must have labels. Otherwise one label file suffices.
+    """
+    if takes == "images":
+        return
+    if recording.has_images:
+        raise ValueError(f"{name} needs points, found only images in sequence {recording.name}")
+    if takes != "labelled points":
+        return
+    if not recording.has_labels:
+        raise ValueError(f"{name} needs labels beside the scans, found none in sequence {recording.name}")
+    missing = [name for name, labelled in zip(recording.ids, recording.labelled, strict=True) if not labelled]
+    if every_label and missing:
+        raise ValueError(
+            f"{name} needs labels of every scan, found none for {len(missing)} scans of sequence {recording.name}, "
+            f"the first is {missing[0]}"
+        )

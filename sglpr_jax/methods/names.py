@@ -13,8 +13,6 @@ HANDCRAFTED_NAMES = (
     "ring",
     "probe",
     "polar-fft",
-    "thumbnail",
-    "random",
 )
 METHODS = (NETWORK, *HANDCRAFTED_NAMES)
 """Names of the methods that need no trained weights of their own, or have shipped ones."""
@@ -31,7 +29,7 @@ LEARNED_NAMES = (
 UNTRAINED, SHIPPED = "untrained", "shipped"
 """Methods for comparison with a newly trained network: the same network with random weights, and the default
 weights."""
-BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
+BESIDE = (UNTRAINED, "polar-fft")
 """Default methods for comparison with a newly trained network."""
 
 if TYPE_CHECKING:

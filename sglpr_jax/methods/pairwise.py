@@ -1,4 +1,4 @@
-"""Distances between all pairs of two sets of descriptors, in blocks that bound the memory, and for all shifts."""
+"""Unit vectors, and distances between all pairs of two sets of descriptors, in blocks and for all shifts."""
 
 import os
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 Rows = Float32[np.ndarray, "rows d"]
 
@@ -53,3 +53,9 @@ def correlate(
     spectra = (np.moveaxis(np.fft.rfft(scans), -1, 0) for scans in (queries, database))
     by_frequency = next(spectra).conj() @ next(spectra).swapaxes(1, 2)
     return np.fft.irfft(np.moveaxis(by_frequency, 0, -1), n=queries.shape[-1])
+
+
+def unit_length(vectors: Float[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
+    """Return each vector divided by its length. Zero vectors stay zero."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0).astype(np.float32)

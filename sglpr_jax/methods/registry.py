@@ -12,8 +12,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
-from sglpr_jax.methods.learned.describe import apply_network
-from sglpr_jax.methods.learned.distance import stated_distance
+from sglpr_jax.methods.learned.describe import apply_network, stated_distance
 from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.weights_file import load_variables, method_of, variables_hash
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, RecordMethod, ScanMethod

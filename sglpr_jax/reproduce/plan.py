@@ -14,8 +14,8 @@ from sglpr_jax.methods.registry import method_with_weights
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
 from sglpr_jax.reproduce.runs import Runs, content_of
 from sglpr_jax.revisits import revisits
-from sglpr_jax.training.batches import TupleBatches, tuple_pool
-from sglpr_jax.training.state import new_state
+from sglpr_jax.training.batches import batches_of, tuple_pool
+from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.step import train_step
 
 TIMED_STEPS = 3
@@ -154,11 +154,12 @@ def time_a_step(runs: Runs, variant: str, seq: str) -> float:
     first."""
     config = runs.config_of(variant)
     recordings = runs.recordings_but(seq)
-    state, batches = new_state(config), TupleBatches(recordings, tuple_pool(recordings, config), config)
+    network, batches = ImageNetwork(config), batches_of(recordings, tuple_pool(recordings, config), config)
+    state = network.new_state()
     seconds = []
     for step in range(1 + TIMED_STEPS):
         since = time.perf_counter()
-        state, metrics = train_step(state, batches.batch(step), config=config)
+        state, metrics = train_step(state, batches.batch(step), network=network)
         jax.block_until_ready(metrics)
         seconds.append(time.perf_counter() - since)
     return sum(seconds[1:]) / TIMED_STEPS

@@ -22,10 +22,9 @@ from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.reuse import embed_or_reuse
-from sglpr_jax.training.callbacks import Callbacks
+from sglpr_jax.training.callbacks import Callbacks, ProgressBar
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.progress_bar import ProgressBar
-from sglpr_jax.training.recipe import TrainResult, train
+from sglpr_jax.training.recipe import LIMITS, TrainResult, run_settings, train
 from sglpr_jax.training.run_folder import CONFIG_FILE, require_same_settings
 
 ROTATION_SEED = 0
@@ -68,7 +67,8 @@ class Runs:
         folder = self._folder(variant, seq)
         if not _begun(folder):
             return False
-        require_same_settings(folder, self.config_of(variant), self._settings(seq))
+        settings = run_settings(self.config_of(variant), self._settings(seq))
+        require_same_settings(folder, settings, limits=LIMITS)
         done = folder / DONE_FILE
         steps = read_json(done) if done.is_file() else {"steps": 0}
         if not isinstance(steps, dict) or type(steps := steps.get("steps")) is not int:

@@ -76,6 +76,6 @@ def distance_function(name: str) -> DistanceFn:
 
 def _learned(name: str) -> DistanceFn:
     from sglpr_jax.methods.learned import LEARNED  # slow import: the networks
-    from sglpr_jax.methods.learned.distance import distance_of_weights
+    from sglpr_jax.methods.learned.describe import distance_of_weights
 
     return distance_of_weights(LEARNED[name.partition(":")[0]], name)

@@ -20,9 +20,8 @@ from sglpr_jax.data.submap import SUBMAPS
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.learned.content import require_content
 from sglpr_jax.methods.learned.describe import check_descriptors
-from sglpr_jax.methods.method import ImageMethod, Method, RecordMethod, ScanMethod
+from sglpr_jax.methods.method import ImageMethod, Method, RecordMethod, ScanMethod, require_content
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view

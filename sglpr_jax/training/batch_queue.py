@@ -1,27 +1,28 @@
-"""Batches of a run in order. They are prefetched, but only up to the next refresh of the mined negatives."""
+"""Batches of a run in order, read by a thread while the device works, but only up to the next refresh of mining."""
 
-from abc import ABC, abstractmethod
+import queue
+import threading
 from collections.abc import Callable, Generator
+from typing import Any, TypeVar
 
-from sglpr_jax.data.sampling.batch import Batch
-from sglpr_jax.data.sampling.read_ahead import read_ahead
-from sglpr_jax.models.params import Params
+from sglpr_jax.training.step import TrainState
+
+T = TypeVar("T")
 
 
-class BatchSource(ABC):
-    """Source of the batches of a run."""
+class BatchSource:
+    """Source of the batches of a run. Subclasses define `batch`."""
 
     refresh_steps: int = 0
     """Number of steps between calls of `refresh`, or 0 for no refresh. No batch at or after a refresh step may be
     requested before that call."""
 
-    @abstractmethod
-    def batch(self, step: int) -> Batch:
+    def batch(self, step: int) -> Any:
         """Return this host's part of the batch of a step. Repeated calls return the same batch."""
+        raise NotImplementedError
 
-    def refresh(self, step: int, params: Params) -> None:
-        """Give the source the weights before a step. The batches from that step on may depend on these weights."""
-        return None  # default: the batches do not depend on the weights
+    def refresh(self, step: int, state: TrainState) -> None:
+        """Give the source the state before a step. The batches from that step on may depend on it."""
 
     def places(self, step: int) -> str:
         """Describe the places in the batch of a step, for error messages."""
@@ -36,22 +37,22 @@ class BatchQueue:
     """
 
     def __init__(
-        self, source: BatchSource, *, start: int, stop: int, place: Callable[[Batch], Batch] = lambda batch: batch
+        self, source: BatchSource, *, start: int, stop: int, place: Callable[[Any], Any] = lambda batch: batch
     ):
         self._source, self._place = source, place
         self._next, self._stop = start, stop
         self._ahead = self._read(start if source.refresh_steps else stop)
 
-    def prepare(self, params: Params) -> None:
-        """Refresh the source if the next step requires it. `params` are the current weights."""
+    def prepare(self, state: Callable[[], TrainState]) -> None:
+        """Refresh the source with the current state if the next step requires it."""
         every = self._source.refresh_steps
         if not every or self._next < self._end:
             return
         self._ahead.close()
-        self._source.refresh(self._next, params)
+        self._source.refresh(self._next, state())
         self._ahead = self._read(self._next - self._next % every + every)
 
-    def __next__(self) -> Batch:
+    def __next__(self) -> Any:
         batch = next(self._ahead)
         self._next += 1
         return batch
@@ -60,6 +61,45 @@ class BatchQueue:
         """Stop the prefetching thread."""
         self._ahead.close()
 
-    def _read(self, end: int) -> Generator[Batch, None, None]:
+    def _read(self, end: int) -> Generator[Any, None, None]:
         self._end = min(end, self._stop)
         return read_ahead(lambda step: self._place(self._source.batch(step)), start=self._next, stop=self._end)
+
+
+def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 2) -> Generator[T, None, None]:
+    """Yield make(start), ..., make(stop - 1) in order. A thread computes up to `depth` values ahead.
+
+    An exception of `make` is raised when its value is due. Closing the iterator stops the thread.
+    """
+    ready: queue.Queue = queue.Queue(maxsize=depth)
+    ended = threading.Event()
+
+    def put(item) -> bool:
+        while not ended.is_set():
+            try:
+                ready.put(item, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def work():
+        for step in range(start, stop):
+            try:
+                item = (make(step), None)
+            except BaseException as error:  # The consumer raises it.
+                item = (None, error)
+            if not put(item) or item[1] is not None:
+                return
+
+    thread = threading.Thread(target=work, name="read-ahead", daemon=True)
+    thread.start()
+    try:
+        for _ in range(start, stop):
+            value, error = ready.get()
+            if error is not None:
+                raise error
+            yield value
+    finally:
+        ended.set()
+        thread.join()

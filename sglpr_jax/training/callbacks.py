@@ -1,7 +1,20 @@
-"""Hooks that run during training: progress display, logs of measurements, curves."""
+"""Hooks that run during training: the progress on stderr, and event files for TensorBoard."""
 
 import contextlib
+import sys
+import time
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from sglpr_jax.files import writing
+from sglpr_jax.training.loss import MEASURES, TERM_NAMES
+
+EVENTS = "tensorboard"
+_SHOWN = ("loss", *TERM_NAMES, *MEASURES, "steps_per_second")
 
 
 class Callback:
@@ -73,3 +86,105 @@ class Callbacks(Callback):
         with contextlib.ExitStack() as closing:
             for callback in reversed(self._callbacks):
                 closing.callback(callback.close)
+
+
+class ProgressBar(Callback):
+    """Shows finished steps, remaining time and the latest measurements.
+
+    Without a terminal it prints a line for each call of `on_step`.
+    """
+
+    def __init__(self):
+        self._progress: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+        self._steps = 0
+
+    def on_pack(self, recording: str, done: int, scans: int) -> None:
+        """Show how many scans of the recording are packed."""
+        self._show(f"pack {recording}", done, scans)
+
+    def on_start(self, step: int, steps: int) -> None:
+        """Show the number of finished steps."""
+        self._steps = steps
+        self._show("train", step, steps)
+
+    def on_step(self, step: int, values: Mapping[str, float]) -> None:
+        """Show the step and its measurements."""
+        terms = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
+        self._show("train", step, None, terms=terms)
+        if self._progress is not None and self._progress.disable:
+            print(f"step {step} of {self._steps}: {terms}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Stop the bar and leave it on the screen."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+            self._tasks.clear()  # the next training run gets new bars
+
+    def _show(self, title: str, done: int, total: int | None, *, terms: str = "") -> None:
+        if self._progress is None:
+            self._progress = _progress()
+            self._progress.start()
+        if title not in self._tasks:
+            self._tasks[title] = self._progress.add_task(title, total=total, terms="")
+        self._progress.update(self._tasks[title], completed=done, terms=terms)
+
+
+def _progress() -> Progress:
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, TextColumn("{task.fields[terms]}"), console=console, disable=not console.is_terminal)
+
+
+class EventFiles(Callback):
+    """Writes all measurements into event files in a folder, without delay.
+
+    The first record hides what an interrupted run wrote for this step and later ones. Raises ImportError if the extra
+    is not installed. Writing raises OSError if the files cannot be written.
+    """
+
+    def __init__(self, folder: Path):
+        try:
+            import tensorboardX  # noqa: F401
+        except ImportError as error:
+            raise ImportError("event files need the extra tensorboard: pip install 'sglpr-jax[tensorboard]'") from error
+        self._folder = folder
+        self._writer: Any = None
+
+    def on_step(self, step: int, values: Mapping[str, float]) -> None:
+        """Write the measurements of a step."""
+        self._write(step, values)
+
+    def on_score(self, step: int, scores: Mapping[str, float]) -> None:
+        """Write the scores after a step."""
+        self._write(step, scores)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._writer is not None:
+            with writing(self._folder):
+                self._writer.close()
+            self._writer = None
+
+    def _write(self, step: int, values: Mapping[str, float]) -> None:
+        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - generated
+        from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
+
+        scalars = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+        with writing(self._folder):
+            if self._writer is None:
+                self._writer = _new_writer(self._folder, step)
+            self._writer.write_event(Event(wall_time=time.time(), step=step, summary=Summary(value=scalars)))
+            self._writer.flush()
+
+
+def _new_writer(folder: Path, step: int) -> Any:
+    # tensorboardX's SummaryWriter writes from a thread, where errors are lost.
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+
+    folder.mkdir(parents=True, exist_ok=True)
+    writer = EventsWriter(str(folder / "events"))
+    writer.write_event(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
+    return writer

@@ -1,214 +1,155 @@
-"""Checkpoints of a training run. Checkpoints are written atomically with checksums. The newest ones and the best one
-are kept.
+"""Checkpoints of a training run: one safetensors file each, complete or absent, with the SHA-256 of its values.
 
-This is the only file that imports orbax.
+17.safetensors            state after step 17, and JSON about it: its score and what the run had measured and spent
+damaged-17.safetensors    renamed file whose values do not match their checksum
 
-17/               one checkpoint: weights, optimizer, metrics, measurements that are not logged yet, checksums.json
-damaged-17/       renamed checkpoint whose files do not match their checksums
+The newest two checkpoints and the one with the best score are kept.
 """
 
-import asyncio
-import contextlib
-import shutil
+import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
-from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
-from orbax.checkpoint.path import atomicity
+import safetensors
 
-from sglpr_jax.files import in_short
-from sglpr_jax.models.params import Params
-from sglpr_jax.training.checksums import damage, write_checksums
-from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.hosts import is_first_host, on_all_hosts
-from sglpr_jax.training.state import TrainState, new_state
+from sglpr_jax.files import replacing
+from sglpr_jax.methods.learned.weights_file import check_leaves, checked_tensors, read_tensors
+from sglpr_jax.training.devices import is_first_host, on_all_hosts
+from sglpr_jax.training.step import TrainState
 
+ENDING = ".safetensors"
 _KEPT_LATEST = 2
-_MOST_OF_AN_ERROR = 500
-"""Maximum number of characters of an error of orbax, whose reason comes last. The folder is not counted."""
-_INTACT = "the last checkpoint is intact"
-_UNLOGGED = "unlogged"
-_OUTDATED = "outdated"
-"""Folder to which a checkpoint is moved before it is deleted. A partly deleted checkpoint would look like a valid
-one."""
-
-
-class _WithChecksums(atomicity.AtomicRenameTemporaryPath):
-    """Temporary checkpoint folder that gets its checksums before it is renamed to its final name."""
-
-    async def finalize(self) -> None:
-        """Called once for each item, and once for the whole checkpoint."""
-        if self.get_final().name.isdecimal():
-            await asyncio.to_thread(write_checksums, Path(self.get()))
-        await super().finalize()
+_ABOUT = "about"
+"""Name of the array with the bytes of the JSON text, so that its checksum is that of the values."""
 
 
 class Checkpoints:
-    """Checkpoints in one folder. Weights and optimiser state are separate items, so that each can be read alone."""
+    """Checkpoints in one folder, which all hosts share. The first host writes them."""
 
     def __init__(self, folder: Path):
         """Rename damaged checkpoints and report them on stderr. Raises ValueError if all checkpoints are damaged."""
         self._folder = folder.resolve()
-        self._sweep()
         on_all_hosts(lambda: is_first_host() and set_damaged_aside(self._folder))
-        policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=_score, n=1)])
-        options = ocp.CheckpointManagerOptions(
-            best_fn=_score,  # without it no scores are written, and a resumed run keeps all checkpoints
-            preservation_policy=policy,
-            cleanup_tmp_directories=True,
-            todelete_subdir=_OUTDATED,
-            temporary_path_class=_WithChecksums,
-        )
-        handlers: dict[str, Any] = {name: ocp.StandardCheckpointHandler() for name in ("weights", "optimizer")}
-        handlers[_UNLOGGED] = ocp.JsonCheckpointHandler()
-        self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=handlers)
+        self._scores = {step: _about(self._path(step))["score"] for step in checkpoint_steps(self._folder)}
 
-    def save(
-        self, state: TrainState, *, score: float | None = None, unlogged: Sequence[Mapping[str, float]] = ()
-    ) -> None:
+    def save(self, state: TrainState, *, score: float | None = None, about: Mapping[str, Any] | None = None) -> None:
         """Write the state under its step. An existing checkpoint of that step stays unchanged.
 
         Arguments:
           state: State to save.
           score: Score of the weights, if it was measured.
-          unlogged: Measurements of the steps since the last line of the log.
+          about: Further JSON values, which `restore` returns.
 
         Raises:
-          OSError: This checkpoint, or the previous one that is still being written, cannot be written.
+          OSError: The checkpoint cannot be written. The earlier ones are intact.
         """
         step = int(state.step)
-        if step in self._manager.all_steps():
-            return
-        self._wait()
-        self._require_room(state)
-        items = ocp.args.Composite(
-            weights=ocp.args.StandardSave(state.params.weights),
-            optimizer=ocp.args.StandardSave(state.optimizer),
-            unlogged=ocp.args.JsonSave({_UNLOGGED: [dict(measured) for measured in unlogged]}),
-        )
-        with self._writing():
-            self._manager.save(
-                step,
-                args=items,
-                metrics={"score": -1.0 if score is None else score},
-                force=True,
-            )
+        if step not in self._scores:
+            score = -1.0 if score is None else score
+            text = json.dumps({**(about or {}), "score": score})
+            on_all_hosts(lambda: is_first_host() and self._write(state, text))
+            self._scores[step] = score
+            self._drop_old()
 
+    @property
     def latest_step(self) -> int | None:
-        """Return the step of the newest complete checkpoint, or None."""
-        return self._manager.latest_step()
+        """Step of the newest checkpoint, or None."""
+        return max(self._scores, default=None)
 
-    def restore(self, config: TrainConfig) -> TrainState:
-        """Return the newest state, in host memory because the devices may differ from those of the saved run.
+    def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        """Return the newest state, which has the arrays of `like`, in host memory, and the JSON values about it.
 
         Raises ValueError if there is no checkpoint, or if it belongs to another model.
         """
-        self._wait()
-        step = self.latest_step()
-        if step is None:
-            raise ValueError(f"{self._manager.directory}: expected a checkpoint to resume from, found none")
-        like = jax.eval_shape(lambda: new_state(config))
-        # Check before any array is read: if reading one fails, orbax abandons the others half-way.
-        there, expected = _shapes(self._manager.item_metadata(step).weights), _shapes(like.params.weights)
-        if there != expected:
-            name = min(dict(set(there.items()) ^ set(expected.items())))
-            raise ValueError(
-                f"{self._manager.directory}/{step}: not a checkpoint of this configuration: expected {name} of shape "
-                f"{expected.get(name, 'none (unknown weight)')}, found {there.get(name, 'none (missing)')}"
-            )
-        weights, moments = (
-            jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), tree)
-            for tree in (like.params.weights, like.optimizer)
-        )
-        items = ocp.args.Composite(
-            weights=ocp.args.StandardRestore(weights), optimizer=ocp.args.StandardRestore(moments)
-        )
-        found: Any = self._manager.restore(step, args=items)
-        return TrainState(np.int32(step), Params(found.weights, config.model), found.optimizer)
+        if self.latest_step is None:
+            raise ValueError(f"{self._folder}: expected a checkpoint to resume from, found none")
+        path = self._path(self.latest_step)
+        return _read(path, like), _about(path)
 
-    def unlogged(self) -> list[dict[str, float]]:
-        """Return the measurements that were saved with the newest state."""
-        self._wait()
-        found: Any = self._manager.restore(self.latest_step(), args=ocp.args.Composite(unlogged=ocp.args.JsonRestore()))
-        return found.unlogged[_UNLOGGED]
-
-    def best_params(self, config: TrainConfig) -> Params:
-        """Return the weights with the best score among the kept checkpoints. Of several equal scores, the latest
-        counts.
+    def best(self, like: TrainState) -> TrainState:
+        """Return the state with the best score. Of several equal scores, the latest counts.
 
         Raises ValueError if there is no checkpoint.
         """
-        self._manager.wait_until_finished()
-        scores = {step: (self._manager.metrics(step) or {}).get("score", -1.0) for step in self._manager.all_steps()}
-        if not scores:
-            raise ValueError(f"{self._manager.directory}: expected a checkpoint with a score, found none")
-        best = max(scores, key=lambda step: (scores[step], step))
-        like = jax.eval_shape(lambda: new_state(config)).params.weights
-        items = ocp.args.Composite(weights=ocp.args.StandardRestore(like))
-        found: Any = self._manager.restore(best, args=items)
-        return Params(found.weights, config.model)
+        if not self._scores:
+            raise ValueError(f"{self._folder}: expected a checkpoint with a score, found none")
+        return _read(self._path(self._best_step()), like)
 
-    def close(self) -> None:
-        """Wait until everything is written. Raises OSError if writing fails."""
-        with self._writing():
-            self._manager.close()
-        self._sweep()
+    def _write(self, state: TrainState, text: str) -> None:
+        values = {name: np.asarray(leaf, order="C") for name, leaf in _by_path(state).items()}
+        content = checked_tensors({**values, _ABOUT: np.frombuffer(text.encode(), np.uint8)})
+        with replacing(self._path(int(state.step))) as temporary:
+            temporary.write_bytes(content)
 
-    def _wait(self) -> None:
-        with self._writing():
-            self._manager.wait_until_finished()
-        self._sweep()
+    def _drop_old(self) -> None:
+        kept = {self._best_step(), *sorted(self._scores)[-_KEPT_LATEST:]}
+        for step in self._scores.keys() - kept:
+            del self._scores[step]
+            if is_first_host():
+                self._path(step).unlink()
 
-    def _sweep(self) -> None:
-        shutil.rmtree(self._folder / _OUTDATED, ignore_errors=True)
+    def _best_step(self) -> int:
+        return max(self._scores, key=lambda step: (self._scores[step], step))
 
-    def _require_room(self, state: TrainState) -> None:
-        """Raise OSError before writing if the disk has too little space for a checkpoint."""
-        needed = sum(leaf.nbytes for leaf in jax.tree.leaves((state.params.weights, state.optimizer)))
-        free = shutil.disk_usage(self._folder).free
-        if free < needed:
-            raise OSError(f"{self._folder}: expected {needed:,} bytes free for a checkpoint, found {free:,}; {_INTACT}")
+    def _path(self, step: int) -> Path:
+        return self._folder / f"{step}{ENDING}"
 
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Replace the long errors of orbax by one line with the name of the folder."""
-        try:
-            yield
-        except (OSError, ValueError) as error:
-            named_once = str(error).replace(f"{self._folder}/", "")
-            reason = getattr(error, "strerror", None) or in_short(
-                named_once or type(error).__name__, most=_MOST_OF_AN_ERROR
-            )
-            raise OSError(f"{self._folder}: expected to write a checkpoint, found: {reason}; {_INTACT}") from error
+
+def checkpoint_steps(folder: Path) -> list[int]:
+    """Return the steps of all checkpoints in `folder`, in order."""
+    return sorted(int(path.stem) for path in folder.glob(f"*{ENDING}") if path.stem.isdecimal())
 
 
 def set_damaged_aside(folder: Path) -> None:
-    """Rename the checkpoints in `folder` whose files do not match their checksums, and report them on stderr.
+    """Rename the checkpoints in `folder` whose values do not match their checksum, and report them on stderr.
 
     If all checkpoints are damaged, the function renames none and raises ValueError.
     """
-    steps = [path for path in folder.glob("*") if path.name.isdecimal()]
-    damaged = {path: found for path in steps if (found := damage(path)) is not None}
-    if damaged and len(damaged) == len(steps):
-        newest = max(damaged, key=lambda path: int(path.name))
-        raise ValueError(f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[newest]}")
+    paths = [folder / f"{step}{ENDING}" for step in checkpoint_steps(folder)]
+    damaged = {path: found for path in paths if (found := _damage(path)) is not None}
+    if damaged and len(damaged) == len(paths):
+        raise ValueError(
+            f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[max(damaged, key=_step)]}"
+        )
     for path, found in damaged.items():
-        names = (path.with_name(f"damaged-{path.name}{suffix}") for suffix in ("", *map("-{}".format, range(2, 100))))
+        names = (
+            path.with_name(f"damaged-{path.stem}{suffix}{ENDING}") for suffix in ("", *map("-{}".format, range(2, 100)))
+        )
         aside = next(name for name in names if not name.exists())
         path.rename(aside)
-        print(f"damaged checkpoint {path} set aside as {aside.name}: {found}", file=sys.stderr)
+        print(f"damaged checkpoint set aside as {aside.name}: {found}", file=sys.stderr)
 
 
-def _score(metrics: Any) -> float:
-    return metrics["score"]
+def _damage(path: Path) -> str | None:
+    try:
+        if _ABOUT in read_tensors(path):
+            return None
+    except (ValueError, OSError) as error:
+        return str(error)
+    return f"{path}: expected a checkpoint, found other arrays"
 
 
-def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every array by its path."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): tuple(leaf.shape) for path, leaf in leaves}
+def _step(path: Path) -> int:
+    return int(path.stem)
+
+
+def _read(path: Path, like: TrainState) -> TrainState:
+    values, expected = read_tensors(path), _by_path(like)
+    del values[_ABOUT]
+    check_leaves(values, expected, source=path)
+    return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in expected])
+
+
+def _about(path: Path) -> dict[str, Any]:
+    with safetensors.safe_open(path, framework="np") as file:
+        return json.loads(file.get_tensor(_ABOUT).tobytes())
+
+
+def _by_path(state: TrainState) -> dict[str, Any]:
+    """Return every array by its place in the state."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -1,10 +1,10 @@
 """Settings of a training run as plain values, readable without JAX. The presets in configs/ set them."""
 
 import dataclasses
-from typing import Literal
+from typing import Annotated, Literal
 
-from sglpr_jax.data.sampling.config import TupleConfig, ValidationConfig
-from sglpr_jax.fields import Count, CountOrNone, Degrees, NotNegative, Positive, Share, check_fields
+from sglpr_jax.fields import Bounds, Count, CountOrNone, Degrees, NotNegative, Positive, Share, check_fields
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import ModelConfig
 
 
@@ -88,6 +88,18 @@ class OcclusionConfig:
     """Fraction of the images of a step that are occluded."""
     widest_deg: Degrees = 180.0
     """Maximum width of the hidden sector, in degrees. Widths are drawn uniformly from 0 to this value."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class ValidationConfig:
+    """Held-out part of every training recording."""
+
+    share: Annotated[float, Bounds(0, 0.5)] = 0.0
+    """Length of the held-out stretch of consecutive frames, as a fraction of the recording; 0: none, as in the
+    paper."""
 
     def __post_init__(self):
         check_fields(self)

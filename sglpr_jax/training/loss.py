@@ -11,11 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax import losses
-from sglpr_jax.data.sampling.batch import Batch
+from sglpr_jax.training.batches import Batch, in_batch_order, in_network_order
 from sglpr_jax.training.config import LossConfig
-from sglpr_jax.training.place_order import in_batch_order, in_network_order
-
-Metrics = dict[str, Float[Array, ""]]
+from sglpr_jax.training.step import Metrics
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,13 +1,16 @@
-"""Measurements of a run as JSON lines. Lines are appended, so an interrupted run loses none."""
+"""Measurements of a run as JSON lines, and its speed. Lines are appended, so an interrupted run loses none."""
 
 import contextlib
+import dataclasses
 import itertools
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sglpr_jax.files import parse_json, write_text, writing
 
@@ -15,14 +18,10 @@ from sglpr_jax.files import parse_json, write_text, writing
 class MetricsLog:
     """Append-only file of JSON lines. After a resume, lines of steps that will be repeated are removed.
 
-    Without a path nothing is written: of several hosts, only one keeps the log. Raises OSError, with the name of the
-    file, if a line cannot be written.
+    Raises OSError, with the name of the file, if a line cannot be written.
     """
 
-    def __init__(self, path: Path | None, *, start_step: int = 0):
-        self._file = None
-        if path is None:
-            return
+    def __init__(self, path: Path, *, start_step: int = 0):
         kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
         write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
         self._path = path
@@ -30,26 +29,20 @@ class MetricsLog:
 
     def append(self, step: int, values: Mapping[str, Any]) -> None:
         """Write the measurements of one step. Values that are not finite become null."""
-        self._write({"step": step, **{name: _plain(value) for name, value in values.items()}})
-
-    def sync(self) -> None:
-        """Flush the lines to disk. Called before a checkpoint, which must not be ahead of the log."""
-        if self._file:
-            with writing(self._path):
-                os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._file:
-            self._file.close()
-
-    def _write(self, line: dict[str, Any]) -> None:
-        if not self._file:
-            return
+        line = {"step": step, **{name: _plain(value) for name, value in values.items()}}
         left = json.dumps(line).encode() + b"\n"
         with writing(self._path):
             while left:  # a nearly full disk may accept only a part
                 left = left[self._file.write(left) :]
+
+    def sync(self) -> None:
+        """Flush the lines to disk. Called before a checkpoint, which must not be ahead of the log."""
+        with writing(self._path):
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -82,3 +75,31 @@ def _is_measured(value: Any) -> bool:
 def _plain(value: Any) -> float | None:
     value = float(value)
     return value if math.isfinite(value) else None
+
+
+@dataclasses.dataclass(frozen=True)
+class Throughput:
+    """Speed of a run without scores and compilation: steps per second, and fraction of the time spent waiting for
+    data."""
+
+    steps_per_second: float
+    data_wait: float
+
+
+def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
+    """Return the mean throughput over all lines of the log that state a speed, or None if no line states one.
+
+    The first line after a start or a resume has no speed, because the step is compiled then. Logs of earlier versions
+    have a speed on these lines: the very first line is skipped, but the first line after each resume is counted.
+    """
+    timed = [
+        (line["step"] - before["step"], line)
+        for before, line in itertools.pairwise(lines)
+        if "steps_per_second" in line
+    ]
+    if not timed:
+        return None
+    steps = np.array([made for made, _ in timed])
+    seconds = steps / [line["steps_per_second"] for _, line in timed]
+    waited = seconds * [line["data_wait"] for _, line in timed]
+    return Throughput(float(steps.sum() / seconds.sum()), float(waited.sum() / seconds.sum()))

@@ -12,28 +12,32 @@ import numpy as np
 
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.sampling.held_out import hold_out
-from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import graft, unwhitened
 from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.training.batches import TupleBatches, positions_of, tuple_pool
+from sglpr_jax.training.batch_queue import BatchSource
+from sglpr_jax.training.batches import batches_of, positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.checkpoint import Checkpoints, checkpoint_steps
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
-from sglpr_jax.training.describe_places import describe_places
-from sglpr_jax.training.devices import own_copy
-from sglpr_jax.training.hosts import is_first_host, on_all_hosts
-from sglpr_jax.training.loop import METRICS_FILE, ScoreFn, best_params, checkpoint_steps, run_steps
-from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.devices import data_mesh, is_first_host, of_first_host, on_all_hosts, own_copy
+from sglpr_jax.training.image_network import ImageNetwork
+from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
 from sglpr_jax.training.mining import FOLDER as MINING
 from sglpr_jax.training.mining import Mining
 from sglpr_jax.training.run_folder import claimed
-from sglpr_jax.training.throughput import Throughput, throughput
-from sglpr_jax.training.training_recall import training_recall
-from sglpr_jax.training.validation import validation_score
+from sglpr_jax.training.step import TrainState
+from sglpr_jax.training.trainer import CHECKPOINTS, METRICS_FILE, Schedule, Trained, run_steps
+from sglpr_jax.training.tuples import TuplePool, hold_out
+from sglpr_jax.training.validation import describe_places, training_recall, validation_score
 
 WEIGHTS = "weights"
+LIMITS = ("config.steps",)
+"""Settings that may differ in a resumed run."""
+
+ScoreFn = Callable[[Params], dict[str, float]]
+"""Scores weights. The entry "score" selects the best checkpoint."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -127,11 +131,16 @@ def train(
         pack = functools.partial(_packed, cache=cache, callback=followed, stopped=stopped)
         recordings, also = on_all_hosts(lambda: (pack(recordings), pack(also)))
         source, score = _source_and_score(recordings, also, config, folder)
-        made = max(checkpoint_steps(folder), default=0) if resume else 0
+        made = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
         start_from = None if weights is None or made else _grafted(weights, config)
-        claim = claimed(folder, config, settings, resume=resume, made=made)
+        if config.steps < made:
+            raise ValueError(
+                f"{folder}: expected at least the {made} steps that are already done, found {config.steps}"
+            )
+        noted = run_settings(config, settings)
+        claim = claimed(folder, noted, seed=config.seed, resume=resume, limits=LIMITS)
         on_all_hosts(lambda: is_first_host() and opened.enter_context(claim))
-        state = run_steps(
+        run = run_network(
             config,
             source,
             folder,
@@ -141,14 +150,45 @@ def train(
             callback=followed,
             stopped=stopped,
         )
-        result = _finish(state.params, int(state.step), folder, config)
+        result = _finish(run.state, folder, config)
         followed.on_end(result.steps)
     return result
 
 
+def run_settings(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a run's config.json."""
+    return {**settings, "config": dataclasses.asdict(config)}
+
+
+def run_network(
+    config: TrainConfig,
+    source: BatchSource,
+    folder: Path,
+    *,
+    score: ScoreFn,
+    start_from: Params | None = None,
+    **options: Any,
+) -> Trained:
+    """Train the network of a configuration with ready-made batches. The options are those of `run_steps`.
+
+    Raises the errors of `run_steps`, and ValueError if the devices cannot share a step (`data_mesh`).
+    """
+
+    def score_once(run: Trained, snapshots: list[int]) -> dict[str, float]:
+        """Compute the scores on the first host. The other hosts receive the entry "score"."""
+        params = run.state.params
+        own = on_all_hosts(lambda: score(own_copy(params)) if is_first_host() else {"score": 0.0})
+        return own | {"score": of_first_host(own["score"])}
+
+    network = ImageNetwork(config)
+    schedule = Schedule(config.log_every, config.score_every, steps=config.steps)
+    begin = functools.partial(network.new_state, start_from)
+    return run_steps(network, source, folder, schedule, mesh=data_mesh(config), keep=score_once, begin=begin, **options)
+
+
 def _source_and_score(
     recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
-) -> tuple[TupleBatches, ScoreFn]:
+) -> tuple[BatchSource, ScoreFn]:
     """Return the batches of the training places, and the score: on held-out places, if there are any."""
     splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
     pool = tuple_pool(recordings, config, frames=[split.training for split in splits])
@@ -157,17 +197,23 @@ def _source_and_score(
         score = validation_score(recordings, [split.validation for split in splits], config)
     else:
         score = training_recall(recordings, pool, config)
-    return TupleBatches(recordings, pool, config, also=also, mining=mining), score
+    return batches_of(recordings, pool, config, also=also, mining=mining), score
 
 
-def _finish(last: Params, steps: int, folder: Path, config: TrainConfig) -> TrainResult:
+def _finish(last: TrainState, folder: Path, config: TrainConfig) -> TrainResult:
     """Save and return the final weights."""
-    best = steps == config.steps and config.select == "best"
-    params, measured = best_params(folder, config) if best else own_copy(last), None
+    steps, params, measured = int(last.step), own_copy(last.params), None
+    if steps == config.steps and config.select == "best":
+        params = best_params(folder, config)
     if is_first_host():
         save(params, folder / WEIGHTS)
         measured = throughput(read_metrics(folder / METRICS_FILE))
     return TrainResult(params, folder, steps, config, measured)
+
+
+def best_params(folder: Path, config: TrainConfig) -> Params:
+    """Return the weights with the best score of the run in `folder`."""
+    return Checkpoints(folder / CHECKPOINTS).best(jax.eval_shape(ImageNetwork(config).new_state)).params
 
 
 def _require_usable(
@@ -229,11 +275,11 @@ def _packed(
 
 
 def _mining(recordings: Sequence[Recording], pool: TuplePool, config: TrainConfig, folder: Path) -> Mining:
-    def describe(params: Params, places: np.ndarray) -> np.ndarray:
-        return describe_places(params, recordings, pool, places, np.zeros(len(places)), config)
+    def describe(state: TrainState, places: np.ndarray) -> np.ndarray:
+        return describe_places(state.params, recordings, pool, places, np.zeros(len(places)), config)
 
-    checkpoints = functools.partial(checkpoint_steps, folder)
-    return Mining(describe, len(pool), config, folder / MINING, checkpoints=checkpoints)
+    checkpoints = functools.partial(checkpoint_steps, folder / CHECKPOINTS)
+    return Mining(describe, len(pool), config.sampling, folder / MINING, seed=config.seed, checkpoints=checkpoints)
 
 
 def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:

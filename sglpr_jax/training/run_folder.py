@@ -1,45 +1,53 @@
-"""Folder of a run: its settings and environment. A run can only be resumed with the same settings."""
+"""Folder of a run: its settings and its environment. A run can only be resumed with the same settings."""
 
 import contextlib
-import dataclasses
+import datetime
+import importlib.metadata
 import json
-from collections.abc import Iterator, Mapping
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from sglpr_jax.files import alone_in, read_json, remove_half_written, write_json
-from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.environment import note_environment
 
 CONFIG_FILE = "config.json"
+ENVIRONMENT_FILE = "environment.json"
+PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy")
+_CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 @contextlib.contextmanager
 def claimed(
-    folder: Path, config: TrainConfig, settings: Mapping[str, Any], *, resume: bool, made: int = 0
+    folder: Path, settings: Mapping[str, Any], *, seed: int, resume: bool, limits: Collection[str] = ()
 ) -> Iterator[None]:
     """Lock a run's folder for this process while the block runs.
 
-    The block starts with the configuration and the `settings` written to the folder, and without incomplete files of
+    The block starts with the settings and the environment written to the folder, and without incomplete files of
     killed processes.
 
     Arguments:
       folder: Folder of the run.
-      config: Configuration of the run.
-      settings: Further entries of config.json.
+      settings: Content of config.json.
+      seed: Seed of the run, for environment.json.
       resume: Continue the run in the folder.
-      made: Number of finished steps of that run.
+      limits: Settings that may differ in a resumed run, such as `config.steps`.
 
     Raises:
       FileExistsError: The folder already has a run, and `resume` is false.
       BlockingIOError: Another process trains in the folder.
-      ValueError: `config.steps` is less than `made`, or settings differ (see `require_same_settings`).
+      ValueError: Settings differ (see `require_same_settings`).
       FileNotFoundError: There is no run to resume.
     """
     path = folder / CONFIG_FILE
     if resume:
-        require_same_settings(folder, config, settings)
-        _require_steps(folder, config, made)
+        require_same_settings(folder, settings, limits=limits)
     folder.mkdir(parents=True, exist_ok=True)
     with alone_in(folder):
         if path.exists() and not resume:
@@ -47,34 +55,88 @@ def claimed(
                 f"{folder}: there is a run already; resume it (--resume) or choose another folder (--out)"
             )
         remove_half_written(folder)
-        write_json(path, _as_json(config, settings))
-        note_environment(folder, seed=config.seed)
+        write_json(path, _as_json(settings))
+        note_environment(folder, seed=seed)
         yield
 
 
-def require_same_settings(folder: Path, config: TrainConfig, settings: Mapping[str, Any]) -> None:
-    """Check that the run in `folder` has this configuration and these settings. The number of steps may differ.
+def require_same_settings(folder: Path, settings: Mapping[str, Any], *, limits: Collection[str]) -> None:
+    """Check that the run in `folder` has these settings, except for `limits`.
 
     Raises FileNotFoundError if there is no run, and ValueError with the names of the settings that differ.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a run to resume, found none")
-    different = sorted(_differences(read_json(path), _as_json(config, settings)) - {"config.steps"})
+    different = sorted(_differences(read_json(path), _as_json(settings)) - set(limits))
     if different:
         raise ValueError(f"{path}: expected the settings of the run to resume, found others: {', '.join(different)}")
 
 
-def _require_steps(folder: Path, config: TrainConfig, made: int) -> None:
-    if config.steps < made:
-        raise ValueError(f"{folder}: expected at least the {made} steps that are already done, found {config.steps}")
-
-
-def _as_json(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:
-    return json.loads(json.dumps({**settings, "config": dataclasses.asdict(config)}, default=str))
+def _as_json(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return json.loads(json.dumps(settings, default=str))
 
 
 def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
     if not (isinstance(a, dict) and isinstance(b, dict)):
         return set() if a == b else {prefix.removesuffix(".")}
     return {name for key in a.keys() | b.keys() for name in _differences(a.get(key), b.get(key), f"{prefix}{key}.")}
+
+
+def note_environment(folder: Path, *, seed: int) -> None:
+    """Write the environment of a run into its folder. A resumed run appends its environment under `resumes`.
+
+    Raises ValueError if the existing file is damaged.
+    """
+    path = folder / ENVIRONMENT_FILE
+    now = environment() | {"seed": seed}
+    if not path.exists():
+        write_json(path, now | {"resumes": []})
+        return
+    first = read_json(path)
+    resumes = first.get("resumes") if isinstance(first, dict) else None
+    if not isinstance(resumes, list):
+        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {first!r:.60}")
+    write_json(path, first | {"resumes": [*resumes, now]})
+
+
+def environment() -> dict[str, Any]:
+    """Return the versions, the machine, the commit and the command line of this process."""
+    return {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": shlex.join(sys.argv),
+        "git": git_commit(_CHECKOUT),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "platform": platform.platform(),
+        "cores": os.cpu_count(),
+        "backend": jax.default_backend(),
+        "devices": [device.device_kind for device in jax.devices()],
+        "variables": {name: value for name, value in sorted(os.environ.items()) if name.startswith(("JAX_", "XLA_"))},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # the package runs from a checkout without installation
+        return None
+
+
+def git_commit(checkout: Path) -> dict[str, Any] | None:
+    """Return the commit of a checkout and whether its files differ from it.
+
+    Returns None without a checkout or without git.
+    """
+    if not (checkout / ".git").exists():
+        return None
+    try:
+        commit, changes = _git(checkout, "rev-parse", "HEAD"), _git(checkout, "status", "--porcelain")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return {"commit": commit, "dirty": bool(changes)}
+
+
+def _git(checkout: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(checkout), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout.strip()

@@ -1,20 +1,61 @@
-"""Score of a training run on held-out places: retrieval among places that were never trained on."""
+"""Scores of weights during a training: on training places, on held-out places, and on held-out recordings."""
 
 from collections.abc import Callable, Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Array, Float, Float32, Int
 from scipy.spatial.distance import cdist
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.methods.method import DistanceFn
 from sglpr_jax.metrics import decision_curve
 from sglpr_jax.models.params import Params
-from sglpr_jax.training.batches import tuple_pool
+from sglpr_jax.models.sglpr import describe
+from sglpr_jax.revisits import database_end, revisits
+from sglpr_jax.training.batches import Batch, read_batch, tuple_pool, views
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.describe_places import describe_places
+from sglpr_jax.training.tuples import TuplePool
 
-_SEED = 2**31 - 1
+CHUNK = 16
+"""Number of places that are described at a time."""
+PLACES = 192
+"""Number of pairs of training places that are scored."""
+RECALL = "recall_at_1"
+"""Name of the score on held-out recordings."""
+FOUND_M = 5.0
+"""Maximum distance of a right answer in a held-out recording, in metres."""
+QUERIES = 256
+"""Number of queries that are compared at a time."""
+_SEED = 2**31 - 1  # not the seed of a training run, so that these are not the tuples of a step
+
+
+def training_recall(
+    recordings: Sequence[Recording], pool: TuplePool, config: TrainConfig
+) -> Callable[[Params], dict[str, float]]:
+    """Return a function that scores weights by Recall@1 among fixed places of the training recordings.
+
+    The places are pairs of an anchor and a positive, each rotated at random. A pair counts as found if the nearest of
+    all positive descriptors belongs to a place within the positive distance of the anchor. The test recording is not
+    used, so the score may select checkpoints. The places are training places, so the score says little about new
+    places.
+    """
+    frames = pool.draw(seed=_SEED, step=0, tuples=PLACES)[:, :2]
+    offset = pool.positions[frames[:, :1], :2] - pool.positions[None, frames[:, 1], :2]
+    same_recording = pool.recording[frames[:, :1]] == pool.recording[None, frames[:, 1]]
+    same_place = same_recording & (np.linalg.norm(offset, axis=-1) < pool.config.positive_m)
+    angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, frames.shape).astype(np.float32)
+
+    def score(params: Params) -> dict[str, float]:
+        described = describe_places(
+            params, recordings, pool, frames.reshape(-1), angles.reshape(-1) * config.rotate, config
+        )
+        anchors, positives = described.reshape(PLACES, 2, -1).transpose(1, 0, 2)
+        nearest = (anchors @ positives.T).argmax(1)
+        return {"score": float(same_place[np.arange(PLACES), nearest].mean())}
+
+    return score
 
 
 def validation_score(
@@ -68,3 +109,81 @@ def retrieval(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: 
         missed_if_rejected=searched,
     )
     return float(found[searched].mean()), curve.f1_max
+
+
+def describe_places(
+    params: Params,
+    recordings: Sequence[Recording],
+    pool: TuplePool,
+    places: Int[np.ndarray, "n"],
+    angles: Float[np.ndarray, "n"],
+    config: TrainConfig,
+) -> Float32[np.ndarray, "n d"]:
+    """Describe places of the training recordings.
+
+    Arguments:
+      params: Weights of the model.
+      recordings: Recordings of the pool.
+      pool: Pool of the places.
+      places: Frame numbers of the pool.
+      angles: Rotation of each place about z, in radians.
+      config: Settings of the run.
+
+    Raises the errors of reading a scan.
+    """
+    described = []
+    for start in range(0, len(places), CHUNK):
+        rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)  # the last batch is padded with its last place
+        batch = read_batch(
+            recordings,
+            pool,
+            places[rows][:, None],
+            max_points=config.max_points,
+            share_negatives=True,
+            categories=config.model.categories_read,
+            image=config.model.image,
+        )
+        described.append(np.asarray(_describe(params, batch, jnp.asarray(angles[rows], jnp.float32))))
+    return np.concatenate(described)[: len(places)].astype(np.float32)
+
+
+@jax.jit
+def _describe(params: Params, batch: Batch, angles: Float[Array, "b"]) -> Float[Array, "b d"]:
+    return describe(params, *views(batch, angles, params.config.grid))
+
+
+def require_revisits(recordings: Sequence[Recording]) -> None:
+    """Raise ValueError if a recording has no poses or no revisits."""
+    for recording in recordings:
+        if recording.positions is None:
+            raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
+        if not revisits(recording.positions[:, :2], times=recording.times, radius_m=FOUND_M).any():
+            raise ValueError(
+                f"sequence {recording.name}: expected revisits within {FOUND_M:g} m to score on, found none"
+            )
+
+
+def recall_at_1(
+    descriptors: Float32[np.ndarray, "n d"],
+    positions: Float[np.ndarray, "n 3"],
+    times: Float[np.ndarray, " n"] | None,
+    distance: DistanceFn,
+) -> float:
+    """Return the fraction of the revisits whose nearest descriptor, among frames older than 30 s, is within 5 m.
+
+    Arguments:
+      descriptors: Descriptor of each frame.
+      positions: Position of each frame in metres. Distances are horizontal.
+      times: Time of each frame in seconds. None: 290 frames replace 30 s.
+      distance: Distance between descriptors.
+    """
+    places = positions[:, :2]
+    queries = np.flatnonzero(revisits(places, times=times, radius_m=FOUND_M))
+    ends = database_end(len(places), times=times)[queries]
+    hits = 0
+    for start in range(0, len(queries), QUERIES):
+        rows, last = queries[start : start + QUERIES], ends[start : start + QUERIES]
+        apart = distance(descriptors[rows], descriptors[: last.max()])
+        nearest = np.where(np.arange(last.max())[None] < last[:, None], apart, np.inf).argmin(axis=1)
+        hits += int((np.linalg.norm(places[rows] - places[nearest], axis=1) <= FOUND_M).sum())
+    return hits / len(queries)

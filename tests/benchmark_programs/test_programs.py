@@ -20,7 +20,7 @@ TINY = f"{ROOT}/tests/tiny.py"
 """A preset of next to no arithmetic."""
 SMALL = "--scans 12 --azimuth-steps 90"
 RUN = (
-    "methods baselines --data town --methods random --frames 100",
+    "methods baselines --data town --methods solid --frames 100",
     f"loops simulated --drives walls:none:1:vlp16 --methods sglpr scan-context --weights circular {SMALL}",
     f"repeating render --sceneries walls town --sensors vlp16 --revisits same {SMALL} --weights circular --out drives",
     "repeating search drives --weights circular",
@@ -34,7 +34,7 @@ RUN = (
     "speed index --rows 300 --repeats 1",
     "fleet index --drives drawn.npz --places 2000 --queries 3",
     f"learned data --out learned --only test/town-601 {SMALL}",
-    "learned score random --data learned --only town-601-00 --out learned/scores",
+    "learned score ring --data learned --only town-601-00 --out learned/scores",
     "learned cost rinet@random:0 --data learned --scans 1 --out learned/cost.json",
     "learned leaderboard --build learned --kept kept.json --page page.md --figure figure.svg",
 )

@@ -9,12 +9,12 @@ import pytest
 import sglpr_jax
 from sglpr_jax.bev import even_cells
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.views import rotated
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.params import Params
-from sglpr_jax.training.batches import TupleBatches, tuple_pool
+from sglpr_jax.training.batches import batches_of, tuple_pool
 from sglpr_jax.training.config import LossConfig, TrainConfig
-from sglpr_jax.training.describe_places import describe_places
+from sglpr_jax.training.validation import describe_places
 
 ROWS = np.arange(16)
 
@@ -62,7 +62,7 @@ def test_training_sees_the_same_images(params, town):
         loss=LossConfig(ce_weight=0.0, dice_weight=0.0),
     )
     pool = tuple_pool([recording], config)
-    batch = TupleBatches([recording], pool, config).batch(0)
+    batch = batches_of([recording], pool, config).batch(0)
     rows = pool.draw(seed=config.seed, step=0, tuples=1).reshape(-1)
     np.testing.assert_array_equal(batch.images, [sglpr_jax.density_bev(recording.points(int(row))) for row in rows])
     found = describe_places(params, [recording], pool, ROWS, np.zeros(16), config)

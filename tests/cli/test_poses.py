@@ -13,7 +13,7 @@ from sglpr_jax.pose_graph.files import write_tum
 from .conftest import SCANS, assert_one_line_error
 
 load = sglpr_jax.DescriptorFile.load
-METHOD = ("--method", "thumbnail")
+METHOD = ("--method", "polar-fft")
 PROTOCOL = ("--protocol", "top1-f1max")
 
 

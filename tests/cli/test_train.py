@@ -13,16 +13,16 @@ from PIL import Image
 import sglpr_jax
 from sglpr_jax.cli.train import TrainCommand, parse
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.evaluation import final_test
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.training import batches as training_batches
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
+from sglpr_jax.training.tuples import TuplePool
 
 from .conftest import assert_one_line_error
 
-METHODS = ("sglpr", "untrained", "thumbnail", "polar-fft")
+METHODS = ("sglpr", "untrained", "polar-fft")
 
 
 def test_without_flags_the_preset_sglpr_runs_and_08_stays_a_string():
@@ -56,9 +56,9 @@ def test_a_run_leaves_everything_that_it_printed(trained, town):
         top1 = report[title]["sglpr"][0]
         assert top1["protocol"] == "top-1 F1max" and top1["counts"]["revisits"] > 0
         assert f"{top1['score']:.3f}" in ended.out
-    raw, rotated = (folder / "test" / f"thumbnail-{title}.npz" for title in ("raw", "rotated"))
+    raw, rotated = (folder / "test" / f"polar-fft-{title}.npz" for title in ("raw", "rotated"))
     change = sglpr_jax.DescriptorFile.load(raw).descriptors - sglpr_jax.DescriptorFile.load(rotated).descriptors
-    assert np.abs(change).max() > 0.1
+    assert np.abs(change).max() > 1e-3
     segmentation = report["segmentation"]
     assert 0 <= segmentation["mean_iou"] <= 1 and segmentation["cells"] > 1000
     assert f"{segmentation['mean_iou']:.3f}" in ended.out
@@ -163,9 +163,11 @@ def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, tow
     out = tmp_path / "run"
     options = ("--data", town, "--preset", preset, "--out", out)
 
+    first = iter([True])
+
     def interrupted(*arguments, **named):
-        os.kill(os.getpid(), signal.SIGINT)
-        monkeypatch.setattr(training_batches, "read_batch", read_batch)
+        if next(first, False):
+            os.kill(os.getpid(), signal.SIGINT)
         return read_batch(*arguments, **named)
 
     monkeypatch.setattr(training_batches, "read_batch", interrupted)

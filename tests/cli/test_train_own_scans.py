@@ -33,13 +33,13 @@ def damaged(town, tmp_path):
 
 @pytest.mark.slow
 def test_bad_scans_are_left_out_before_the_training(damaged, preset, command, tmp_path):
-    options = ("--seq", "08", "--data", damaged, "--preset", preset, "--method", "thumbnail")
+    options = ("--seq", "08", "--data", damaged, "--preset", preset, "--method", "polar-fft")
     ended = command("train", *options, "--out", tmp_path / "run", "--skip-bad", "--sensor-height", "1.73")
     assert ended.status == 0, ended.error
     assert "skipped 000003: " in ended.error and "skipped 000005: scan 000005 of sequence 08" in ended.error
     assert "as given" in ended.error
     assert json.loads((tmp_path / "run/config.json").read_text())["skip_bad"] is True
-    with np.load(tmp_path / "run/test/thumbnail-raw.npz") as file:
+    with np.load(tmp_path / "run/test/polar-fft-raw.npz") as file:
         assert len(file["ids"]) == 39 and "000005" not in file["ids"]
 
 

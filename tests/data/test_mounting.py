@@ -14,14 +14,14 @@ from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Record
-from sglpr_jax.data.sampling.batch import read_batch
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.data.views import view
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.grid import Grid
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.methods.registry import handcrafted
 from sglpr_jax.models.config import model_preset
+from sglpr_jax.training.batches import read_batch
+from sglpr_jax.training.tuples import TuplePool
 
 
 def street(seed: int, *, height: float = MODEL_HEIGHT_M, n: int = 6000) -> np.ndarray:

@@ -10,11 +10,11 @@ from recordings import of_scans
 from sglpr_jax.data.corruption import Corruption, corrupted
 from sglpr_jax.data.formats import bin_records, scan_files
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.sampling.batch import read_batch
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.methods.method import ScanMethod
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.retrieval.embed import embed
+from sglpr_jax.training.batches import read_batch
+from sglpr_jax.training.tuples import TuplePool
 
 
 @pytest.fixture

@@ -20,7 +20,6 @@ from sglpr_jax.data.formats.scan_files import read_labels, read_scan
 from sglpr_jax.data.packed import open_pack, packed
 from sglpr_jax.data.readers import bev_images, nclt, open_recording
 from sglpr_jax.data.recording import Record, Recording
-from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
 from sglpr_jax.evaluation.inputs import read_input
 from sglpr_jax.files import read_json
 from sglpr_jax.grid import Grid
@@ -34,6 +33,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.mining import DescriptorCache
 
 N = 5
 RNG = np.random.default_rng(0)

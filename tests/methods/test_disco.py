@@ -9,7 +9,7 @@ import pytest
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record
-from sglpr_jax.methods.learned.disco import DISCO, DiSCO, doubled, loss, occupancy, prepare, spectrum, turned
+from sglpr_jax.methods.learned.disco import DISCO, DiSCO, occupancy, prepare
 from sglpr_jax.methods.learned.method import Tuples
 
 from . import image_reference as reference
@@ -35,12 +35,6 @@ def test_a_cell_with_a_point_is_1(places):
     wide = np.column_stack([rng.uniform(-90, 90, (2000, 2)), rng.uniform(-4, 14, 2000)]).astype(np.float32)
     for points in (places[0][0], wide):
         np.testing.assert_array_equal(occupancy(points), in_loops(points))
-
-
-def test_every_layer_can_be_filled():
-    heights = np.arange(20, dtype=np.float32) / 2 - 1.25
-    points = np.stack([np.full(20, 10), np.zeros(20), heights], axis=1).astype(np.float32)
-    assert occupancy(points)[5, 0].all() and occupancy(points).sum() == 20
 
 
 def test_the_height_of_the_sensor_and_holes_do_not_change_the_input(places):
@@ -78,11 +72,6 @@ def doubled_in_loops(x):
     return found
 
 
-def test_doubling():
-    x = jax.random.normal(jax.random.key(0), (2, 5, 6, 3))
-    np.testing.assert_allclose(doubled(x), doubled_in_loops(np.asarray(x)), atol=1e-5)
-
-
 def test_the_network_is_the_published_u_net(variables):
     params, statistics = variables["params"], variables["batch_stats"]
     cells = jax.random.bernoulli(jax.random.key(0), 0.1, (1, 40, 120, 20)).astype(jnp.uint8)
@@ -104,13 +93,6 @@ def test_the_network_is_the_published_u_net(variables):
 
 def test_the_number_of_weights_is_the_published_one(variables):
     assert sum(leaf.size for leaf in jax.tree.leaves(variables["params"])) == DISCO.weights == 7_798_337
-
-
-def test_the_spectrum_does_not_change_with_rotations_by_3_degrees():
-    maps = jax.random.normal(jax.random.key(0), (1, 40, 120))
-    rolled = jnp.concatenate([jnp.roll(maps, shift, axis=2) for shift in (1, 7, 60)])
-    found = spectrum(rolled)
-    np.testing.assert_allclose(found, jnp.broadcast_to(spectrum(maps), found.shape), atol=1e-4)
 
 
 def test_rotations_by_24_degrees_do_not_change_the_descriptor(variables, places):
@@ -143,7 +125,7 @@ def test_training_moves_the_statistics_and_every_weight(variables):
 
 def test_each_grid_is_rotated_by_its_own_number_of_sectors():
     cells = jnp.zeros((5, 40, 120, 20), jnp.uint8).at[:, 3, 0, 2].set(1)
-    found = np.asarray(turned(jax.random.key(0), cells))
+    found = np.asarray(DISCO.turned(jax.random.key(0), cells))
     sectors = found[:, 3, :, 2].argmax(1)
     assert found.dtype == np.uint8 and (found.sum((1, 2, 3)) == 1).all() and len(set(sectors.tolist())) == 5
 
@@ -156,5 +138,5 @@ def test_the_loss_is_a_lazy_quadruplet():
         far, stranger = max(square[:2]), descriptors[(i + 1) % 3, 0]
         apart = [float(((stranger - negative) ** 2).sum()) for negative in others[2:]]
         total += max(0, *(0.5 + far - d for d in square[2:])) + max(0, *(0.2 + far - d for d in apart))
-    found = loss({}, Tuples(jnp.asarray(descriptors), jnp.zeros((3, 6)), 2))
+    found = DISCO.loss({}, Tuples(jnp.asarray(descriptors), jnp.zeros((3, 6)), 2))
     assert found == pytest.approx(total / 3, rel=1e-5)

@@ -13,12 +13,8 @@ from sglpr_jax.methods.learned.overlap_transformer import (
     HEIGHTS,
     OVERLAP_TRANSFORMER,
     OverlapTransformer,
-    Transformer,
-    loss,
     prepare,
     range_image,
-    stacked,
-    turned,
 )
 
 from . import image_reference as reference
@@ -62,17 +58,6 @@ def test_the_beams_of_a_sensor_are_inside(beams, rows):
     assert abs(np.count_nonzero(range_image(points)) - rows) <= 1
 
 
-@pytest.mark.parametrize(("height", "stride"), [(4, 2), (2, 1)])
-def test_stacked_rows_and_a_matrix_are_a_convolution(height, stride):
-    x = np.random.default_rng(0).normal(size=(2, 11, 3, 2)).astype(np.float32)
-    kernel = np.random.default_rng(1).normal(size=(height * 2, 5))
-    found = np.asarray(stacked(jnp.asarray(x), height=height, stride=stride)) @ kernel
-    for i in range((11 - height) // stride + 1):
-        rows = x[:, i * stride : i * stride + height]
-        expected = np.einsum("bhwc,hcf->bwf", rows, kernel.reshape(height, 2, 5))
-        np.testing.assert_allclose(found[:, i], expected, atol=1e-5)
-
-
 def layer_norm(x, layer):
     centred = x - x.mean(-1, keepdims=True)
     return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-6) * layer["scale"] + layer["bias"]
@@ -91,15 +76,6 @@ def transformer(x, params):
     x = layer_norm(x + mixed, params["LayerNorm_0"])
     hidden = np.maximum(x @ params["Dense_0"]["kernel"] + params["Dense_0"]["bias"], 0)
     return layer_norm(x + hidden @ params["Dense_1"]["kernel"] + params["Dense_1"]["bias"], params["LayerNorm_1"])
-
-
-def test_the_transformer_layer():
-    x = jax.random.normal(jax.random.key(0), (1, 6, 8))
-    variables = Transformer().init(jax.random.key(1), x)
-    rng = np.random.default_rng(0)
-    params = jax.tree.map(lambda leaf: np.asarray(leaf) + rng.normal(0, 0.1, leaf.shape), variables["params"])
-    found = Transformer().apply({"params": jax.tree.map(jnp.float32, params)}, x)
-    np.testing.assert_allclose(found[0], transformer(np.asarray(x[0]), params), atol=1e-5)
 
 
 def unit(x):
@@ -153,7 +129,7 @@ def test_training_reaches_every_weight(variables):
     def gradient(params):
         def tuples_loss(params):
             found = OverlapTransformer().apply({"params": params}, images, train=True)
-            return loss({}, Tuples(found.reshape(1, 4, -1), jnp.zeros((1, 4)), 1))
+            return OVERLAP_TRANSFORMER.loss({}, Tuples(found.reshape(1, 4, -1), jnp.zeros((1, 4)), 1))
 
         return jax.grad(tuples_loss)(params)
 
@@ -163,7 +139,7 @@ def test_training_reaches_every_weight(variables):
 
 def test_each_image_is_rotated_by_its_own_number_of_columns():
     images = jnp.zeros((5, 64, 900)).at[:, 3, 0].set(1)
-    found = np.asarray(turned(jax.random.key(0), images))
+    found = np.asarray(OVERLAP_TRANSFORMER.turned(jax.random.key(0), images))
     assert (found.sum((1, 2)) == 1).all() and len(set(found[:, 3].argmax(1).tolist())) == 5
 
 
@@ -173,5 +149,5 @@ def test_the_loss_sums_over_the_negatives():
     for anchor, *others in descriptors:
         square = [float(((anchor - other) ** 2).sum()) for other in others]
         total += sum(max(0, 0.5 + max(square[:3]) - d) for d in square[3:])
-    found = loss({}, Tuples(jnp.asarray(descriptors), jnp.zeros((2, 6)), 3))
+    found = OVERLAP_TRANSFORMER.loss({}, Tuples(jnp.asarray(descriptors), jnp.zeros((2, 6)), 3))
     assert found == pytest.approx(total / 2, rel=1e-5)

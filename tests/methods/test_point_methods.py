@@ -7,8 +7,6 @@ from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.handcrafted.m2dp import m2dp
-from sglpr_jax.methods.handcrafted.random_vector import random_vector
-from sglpr_jax.methods.handcrafted.scan_context import scan_context
 from sglpr_jax.methods.handcrafted.solid import solid
 from sglpr_jax.retrieval.distances import distance_function
 
@@ -60,15 +58,6 @@ def test_the_order_of_the_points_does_not_matter(places, name):
     )
 
 
-def test_random_vectors_know_the_image_and_nothing_else():
-    images = np.random.default_rng(0).integers(0, 5, (3, 8, 8)).astype(np.float32)
-    found = random_vector(images)
-    np.testing.assert_array_equal(random_vector(images[1:])[0], found[1])
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)
-    images[0, 0, 0] += 1
-    assert abs(random_vector(images)[0] @ found[0]) < 0.3 and abs(found[0] @ found[1]) < 0.3
-
-
 @pytest.fixture(scope="module")
 def real(shared):
     """Return points and classes of real scans by sequence and frame."""
@@ -92,12 +81,3 @@ def test_real_loops_rank_above_a_pair_that_is_none(real, name):
     none = apart("00", 88, 850)
     assert apart("00", 52, 4501) < none
     assert apart("08", 720, 1500) < none  # driven in the opposite direction
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [scan_context, m2dp])
-def test_a_turn_of_a_real_scan_is_less_than_the_step_to_another_place(real, turn_points, method):
-    name = "scan-context" if method is scan_context else "m2dp"
-    here, there = (method(real["00", frame][0])[None] for frame in (88, 850))
-    turned = method(turn_points(real["00", 88][0], 1.234))[None]
-    assert compare(name, turned, here)[0, 0] < 0.25 * compare(name, there, here)[0, 0]

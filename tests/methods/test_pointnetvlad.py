@@ -8,7 +8,7 @@ import pytest
 from sglpr_jax.data.recording import Record
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.method import Tuples
-from sglpr_jax.methods.learned.pointnetvlad import POINTNETVLAD, TNet, loss, scaled_points, turned
+from sglpr_jax.methods.learned.pointnetvlad import POINTNETVLAD, TNet, scaled_points, turned
 from sglpr_jax.methods.voxel_means import voxel_means
 
 
@@ -102,10 +102,6 @@ def test_the_descriptor_is_the_published_one(variables, points, found):
     assert np.abs(expected[0] - expected[1]).max() > 0.003
 
 
-def test_descriptors_have_length_one(found):
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)
-
-
 def test_the_order_of_the_points_does_not_matter(variables, points, found):
     order = np.random.default_rng(0).permutation(points.shape[1])
     again = jax.jit(POINTNETVLAD.network.apply)(variables, points[:, order])
@@ -115,17 +111,6 @@ def test_the_order_of_the_points_does_not_matter(variables, points, found):
 def test_the_learned_transformation_starts_as_the_identity(points):
     moved, _ = TNet().init_with_output(jax.random.key(0), jnp.asarray(points), train=False)
     np.testing.assert_array_equal(moved, points)
-
-
-def test_training_follows_the_batch_and_keeps_its_statistics(start, points):
-    apply = jax.jit(POINTNETVLAD.network.apply, static_argnames=("train", "mutable"))
-    _, changed = apply(start, points, train=True, mutable=("batch_stats",))
-    before = start["batch_stats"]["TNet_0"]["Mlp_0"]["BatchNorm_0"]
-    after = changed["batch_stats"]["TNet_0"]["Mlp_0"]["BatchNorm_0"]
-    layer = start["params"]["TNet_0"]["Mlp_0"]["Dense_0"]
-    rows = points.reshape(-1, 3) @ layer["kernel"] + layer["bias"][None]
-    np.testing.assert_allclose(after["mean"], 0.9 * before["mean"] + 0.1 * rows.mean(0), atol=1e-6)
-    np.testing.assert_allclose(after["var"], 0.9 * before["var"] + 0.1 * rows.var(0), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -156,12 +141,12 @@ def loss_in_loops(rows, positives):
 def test_the_loss_is_the_lazy_quadruplet(tuples, positives):
     rows = 0.15 * np.random.default_rng(tuples).normal(size=(tuples, 6, 8)).astype(np.float32)
     apart = jnp.zeros((tuples, 6))
-    found = loss({}, Tuples(jnp.asarray(rows), apart, positives))
+    found = POINTNETVLAD.loss({}, Tuples(jnp.asarray(rows), apart, positives))
     assert found > 0 and found == pytest.approx(loss_in_loops(rows.astype(float), positives), rel=1e-5)
 
 
 def test_equal_descriptors_have_a_finite_gradient():
-    slope = jax.grad(lambda rows: loss({}, Tuples(rows, jnp.zeros((2, 4)), 1)))(jnp.ones((2, 4, 8)))
+    slope = jax.grad(lambda rows: POINTNETVLAD.loss({}, Tuples(rows, jnp.zeros((2, 4)), 1)))(jnp.ones((2, 4, 8)))
     assert np.isfinite(slope).all()
 
 
@@ -184,12 +169,6 @@ def test_few_points_are_all_used_again(places):
     near = places[0][0][(places[0][0][:, 2] > -1.4) & (np.linalg.norm(places[0][0], axis=1) < 40)]
     means = {tuple(row) for row in (voxel_means(near, 0.4) / 40).astype(np.float32)}
     assert len(found) == 4096 > len(means) and {tuple(row) for row in found} == means
-
-
-def test_equal_scans_have_equal_inputs_in_any_order(places):
-    points = places[0][0]
-    order = np.random.default_rng(0).permutation(len(points))
-    np.testing.assert_allclose(scaled_points(record(points[order])), scaled_points(record(points)), atol=1e-6)
 
 
 def test_points_that_are_not_finite_are_ignored(places):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.recording import Record
-from sglpr_jax.methods.learned.distance import learned_distance
+from sglpr_jax.methods.learned.describe import learned_distance
 from sglpr_jax.methods.learned.method import Tuples
 from sglpr_jax.methods.learned.rinet import CLASSES, RINET, loss, prepare, ring_image, same_place, strongest_phase
 from sglpr_jax.methods.learned.rinet import turned as turned_inputs

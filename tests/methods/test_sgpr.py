@@ -1,19 +1,15 @@
 """SGPR: the graph of a scan, the network, its comparison and its loss against numpy, and the order of nodes."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from sglpr_jax.data.recording import Record
 from sglpr_jax.labels import to_raw
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.method import Tuples
-from sglpr_jax.methods.learned.semantic_graph import MOST_POINTS, clusters, semantic_graph
-from sglpr_jax.methods.learned.sgpr import SGPR, compare, loss, turned
+from sglpr_jax.methods.learned.sgpr import MOST_POINTS, SGPR, clusters, compare, loss, semantic_graph, turned
 
 
 def graph(seed, nodes=100):
@@ -135,29 +131,14 @@ def test_the_loss_is_the_cross_entropy_of_both_orders(variables, positives):
     assert found == pytest.approx(np.mean(terms), rel=1e-4)
 
 
-@pytest.mark.slow
-def test_a_few_steps_learn_to_tell_graphs_apart(start):
-    places = np.stack([graph(seed, 40) for seed in range(3)])
-    batch = jnp.asarray(np.stack([[one, one, other] for one, other in itertools.permutations(places, 2)]))
-    optimiser = optax.adam(3e-3)
+def test_training_reaches_every_weight(variables, graphs):
+    def loss_of(params):
+        everything = variables | {"params": params}
+        rows, _ = SGPR.network.apply(everything, jnp.asarray(graphs), train=True, mutable=["batch_stats"])
+        return loss(everything, Tuples(rows[None], jnp.zeros((1, 3)), 1))
 
-    @jax.jit
-    def step(variables, state, key):
-        def of(params):
-            flat = turned(key, batch.reshape(-1, 100, 15))
-            everything = variables | {"params": params}
-            rows, stats = SGPR.network.apply(everything, flat, train=True, mutable=["batch_stats"])
-            return loss(everything, Tuples(rows.reshape(-1, 3, 32), jnp.zeros(batch.shape[:2]), 1)), stats
-
-        (value, stats), slope = jax.value_and_grad(of, has_aux=True)(variables["params"])
-        moves, state = optimiser.update(slope, state, variables["params"])
-        return {"params": optax.apply_updates(variables["params"], moves)} | stats, state, value
-
-    variables, state, values = start, optimiser.init(start["params"]), []
-    for key in jax.random.split(jax.random.key(0), 30):
-        variables, state, value = step(variables, state, key)
-        values.append(float(value))
-    assert np.isfinite(values).all() and np.mean(values[-5:]) < 0.8 * np.mean(values[:5])
+    for path, slope in jax.tree_util.tree_leaves_with_path(jax.jit(jax.grad(loss_of))(variables["params"])):
+        assert np.isfinite(slope).all() and np.abs(slope).max() > 0, path
 
 
 def test_only_positions_turn(graphs):

@@ -6,8 +6,7 @@ import pytest
 
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import to_classes
-from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, ssc, ssc_distance
-from sglpr_jax.methods.outline_alignment import align, best_move, best_shift
+from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, align, best_move, best_shift, ssc, ssc_distance
 from tests.methods import published_ssc as published
 
 SETTINGS = {PAPER: {"rings": 50, "nearest": 0.0}, NEWEST: {"rings": 24, "nearest": 5.0}}

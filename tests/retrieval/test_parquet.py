@@ -41,7 +41,7 @@ def scans(tmp_path) -> Path:
 @pytest.fixture
 def method(scans) -> ImageMethod:
     """A method without weights."""
-    return method_named("thumbnail", None, opened(scans))
+    return method_named("polar-fft", None, opened(scans))
 
 
 def opened(folder: Path) -> sglpr_jax.Recording:

@@ -3,25 +3,17 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.training import loop
+from sglpr_jax.training import recipe, trainer
 from sglpr_jax.training.devices import data_mesh, own_copy, replicate, split
-from sglpr_jax.training.loop import METRICS_FILE, run_steps
+from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import read_metrics
-from sglpr_jax.training.state import new_state
-from sglpr_jax.training.step import train_step
+from sglpr_jax.training.recipe import run_network
+from sglpr_jax.training.trainer import METRICS_FILE
 
-from .conftest import SWIN, Made
-
-STEP = jax.jit(
-    train_step.__wrapped__,
-    static_argnames="config",
-    donate_argnames="state",
-    compiler_options={"xla_backend_optimization_level": 0},
-)
+from .conftest import FAST_STEP, SWIN, Made
 
 
 @pytest.fixture(scope="session")
@@ -38,13 +30,13 @@ def shared(batch):
 
 def make_steps(config, params, batches, devices):
     """The weights after some steps and the measurements of each."""
-    mesh = data_mesh(config, devices)
-    state = replicate(new_state(config, params=params), mesh)
+    mesh, network = data_mesh(config, devices), ImageNetwork(config)
+    state = replicate(network.new_state(params), mesh)
     measured = []
     for batch in batches:
         before = state
         with jax.set_mesh(mesh):
-            state, metrics = STEP(before, split(batch, mesh), config=config)
+            state, metrics = FAST_STEP(before, split(batch, mesh), network=network)
         measured.append(jax.device_get(metrics))
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before.params))
     for leaf in jax.tree.leaves(state):
@@ -79,8 +71,7 @@ def test_eight_devices_make_the_steps_of_one(config, params, random_params, make
 
 
 def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, monkeypatch, tmp_path):
-    monkeypatch.setattr(loop, "new_state", lambda c, **_: new_state(c, params=jax.tree.map(jnp.copy, params)))
-    monkeypatch.setattr(loop, "train_step", STEP)
+    monkeypatch.setattr(trainer, "train_step", FAST_STEP)
     config = dataclasses.replace(config, score_every=100)
 
     def score(params):
@@ -88,8 +79,9 @@ def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, mo
         return {"score": float(sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(params.weights)))}
 
     def run(folder, *, devices, stop=lambda: False):
-        monkeypatch.setattr(loop, "data_mesh", lambda c: data_mesh(c, jax.devices()[:devices]))
-        return run_steps(config, Made(make_batch), folder, score=score, resume=True, stopped=stop)
+        monkeypatch.setattr(recipe, "data_mesh", lambda c: data_mesh(c, jax.devices()[:devices]))
+        options = {"score": score, "start_from": params, "resume": True, "stopped": stop}
+        return run_network(config, Made(make_batch), folder, **options).state
 
     whole = run(tmp_path / "whole", devices=1)
     checks = iter([False, False, True])
@@ -106,10 +98,12 @@ def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, mo
 def test_each_device_does_its_share(config, params, make_batch):
     def flops(devices):
         """Of the compiled step, for each of the devices."""
-        mesh = data_mesh(config, devices)
-        state = replicate(new_state(config, params=params), mesh)
+        mesh, network = data_mesh(config, devices), ImageNetwork(config)
+        state = replicate(network.new_state(params), mesh)
         with jax.set_mesh(mesh):
-            return STEP.lower(state, split(make_batch(0), mesh), config=config).compile().cost_analysis()["flops"]
+            return (
+                FAST_STEP.lower(state, split(make_batch(0), mesh), network=network).compile().cost_analysis()["flops"]
+            )
 
     whole, share = flops(jax.devices()[:1]), flops(jax.devices())
     assert whole / 10 < share < whole / 6

@@ -10,7 +10,7 @@ import jax
 import pytest
 
 from sglpr_jax.training.devices import data_mesh
-from sglpr_jax.training.state import new_state
+from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.step import train_step
 
 
@@ -25,8 +25,9 @@ def test_eight_devices():
 
 
 def test_on_one_device_nothing_is_added_to_the_step(config, params, make_batch):
+    network = ImageNetwork(config)
     with jax.set_mesh(data_mesh(config, jax.devices()[:1])):
-        traced = str(train_step.trace(new_state(config, params=params), make_batch(0), config=config).jaxpr)
+        traced = str(train_step.trace(network.new_state(params), make_batch(0), network=network).jaxpr)
     assert "dot_general" in traced
     assert "sharding_constraint" not in traced and "shard_map" not in traced
 

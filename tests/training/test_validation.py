@@ -7,13 +7,14 @@ import pytest
 from recordings import of_images
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.training import validation
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.validation import retrieval, validation_score
+from sglpr_jax.training.tuples import TuplePool
+from sglpr_jax.training.validation import recall_at_1, retrieval, validation_score
 
 PARAMS = Params({}, ModelConfig())
 
@@ -87,3 +88,18 @@ def test_a_part_without_two_frames_of_one_place_is_refused():
     street = np.column_stack([np.arange(60.0) * 10, np.zeros((60, 2))])
     with pytest.raises(ValueError, match=r"validation\.share is too small: expected frames within 3\.0 m"):
         validation_score([sequence(street)], [np.arange(5)], TrainConfig())
+
+
+def test_recall_is_counted_by_hand():
+    rng = np.random.default_rng(0)
+    positions, descriptors = rng.uniform(0, 20, (120, 3)), rng.normal(size=(120, 4)).astype(np.float32)
+    times = np.arange(120) * 1.0
+    hits = asked = 0
+    for i in range(30, 120):
+        old = [j for j in range(i) if times[j] <= times[i] - 30] + [i - 29]
+        near = [np.hypot(*(positions[i] - positions[j])[:2]) <= 5 for j in old]
+        if any(near):
+            asked += 1
+            hits += near[int(np.argmin([np.linalg.norm(descriptors[i] - descriptors[j]) for j in old]))]
+    distance = distance_function("l2")
+    assert recall_at_1(descriptors, positions, times, distance) == pytest.approx(hits / asked)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Int, Num
 
 from sglpr_jax.methods.method import HandcraftedMethod
-from sglpr_jax.methods.unit_length import unit_length
+from sglpr_jax.methods.pairwise import unit_length
 
 RINGS = 20
 SECTORS = 60

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, Int
 
 from sglpr_jax.methods.method import HandcraftedMethod
-from sglpr_jax.methods.pairwise import correlate, in_blocks
-from sglpr_jax.methods.unit_length import unit_length
+from sglpr_jax.methods.pairwise import correlate, in_blocks, unit_length
 
 RINGS = 40
 SECTORS = 60

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sglpr_jax.methods.method import HandcraftedMethod
-from sglpr_jax.methods.unit_length import unit_length
+from sglpr_jax.methods.pairwise import unit_length
 from sglpr_jax.methods.voxel_means import voxel_means
 
 RANGES = 40

@@ -11,23 +11,30 @@ step, because a step of 24 images already needs 6 GB. NetVLAD starts from k-mean
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float, Num, UInt8
+from jaxtyping import Array, Float, Float32, Float64, Int32, Num, UInt8
 
 from sglpr_jax.bev import rotate_image
 from sglpr_jax.data.density_grid import MAX_COUNT, SIZE
 from sglpr_jax.data.recording import Record, check_cloud
-from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.views import check_ready_made, picture
-from sglpr_jax.losses import descriptor_distance, lazy_triplet
-from sglpr_jax.methods.learned.bicubic import resampled, resampled_maps, resized, turned_taps
-from sglpr_jax.methods.learned.clusters import FEATURES, LOCAL, with_clusters
-from sglpr_jax.methods.learned.image_layers import HE, Convolution, NetVLAD, batch_norm, max_pool
-from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.methods.learned.layers import (
+    FEATURES,
+    HE,
+    LOCAL,
+    Convolution,
+    NetVLAD,
+    batch_norm,
+    max_pool,
+    with_clusters,
+)
+from sglpr_jax.methods.learned.method import LearnedMethod, triplet
+from sglpr_jax.methods.recipe import Recipe, TupleConfig
 from sglpr_jax.models.convolution import convolve
 from sglpr_jax.models.layers import l2_normalize
 
@@ -38,6 +45,8 @@ STRIDE = 8
 DENSER = 4
 """The local features of NetVLAD are resampled to this fraction of the image's rows and columns."""
 MARGIN = 0.3
+SHARPNESS = -0.75
+"""Parameter a of the cubic kernel. PyTorch uses -0.75, `jax.image.resize` -0.5."""
 
 
 class Block(nn.Module):
@@ -134,6 +143,68 @@ def turned_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
     return jnp.concatenate([*parts[:4], between]).reshape(8, -1, *maps.shape[1:])
 
 
+class Taps(NamedTuple):
+    """The 16 pixels around each point of a resampled image, by row and column, and their weights."""
+
+    pixels: Int32[np.ndarray, "points 16"]
+    """Index in the flattened image. Pixels outside have the weight 0."""
+    weights: Float32[np.ndarray, "points 16"]
+
+
+@functools.cache
+def turned_taps(size: int, degrees: int) -> Taps:
+    """Return the table that rotates an image of `size` x `size` pixels about its centre, with zeros outside.
+
+    Arguments:
+      size: Number of rows and of columns.
+      degrees: Angle of the rotation, counter-clockwise as in `bev.rotate_image`.
+    """
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    down, right = (np.mgrid[:size, :size] - (size - 1) / 2).reshape(2, -1)
+    return _taps(np.stack([cos * down + sin * right, cos * right - sin * down]) + (size - 1) / 2, size)
+
+
+def _taps(at: Float64[np.ndarray, "2 points"], size: int) -> Taps:
+    """Return the table for points at the given rows and columns."""
+    first = np.floor(at) - 1
+    rows, columns = lines = first[..., None] + np.arange(4)
+    down, right = cubic(lines - at[..., None]) * ((lines >= 0) & (lines < size))
+    rows, columns = (line.clip(0, size - 1).astype(np.int32) for line in (rows, columns))
+    pixels = rows[:, :, None] * size + columns[:, None]
+    weights = (down[:, :, None] * right[:, None]).astype(np.float32)
+    return Taps(pixels.reshape(-1, 16), weights.reshape(-1, 16))
+
+
+def cubic(distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    """Return the weight of a pixel at a distance in pixels, by the cubic convolution kernel."""
+    x, a = np.abs(distance), SHARPNESS
+    near = ((a + 2) * x - (a + 3)) * x**2 + 1
+    far = a * (((x - 5) * x + 8) * x - 4)
+    return np.where(x <= 1, near, np.where(x < 2, far, 0.0))
+
+
+def resampled(images: Float[Array, "b h h"], taps: Taps) -> Float[Array, "b h h"]:
+    """Return images resampled by a table of the same size."""
+    flat = images.reshape(len(images), -1)
+    parts = (flat[:, pixels] * weights[None] for pixels, weights in zip(taps.pixels.T, taps.weights.T, strict=True))
+    return functools.reduce(jnp.add, parts).reshape(images.shape)
+
+
+def resampled_maps(maps: Float[Array, "b h h c"], taps: Taps) -> Float[Array, "b h h c"]:
+    """Return small maps of many channels resampled by a table, as a product with a dense matrix."""
+    matrix = np.zeros((len(taps.pixels),) * 2, np.float32)
+    np.add.at(matrix, (np.arange(len(matrix))[:, None], taps.pixels), taps.weights)
+    return jnp.einsum("pq,bqc->bpc", matrix, maps.reshape(len(maps), -1, maps.shape[-1])).reshape(maps.shape)
+
+
+def resized(maps: Float[Array, "b h h c"], size: int) -> Float[Array, "b {size} {size} c"]:
+    """Return maps resampled to another size. The corners of both sizes coincide, and zeros surround the maps."""
+    before = maps.shape[1]
+    at = np.linspace(0, before - 1, size)
+    along = cubic(at[:, None] - np.arange(before)).astype(np.float32)
+    return jnp.einsum("ip,jq,bpqc->bijc", along, along, maps)
+
+
 def grey_image(record: Record) -> UInt8[np.ndarray, "151 151"]:
     """Return the ready-made density image of a record, or the density image of a scan, as grey values.
 
@@ -154,14 +225,6 @@ def turned(key: Array, images: Num[Array, "b h h"]) -> Num[Array, "b h h"]:
     angles = jax.random.uniform(key, (len(images),), maxval=2 * jnp.pi)
     rotated = rotate_image(images.astype(jnp.float32), angles)
     return jnp.rint(rotated).astype(images.dtype)
-
-
-def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the mean over the tuples of max over the negatives of [0.3 + d_positive - d_negative]_+, d = L2."""
-    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
-    distances = descriptor_distance(*jnp.broadcast_arrays(anchors, others))
-    positive, negative = jnp.split(distances, [tuples.positives], axis=1)
-    return lazy_triplet(positive, negative, margin=MARGIN, closest_positive=False).mean()
 
 
 PUBLISHED = (
@@ -194,7 +257,7 @@ def _method(name: str, source: str, *, rotations: int, tuples: int) -> LearnedMe
         network=network,
         prepare=grey_image,
         turned=turned,
-        loss=loss,
+        loss=functools.partial(triplet, margin=MARGIN, closest_positive=False),
         recipe=recipe,
         start=functools.partial(with_clusters, network),
     )

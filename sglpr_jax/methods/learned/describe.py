@@ -1,17 +1,30 @@
-"""Descriptors of prepared inputs by a learned method, in evaluation mode."""
+"""Descriptors of prepared inputs by a learned method, and their distances, for arrays of any size.
+
+A descriptor file states a learned distance as `METHOD:WEIGHTS#HASH`: the folder of the weights, or `random:SEED`, and
+the beginning of their hash. The distance can be computed as long as this folder holds these weights.
+"""
 
 import functools
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32, Shaped
 
 from sglpr_jax.methods.learned.method import LearnedMethod, Variables
+from sglpr_jax.methods.learned.weights_file import RANDOM, load_variables, variables_hash
+from sglpr_jax.methods.method import DistanceFn
+from sglpr_jax.methods.pairwise import in_blocks
 
 BATCH = 16
 """Number of inputs that are described at a time."""
+BLOCK = 512
+"""Number of descriptors on each side of a block of distances."""
+HASHED = 12
+"""Number of characters of the hash in the name of a distance."""
 
 
 @functools.partial(jax.jit, static_argnames="method")
@@ -50,3 +63,54 @@ def check_descriptors(method: str, descriptors: np.ndarray, names: Sequence[str]
         if bad.any():
             raise ValueError(f"{method}: expected a descriptor of {names[int(bad.argmax())]}, found {what}")
     return descriptors.astype(np.float32)
+
+
+def learned_distance(method: LearnedMethod, variables: Variables) -> DistanceFn:
+    """Return the distance of a trained method: its own one, or L2 if it has none.
+
+    Arguments:
+      method: Method of the descriptors.
+      variables: Weights of its network.
+    """
+    own = method.compare
+    compare = jax.jit(_l2 if own is None else lambda queries, database: own(variables, queries, database))
+
+    def of_block(queries: tuple[Any, int], database: tuple[Any, int]) -> np.ndarray:
+        (a, q), (b, n) = queries, database
+        return np.asarray(compare(a, b))[:q, :n]
+
+    def distance(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> np.ndarray:
+        return in_blocks(of_block, queries, database, block=BLOCK, prepare=_padded)
+
+    return distance
+
+
+def stated_distance(method: str, weights: str, hashed: str) -> str:
+    """Return the name of a learned distance. Folders become absolute, for other working folders."""
+    where = weights if weights.startswith(RANDOM) else str(Path(weights).absolute())
+    return f"{method}:{where}#{hashed[:HASHED]}"
+
+
+@functools.lru_cache(maxsize=4)
+def distance_of_weights(method: LearnedMethod, name: str) -> DistanceFn:
+    """Return the distance called `name`, of `stated_distance`.
+
+    Raises:
+      FileNotFoundError: If the folder of the weights does not exist any more.
+      ValueError: If it holds other weights.
+    """
+    weights, _, hashed = name.removeprefix(f"{method.name}:").rpartition("#")
+    variables = load_variables(weights, method)
+    if variables_hash(variables)[:HASHED] != hashed or not hashed:
+        raise ValueError(f"{weights}: expected the weights {hashed} that made the descriptors, found others")
+    return learned_distance(method, variables)
+
+
+def _l2(queries: jax.Array, database: jax.Array) -> jax.Array:
+    return jax.lax.map(lambda query: jnp.sqrt(jnp.square(query[None] - database).sum(-1)), queries)
+
+
+def _padded(rows: Float32[np.ndarray, "n d"]) -> tuple[Float32[np.ndarray, "m d"], int]:
+    """Return the rows, padded to a power of two so that few sizes are compiled, and their number."""
+    missing = 2 ** max(len(rows) - 1, 0).bit_length() - len(rows)
+    return np.pad(rows, ((0, missing), (0, 0))), len(rows)

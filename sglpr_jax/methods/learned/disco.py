@@ -12,17 +12,15 @@ not use it. Trained from scratch, as published.
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Shaped, UInt8
 
-from sglpr_jax.data.recording import Record, check_cloud
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.methods.learned.image_layers import Convolution, batch_norm, max_pool
-from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
-from sglpr_jax.methods.learned.quadruplet import quadruplet
+from sglpr_jax.data.recording import Record
+from sglpr_jax.methods.learned.layers import Convolution, batch_norm, max_pool
+from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rolled
+from sglpr_jax.methods.recipe import Recipe, TupleConfig
 
 RINGS, SECTORS, LAYERS = 40, 120, 20
 NEAREST_M, FARTHEST_M = 1.0, 70.0
@@ -42,9 +40,9 @@ def occupancy(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "40 120 2
     several of them. Points beyond 70 m are dropped; the published grid adds the corners of a square to its last ring.
 
     Arguments:
-      points: Points in metres: x forward, y left, z up. Points that are not finite are dropped.
+      points: Points in metres: x forward, y left, z up.
     """
-    x, y, z = points[np.isfinite(points).all(axis=1)].astype(np.float64).T
+    x, y, z = points.astype(np.float64).T
     radius, angle = np.hypot(x, y), np.arctan2(y, x) % (2 * np.pi)
     layer = np.floor((z - LOWEST_M) / LAYER_M)
     inside = (radius >= NEAREST_M) & (radius < FARTHEST_M) & (layer >= 0) & (layer < LAYERS)
@@ -117,20 +115,7 @@ def spectrum(maps: Float[Array, "b 40 120"]) -> Float[Array, "b 1024"]:
 
 def prepare(record: Record) -> UInt8[np.ndarray, "40 120 20"]:
     """Return the polar occupancy grid of a scan. Raises ValueError if the scan shows no place."""
-    points = record.upright_points
-    check_cloud(points, name=record.name)
-    return occupancy(points)
-
-
-def turned(key: Array, cells: Shaped[Array, "b 40 120 20"]) -> Shaped[Array, "b 40 120 20"]:
-    """Rotate each grid by a random number of sectors."""
-    shifts = jax.random.randint(key, (len(cells),), 0, SECTORS)
-    return jax.vmap(functools.partial(jnp.roll, axis=1))(cells, shifts)
-
-
-def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the lazy quadruplet loss with the farthest positive."""
-    return quadruplet(tuples, closest_positive=False)
+    return occupancy(finite_points(record))
 
 
 PUBLISHED = (
@@ -146,7 +131,7 @@ DISCO = LearnedMethod(
     weights=7_798_337,
     network=DiSCO(),
     prepare=prepare,
-    turned=turned,
-    loss=loss,
+    turned=functools.partial(rolled, axis=2),
+    loss=functools.partial(quadruplet, closest_positive=False),
     recipe=Recipe(PUBLISHED, TupleConfig(positives=2, negatives=9), tuples=2, learning_rates=(3e-6, 1e-5, 1e-4)),
 )

@@ -1,17 +1,22 @@
-"""Interface of a learned method: its network, input, loss and the settings of its training."""
+"""Interface of a learned method: network, input, loss and recipe. Points, rotations and losses that several share."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float, Shaped
+from jaxtyping import Array, Float, Float32, Shaped
 
-from sglpr_jax.data.recording import Record
-from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.recording import Record, check_cloud
+from sglpr_jax.losses import descriptor_distance, lazy_triplet
 from sglpr_jax.methods.method import Takes
+from sglpr_jax.methods.recipe import Recipe
 
+MARGIN, OTHER_MARGIN = 0.5, 0.2
+"""Margins of the lazy quadruplet loss."""
 Variables = Mapping[str, Any]
 """Variables of a network: `params`, and `batch_stats` if it has batch normalisation."""
 
@@ -35,20 +40,6 @@ class Compare(Protocol):
     ) -> Float[Array, "q n"]:
         """Return the distances. Smaller distances mean more similar places."""
         ...
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """Settings of the training."""
-
-    published: str
-    """Training of the authors, in words: optimiser, loss, tuples, duration."""
-    sampling: TupleConfig
-    tuples: int
-    """Number of tuples in a step."""
-    learning_rates: tuple[float, float, float]
-    """Learning rates of the search, smallest first. The second one is the published one, if that is known."""
-    weight_decay: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -82,3 +73,49 @@ class LearnedMethod:
     start: Callable[[Variables, Shaped[np.ndarray, "n ..."]], Variables] | None = None
     """Changes random weights before the first step, for example to clusters of local features. It receives the inputs
     of random training places. None: the weights stay as they are."""
+
+
+def finite_points(record: Record) -> Float32[np.ndarray, "n 3"]:
+    """Return the finite points of a scan, gravity-aligned. Raises ValueError if the scan shows no place."""
+    points = record.upright_points
+    check_cloud(points, name=record.name)
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def rolled(key: Array, inputs: Shaped[Array, "b ..."], *, axis: int) -> Shaped[Array, "b ..."]:
+    """Roll each input along `axis`, the azimuths, by its own random number of columns."""
+    shifts = jax.random.randint(key, (len(inputs),), 0, inputs.shape[axis])
+    return jax.vmap(lambda one, shift: jnp.roll(one, shift, axis=axis - 1))(inputs, shifts)
+
+
+def triplet(variables: Variables, tuples: Tuples, *, squared: bool = False, **options) -> Float[Array, ""]:
+    """Return the mean over the tuples of `losses.lazy_triplet` with these options, with d = L2 or its square."""
+    positive, negative = from_anchors(tuples, squared=squared)
+    return lazy_triplet(positive, negative, **options).mean()
+
+
+def quadruplet(variables: Variables, tuples: Tuples, *, closest_positive: bool) -> Float[Array, ""]:
+    """Return the mean over the tuples of the lazy quadruplet loss, with d = L2 squared.
+
+        max over negatives of [0.5 + d(anchor, p) - d(anchor, n)]_+ + the same of [0.2 + d(anchor, p) - d(o, n)]_+
+
+    The published other negative o is far from all places of the tuple. Here it is the anchor of the next tuple, because
+    tuples have no more places. Its distance from the negatives is not checked. A single tuple has no second term.
+
+    With `closest_positive`, p is the closest positive. Otherwise it is the farthest one.
+    """
+    positive, negative = from_anchors(tuples, squared=True)
+    total = lazy_triplet(positive, negative, margin=MARGIN, closest_positive=closest_positive)
+    if len(tuples.descriptors) > 1:
+        others = jnp.roll(tuples.descriptors[:, :1], -1, axis=0)
+        negatives = tuples.descriptors[:, 1 + tuples.positives :]
+        between = descriptor_distance(*jnp.broadcast_arrays(others, negatives), squared=True)
+        total = total + lazy_triplet(positive, between, margin=OTHER_MARGIN, closest_positive=closest_positive)
+    return total.mean()
+
+
+def from_anchors(tuples: Tuples, *, squared: bool) -> list[Float[Array, "t _"]]:
+    """Return the distances of the anchors to their positives and to their negatives."""
+    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
+    distances = descriptor_distance(*jnp.broadcast_arrays(anchors, others), squared=squared)
+    return jnp.split(distances, [tuples.positives], axis=1)

@@ -8,17 +8,17 @@ Recipe here: the same optimiser and loss, 2 tuples a step. Distances decide whic
 Trained from scratch, as published.
 """
 
-import jax
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.data.recording import Record, check_cloud
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.losses import descriptor_distance, lazy_triplet
-from sglpr_jax.methods.learned.image_layers import HE, NetVLAD
-from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.data.recording import Record
+from sglpr_jax.methods.learned.layers import HE, NetVLAD
+from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, rolled, triplet
+from sglpr_jax.methods.recipe import Recipe, TupleConfig
 from sglpr_jax.models.layers import l2_normalize
 
 ROWS, COLUMNS = 64, 900
@@ -42,9 +42,9 @@ def range_image(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "64 9
     counter-clockwise from x.
 
     Arguments:
-      points: Points in metres: x forward, y left, z up. Points that are not finite are dropped.
+      points: Points in metres: x forward, y left, z up.
     """
-    x, y, z = points[np.isfinite(points).all(axis=1)].astype(np.float64).T
+    x, y, z = points.astype(np.float64).T
     distance, angle = np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x) % (2 * np.pi)
     elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
     row = np.floor((HIGHEST_DEG - elevation) * (ROWS / (HIGHEST_DEG - LOWEST_DEG)))
@@ -101,26 +101,7 @@ def dense(features: int, x: Float[Array, "*b c"]) -> Float[Array, "*b {features}
 
 def prepare(record: Record) -> Float32[np.ndarray, "64 900"]:
     """Return the range image of a scan. Raises ValueError if the scan shows no place."""
-    points = record.upright_points
-    check_cloud(points, name=record.name)
-    return range_image(points)
-
-
-def turned(key: Array, images: Float[Array, "b 64 900"]) -> Float[Array, "b 64 900"]:
-    """Rotate each image by a random number of columns."""
-    shifts = jax.random.randint(key, (len(images),), 0, COLUMNS)
-    return jax.vmap(lambda image, shift: jnp.roll(image, shift, axis=1))(images, shifts)
-
-
-def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the mean over the tuples of the sum over negatives of [0.5 + d_positive - d_negative]_+.
-
-    d is L2 squared, and d_positive is the distance of the farthest positive.
-    """
-    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
-    distances = descriptor_distance(*jnp.broadcast_arrays(anchors, others), squared=True)
-    positive, negative = jnp.split(distances, [tuples.positives], axis=1)
-    return lazy_triplet(positive, negative, margin=MARGIN, closest_positive=False, reduction="sum").mean()
+    return range_image(finite_points(record))
 
 
 PUBLISHED = (
@@ -136,7 +117,7 @@ OVERLAP_TRANSFORMER = LearnedMethod(
     weights=9_484_848,
     network=OverlapTransformer(),
     prepare=prepare,
-    turned=turned,
-    loss=loss,
+    turned=functools.partial(rolled, axis=2),
+    loss=functools.partial(triplet, squared=True, margin=MARGIN, closest_positive=False, reduction="sum"),
     recipe=Recipe(PUBLISHED, TupleConfig(positives=6, negatives=6), tuples=2, learning_rates=(2e-6, 5e-6, 1e-4)),
 )

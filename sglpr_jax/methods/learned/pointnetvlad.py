@@ -12,6 +12,7 @@ The PyTorch port of others differs in batch normalisation, activations, the choi
 rate. It is not followed.
 """
 
+import functools
 from collections.abc import Sequence
 
 import jax
@@ -21,11 +22,10 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Int
 
 from sglpr_jax.bev import rotate_points
-from sglpr_jax.data.recording import Record, check_cloud
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.methods.learned.maximum import maximum
-from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
-from sglpr_jax.methods.learned.quadruplet import quadruplet
+from sglpr_jax.data.recording import Record
+from sglpr_jax.methods.learned.layers import maximum
+from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet
+from sglpr_jax.methods.recipe import Recipe, TupleConfig
 from sglpr_jax.methods.voxel_means import voxel_means
 from sglpr_jax.models.layers import l2_normalize
 
@@ -122,9 +122,7 @@ def scaled_points(record: Record) -> Float32[np.ndarray, "4096 3"]:
     Raises:
       ValueError: If the scan shows no place, or has no points above the ground within 40 m.
     """
-    points = record.upright_points
-    check_cloud(points, name=record.name)
-    points = points[np.isfinite(points).all(axis=1)]
+    points = finite_points(record)
     near = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]
     if len(near) == 0:
         raise ValueError(
@@ -147,11 +145,6 @@ def turned(key: Array, points: Float[Array, "b n 3"]) -> Float[Array, "b n 3"]:
     return rotate_points(points, jax.random.uniform(key, (len(points),), maxval=2 * jnp.pi))
 
 
-def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the lazy quadruplet loss with the closest positive."""
-    return quadruplet(tuples, closest_positive=True)
-
-
 POINTNETVLAD = LearnedMethod(
     name="pointnetvlad",
     source='Uy and Lee, "PointNetVLAD", CVPR 2018, TensorFlow form',
@@ -161,7 +154,7 @@ POINTNETVLAD = LearnedMethod(
     network=PointNetVlad(),
     prepare=scaled_points,
     turned=turned,
-    loss=loss,
+    loss=functools.partial(quadruplet, closest_positive=True),
     recipe=Recipe(
         published=(
             "Adam 5e-5, times 0.9 every 5 epochs, at least 1e-5; lazy quadruplet loss with margins 0.5 and 0.2 and "

@@ -16,10 +16,10 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Int32
 
 from sglpr_jax.data.recording import Record
-from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.losses import descriptor_distance
-from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
+from sglpr_jax.methods.recipe import Recipe, TupleConfig
 
 COLUMNS = 360
 RANGE_M = 50.0

@@ -57,7 +57,7 @@ def save_variables(folder: Path, method: LearnedMethod, variables: Variables, ab
     values = {name: np.asarray(leaf, order="C") for name, leaf in by_name(variables).items()}
     with replacing(folder) as new:
         new.mkdir()
-        (new / WEIGHTS_FILE).write_bytes(tensors_as_bytes(values, {"sha256": hash_of(values)}))
+        (new / WEIGHTS_FILE).write_bytes(checked_tensors(values))
         (new / CONFIG_FILE).write_text(json_text({"method": method.name, **about}))
 
 
@@ -97,6 +97,11 @@ def method_of(folder: Path) -> str | None:
     about = read_json(folder / CONFIG_FILE) if (folder / CONFIG_FILE).is_file() else None
     found = about.get("method") if isinstance(about, dict) else None
     return found if isinstance(found, str) else None
+
+
+def checked_tensors(values: Mapping[str, np.ndarray]) -> bytes:
+    """Return the content of a safetensors file of C-contiguous arrays, with their checksum for `read_tensors`."""
+    return tensors_as_bytes(values, {"sha256": hash_of(values)})
 
 
 def read_tensors(path: Path) -> dict[str, np.ndarray]:

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Int, Shaped
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.data.scan_stream import check_readable, scan_stream
 from sglpr_jax.files import file_name, in_short, replacing
-from sglpr_jax.methods.learned.content import require_content
 from sglpr_jax.methods.learned.method import LearnedMethod
+from sglpr_jax.methods.method import require_content
 from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.training.tuples import TuplePool
 
 SCANS_AHEAD = 8
 """Number of scans that are read ahead."""

@@ -1,13 +1,14 @@
-"""Every tuple is what its configuration says, and a pure function of seed and step."""
+"""Every tuple is what its configuration says, and a pure function of seed and step; held-out places are apart."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
-from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.methods.recipe import TupleConfig
+from sglpr_jax.training.config import ValidationConfig
+from sglpr_jax.training.mining import DescriptorCache
+from sglpr_jax.training.tuples import TuplePool, hold_out
 
 LAP = 60
 
@@ -77,15 +78,6 @@ def test_three_metres_are_too_far_for_a_positive_and_twenty_too_near_for_a_negat
     np.testing.assert_array_equal(pool.far_apart(np.array(0), np.arange(5)), [False, False, False, False, True])
 
 
-def test_places_of_different_drives_are_never_positives_and_always_negatives():
-    config = TupleConfig(negatives=5)
-    recording = circuit(1)
-    pool = TuplePool([recording, recording], config)
-    anchors, near, _ = columns(pool.draw(seed=0, step=0, tuples=20), config)
-    assert (pool.recording[anchors] == pool.recording[near]).all()
-    assert pool.far_apart(np.arange(LAP), np.arange(LAP) + LAP).all()
-
-
 def test_a_batch_is_a_pure_function_of_seed_and_step():
     pool = TuplePool([circuit(3)], TupleConfig(revisit_gap=LAP // 2))
     rows = pool.draw(seed=1, step=2, tuples=4)
@@ -142,13 +134,6 @@ def test_the_anchors_of_a_cluster_lie_near_each_other_and_the_others_anywhere():
     assert (np.abs(np.diff(pool.frame[single])) > 40).mean() > 0.8
 
 
-def test_a_cluster_without_another_anchor_nearby_goes_elsewhere():
-    pairs = np.zeros((20, 3))
-    pairs[:, 0] = np.repeat(np.arange(10) * 500.0, 2) + np.tile([0, 1], 10)
-    pool = TuplePool([pairs], TupleConfig(negatives=0, cluster=2, cluster_m=0.5, revisit_gap=1))
-    assert len(pool.draw(seed=0, step=0, tuples=10)) == 10
-
-
 def described(pool: TuplePool, places: np.ndarray | None = None) -> DescriptorCache:
     places = np.arange(len(pool)) if places is None else places
     return DescriptorCache(places, np.random.default_rng(3).normal(size=(len(places), 4)).astype(np.float32))
@@ -179,18 +164,6 @@ def test_negatives_are_drawn_from_more_of_the_hardest_than_are_needed():
     hardest = set(cache.nearest(int(of_one[0, 0]), far, 6).tolist())
     drawn = set(of_one[:, 2:].ravel().tolist())
     assert len(of_one) > 8 and len(drawn) > 2 and drawn <= hardest
-
-
-def test_a_mined_batch_is_a_pure_function_of_seed_step_and_cache():
-    config = TupleConfig(negatives=3, mining="hardest", revisit_gap=LAP // 2)
-    pool = TuplePool([circuit(3)], config)
-    cache = described(pool)
-    rows = pool.draw(seed=1, step=2, tuples=4, cache=cache)
-    again = DescriptorCache(cache.places.copy(), cache.descriptors.copy())
-    np.testing.assert_array_equal(pool.draw(seed=1, step=2, tuples=4, cache=again), rows)
-    other = DescriptorCache(cache.places, cache.descriptors[::-1].copy())
-    assert (pool.draw(seed=1, step=2, tuples=4, cache=other) != rows).any()
-    assert (pool.draw(seed=1, step=2, tuples=4) != rows).any()
 
 
 def test_mined_clusters_look_alike_and_lie_far_apart():
@@ -234,3 +207,58 @@ def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
     for group, other_visit in ((pool.neighbours, False), (pool.revisits, True)):
         anchors = np.repeat(np.arange(len(pool)), np.diff(group.starts))
         assert ((np.abs(pool.frame[anchors] - pool.frame[group.frames]) > LAP // 2) == other_visit).all()
+
+
+SAMPLING = TupleConfig(revisit_gap=20)
+
+
+def wandering(seed: int, frames: int = 400) -> np.ndarray:
+    """A recording of 2 m between frames that turns at random, so that it may cross itself; heights are noise."""
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(rng.normal(scale=0.15, size=frames))
+    across = np.cumsum(2 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    return np.column_stack([across, rng.normal(scale=50, size=frames)])
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10**6), share=st.floats(0.02, 0.5))
+def test_no_training_frame_lies_within_the_negative_distance_of_a_validation_frame(seed, share):
+    positions = wandering(seed)
+    split = hold_out(positions, ValidationConfig(share=share), SAMPLING)
+    assert not set(split.training) & set(split.validation)
+    assert len(split.validation) >= round(share * len(positions))
+    if len(split.training):
+        assert apart(positions[split.training], positions[split.validation]).min() > SAMPLING.negative_m
+    left_out = np.setdiff1d(np.arange(len(positions)), np.r_[split.training, split.validation])
+    if len(left_out):
+        assert apart(positions[left_out], positions[split.validation]).min(1).max() <= SAMPLING.negative_m
+
+
+def test_the_stretch_comes_with_its_revisits_and_its_fair_share_of_them():
+    out_and_back = np.r_[np.arange(0, 600, 2.0), np.arange(600, 300, -2.0)]  # the second half of the way out comes back
+    positions = np.column_stack([out_and_back, np.zeros((len(out_and_back), 2))])
+    split = hold_out(positions, ValidationConfig(share=0.1), SAMPLING)
+    there, back = split.validation[split.validation < 300], split.validation[split.validation >= 300]
+    assert len(there) and len(back)
+    assert apart(positions[there], positions[back]).min(0).max() < SAMPLING.positive_m
+    rows = split.training[split.training < 300]
+    assert (positions[rows, 0] > 300).sum() > 60  # most of what is revisited is still trained on
+
+
+def test_a_drive_without_revisits_gives_its_first_frames_and_share_0_nothing():
+    positions = np.column_stack([np.arange(0, 400, 2.0), np.zeros((200, 2))])
+    split = hold_out(positions, ValidationConfig(share=0.25), SAMPLING)
+    np.testing.assert_array_equal(split.validation, np.arange(51))  # and the one frame less than 3 m further on
+    np.testing.assert_array_equal(split.training, np.arange(61, 200))
+    nothing = hold_out(positions, ValidationConfig(), SAMPLING)
+    assert len(nothing.validation) == 0 and len(nothing.training) == 200
+
+
+@pytest.mark.parametrize("share", [-0.1, 0.6])
+def test_a_share_out_of_range_is_refused(share):
+    with pytest.raises(ValueError, match=r"ValidationConfig\.share: expected a number from 0 up to 0\.5, found"):
+        ValidationConfig(share=share)

@@ -1,4 +1,4 @@
-"""NetVLAD's clusters at the start: centres of the local features, and an assignment of stated sharpness."""
+"""Layers of the learned methods: NetVLAD and its clusters at the start, and the maximum with its derivative."""
 
 import jax
 import jax.numpy as jnp
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from sglpr_jax.methods.learned.clusters import FEATURES, LOCAL, with_clusters
-from sglpr_jax.methods.learned.image_layers import NetVLAD
+from sglpr_jax.methods.learned.layers import FEATURES, LOCAL, NetVLAD, maximum, with_clusters
 from sglpr_jax.models.layers import l2_normalize
+
+from . import image_reference as reference
 
 DIRECTIONS = l2_normalize(2 + jax.random.normal(jax.random.key(0), (8, 16)))
 
@@ -52,3 +53,27 @@ def test_descriptors_are_farther_apart(clustered):
         return np.linalg.norm(found[:, None] - found[None], axis=-1).mean()
 
     assert apart(after) > 1.5 * apart(before)
+
+
+def test_netvlad():
+    x = jax.random.normal(jax.random.key(0), (2, 30, 5))
+    layer = NetVLAD(7)
+    variables = layer.init(jax.random.key(0), x)
+    params = jax.tree.map(np.asarray, variables["params"])
+    expected = np.stack([reference.netvlad(one, params) for one in np.asarray(x)])
+    np.testing.assert_allclose(layer.apply(variables, x), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_maximum_and_its_derivative_are_those_of_numpy(axis):
+    x = np.random.default_rng(0).normal(size=(3, 4, 5)).astype(np.float32)
+    np.testing.assert_array_equal(maximum(jnp.asarray(x), axis), x.max(axis))
+    slope = jax.grad(lambda x: jnp.square(maximum(x, axis)).sum())(jnp.asarray(x))
+    highest = x == x.max(axis, keepdims=True)
+    np.testing.assert_allclose(slope, 2 * x * highest, rtol=1e-6)
+
+
+def test_equal_values_have_one_winner():
+    slope = jax.grad(lambda x: maximum(x, 0).sum())(jnp.ones((4, 2)))
+    np.testing.assert_array_equal(slope.sum(0), 1)
+    assert set(np.asarray(slope).ravel().tolist()) == {0.0, 1.0}

@@ -1,4 +1,4 @@
-"""A step in chunks is the step of the whole batch, and it learns."""
+"""What a step sees, and its gradient: a step in chunks is the step of the whole batch, and it learns."""
 
 import dataclasses
 import functools
@@ -9,18 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.data.sampling.batch import Batch
+from sglpr_jax.grid import Grid
+from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.sglpr import forward
 from sglpr_jax.models.weights import by_name, for_places
-from sglpr_jax.training.config import LossConfig, without_untrained_head
+from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
+from sglpr_jax.training.config import LossConfig, OcclusionConfig, without_untrained_head
+from sglpr_jax.training.image_network import ImageNetwork, _angles, _chunks, gradients, summarize, visible
 from sglpr_jax.training.loss import Summary, joint_loss, triplet, violations
-from sglpr_jax.training.presets import load_preset
-from sglpr_jax.training.state import new_state
-from sglpr_jax.training.step import _chunks, gradients, summarize, train_step
+from sglpr_jax.training.step import train_step
 
-from .conftest import SWIN
-
-FAST_COMPILE = {"xla_backend_optimization_level": 0}
+from .conftest import FAST_COMPILE, SWIN
 
 
 @functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILE)
@@ -51,17 +50,6 @@ def test_chunks_give_the_gradient_and_metrics_of_the_whole_batch(config, params,
     assert_same(gradient, whole[0])
     assert np.abs(gradient["segmentation_head"]["kernel"]).max() > 1e-3
     assert np.abs(gradient["place_head"]["netvlad"]["centres"]).max() > 1e-3
-
-
-@pytest.mark.slow
-def test_without_labels_the_triplet_loss_is_all_in_chunks_too(config, params, make_batch):
-    batch = make_batch(0, images=True)
-    gradient, metrics = gradients_of(params, batch, config)
-    assert set(metrics) == {"loss", "triplet", "violations"}
-    assert metrics["loss"] == metrics["triplet"] > 0
-    assert np.abs(gradient["segmentation_head"]["kernel"]).max() == 0
-    assert np.abs(gradient["place_head"]["netvlad"]["centres"]).max() > 1e-3
-    assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
 
 
 @pytest.fixture(scope="module")
@@ -179,9 +167,8 @@ def test_a_term_without_weight_is_not_computed(config, params, make_batch, whole
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tap", ["tokens", "pixels"])
-def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(config, random_params, make_batch, tap):
-    head = dataclasses.replace(config.model.head, tap=tap)
+def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(config, random_params, make_batch):
+    head = dataclasses.replace(config.model.head, tap="pixels")
     loss = dataclasses.replace(config.loss, segmentation_alone=True)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head, detail=4), loss=loss)
     params, batch = random_params(config.model), make_batch(0)
@@ -195,8 +182,9 @@ def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(con
         assert_same(gradient, np.zeros_like(gradient) if name in described else by_name(expected)[name])
     assert {"segmentation_head/kernel", "narrow/kernel"} <= set(by_name(found)) - set(described)
 
-    state = new_state(config, params=jax.tree.map(jnp.copy, params))
-    learnt = by_name(train_step(state, batch, config=config)[0].params.weights)
+    network = ImageNetwork(config)
+    state = network.new_state(jax.tree.map(jnp.copy, params))
+    learnt = by_name(train_step(state, batch, network=network)[0].params.weights)
     moved = {name for name, value in by_name(params.weights).items() if not np.array_equal(value, learnt[name])}
     assert moved == set(learnt) - set(described)
 
@@ -245,11 +233,10 @@ def test_both_passes_over_a_chunk_drop_the_same_branches(config, random_params, 
     config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(SWIN, backbone=backbone))
     params, batch = random_params(config.model), jax.tree.map(jnp.asarray, make_batch(0))
 
-    def loss_of(weights, backbone=backbone):
-        model = dataclasses.replace(config.model, backbone=backbone)
+    def loss_of(weights):
         chunks = chunks_of(batch, config)
         parts = [
-            summarize(dataclasses.replace(params, weights=weights, config=model), chunk, config.loss)
+            summarize(dataclasses.replace(params, weights=weights), chunk, config.loss)
             for chunk in (jax.tree.map(lambda x, i=i: x[i], chunks) for i in range(config.images // config.chunk))
         ]
         descriptors, sums = zip(*parts, strict=True)
@@ -259,9 +246,6 @@ def test_both_passes_over_a_chunk_drop_the_same_branches(config, random_params, 
     found = gradients_of(params, batch, config)
     plain = jax.grad(loss_of, has_aux=True)
     assert_same(found, jax.jit(plain, compiler_options=FAST_COMPILE)(params.weights))
-    whole = functools.partial(loss_of, backbone=dataclasses.replace(backbone, drop_path=0.0))
-    of_all = jax.jit(whole, compiler_options=FAST_COMPILE)(params.weights)[1]
-    assert abs(float(found[1]["loss"] - of_all["loss"])) > 1e-4
 
 
 def test_the_share_of_violations_is_that_of_the_margin_for_the_smooth_loss_too(make_batch):
@@ -280,13 +264,14 @@ def test_steps_lower_the_loss_and_compile_once(config, random_params, make_batch
     params = random_params(config.model)
     chex.clear_trace_counter()
     traced = chex.assert_max_traces(train_step.__wrapped__, n=1)
-    step = jax.jit(traced, static_argnames="config", donate_argnames="state", compiler_options=FAST_COMPILE)
+    step = jax.jit(traced, static_argnames="network", donate_argnames="state", compiler_options=FAST_COMPILE)
+    network = ImageNetwork(config)
 
     def run(*, steps: int, start: int = 0):
-        state = new_state(config, params=jax.tree.map(jnp.copy, params)).replace(step=jnp.int32(start))
+        state = network.new_state(jax.tree.map(jnp.copy, params)).replace(step=jnp.int32(start))
         seen = []
         for i in range(steps):
-            state, metrics = step(state, make_batch(0), config=config)
+            state, metrics = step(state, make_batch(0), network=network)
             assert state.step == start + i + 1
             seen.append(jax.device_get(metrics))
         return state.params.weights, seen
@@ -303,19 +288,155 @@ def test_steps_lower_the_loss_and_compile_once(config, random_params, make_batch
     assert run(steps=1, start=1)[1][0]["loss"] != losses[0]  # each step has its own rotations
 
 
-@pytest.mark.slow
-def test_the_step_of_the_preset_that_the_pages_train_is_whole():
-    """Only traced, for it would be compiled for a minute."""
-    config = dataclasses.replace(load_preset("sglpr"), tuples=4)
-    grid, images = config.model.grid, config.images
-    batch = Batch(
-        labelled=np.ones(images, bool),
-        negatives=np.arange(images)[None] > config.sampling.positives,
-        positives=config.sampling.positives,
-        images=np.zeros((images, grid.height, grid.width), np.float32),
-        maps=np.zeros((images, grid.height, grid.width), np.int32),
+def test_rotations_follow_the_key_and_can_be_turned_off(config, make_batch):
+    batch = make_batch(0)
+    angle_key, other_key = jax.random.split(jax.random.key(0))
+    turned, again, other = (
+        _chunks(batch, key, other_key, config).images for key in (angle_key, angle_key, jax.random.key(5))
     )
-    state = jax.eval_shape(lambda: new_state(config))
-    after, metrics = jax.eval_shape(functools.partial(train_step, config=config), state, batch)
-    assert jax.tree.structure(after) == jax.tree.structure(state)
-    assert {"loss", "triplet", "cross_entropy", "dice"} <= set(metrics)
+    np.testing.assert_array_equal(turned, again)
+    assert (turned != other).any(axis=(0, 2, 3)).all()
+    still = [
+        _chunks(batch, key, other_key, dataclasses.replace(config, rotate=False)).images
+        for key in (angle_key, jax.random.key(5))
+    ]
+    np.testing.assert_array_equal(*still)
+
+
+def test_of_a_share_of_the_places_the_rotation_is_a_quarter_turn_or_more(config, make_batch):
+    config = dataclasses.replace(config, quarter_turns=0.5)
+    keys = jax.random.split(jax.random.key(0), 60)
+    quarters = np.stack([_angles(key, config) for key in keys]) / (np.pi / 2)
+    whole = np.abs(quarters - np.round(quarters)) < 1e-5
+    assert 0.4 < whole.mean() < 0.6
+    assert np.bincount(np.round(quarters[whole]).astype(int), minlength=4).min() > whole.sum() / 6
+    assert np.ptp(np.histogram(quarters[~whole], bins=4, range=(0, 4))[0]) < (~whole).sum() / 6
+    batch = make_batch(0, images=True)
+    all_quarters = dataclasses.replace(config, quarter_turns=1.0)
+    for image, turned in zip(batch.images, chunks_of(batch, all_quarters).images[0], strict=True):
+        assert any(np.allclose(np.rot90(image, k), turned, atol=1e-4) for k in range(4))
+
+
+def test_labels_count_only_where_the_network_sees(config, make_batch):
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, field="circle"))
+    maps = np.asarray(chunks_of(make_batch(0), config).maps)
+    down, right = np.mgrid[:16, :16] - 7.5
+    outside = np.hypot(down, right) >= 8
+    assert (maps[..., outside] == 0).all()
+    assert (maps[..., ~outside] > 0).any()
+
+
+GRID = Grid(resolution_m=1.0, height=64, width=48)
+IMAGES = 400
+
+
+def bearings(grid):
+    """Of each cell's centre, degrees, by complex numbers."""
+    x, y = np.mgrid[: grid.height, : grid.width] + 0.5
+    return np.rad2deg(np.angle((x - grid.height / 2) + 1j * (y - grid.width / 2))) % 360
+
+
+def widths(hidden, grid):
+    """The width of each image's hidden cells in degrees; they must be one sector, without a cell left inside."""
+    bearing, group = np.unique(bearings(grid).round(3).ravel(), return_inverse=True)
+    step = np.diff([*bearing, bearing[0] + 360])
+    found = []
+    for one in hidden:
+        is_hidden = np.bincount(group, weights=one.ravel()) > 0
+        assert (is_hidden != np.roll(is_hidden, 1)).sum() <= 2
+        found.append(step[is_hidden].sum())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("widest_deg", [60.0, 180.0, 270.0])
+def test_a_sector_of_each_chosen_image_is_hidden(widest_deg):
+    config = OcclusionConfig(share=0.5, widest_deg=widest_deg)
+    shown = np.asarray(visible(jax.random.key(3), IMAGES, GRID, config))
+    hidden_deg = widths(~shown, GRID)
+    assert shown.shape == (IMAGES, 64, 48)
+    chosen = hidden_deg > 1
+    assert 0.4 < chosen.mean() < 0.6
+    assert 0.9 * widest_deg < hidden_deg.max() < widest_deg + 2
+    np.testing.assert_allclose(np.quantile(hidden_deg[chosen], [0.25, 0.75]) / widest_deg, [0.25, 0.75], atol=0.1)
+    hidden_everywhere = (~shown[chosen]).mean(0)  # each bearing as often as the others
+    assert np.ptp([hidden_everywhere[bearings(GRID) // 90 == quarter].mean() for quarter in range(4)]) < 0.12
+
+
+def test_what_is_hidden_has_neither_counts_nor_labels(config, make_batch):
+    batch = make_batch(0, images=True)
+    batch = batch.replace(
+        images=batch.images + 1, maps=np.ones(batch.images.shape, np.int32), labelled=np.ones(config.images, bool)
+    )
+    batch, config = jax.tree.map(jnp.asarray, batch), dataclasses.replace(config, rotate=False)
+    angle_key, model_key = jax.random.split(jax.random.key(0))
+
+    def chunk(occlusion):
+        chunks = _chunks(batch, angle_key, model_key, dataclasses.replace(config, occlusion=occlusion))
+        return np.asarray(chunks.images[0]), np.asarray(chunks.maps[0])
+
+    whole, labels = chunk(OcclusionConfig())
+    images, maps = chunk(OcclusionConfig(share=0.75))
+    hidden = images == 0
+    assert (whole > 0).all() and hidden.any((1, 2)).sum() >= 3 and not hidden.all((1, 2)).any()
+    np.testing.assert_array_equal(images, np.where(hidden, 0, whole))
+    np.testing.assert_array_equal(maps, np.where(hidden, UNLABELLED, labels))
+    assert (labels != UNLABELLED).any()
+
+
+def half(batch, rows: slice, tuples: slice):
+    """Some tuples of a batch, alone."""
+    cut = {
+        name: None if value is None else value[rows]
+        for name, value in ((n, getattr(batch, n)) for n in ("labelled", "images", "points", "count", "classes"))
+    }
+    return batch.replace(negatives=batch.negatives[tuples, rows], **cut)
+
+
+@pytest.fixture
+def mixed(make_batch):
+    """A tuple of images and one of scans, of which one has no labels; the scans count for the segmentation alone."""
+    images = half(make_batch(0, images=True), slice(0, 4), slice(0, 1))
+    scans = half(make_batch(1), slice(4, 8), slice(1, 2))
+    return mix(images, scans, triplets=False, share_negatives=False)
+
+
+@pytest.mark.parametrize("every", [1, 2, 4])
+def test_labelled_places_come_where_the_segmentation_head_looks_and_go_back(mixed, every):
+    places = jnp.arange(8)
+    order = in_network_order(places, mixed, every=every)
+    np.testing.assert_array_equal(in_batch_order(order, mixed, every=every), places)
+    seen = np.asarray(order)[::every]
+    assert (seen >= 4).sum() == min(len(seen), 4)
+    alone = mixed.replace(also=None)
+    np.testing.assert_array_equal(in_network_order(places, alone, every=every), places)
+
+
+@pytest.mark.slow
+def test_the_segmentation_learns_from_labelled_places_alone_and_the_triplet_loss_from_its_own(mixed, config, params):
+    assert mixed.labelled.sum() == 3
+    gradient, metrics = gradients_of(params, mixed, config)
+    assert np.abs(gradient["segmentation_head"]["kernel"]).max() > 1e-3
+    assert metrics["cross_entropy"] > 0 and metrics["triplet"] > 0
+
+    def segmentation_gradient(batch):
+        return gradients_of(params, batch, config)[0]["segmentation_head"]["kernel"]
+
+    other_images = mixed.replace(images=mixed.images[::-1].copy())
+    np.testing.assert_array_equal(segmentation_gradient(other_images), gradient["segmentation_head"]["kernel"])
+    unlabelled = np.flatnonzero(~mixed.labelled[4:])
+    points = mixed.also.points.copy()
+    points[unlabelled] += 3
+    other_scan = mixed.replace(also=mixed.also.replace(points=points))
+    np.testing.assert_array_equal(segmentation_gradient(other_scan), gradient["segmentation_head"]["kernel"])
+    classes = (mixed.also.classes + 1) % 20
+    relabelled = mixed.replace(also=mixed.also.replace(classes=classes))
+    assert np.abs(segmentation_gradient(relabelled) - gradient["segmentation_head"]["kernel"]).max() > 1e-4
+    assert gradients_of(params, relabelled, config)[1]["triplet"] == metrics["triplet"]
+
+
+@pytest.mark.slow
+def test_the_order_changes_nothing_but_who_is_segmented(mixed, config, params):
+    every = dataclasses.replace(config, loss=dataclasses.replace(config.loss, segment_every=2))
+    expected, found = gradients_of(params, mixed, config), gradients_of(params, mixed, every)
+    assert_same(found, expected)  # four of the eight images are segmented: those that could have labels
+    assert_same(gradients_of(params, mixed, dataclasses.replace(every, chunk=4)), expected)

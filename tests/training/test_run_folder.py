@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from sglpr_jax.training.environment import git_commit, note_environment
+from sglpr_jax.training.run_folder import git_commit, note_environment
 
 
 def git(folder, *arguments):
@@ -22,7 +22,7 @@ def test_versions_machine_and_command_line_are_noted(tmp_path, monkeypatch):
     note_environment(tmp_path, seed=3)
     noted = json.loads((tmp_path / "environment.json").read_text())
     assert noted["command"] == "train --out 'a folder'"
-    assert noted["packages"].keys() == {"sglpr-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy"}
+    assert noted["packages"].keys() == {"sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy"}
     assert (noted["packages"]["jax"], noted["packages"]["numpy"]) == (jax.__version__, np.__version__)
     assert noted["python"] == ".".join(map(str, sys.version_info[:3]))
     assert noted["backend"] == jax.default_backend() and len(noted["devices"]) == jax.device_count()
@@ -53,9 +53,7 @@ def test_a_checkout_has_a_commit_and_may_differ_from_it(tmp_path):
     assert git_commit(tmp_path) == {"commit": commit, "dirty": True}
 
 
-@pytest.mark.parametrize(
-    ("text", "found"), [("{", "expected JSON"), ("[]", r"a list `resumes`, found \[\]"), ('{"resumes": 3}', "resumes")]
-)
+@pytest.mark.parametrize(("text", "found"), [("{", "expected JSON"), ('{"resumes": 3}', "a list `resumes`")])
 def test_a_damaged_one_is_named(tmp_path, text, found):
     (tmp_path / "environment.json").write_text(text)
     with pytest.raises(ValueError, match=rf"environment\.json: .*{found}"):

@@ -1,14 +1,16 @@
-"""Draws training tuples: 1 anchor, k_p positives of the same place, k_n negatives of other places."""
+"""Draws training tuples: 1 anchor, k_p positives of the same place, k_n negatives of other places; holds out places."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
-from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
+from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.revisits import close_pairs
+from sglpr_jax.training.config import ValidationConfig
+from sglpr_jax.training.mining import DescriptorCache
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +127,13 @@ class TuplePool:
         """Return whether two frames show different places: in different recordings, or beyond the negative distance."""
         return ~self._within(a, b, self.config.negative_m)
 
+    def distances_from_anchors(self, frames: Int[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
+        """Return the horizontal distance of each place from the anchor of its tuple, in metres. Infinite between
+        recordings."""
+        offset = self.positions[frames, :2] - self.positions[frames[:, :1], :2]
+        same = self.recording[frames] == self.recording[frames[:, :1]]
+        return np.where(same, np.hypot(offset[..., 0], offset[..., 1]), np.inf).astype(np.float32)
+
     def _within(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."], metres: float) -> np.ndarray:
         """Whether two frames are in the same recording and at most this distance apart, in metres."""
         offset = self.positions[a, :2] - self.positions[b, :2]
@@ -142,3 +151,45 @@ class TuplePool:
 
 def _unless_empty(wanted: Int[np.ndarray, "_"], otherwise: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
     return wanted if len(wanted) else otherwise
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Split:
+    """Training and validation frames of one recording, in ascending order.
+
+    Frames close to a validation frame are in neither.
+    """
+
+    training: Int[np.ndarray, "_"]
+    validation: Int[np.ndarray, "_"]
+
+
+def hold_out(positions: Float[np.ndarray, "n 3"], config: ValidationConfig, sampling: TupleConfig) -> Split:
+    """Split a recording: a stretch of frames with all its revisits for validation, and distant frames for training.
+
+    Every validation frame is within the positive distance of the stretch. Every training frame is beyond the negative
+    distance of all validation frames, so that no house is visible in both parts. Both distances are horizontal. The
+    stretch is the first one whose fraction of the revisiting frames is nearest to its fraction of all frames.
+    """
+    n = len(positions)
+    length = round(config.share * n)
+    if length == 0:
+        return Split(np.arange(n), np.arange(0))
+    places = positions[:, :2]
+    revisiting = _revisiting(places, sampling)
+    inside = np.convolve(revisiting, np.ones(length), mode="valid")
+    start = int(np.abs(inside - config.share * revisiting.sum()).argmin())
+    validation = _within(places, places[start : start + length], np.nextafter(sampling.positive_m, 0))
+    near = _within(places, places[validation], sampling.negative_m)
+    return Split(np.flatnonzero(~near), np.flatnonzero(validation))
+
+
+def _revisiting(places: Float[np.ndarray, "n 2"], sampling: TupleConfig) -> Bool[np.ndarray, "n"]:
+    """Mark the frames that have a positive in another visit."""
+    pairs = close_pairs(places, closer_than_m=sampling.positive_m)
+    revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
+    return np.isin(np.arange(len(places)), revisits)
+
+
+def _within(places: Float[np.ndarray, "n 2"], some: Float[np.ndarray, "m 2"], metres: float) -> Bool[np.ndarray, "n"]:
+    return KDTree(some).query(places)[0] <= metres

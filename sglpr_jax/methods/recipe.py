@@ -1,9 +1,9 @@
-"""Configuration of the training tuples and of the held-out part."""
+"""Recipe of a training as plain values: its tuples, its learning rates. Presets and learned methods set them."""
 
 import dataclasses
-from typing import Annotated, Literal
+from typing import Literal
 
-from sglpr_jax.fields import Bounds, Count, CountOrNone, NotNegative, Share, check_fields
+from sglpr_jax.fields import Count, CountOrNone, NotNegative, Share, check_fields
 from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M, SAME_PASS_FRAMES
 
 
@@ -55,12 +55,14 @@ class TupleConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class ValidationConfig:
-    """Held-out part of every training recording."""
+class Recipe:
+    """Training of a learned method, beside its loss."""
 
-    share: Annotated[float, Bounds(0, 0.5)] = 0.0
-    """Length of the held-out stretch of consecutive frames, as a fraction of the recording; 0: none, as in the
-    paper."""
-
-    def __post_init__(self):
-        check_fields(self)
+    published: str
+    """Training of the authors, in words: optimiser, loss, tuples, duration."""
+    sampling: TupleConfig
+    tuples: int
+    """Number of tuples in a step."""
+    learning_rates: tuple[float, float, float]
+    """Learning rates of the search, smallest first. The second one is the published one, if that is known."""
+    weight_decay: float = 0.0

@@ -1,12 +1,17 @@
-"""Reading ahead keeps the order, passes errors on at their turn, and leaves no thread behind."""
+"""Batches are read ahead in their order, but not past a refresh; errors come at their turn, and no thread is left."""
 
 import threading
 
 import pytest
 
-from sglpr_jax.data.sampling.read_ahead import read_ahead
+from sglpr_jax.training.batch_queue import BatchQueue, read_ahead
+from sglpr_jax.training.batches import Batch
+from sglpr_jax.training.step import TrainState
+
+from .conftest import Made
 
 TIMEOUT_S = 10
+STATE = TrainState(0, {}, {})
 
 
 def reading_threads() -> list[threading.Thread]:
@@ -19,13 +24,9 @@ def no_thread_is_left():
     assert reading_threads() == []
 
 
-@pytest.mark.parametrize("depth", [1, 2, 5])
+@pytest.mark.parametrize("depth", [1, 5])
 def test_items_come_in_order(depth):
     assert list(read_ahead(lambda step: step * step, start=3, stop=20, depth=depth)) == [i * i for i in range(3, 20)]
-
-
-def test_nothing_to_do_yields_nothing():
-    assert list(read_ahead(lambda step: step, start=5, stop=5)) == []
 
 
 def test_an_error_is_raised_at_its_turn():
@@ -62,3 +63,33 @@ def test_reading_runs_ahead_of_the_consumer():
     assert next(items) == 0
     assert third.wait(TIMEOUT_S)  # made although only the first was taken
     items.close()
+
+
+def test_batches_are_never_read_past_a_refresh():
+    refreshed, made = [], []
+
+    def make(step: int) -> Batch:
+        made.append(step)
+        return Batch(labelled=step, negatives=refreshed[-1], positives=1)
+
+    source = Made(make)
+    source.refresh_steps, source.refresh = 4, lambda step, params: refreshed.append(step)
+    batches = BatchQueue(source, start=3, stop=11)
+    found = []
+    for _ in range(3, 11):
+        batches.prepare(lambda: STATE)
+        batch = next(batches)
+        found.append((batch.labelled, batch.negatives))
+    batches.close()
+    assert refreshed == [3, 4, 8] and made == list(range(3, 11))
+    assert found == [(3, 3), (4, 4), (5, 4), (6, 4), (7, 4), (8, 8), (9, 8), (10, 8)]
+
+
+def test_without_a_refresh_batches_are_read_as_they_come():
+    batches = BatchQueue(Made(lambda step: Batch(step, None, 1)), start=2, stop=5)
+    found = []
+    for _ in range(3):
+        batches.prepare(lambda: STATE)
+        found.append(next(batches).labelled)
+    batches.close()
+    assert found == [2, 3, 4]

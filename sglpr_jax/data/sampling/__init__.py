@@ -1,1 +1,0 @@
-"""Input of a training step: tuples of places, and batches of tuples."""

@@ -1,0 +1,364 @@
+"""Training of the networks of other publications (`methods/learned/`), and the search of their learning rate."""
+
+import contextlib
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import AxisType, Mesh
+from jaxtyping import Array, Float, Float32, Int, Shaped
+
+from sglpr_jax.fields import CountOrNone, NotNegative, Positive, check_fields
+from sglpr_jax.files import read_json, write_json
+from sglpr_jax.methods.learned.describe import describe_inputs, learned_distance
+from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
+from sglpr_jax.methods.learned.weights_file import LAST, random_variables, save_variables
+from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.training.batches import TupleBatches
+from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.checkpoint import checkpoint_steps
+from sglpr_jax.training.devices import AXIS
+from sglpr_jax.training.mining import FOLDER as MINING
+from sglpr_jax.training.mining import Mining
+from sglpr_jax.training.peer_inputs import Prepared
+from sglpr_jax.training.run_folder import CONFIG_FILE, claimed
+from sglpr_jax.training.step import Gradient, TrainState
+from sglpr_jax.training.trainer import CHECKPOINTS, Schedule, Trained, run_steps
+from sglpr_jax.training.tuples import TuplePool
+from sglpr_jax.training.validation import RECALL, recall_at_1, require_revisits
+
+SCORES_FILE = "scores.jsonl"
+RATES_FILE = "rates.json"
+LIMITS = ("settings.seconds", "settings.images")
+"""Settings that may differ when a run is resumed."""
+FIRST_SNAPSHOT = 1000
+"""Number of images at the first snapshot. Each further one has twice as many."""
+START_PLACES = 100
+"""Number of random places from which `LearnedMethod.start` sets weights."""
+LOG_EVERY = 10
+"""Number of steps between two lines of the metrics."""
+SAVE_EVERY_S, REPORT_EVERY_S = 60.0, 30.0
+"""Training time between two saved states, and between two lines of progress, in seconds."""
+DESCRIBED = 256
+"""Number of places whose inputs are in memory at a time."""
+
+ScoreFn = Callable[[Variables], dict[str, float]]
+"""Scores weights. The entry `recall_at_1` selects among them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSettings:
+    """Settings of a run, beside the recipe of its method."""
+
+    learning_rate: Positive
+    seed: CountOrNone = 0
+    seconds: NotNegative = 3600.0
+    """Training time in seconds. Scores and the compilation of the step do not count."""
+    images: CountOrNone = 0
+    """Number of images after which the training stops; 0: no limit."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+class PeerBatch(NamedTuple):
+    """Tuples of one step. All their places are in one array, tuple after tuple."""
+
+    inputs: Shaped[Any, "b ..."]
+    apart_m: Float[Any, "t k"]
+    """Distance of each place from the anchor of its tuple, in metres. Infinite between recordings."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PeerNetwork:
+    """A `PlaceNetwork` (`training.step`) with the network and the recipe of a learned method.
+
+    The learning rate is in the state of the optimiser, so that one compiled step serves every rate.
+    """
+
+    method: LearnedMethod
+    seed: int = 0
+
+    @property
+    def images(self) -> int:
+        """Images per step."""
+        sampling = self.method.recipe.sampling
+        return self.method.recipe.tuples * (1 + sampling.positives + sampling.negatives)
+
+    @property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam. The weight decay is added to the gradient, as in PyTorch."""
+        return self._adam(0.0)
+
+    def new_state(self, learning_rate: float = 0.0) -> TrainState:
+        """Return the state before the first step, with random weights."""
+        variables = dict(random_variables(self.method, seed=self.seed))
+        params = variables.pop("params")
+        return TrainState(jnp.int32(0), params, self._adam(learning_rate).init(params), variables)
+
+    def gradient(self, state: TrainState, batch: PeerBatch, key: Array) -> Gradient:
+        """Return the gradient of the loss of the rotated inputs, and the loss."""
+        inputs = self.method.turned(key, batch.inputs)
+
+        def loss_of(params):
+            variables, kept = {"params": params, **state.statistics}, [*state.statistics]
+            described, updated = self.method.network.apply(variables, inputs, train=True, mutable=kept)
+            descriptors = described.reshape(*batch.apart_m.shape, -1)
+            tuples = Tuples(descriptors, batch.apart_m, self.method.recipe.sampling.positives)
+            return self.method.loss({"params": params, **updated}, tuples), updated
+
+        (loss, updated), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+        return Gradient(gradient, {**state.statistics, **updated}, {"loss": loss})
+
+    def _adam(self, learning_rate: float) -> optax.GradientTransformation:
+        decay = optax.add_decayed_weights(self.method.recipe.weight_decay)
+        scale = optax.inject_hyperparams(optax.scale_by_learning_rate)(learning_rate=learning_rate)
+        return optax.chain(decay, optax.scale_by_adam(), scale)
+
+
+def variables_of(state: TrainState) -> Variables:
+    """Return the variables of a learned method."""
+    return {"params": state.params, **state.statistics}
+
+
+def train_learned(
+    method: LearnedMethod,
+    data: Prepared,
+    settings: RunSettings,
+    out: Path,
+    *,
+    score: ScoreFn | None = None,
+    resume: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+    report: Callable[[str], None] = lambda line: None,
+    progress: Progress = no_progress,
+) -> Trained:
+    """Train a method until its time or its number of images is reached, whichever is first.
+
+    The folder gets the settings, the measurements (`metrics.jsonl`), snapshots of the weights (`weights-1000`,
+    `weights-2000`, `weights-4000`, ...), the last weights (`weights`) and checkpoints for resuming. A resumed run has
+    the batches and the weights of an uninterrupted one.
+
+    Arguments:
+      method: Method to train, from random weights.
+      data: Training recordings and their inputs.
+      settings: Settings of the run.
+      out: Folder of the run.
+      score: Scores each snapshot. The scores are written to `scores.jsonl`.
+      resume: Continue the run in the folder.
+      stopped: Asked after every step. If it returns True, the state is saved and the training stops.
+      report: Receives a line about the progress every 30 s.
+      progress: Displays the training time.
+
+    Returns:
+      The last state, the number of images and the training time.
+
+    Raises:
+      FloatingPointError: The loss is not finite. The message names the step.
+      ValueError: The recordings give no tuples, or the run to resume has other settings.
+      OSError: The folder cannot be written, has a run already, or has none to resume.
+    """
+    network = PeerNetwork(method, settings.seed)
+    schedule = Schedule(
+        LOG_EVERY,
+        first_snapshot=FIRST_SNAPSHOT,
+        save_every_s=SAVE_EVERY_S,
+        images=settings.images or Schedule.images,
+        seconds=settings.seconds,
+        costs=True,
+        scores_file=SCORES_FILE,
+    )
+
+    def save(run: Trained, name: str) -> None:
+        about = {"images": run.images, "seconds": round(run.seconds, 3), "settings": dataclasses.asdict(settings)}
+        save_variables(out / name, method, variables_of(run.state), about)
+
+    def keep(run: Trained, snapshots: list[int]) -> Mapping[str, float]:
+        for snapshot in snapshots:
+            save(run, f"{LAST}-{snapshot}")
+        return {} if score is None else score(variables_of(run.state))
+
+    with contextlib.ExitStack() as opened:
+        config = _as_config(method, data, settings)
+        opened.enter_context(claimed(out, config, seed=settings.seed, resume=resume, limits=LIMITS))
+        pool = TuplePool(
+            [one.positions for one in data.recordings if one.positions is not None], method.recipe.sampling
+        )
+        show = opened.enter_context(progress(f"train {method.name}", math.ceil(settings.seconds)))
+        run = run_steps(
+            network,
+            _batches(network, data, pool, out),
+            out,
+            schedule,
+            mesh=Mesh(np.array(jax.devices()[:1]), (AXIS,), axis_types=(AxisType.Auto,)),
+            keep=keep,
+            begin=functools.partial(_first_state, network, data, pool, settings.learning_rate),
+            resume=resume,
+            callback=_Report(report, show),
+            stopped=stopped,
+        )
+        save(run, LAST)
+        return run
+
+
+class _Report(Callback):
+    """Reports the loss every 30 s and with each score, and shows the training time."""
+
+    def __init__(self, report: Callable[[str], None], show: Callable[[int], None]):
+        self._report, self._show, self._reported_s, self._line = report, show, 0.0, ""
+
+    def on_step(self, step: int, values: Mapping[str, float]) -> None:
+        seconds = values["seconds"]
+        self._show(int(seconds))
+        self._line = f"step {step}: {values['images']:.0f} images, {seconds:.0f} s, loss {values['loss']:.4g}"
+        if seconds > self._reported_s + REPORT_EVERY_S:
+            self._reported_s = seconds
+            self._report(self._line)
+
+    def on_score(self, step: int, scores: Mapping[str, float]) -> None:
+        self._report(", ".join(f"{name} {value:.3f}" for name, value in scores.items() if name.startswith(RECALL)))
+
+    def on_checkpoint(self, step: int) -> None:
+        self._report(self._line)
+
+
+def _first_state(network: PeerNetwork, data: Prepared, pool: TuplePool, learning_rate: float) -> TrainState:
+    """Return random weights, changed by the method's `start`, which sees the inputs of random places."""
+    state = network.new_state(learning_rate)
+    if network.method.start is None:
+        return state
+    places = np.random.default_rng(network.seed).permutation(len(pool))[:START_PLACES]
+    variables = network.method.start(variables_of(state), data.of(pool, places))
+    return dataclasses.replace(state, params=variables["params"])
+
+
+def _batches(network: PeerNetwork, data: Prepared, pool: TuplePool, out: Path) -> TupleBatches:
+    """Return the batches of a run, with hard negatives if its recipe mines them."""
+    recipe, seed, mining = network.method.recipe, network.seed, None
+
+    def read(frames: Int[np.ndarray, "t k"]) -> PeerBatch:
+        return PeerBatch(data.of(pool, frames.reshape(-1)), pool.distances_from_anchors(frames))
+
+    def described(state: TrainState, places: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
+        blocks = np.array_split(places, math.ceil(len(places) / DESCRIBED))
+        inputs = (data.of(pool, block) for block in blocks)
+        return np.concatenate([describe_inputs(network.method, variables_of(state), one) for one in inputs])
+
+    if recipe.sampling.mining == "hardest":
+        checkpoints = functools.partial(checkpoint_steps, out / CHECKPOINTS)
+        mining = Mining(described, len(pool), recipe.sampling, out / MINING, seed=seed, checkpoints=checkpoints)
+    return TupleBatches(data.recordings, pool, read, seed=seed, tuples=recipe.tuples, mining=mining)
+
+
+def _as_config(method: LearnedMethod, data: Prepared, settings: RunSettings) -> dict[str, Any]:
+    """Return the content of config.json."""
+    recipe = {name: value for name, value in dataclasses.asdict(method.recipe).items() if name != "learning_rates"}
+    recordings = [{"name": one.name, "scans": len(one)} for one in data.recordings]
+    return {
+        "method": method.name,
+        "settings": dataclasses.asdict(settings),
+        "recipe": recipe,
+        "recordings": recordings,
+    }
+
+
+def held_out_score(method: LearnedMethod, held_out: Prepared) -> ScoreFn:
+    """Return a function that scores weights on held-out recordings.
+
+    The entries of a score are `recall_at_1`, the mean, and `recall_at_1 NAME` for each recording.
+
+    Raises ValueError if a recording has no revisits.
+    """
+    require_revisits(held_out.recordings)
+
+    def score(variables: Variables) -> dict[str, float]:
+        distance, found = learned_distance(method, variables), {}
+        for recording, inputs in zip(held_out.recordings, held_out.inputs, strict=True):
+            descriptors = describe_inputs(method, variables, inputs)
+            assert recording.positions is not None
+            recall = recall_at_1(descriptors, recording.positions, recording.times, distance)
+            found[f"{RECALL} {recording.name}"] = recall
+        return {RECALL: float(np.mean(list(found.values()))), **found}
+
+    return score
+
+
+class Stopped(Exception):
+    """The search was asked to stop. Its trainings can be resumed."""
+
+
+def best_rate(
+    method: LearnedMethod,
+    data: Prepared,
+    score: ScoreFn,
+    out: Path,
+    *,
+    seconds: float = 300.0,
+    seed: int = 0,
+    stopped: Callable[[], bool] = lambda: False,
+    report: Callable[[str], None] = lambda line: None,
+    progress: Progress = no_progress,
+) -> float:
+    """Train with each of the three learning rates and return the one with the highest Recall@1.
+
+    The folder gets the trainings and `rates.json` with all scores. Finished trainings are not repeated. A rate whose
+    loss is not finite has no score. Of equal scores, the smaller rate wins.
+
+    Arguments:
+      method: Method to train.
+      data: Training recordings and their inputs.
+      score: Scores weights on a held-out recording.
+      out: Folder of the search.
+      seconds: Training time of each rate.
+      seed: Seed of each training.
+      stopped: Asked after every step.
+      report: Receives lines about the progress.
+      progress: Displays the training time.
+
+    Raises:
+      FloatingPointError: If the loss is not finite with any rate.
+      Stopped: If the search was asked to stop.
+    """
+    scores: dict[float, float | None] = {}
+    for rate in method.recipe.learning_rates:
+        settings = RunSettings(learning_rate=rate, seed=seed, seconds=seconds)
+        options = {"stopped": stopped, "report": report, "progress": progress}
+        scores[rate] = _score_of_rate(method, data, score, settings, out / f"rate-{rate:g}", options)
+        report(f"learning rate {rate:g}: {RECALL} {scores[rate]}")
+    finite = {rate: found for rate, found in scores.items() if found is not None}
+    if not finite:
+        raise FloatingPointError(f"{out}: the loss of {method.name} is not finite with any of its learning rates")
+    best = max(finite, key=lambda rate: finite[rate])
+    recalls = {f"{rate:g}": found for rate, found in scores.items()}
+    about = {"method": method.name, "seconds": seconds, "seed": seed}
+    write_json(out / RATES_FILE, {**about, RECALL: recalls, "best": best})
+    return best
+
+
+def _score_of_rate(
+    method: LearnedMethod,
+    data: Prepared,
+    score: ScoreFn,
+    settings: RunSettings,
+    folder: Path,
+    options: dict[str, Any],
+) -> float | None:
+    """Train with one rate and return its Recall@1, or None if its loss is not finite."""
+    try:
+        resume = (folder / CONFIG_FILE).is_file()
+        found = train_learned(method, data, settings, folder, resume=resume, **options)
+    except FloatingPointError:
+        return None
+    if found.seconds < settings.seconds:
+        raise Stopped
+    kept = folder / "score.json"
+    if not kept.is_file():
+        write_json(kept, score(variables_of(found.state)))
+    return float(read_json(kept)[RECALL])
