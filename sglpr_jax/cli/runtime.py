@@ -7,6 +7,7 @@ import gc
 import inspect
 import io
 import json
+import logging
 import os
 import re
 import signal
@@ -124,6 +125,11 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     """Parse a command line and run the command. Invalid input gives one line on stderr and exit status 1, Ctrl-C gives
     130. If the reader of the output ends early, as `head` does, the command ends without a message."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
+    for chatty in ("absl", "asyncio"):  # they log pages about a failed checkpoint, which orbax also raises
+        logging.getLogger(chatty).setLevel(logging.CRITICAL)
+    warnings.filterwarnings(
+        "ignore", "coroutine .* was never awaited", RuntimeWarning
+    )  # a failed checkpoint again, at exit
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", DataWarning)
     if sys.unraisablehook is sys.__unraisablehook__:

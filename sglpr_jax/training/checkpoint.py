@@ -1,30 +1,33 @@
-"""Checkpoints of a training run: one safetensors file each, complete or absent, with the SHA-256 of its values.
+"""Checkpoints of a training run: folders that are complete or absent, with the SHA-256 of every file.
 
-17.safetensors            state after step 17, and JSON about it: its score and what the run had measured and spent
-damaged-17.safetensors    renamed file whose values do not match their checksum
+17/               state after step 17, written by Orbax, and about.json: score, what the run had measured, checksums
+damaged-17/       renamed checkpoint whose files do not match their checksums
 
 The newest two checkpoints and the one with the best score are kept.
 """
 
+import contextlib
+import hashlib
 import json
+import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import safetensors
+import orbax.checkpoint as ocp
 
-from sglpr_jax.files import replacing
-from sglpr_jax.methods.learned.weights_file import check_leaves, checked_tensors, read_tensors
+from sglpr_jax.files import in_short, read_json, replacing, write_json
+from sglpr_jax.methods.learned.weights_file import check_leaves
 from sglpr_jax.training.devices import is_first_host, on_all_hosts
 from sglpr_jax.training.step import TrainState
 
-ENDING = ".safetensors"
 _KEPT_LATEST = 2
-_ABOUT = "about"
-"""Name of the array with the bytes of the JSON text, so that its checksum is that of the values."""
+_STATE, _ABOUT = "state", "about.json"
+_MOST_OF_AN_ERROR = 500
+"""Maximum number of characters of an error of Orbax, whose reason comes last."""
 
 
 class Checkpoints:
@@ -50,8 +53,7 @@ class Checkpoints:
         step = int(state.step)
         if step not in self._scores:
             score = -1.0 if score is None else score
-            text = json.dumps({**(about or {}), "score": score})
-            on_all_hosts(lambda: is_first_host() and self._write(state, text))
+            on_all_hosts(lambda: is_first_host() and self._write(state, {**(about or {}), "score": score}))
             self._scores[step] = score
             self._drop_old()
 
@@ -79,77 +81,112 @@ class Checkpoints:
             raise ValueError(f"{self._folder}: expected a checkpoint with a score, found none")
         return _read(self._path(self._best_step()), like)
 
-    def _write(self, state: TrainState, text: str) -> None:
-        values = {name: np.asarray(leaf, order="C") for name, leaf in _by_path(state).items()}
-        content = checked_tensors({**values, _ABOUT: np.frombuffer(text.encode(), np.uint8)})
-        with replacing(self._path(int(state.step))) as temporary:
-            temporary.write_bytes(content)
+    def _write(self, state: TrainState, about: dict[str, Any]) -> None:
+        values = {name: np.array(leaf) for name, leaf in _by_path(state).items()}
+        with replacing(self._path(int(state.step))) as temporary, _reported(), _orbax() as orbax:
+            orbax.save(temporary / _STATE, args=ocp.args.StandardSave(values))
+            write_json(temporary / _ABOUT, {"about": about, "sha256": _checksums(temporary, about)})
 
     def _drop_old(self) -> None:
         kept = {self._best_step(), *sorted(self._scores)[-_KEPT_LATEST:]}
         for step in self._scores.keys() - kept:
             del self._scores[step]
-            if is_first_host():
-                self._path(step).unlink()
+            if is_first_host():  # renamed first: a partly deleted checkpoint would be reported as damaged
+                shutil.rmtree(self._path(step).rename(self._folder / f".{step}.old"))
 
     def _best_step(self) -> int:
         return max(self._scores, key=lambda step: (self._scores[step], step))
 
     def _path(self, step: int) -> Path:
-        return self._folder / f"{step}{ENDING}"
+        return self._folder / f"{step}"
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
     """Return the steps of all checkpoints in `folder`, in order."""
-    return sorted(int(path.stem) for path in folder.glob(f"*{ENDING}") if path.stem.isdecimal())
+    return sorted(int(path.name) for path in folder.glob("*") if path.name.isdecimal())
 
 
 def set_damaged_aside(folder: Path) -> None:
-    """Rename the checkpoints in `folder` whose values do not match their checksum, and report them on stderr.
+    """Rename the checkpoints in `folder` whose files do not match their checksums, and report them on stderr.
 
     If all checkpoints are damaged, the function renames none and raises ValueError.
     """
-    paths = [folder / f"{step}{ENDING}" for step in checkpoint_steps(folder)]
+    for left in folder.glob(".*.old"):
+        shutil.rmtree(left)
+    paths = [folder / f"{step}" for step in checkpoint_steps(folder)]
     damaged = {path: found for path in paths if (found := _damage(path)) is not None}
     if damaged and len(damaged) == len(paths):
-        raise ValueError(
-            f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[max(damaged, key=_step)]}"
-        )
+        newest = max(damaged, key=lambda path: int(path.name))
+        raise ValueError(f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[newest]}")
     for path, found in damaged.items():
-        names = (
-            path.with_name(f"damaged-{path.stem}{suffix}{ENDING}") for suffix in ("", *map("-{}".format, range(2, 100)))
-        )
+        names = (path.with_name(f"damaged-{path.name}{suffix}") for suffix in ("", *map("-{}".format, range(2, 100))))
         aside = next(name for name in names if not name.exists())
         path.rename(aside)
         print(f"damaged checkpoint set aside as {aside.name}: {found}", file=sys.stderr)
 
 
 def _damage(path: Path) -> str | None:
+    """Describe the first damaged file of a checkpoint, or return None if all files match their checksums."""
+    file = path / _ABOUT
     try:
-        if _ABOUT in read_tensors(path):
-            return None
+        content = read_json(file)
+        expected, found = content["sha256"], _checksums(path, content["about"])
     except (ValueError, OSError) as error:
         return str(error)
-    return f"{path}: expected a checkpoint, found other arrays"
+    except (KeyError, TypeError):
+        return f"{file}: expected a description with checksums, found another"
+    if not isinstance(expected, dict):
+        return f"{file}: expected a checksum for each file, found {expected!r:.60}"
+    for name in sorted(expected.keys() | found.keys()):
+        if expected.get(name) != found.get(name):
+            return f"{path / name}: expected SHA-256 {expected.get(name)}, found {found.get(name, 'no such file')}"
+    return None
 
 
-def _step(path: Path) -> int:
-    return int(path.stem)
+def _checksums(path: Path, about: dict[str, Any]) -> dict[str, str]:
+    """SHA-256 of every file of the state, and of the JSON values about it."""
+    files = sorted(one for one in (path / _STATE).rglob("*") if one.is_file())
+    found = {one.relative_to(path).as_posix(): hashlib.sha256(one.read_bytes()).hexdigest() for one in files}
+    return {**found, _ABOUT: hashlib.sha256(json.dumps(about).encode()).hexdigest()}
 
 
 def _read(path: Path, like: TrainState) -> TrainState:
-    values, expected = read_tensors(path), _by_path(like)
-    del values[_ABOUT]
+    expected = _by_path(like)
+    with _orbax() as orbax:
+        there: Any = orbax.metadata(path / _STATE).item_metadata
+        check_leaves(there.tree, expected, source=path)
+        empty = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
+        values = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
     check_leaves(values, expected, source=path)
     return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in expected])
 
 
 def _about(path: Path) -> dict[str, Any]:
-    with safetensors.safe_open(path, framework="np") as file:
-        return json.loads(file.get_tensor(_ABOUT).tobytes())
+    return read_json(path / _ABOUT)["about"]
 
 
 def _by_path(state: TrainState) -> dict[str, Any]:
     """Return every array by its place in the state."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _orbax() -> ocp.Checkpointer:
+    """Orbax for this host alone: the first host writes, and all hosts read."""
+    host = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(
+        primary_host=host, active_processes={host}, barrier_sync_key_prefix=f"host{host}"
+    )
+    return ocp.Checkpointer(
+        ocp.StandardCheckpointHandler(multiprocessing_options=options), multiprocessing_options=options
+    )
+
+
+@contextlib.contextmanager
+def _reported() -> Iterator[None]:
+    """Turn the long errors of Orbax into one line."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or in_short(str(error), most=_MOST_OF_AN_ERROR)
+        raise OSError(reason) from error

@@ -170,7 +170,7 @@ def test_corrupted_scans_have_other_descriptors_and_the_same_poses(embed, comman
     assert_one_line_error(embed(*options, "--corruption", "beams")[0], "expected a corruption", "mean 'beams-32'")
     in_store = command("embed", *options, "--corruption", "beams-4", "--out", f"{tmp_path}/places/")
     assert_one_line_error(in_store, "expected a descriptor file with --corruption")
-    of_images = ("--data", images, "--seq", "06", "--method", "thumbnail", "--corruption", "beams-16")
+    of_images = ("--data", images, "--seq", "06", "--method", "polar-fft", "--corruption", "beams-16")
     assert_one_line_error(embed(*of_images)[0], "beams-16 needs points, found only images in sequence 06")
 
 

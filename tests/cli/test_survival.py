@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -131,7 +132,7 @@ def test_a_run_killed_again_and_again_ends_like_one_that_was_not(options, uninte
                 file.write('{"step": 59, "lo')
             (runs.folder / ".config.json.1.tmp").write_text("{")
             (runs.folder / ".weights.1.tmp" / "new").mkdir(parents=True)
-            (runs.checkpoints / ".59.safetensors.1.tmp").write_bytes(b"half")
+            (runs.checkpoints / ".59.1.tmp" / "state").mkdir(parents=True)
     assert len(steps) >= 2
     assert runs.finish() == 0, runs.errors.read_text()
     assert_equal(runs, uninterrupted)
@@ -153,7 +154,7 @@ def test_signals_and_a_full_disk_stop_a_run_that_then_goes_on(options, uninterru
     assert runs.finish(file_kib=8) == 1
     error = runs.errors.read_text()
     assert error.splitlines()[-1].startswith(f"error: {runs.folder}"), error
-    assert "File too large" in error and "Traceback" not in error
+    assert re.search("File too large|Failed to write", error) and "Traceback" not in error
     assert runs.last_step() == last
 
     assert runs.finish() == 0, runs.errors.read_text()

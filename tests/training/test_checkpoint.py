@@ -57,11 +57,13 @@ def test_a_step_is_saved_once(state, tmp_path):
     chex.assert_trees_all_equal(checkpoints.restore(state)[0], state)
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # writes of Orbax that were pending
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
 def test_a_full_disk_leaves_the_earlier_checkpoint(state, tmp_path, small_files):
     checkpoints = saved(tmp_path, state, {2: 0.1})
-    with small_files(1000), pytest.raises(OSError, match=rf"{tmp_path}/4\.safetensors: cannot be written: File too"):
+    with small_files(1000), pytest.raises(OSError, match=rf"{tmp_path}/4: cannot be written: "):
         checkpoints.save(at(state, 4))
-    assert [path.name for path in tmp_path.iterdir()] == ["2.safetensors"]
+    assert [path.name for path in tmp_path.iterdir()] == ["2"]
 
 
 @pytest.mark.parametrize("other", ["other shapes", "missing"])
@@ -73,7 +75,7 @@ def test_the_checkpoint_of_another_model_is_refused(state, tmp_path, other):
     if other == "other shapes":
         weights[name] = jax.tree.map(lambda leaf: leaf[None], state.params.weights[name])
     like = state.replace(params=state.params.replace(weights=weights))
-    with pytest.raises(ValueError, match=rf"{tmp_path}/4\.safetensors: expected params/weights/{name}.* as .*, found"):
+    with pytest.raises(ValueError, match=rf"{tmp_path}/4: expected params/weights/{name}.* as .*, found"):
         Checkpoints(tmp_path).restore(like)
 
 
@@ -87,35 +89,34 @@ def test_nothing_to_resume_from_is_an_error(state, tmp_path):
 
 
 def damage(path, how: str) -> None:
-    content = bytearray(path.read_bytes())
+    file = path / "about.json" if how == "about" else max(path.rglob("*/d/*"), key=lambda one: one.stat().st_size)
+    content = bytearray(file.read_bytes())
     if how == "cut off":
         del content[len(content) // 2 :]
     else:
-        content[{"header": 20, "values": len(content) // 2, "end": len(content) - 1}[how]] ^= 1
-    path.write_bytes(content)
+        content[content.index(b"0.4") if how == "about" else len(content) // 2] ^= 1
+    file.write_bytes(content)
 
 
-@pytest.mark.parametrize("how", ["cut off", "header", "values", "end"])
+@pytest.mark.parametrize("how", ["cut off", "about", "values"])
 def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(state, tmp_path, capfd, how):
-    for aside in (["damaged-4.safetensors"], ["damaged-4-2.safetensors", "damaged-4.safetensors"]):
+    for aside in (["damaged-4"], ["damaged-4", "damaged-4-2"]):
         saved(tmp_path, state, {2: 0.2, 4: 0.4})
-        damage(tmp_path / "4.safetensors", how)
+        damage(tmp_path / "4", how)
         resumed = Checkpoints(tmp_path)
         found, about = resumed.restore(state)
         chex.assert_trees_all_equal(found, at(state, 2))
         assert about["unlogged"] == [{"loss": 2.0}] and resumed.best(state).step == 2
         said = capfd.readouterr().err
-        assert f"damaged checkpoint set aside as {aside[0]}: {tmp_path / '4.safetensors'}: expected" in said
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["2.safetensors", *aside]
+        assert f"damaged checkpoint set aside as {aside[-1]}: {tmp_path / '4'}/" in said and "expected SHA-256" in said
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["2", *aside]
 
 
 def test_without_a_whole_checkpoint_there_is_one_error_and_nothing_is_renamed(state, tmp_path):
     saved(tmp_path, state, {2: None, 4: None})
     for step in (2, 4):
-        damage(tmp_path / f"{step}.safetensors", "values")
-    message = (
-        rf"{tmp_path}: expected a whole checkpoint, found 2 damaged: {tmp_path}/4\.safetensors: expected .*SHA-256"
-    )
+        damage(tmp_path / f"{step}", "values")
+    message = rf"{tmp_path}: expected a whole checkpoint, found 2 damaged: {tmp_path}/4/.*: expected SHA-256"
     with pytest.raises(ValueError, match=message):
         set_damaged_aside(tmp_path)
     assert checkpoint_steps(tmp_path) == [2, 4]
