@@ -20,7 +20,7 @@ from sglpr_jax.bev import (
     uncropped,
 )
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.readers.kitti import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.grid import Grid
 
 # At 0.26 m, 1 / r rounded once differs from the reciprocal of a rounded r, and from a division.

@@ -61,7 +61,7 @@ def params(random_params) -> Params:
 @pytest.fixture
 def placeholder(params, tmp_path, monkeypatch) -> Path:
     """A set of weights `placeholder`, which is all that ships."""
-    monkeypatch.setattr(weights_file, "FOLDER", tmp_path / "package")
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
     folder = save(for_places(params), shipped.FOLDER / "placeholder", half=True)
     (folder / CARD_FILE).write_text("# A card\n" + "".join(f"\n## {title}\n\n{text}\n" for title, text in CARD.items()))
     return folder
@@ -91,7 +91,7 @@ def test_what_is_neither_a_name_nor_a_folder_lists_the_names(placeholder, tmp_pa
     for unknown in ("simulatd", str(tmp_path / "none"), placeholder / WEIGHTS_FILE):
         with pytest.raises(FileNotFoundError, match=rf"{unknown}: .* \(placeholder\), found neither"):
             load(unknown)
-    monkeypatch.setattr(weights_file, "FOLDER", tmp_path / "empty")
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "empty")
     assert shipped_weights() == ()
     with pytest.raises(FileNotFoundError, match=r"circular: .*\(there are none\), found neither"):
         load("circular")
