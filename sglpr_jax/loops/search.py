@@ -207,7 +207,7 @@ class Searched(NamedTuple):
     """A session after the search within it. Lengths are multiplied by the scale of the search."""
 
     given: Input
-    """The drift is that of the odometry, estimated from the drive. Without usable odometry there is none."""
+    """The drift is that of the odometry, estimated from the drive. None without usable odometry."""
     detector: LoopDetector
     loops: list[Loop]
     rejected: list[Rejected]

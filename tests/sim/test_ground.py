@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import FLAT, HILLS, striped_ground
+from surfaces import FLAT, HILLS, striped_ground
 
 from sglpr_jax.sim.ground import (
     CELL_M,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import NOTHING, pose, random_scene, reference, shapes
+from surfaces import NOTHING, pose, random_scene, reference, shapes
 
 from sglpr_jax.sim.objects import BUILDING, ROAD, TERRAIN
 from sglpr_jax.sim.raycast import (

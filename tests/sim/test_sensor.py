@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import FLAT, HILLS, NOTHING, in_world, pose, shapes, striped_ground
+from surfaces import FLAT, HILLS, NOTHING, in_world, pose, shapes, striped_ground
 
 from sglpr_jax.sim.ground import Relief
 from sglpr_jax.sim.objects import BUILDING, POLE, ROAD, TERRAIN, VEGETATION

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import NOTHING, shapes
+from surfaces import NOTHING, shapes
 
 from sglpr_jax.sim.shapes import SOLIDS, Vectors, at_time
 

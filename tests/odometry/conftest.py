@@ -1,0 +1,3 @@
+"""A simulated town that is driven through twice."""
+
+from drives import drive, revisit  # noqa: F401
