@@ -2,8 +2,8 @@
 
 - A .npz file is a descriptor file (`DescriptorFile`).
 - A .npy file is a matrix of descriptors, one row per frame.
-- A text with lines `query: frame frame ...` or `query: frame=score ...`, best first, is a top-k list. A query without an
-  answer is `query:`.
+- A text with lines `query: frame frame ...` or `query: frame=score ...`, best first, is a top-k list. The line `query:`
+  has no answer.
 - A text with lines `i j score [label]` is a list of scored pairs. Label 1 is the same place, 0 different places.
 
 Frames are numbered from 0, in the order of the poses. Higher scores mean closer. In texts, empty lines and lines that

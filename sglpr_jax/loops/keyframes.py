@@ -106,7 +106,7 @@ class StoredScans:
         return found
 
     def some(self, kept: Bool[np.ndarray, " n"]) -> "StoredScans":
-        """The same scans, of which only those with a flag are the nearest ones of a descriptor. They are shared."""
+        """The same scans. Only those with a flag are nearest ones of a descriptor. They are shared."""
         found = copy.copy(self)
         found._kept = kept
         return found
