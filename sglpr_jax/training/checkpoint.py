@@ -83,7 +83,7 @@ class Checkpoints:
 
     def _write(self, state: TrainState, about: dict[str, Any]) -> None:
         values = {name: np.array(leaf) for name, leaf in _by_path(state).items()}
-        with replacing(self._path(int(state.step))) as temporary, _reported(), _orbax() as orbax:
+        with replacing(self._path(int(state.step))) as temporary, _reported(temporary), _orbax() as orbax:
             orbax.save(temporary / _STATE, args=ocp.args.StandardSave(values))
             write_json(temporary / _ABOUT, {"about": about, "sha256": _checksums(temporary, about)})
 
@@ -183,10 +183,11 @@ def _orbax() -> ocp.Checkpointer:
 
 
 @contextlib.contextmanager
-def _reported() -> Iterator[None]:
-    """Turn the long errors of Orbax into one line."""
+def _reported(folder: Path) -> Iterator[None]:
+    """Turn the long errors of Orbax, which repeat the folder, into one line."""
     try:
         yield
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or in_short(str(error), most=_MOST_OF_AN_ERROR)
+        text = str(error).replace(f"{folder}", folder.name)
+        reason = getattr(error, "strerror", None) or in_short(text, most=_MOST_OF_AN_ERROR)
         raise OSError(reason) from error
