@@ -3,6 +3,7 @@
 This module imports no JAX, so a command line can list its fields quickly.
 """
 
+import abc
 import dataclasses
 import math
 import typing
@@ -28,18 +29,18 @@ from sglpr_jax.files import naming
 from sglpr_jax.grid import Grid, ImageKind
 
 
-class BackboneSizes:
+class BackboneSizes(abc.ABC):
     """What every configuration of a backbone says about it. Sizes are rows and columns of the image that it sees."""
 
     @property
+    @abc.abstractmethod
     def token(self) -> tuple[int, int]:
         """Rows and columns of the image that one feature represents."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def width(self) -> int:
         """Channels of the features."""
-        raise NotImplementedError
 
     @property
     def multiple(self) -> tuple[int, int]:
@@ -47,14 +48,14 @@ class BackboneSizes:
         return self.token
 
     @property
+    @abc.abstractmethod
     def needs_polar(self) -> bool:
         """Whether the backbone requires a polar image, because its layers wrap around."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def pictures(self) -> dict[str, str]:
         """Maps to draw as heat maps: from the title of each picture to the name of its map in `Seen.named`."""
-        raise NotImplementedError
 
 
 class _Stages(BackboneSizes):

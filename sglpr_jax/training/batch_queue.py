@@ -1,5 +1,6 @@
 """Batches of a run in order, read by a thread while the device works, but only up to the next refresh of mining."""
 
+import abc
 import queue
 import threading
 from collections.abc import Callable, Generator
@@ -10,16 +11,16 @@ from sglpr_jax.training.step import TrainState
 T = TypeVar("T")
 
 
-class BatchSource:
+class BatchSource(abc.ABC):
     """Source of the batches of a run. Subclasses define `batch`."""
 
     refresh_steps: int = 0
     """Number of steps between calls of `refresh`, or 0 for no refresh. No batch at or after a refresh step may be
     requested before that call."""
 
+    @abc.abstractmethod
     def batch(self, step: int) -> Any:
         """Return this host's part of the batch of a step. Repeated calls return the same batch."""
-        raise NotImplementedError
 
     def refresh(self, step: int, state: TrainState) -> None:
         """Give the source the state before a step. The batches from that step on may depend on it."""

@@ -1,5 +1,6 @@
 """Types of a protocol, a published rule that computes one score from the output of a method, and of its result."""
 
+import abc
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Literal
@@ -60,7 +61,7 @@ class Result:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Protocol:
+class Protocol(abc.ABC):
     """Protocol for scoring a method. Subclasses define `__call__`, and their instances the numbers of one paper."""
 
     name: str
@@ -80,12 +81,12 @@ class Protocol:
     headline: bool = False
     """Whether the protocol is used by default, if no protocol is named."""
 
+    @abc.abstractmethod
     def __call__(self, *sources: Source | ScoredPairs, seed: int = 0) -> Result:
         """Score one source or several sessions. `seed` is that of the bootstrap interval and of drawn pairs.
 
         Raises ValueError if positions are missing.
         """
-        raise NotImplementedError
 
     def result(self, rule: str, *sources: Source | ScoredPairs) -> Result:
         """Return a result of these sources without a score. `rule` has the distances in words."""
