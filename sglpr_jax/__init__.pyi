@@ -40,12 +40,12 @@ from .loops.detector import LoopDetector as LoopDetector
 from .loops.search import find_loops as find_loops
 from .maps.build import map_recording as map_recording
 from .maps.place_map import PlaceMap as PlaceMap
+from .models.backbone_config import CircularConfig as CircularConfig
+from .models.backbone_config import SglprConfig as SglprConfig
+from .models.backbone_config import SwinConfig as SwinConfig
 from .models.config import MODELS as MODELS
-from .models.config import CircularConfig as CircularConfig
 from .models.config import HeadConfig as HeadConfig
 from .models.config import ModelConfig as ModelConfig
-from .models.config import SglprConfig as SglprConfig
-from .models.config import SwinConfig as SwinConfig
 from .models.config import model_preset as model_preset
 from .models.export import save_program as save_program
 from .models.params import Params as Params

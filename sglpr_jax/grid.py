@@ -7,6 +7,13 @@ from sglpr_jax.fields import Positive, Size, check_fields
 
 ImageKind = Literal["points", "density"]
 """Content of a cell: the number of points (equation 1), or of voxels as in the ready-made images of KITTI."""
+DENSITY_RESOLUTION_M = 0.4
+"""Edge of a pixel of a density image, in metres, as in KITTI's ready-made images."""
+DENSITY_MAX_COUNT = 10
+"""Maximum count of a cell of a density image. It is stored as grey value 255."""
+DENSITY_SIZE = 151
+"""Number of rows and of columns of a density image. The outer 13 on each side are empty, because points beyond 25 m are
+cropped."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,3 +29,12 @@ class Grid:
         for name, size in (("height", self.height), ("width", self.width)):
             if size % 2:
                 raise ValueError(f"{name}: expected an even number of cells, found {size}")
+
+
+def check_density_grid(grid: Grid) -> None:
+    """Raise ValueError if a grid has other cells than density images, or more of them."""
+    if grid.resolution_m != DENSITY_RESOLUTION_M or max(grid.height, grid.width) > DENSITY_SIZE:
+        raise ValueError(
+            f"density images have {DENSITY_SIZE} x {DENSITY_SIZE} cells of {DENSITY_RESOLUTION_M} m: expected a grid of at "
+            f"most this size with the same cells, found {grid.height} x {grid.width} cells of {grid.resolution_m} m"
+        )

@@ -10,7 +10,7 @@ from recordings import of_images
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.frame_alignment import AlignedParts, Part, aligned_frames
-from sglpr_jax.loops.search import FoundLoops, Session
+from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse, transform, travelled
 

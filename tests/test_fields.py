@@ -9,7 +9,8 @@ import pytest
 from sglpr_jax.fields import Bounds, Positive, Share, Sizes, check_fields
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig, SglprConfig, SwinConfig
+from sglpr_jax.models.backbone_config import SglprConfig, SwinConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 

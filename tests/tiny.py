@@ -3,7 +3,8 @@
 import dataclasses
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.config import HeadConfig, SwinConfig
+from sglpr_jax.models.backbone_config import SwinConfig
+from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.training.presets import load_preset
 
 TINY = load_preset("tiny")

@@ -15,11 +15,11 @@ from jaxtyping import Int
 
 import sglpr_jax
 from sglpr_jax.bev import uncropped
-from sglpr_jax.data.density_grid import SIZE
 from sglpr_jax.data.density_image import values_of_points
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.files import replacing
+from sglpr_jax.grid import DENSITY_SIZE
 from sglpr_jax.labels import to_raw
 from sglpr_jax.retrieval.image_maps import semantic_map
 from sglpr_jax.sim.dataset import simulate
@@ -151,6 +151,6 @@ def _unlabelled(record: Record) -> Int[np.ndarray, " n"]:
 
 def _predicted(params: sglpr_jax.Params, record: Record) -> Int[np.ndarray, " n"]:
     """Return the raw label of each point's cell, 0 outside the map."""
-    cells = uncropped(semantic_map(params, record).predicted, shape=(SIZE, SIZE))
+    cells = uncropped(semantic_map(params, record).predicted, shape=(DENSITY_SIZE, DENSITY_SIZE))
     classes = values_of_points(np.rot90(cells), record.upright_points)  # density_image is rotated by 90 degrees
     return to_raw(classes, categories=params.config.categories)

@@ -29,7 +29,7 @@ from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen, StoredScans
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.loops.result import FoundLoops
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
 from sglpr_jax.models.params import Params
 from sglpr_jax.pose_graph.files import read_loops_jsonl

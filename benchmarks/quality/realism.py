@@ -12,12 +12,12 @@ from rich.table import Table
 
 import sglpr_jax
 from sglpr_jax.bev import rasterize, rasterize_labels
-from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.evaluation.figures import save, segmentation_panel
 from sglpr_jax.evaluation.segmentation import confusion_matrix, score_confusion
+from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
 from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_classes, to_raw
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.params import Params
@@ -95,7 +95,7 @@ def _measured(kind: str, root: Path, scans: int) -> Iterator[tuple[str, Measures
 
 def _measures(drive: Recording, row: int) -> Measures:
     if drive.has_images:
-        return _image_measures(np.rint(drive.image(row) * (255 / MAX_COUNT)).astype(np.uint8))
+        return _image_measures(np.rint(drive.image(row) * (255 / DENSITY_MAX_COUNT)).astype(np.uint8))
     labels = drive.labels(row)
     return _scan_measures(drive.points(row), None if labels is None else to_classes(labels))
 
@@ -165,7 +165,7 @@ def _image_measures(image: np.ndarray) -> Measures:
     """The measures of a density image (151, 151) of grey values, in the orientation of eq. 1."""
     half = image.shape[0] // 2
     down, right = np.nonzero(image)
-    x, y = (right - half) * RESOLUTION_M, (half - down) * RESOLUTION_M
+    x, y = (right - half) * DENSITY_RESOLUTION_M, (half - down) * DENSITY_RESOLUTION_M
     values = image[down, right]
     return {
         "image_density": _histogram("image_density", values / 25.5),

@@ -5,8 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from sglpr_jax.data.density_grid import SIZE
-from sglpr_jax.grid import Grid, ImageKind
+from sglpr_jax.grid import DENSITY_SIZE, Grid, ImageKind
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
@@ -55,7 +54,7 @@ def random_scans(*shape: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
 def random_images(number: int, grid: Grid, *, image: ImageKind) -> tuple[np.ndarray, np.ndarray]:
     """Images of counts (number, h, w) in the size of `grid`, or of ready-made density images, and their classes."""
     rng = np.random.default_rng(0)
-    shape = (number, *((SIZE, SIZE) if image == "density" else (grid.height, grid.width)))
+    shape = (number, *((DENSITY_SIZE, DENSITY_SIZE) if image == "density" else (grid.height, grid.width)))
     counts = rng.poisson(MEAN_COUNT, shape).clip(max=10)
     return counts.astype(np.float32), (rng.integers(1, 20, shape) * (counts > 0)).astype(np.int32)
 

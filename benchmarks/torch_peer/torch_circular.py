@@ -5,7 +5,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from benchmarks.torch_peer.torch_layers import Convolution, means, repeated
-from sglpr_jax.models.config import CircularConfig, HeadConfig
+from sglpr_jax.models.backbone_config import CircularConfig
+from sglpr_jax.models.config import HeadConfig
 
 
 class CircularBlock(nn.Module):

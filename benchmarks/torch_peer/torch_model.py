@@ -15,7 +15,8 @@ from benchmarks.torch_peer.torch_circular import CircularDecoder, CircularNet, D
 from benchmarks.torch_peer.torch_layers import InputImage, from_polar, to_polar
 from benchmarks.torch_peer.torch_swin import SwinUnet
 from sglpr_jax.losses import DICE_EPSILON
-from sglpr_jax.models.config import CircularConfig, ModelConfig, SglprConfig
+from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig
+from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.training.config import LossConfig, TrainConfig
 

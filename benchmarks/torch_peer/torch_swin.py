@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sglpr_jax.models.config import SglprConfig
+from sglpr_jax.models.backbone_config import SglprConfig
 from sglpr_jax.models.swin import BLOCKED, relative_position_index, shift_mask
 
 

@@ -10,14 +10,17 @@ import tyro
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.recording import (
+    AUTO,
     PosedRecordingOptions,
     SubmapOptions,
+    check_auto,
     open_with_poses,
+    open_with_scan_odometry,
+    remove_odometry,
     report_bad_scan,
     resolved_scale,
 )
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
-from sglpr_jax.cli.scan_odometry import AUTO, check_auto, open_with_scan_odometry, remove_odometry
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.loops.config import (
     MIN_PROBABILITY,
@@ -189,7 +192,8 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.loops.closure import why_rejected
-    from sglpr_jax.loops.search import can_register, find_loops, why_none
+    from sglpr_jax.loops.result import why_none
+    from sglpr_jax.loops.search import can_register, find_loops
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.pose_graph.folder import write_found
     from sglpr_jax.pose_graph.optimize import optimize_trajectory

@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.recording import RecordingOptions, SubmapOptions, open_with_poses, report_bad_scan, resolved_scale
+from sglpr_jax.cli.recording import (
+    AUTO,
+    ENDING,
+    RecordingOptions,
+    SubmapOptions,
+    check_auto,
+    odometry_of,
+    open_with_poses,
+    report_bad_scan,
+    resolved_scale,
+    with_deskew,
+)
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
-from sglpr_jax.cli.scan_odometry import AUTO, ENDING, check_auto, odometry_of, with_deskew
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.config import SPACING_M

@@ -8,8 +8,8 @@ its distance to the sensor. The rows of the image point against x (forward), and
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, Num, UInt8
 
-from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M, SIZE
 from sglpr_jax.data.readers.bev_images import as_counts
+from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, DENSITY_SIZE
 
 REACH_M = 25.0
 """Maximum |x| and |y| of a point, in metres."""
@@ -60,11 +60,11 @@ def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
       name: Name of the image for the error message.
     """
     least, most = image.min(initial=0), image.max(initial=0)
-    within = least >= -BEYOND_COUNTS and most <= MAX_COUNT + BEYOND_COUNTS  # False for NaN
+    within = least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS  # False for NaN
     if np.issubdtype(image.dtype, np.floating) and not within:
         raise ValueError(
-            f"{name}: expected a density image, floats from 0 to {MAX_COUNT}, found floats from {least:g} to {most:g};"
-            f" does the image contain grey values (255 instead of {MAX_COUNT}) or uncapped point counts?"
+            f"{name}: expected a density image, floats from 0 to {DENSITY_MAX_COUNT}, found floats from "
+            f"{least:g} to {most:g}; does the image contain grey values (255 instead of {DENSITY_MAX_COUNT}) or uncapped point counts?"
         )
 
 
@@ -78,8 +78,8 @@ def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 
       points: Points in the LiDAR frame, in metres.
     """
     centroids = _voxel_centroids(points.T.take(np.flatnonzero(_in_crop(points)), axis=1))
-    counts = np.bincount(_cell_of_point(centroids), minlength=SIZE**2).clip(max=MAX_COUNT)
-    return np.round(counts * (255 / max(counts.max(), 1))).astype(np.uint8).reshape(SIZE, SIZE)
+    counts = np.bincount(_cell_of_point(centroids), minlength=DENSITY_SIZE**2).clip(max=DENSITY_MAX_COUNT)
+    return np.round(counts * (255 / max(counts.max(), 1))).astype(np.uint8).reshape(DENSITY_SIZE, DENSITY_SIZE)
 
 
 def density_label_image(
@@ -92,9 +92,9 @@ def density_label_image(
     label.
     """
     counted = _in_crop(points)
-    labels = np.zeros(SIZE**2, np.int32)
+    labels = np.zeros(DENSITY_SIZE**2, np.int32)
     labels[_cell_of_point(points[counted].T)] = classes[counted]  # NumPy keeps the last of repeated assignments.
-    return labels.reshape(SIZE, SIZE)
+    return labels.reshape(DENSITY_SIZE, DENSITY_SIZE)
 
 
 def values_of_points(image: Int[np.ndarray, "151 151"], points: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -112,8 +112,8 @@ def _in_crop(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
 
 def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
     """Return the flat cell index of each point. Truncation makes the central row and column two cells wide."""
-    row, column = SIZE // 2 - np.trunc(points[:2] / RESOLUTION_M).astype(np.int64)
-    return row * SIZE + column
+    row, column = DENSITY_SIZE // 2 - np.trunc(points[:2] / DENSITY_RESOLUTION_M).astype(np.int64)
+    return row * DENSITY_SIZE + column
 
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:

@@ -19,10 +19,9 @@ from sglpr_jax.bev import (
     rotate_labels,
     rotate_points,
 )
-from sglpr_jax.data.density_grid import check_density_grid
 from sglpr_jax.data.density_image import check_density_counts, density_bev, density_label_bev
 from sglpr_jax.data.recording import Record, check_cloud
-from sglpr_jax.grid import Grid, ImageKind
+from sglpr_jax.grid import Grid, ImageKind, check_density_grid
 
 _POINTS_STEP = 16384
 """Clouds are padded to a multiple of this number of points, so that few sizes are compiled."""

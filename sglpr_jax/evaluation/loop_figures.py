@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, Num
 from scipy.ndimage import map_coordinates
 
-from sglpr_jax.data.density_grid import RESOLUTION_M
 from sglpr_jax.evaluation.figures import axes_from_above, new_figure
+from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.se3 import inverse
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def overlaid(
     match: Num[np.ndarray, "n n"],
     match_from_query: Float[np.ndarray, "4 4"],
     *,
-    resolution_m: float = RESOLUTION_M,
+    resolution_m: float = DENSITY_RESOLUTION_M,
 ) -> Float[np.ndarray, "n n 3"]:
     """Overlay a query on its match, as RGB colours from 0 to 1.
 

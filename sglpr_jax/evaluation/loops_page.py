@@ -14,7 +14,7 @@ from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
 from sglpr_jax.loops.frame_alignment import AlignedParts, Part
 from sglpr_jax.loops.keyframes import square_image
-from sglpr_jax.loops.search import FoundLoops, why_none
+from sglpr_jax.loops.result import FoundLoops, why_none
 from sglpr_jax.pose_graph.folder import unique_names
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements, trajectory_error
 from sglpr_jax.same_place import NEGATIVE_M

@@ -12,7 +12,7 @@ from sglpr_jax.evaluation.loops_page import overlay_of, wrong_loops
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.loops.result import FoundLoops
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transformed, travelled
 

@@ -13,8 +13,8 @@ from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import record_of_scan
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rotations_of
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
-from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import BEYOND_S, interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.live.endpoints import Taken

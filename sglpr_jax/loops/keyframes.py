@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Complex64, Float32, Int, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
-from sglpr_jax.data.density_grid import MAX_COUNT
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
+from sglpr_jax.grid import DENSITY_MAX_COUNT
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
@@ -49,7 +49,7 @@ def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
     """Central square of an image, with an even number of cells, as 8 bits."""
     even = even_cells(jnp.asarray(image, jnp.float32))
     size = min(even.shape)
-    grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / MAX_COUNT)
+    grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / DENSITY_MAX_COUNT)
     return np.round(grey).clip(0, 255).astype(np.uint8)
 
 

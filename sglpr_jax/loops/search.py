@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import hashlib
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from sglpr_jax.loops.acceptance import AXES, check_odometry, registered_loops, s
 from sglpr_jax.loops.arguments import check_is, given_poses
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, in_metres, listed, scaled_drift
+from sglpr_jax.loops.closure import Loop, Rejected, in_metres, scaled_drift
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import accepted_between
@@ -35,6 +35,7 @@ from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.frame_alignment import AlignedParts, Part, aligned_frames
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import LoopModel
+from sglpr_jax.loops.result import FoundLoops, Session, ordered_rejections
 from sglpr_jax.loops.sequence import pair_of, probable_loops, verdict
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import Motion
@@ -42,150 +43,6 @@ from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.registration.gicp import check_installed, is_installed
 from sglpr_jax.se3 import inverse
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Session:
-    """A searched recording."""
-
-    recording: Recording
-    frames: int
-    """Number of scans that were searched: all, unless the search was stopped."""
-    odometry: Float[np.ndarray, "n 4 4"] | None = None
-    """Pose of the LiDAR at every scan of the recording."""
-    drift: DriftModel = DriftModel()
-    """Drift of the odometry, estimated from the drive."""
-    skipped: tuple[str, ...] = ()
-    """Ids of scans that cannot be read."""
-    empty: int = 0
-    """Number of searched scans that are almost empty."""
-    unregistered: int = 0
-    """Number of loops within the session that were not registered because the search was stopped."""
-    candidates: tuple[Candidate, ...] = ()
-    """All compared pairs or, with `max_places`, that many of the last ones. Their lengths have the search's scale."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class FoundLoops:
-    """Loops within and between sessions."""
-
-    sessions: tuple[Session, ...]
-    loops: tuple[Loop, ...] = ()
-    """Loops within each session, then those between each pair of sessions."""
-    rejected: tuple[Rejected, ...] = ()
-    """All other compared pairs, each with the reason for its rejection."""
-    transforms: tuple[AlignedParts, ...] = ()
-    """Transforms between the frames of sessions. For each pair, the one with most loops is first; none if no common
-    place was found. With odometry there is at most one."""
-    model: LoopModel | None = None
-    """Model of the probabilities."""
-    config: DetectorConfig = DetectorConfig()
-    """Settings of the search."""
-    scale: Scale = 1
-    """Factor for all lengths during the search. The results are in metres."""
-    stopped: bool = False
-    """Whether the search between sessions was stopped before its end."""
-
-    @property
-    def recording(self) -> Recording:
-        """Recording of the first session."""
-        return self.sessions[0].recording
-
-    @property
-    def frames(self) -> int:
-        """Number of scans of the first session that were searched."""
-        return self.sessions[0].frames
-
-    @property
-    def odometry(self) -> Float[np.ndarray, "n 4 4"] | None:
-        """Pose of the LiDAR at every scan of the first session."""
-        return self.sessions[0].odometry
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Compared pairs of the first session."""
-        return self.sessions[0].candidates
-
-    @property
-    def whole(self) -> bool:
-        """Whether the search was completed."""
-        ended = (one.frames == len(one.recording) and not one.unregistered for one in self.sessions)
-        return not self.stopped and all(ended)
-
-    def split(self, poses: Float[np.ndarray, "n 4 4"]) -> list[Float[np.ndarray, "_ 4 4"]]:
-        """Divide the poses of all searched frames by session."""
-        return np.split(poses, np.cumsum([one.frames for one in self.sessions])[:-1])
-
-    @property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Numbers of the two sessions of each pair: first that of the matches, then that of the queries."""
-        return list(itertools.combinations(range(len(self.sessions)), 2))
-
-    def between(self, match: int, query: int) -> "FoundLoops":
-        """The results whose queries and matches are in these sessions, which may be the same."""
-        ends = match, query
-        return dataclasses.replace(
-            self,
-            loops=tuple(one for one in self.loops if _ends(one) == ends),
-            rejected=tuple(one for one in self.rejected if _ends(one.loop) == ends),
-            transforms=tuple(one for one in self.transforms if (one.match.session, one.query.session) == ends),
-        )
-
-    def within(self, session: int) -> "FoundLoops":
-        """The results of one session, as if it had been searched alone."""
-        found, alone = self.between(session, session), {"match_session": 0, "query_session": 0}
-        loops = (dataclasses.replace(loop, **alone) for loop in found.loops)
-        others = (dataclasses.replace(one, loop=dataclasses.replace(one.loop, **alone)) for one in found.rejected)
-        return dataclasses.replace(
-            found, sessions=(self.sessions[session],), loops=tuple(loops), rejected=tuple(others)
-        )
-
-    def without_degenerate(self) -> "FoundLoops":
-        """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction
-        (`is_degenerate`). Transforms stay, because their weights contain this uncertainty.
-        """
-        kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
-        others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
-        return dataclasses.replace(self, loops=kept, rejected=_in_order([*self.rejected, *others]))
-
-    def __str__(self) -> str:
-        within = (self.within(number)._session_in_words() for number in range(len(self.sessions)))
-        return "\n".join([*within, *(self.between(*pair)._pair_in_words(*pair) for pair in self.pairs)])
-
-    def _session_in_words(self) -> str:
-        one = self.sessions[0]
-        degenerate = sum(loop.is_degenerate for loop in self.loops)
-        loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
-        found = f"{loops} in {one.frames} of {len(one.recording)} frames of {one.recording.name}"
-        skipped = f", {len(one.skipped)} scans skipped" if one.skipped else ""
-        left = f", {one.unregistered} not registered" if one.unregistered else ""
-        scale = f", scale {self.scale}" if self.scale != 1 else ""
-        return f"{found}, {len(self.rejected)} rejected{self._reasons()}{left}{skipped}{scale}"
-
-    def _pair_in_words(self, match: int, query: int) -> str:
-        names = f"{self.sessions[match].recording.name} and {self.sessions[query].recording.name}"
-        if not self.transforms:
-            return f"{names}: no common place found{self._reasons()}"
-        transforms = "; ".join(map(str, self.transforms))
-        return f"{names}: {len(self.loops)} loops, {len(self.rejected)} rejected{self._reasons()}; {transforms}"
-
-    def _reasons(self) -> str:
-        return f" ({listed(counted(self.rejected))})" if self.rejected else ""
-
-
-def _ends(loop: Loop) -> tuple[int, int]:
-    """Sessions of match and query."""
-    return loop.match_session, loop.query_session
-
-
-def _in_order(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
-    """Pairs within the sessions, then those between them, in the order of their frames."""
-
-    def order(one: Rejected) -> tuple[bool, tuple[int, int], int, int]:
-        match, query = _ends(one.loop)
-        return match != query, (match, query), one.loop.query, one.loop.match
-
-    return tuple(sorted(rejected, key=order))
 
 
 class Input(NamedTuple):
@@ -382,7 +239,7 @@ def search_session(
         config = dataclasses.replace(config, drift=finder.present_drift)
     options = {"registered": registered, "knows_height": finder.knows_height, "should_stop": should_stop}
     loops, rejected = settled(recording, detector.loops, odometry, config, **options)
-    rejected = list(_in_order([*rejected, *detector.rejected, *detector.undecided()]))
+    rejected = list(ordered_rejections([*rejected, *detector.rejected, *detector.undecided()]))
     if odometry is not None:
         sensors = mountings_of(recording)
         check_odometry(recording.name, loops, rejected, odometry, config, mounting=sensors, scale=scale)
@@ -434,7 +291,7 @@ def search_pair(
         if some:
             transforms.append(_aligned(some, both, motion, rules["drift"]))
             loops += some
-    return sorted(loops, key=lambda loop: (loop.query, loop.match)), list(_in_order(rejected)), transforms
+    return sorted(loops, key=lambda loop: (loop.query, loop.match)), list(ordered_rejections(rejected)), transforms
 
 
 def _candidates_between(
@@ -539,35 +396,3 @@ def _check_scans(finder: CandidateFinder, recording: Recording) -> None:
         raise ValueError(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )
-
-
-def why_none(found: FoundLoops) -> list[str]:
-    """Reasons why sessions have no loops of their own, one sentence each. With several, names begin the sentences."""
-    if len(found.sessions) != 1:
-        each = ((one.recording.name, why_none(found.within(k))) for k, one in enumerate(found.sessions))
-        return [f"{name}: {line}" for name, lines in each for line in lines]
-    if found.loops:
-        return []
-    session = found.sessions[0]
-    if not session.frames:
-        return ["The search was stopped before the first scan."]
-    reasons, scans = [], len(session.recording)
-    if session.frames < scans:
-        reasons.append(f"The search was stopped after {session.frames} of {scans} frames.")
-    if 2 * session.empty > session.frames:
-        cells = found.config.candidates.min_cells
-        reasons.append(
-            f"{session.empty} of {session.frames} scans are almost empty (fewer than {cells} occupied cells of the "
-            "image): check the format and the range of the points, and whether the sensor was covered."
-        )
-    if 2 * len(session.skipped) > session.frames:
-        reasons.append(f"{len(session.skipped)} of {session.frames} scans cannot be read.")
-    if found.rejected:
-        reason, count = next(iter(counted(found.rejected).items()))
-        return [*reasons, f"{len(found.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]
-    source = "images" if session.odometry is None else "odometry"
-    return [
-        *reasons,
-        f"No pair was compared: according to the {source}, no scan came back to a place after at least "
-        f"{found.config.candidates.recent_m:g} m of travelled distance.",
-    ]

@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sglpr_jax.models.config import CircularConfig
+from sglpr_jax.models.backbone_config import CircularConfig
 from sglpr_jax.models.convolution import Convolution
 from sglpr_jax.models.layers import LayerNorm, Linear, Seen
 

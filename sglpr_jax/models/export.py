@@ -16,7 +16,6 @@ import jax.export
 import numpy as np
 from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
 
-from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.data.density_image import (
     CEILING_M,
     EDGE_STEP_M,
@@ -28,7 +27,7 @@ from sglpr_jax.data.density_image import (
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import check_holds_only, replacing, write_json
-from sglpr_jax.grid import Grid
+from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, Grid
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
@@ -151,8 +150,9 @@ def _counts_of_voxels(grid: Grid) -> dict[str, str]:
         "voxels": f"points with |x| < {REACH_M}, |y| < {REACH_M}, {FLOOR_M} < z < {CEILING_M} are sorted into voxels, "
         f"floor(point / edge); the edge is the smallest of {FIRST_EDGE_M}, {FIRST_EDGE_M + EDGE_STEP_M}, ... m that "
         f"leaves at most {MAX_VOXELS} voxels with points; each of these gives one centroid, the mean of its points",
-        "counts": f"n = min(number of centroids, {MAX_COUNT}) for each pair i = trunc(x / {RESOLUTION_M}), "
-        f"j = trunc(y / {RESOLUTION_M}); value = round(255 n / N) {MAX_COUNT} / 255, N being the largest n",
+        "counts": f"n = min(number of centroids, {DENSITY_MAX_COUNT}) for each pair "
+        f"i = trunc(x / {DENSITY_RESOLUTION_M}), j = trunc(y / {DENSITY_RESOLUTION_M}); "
+        f"value = round(255 n / N) {DENSITY_MAX_COUNT} / 255, N being the largest n",
         "cells": f"the value of (i, j) stands in bev[b, v, u] with u = {u} + i for i > 0, {u - 1} + i for i < 0, and "
         f"v = {v - 1} - j for j > 0, {v} - j for j < 0; for i = 0 half of it stands in u = {u - 1}, half in u = {u}, "
         f"for j = 0 half in v = {v - 1} and half in v = {v}; all other cells are 0, and what lies outside is left out",

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
-from sglpr_jax.data.density_grid import MAX_COUNT
-from sglpr_jax.grid import Grid
+from sglpr_jax.grid import DENSITY_MAX_COUNT, Grid
 from sglpr_jax.models.config import ModelConfig
 
 CLIP_COUNT = 10.0
@@ -47,7 +46,7 @@ def _counts(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h 
                 "this model describes density images: expected counts 0 to 10 as floats, or grey values 0 to 255 as "
                 f"uint8, found {bev.dtype}, which has lost the fractions of the counts"
             )
-        return bev.astype(jnp.float32) * np.float32(MAX_COUNT / 255)
+        return bev.astype(jnp.float32) * np.float32(DENSITY_MAX_COUNT / 255)
     return jnp.asarray(bev, jnp.float32)
 
 

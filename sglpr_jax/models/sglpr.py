@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
+from sglpr_jax.models.backbone_config import BackboneConfig, CircularConfig, SglprConfig, SwinConfig
 from sglpr_jax.models.circular import CircularBackbone
-from sglpr_jax.models.config import BackboneConfig, CircularConfig, ModelConfig, SglprConfig, SwinConfig, model_preset
+from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
 from sglpr_jax.models.layers import Seen

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sglpr_jax.models.backbone_config import SglprConfig, SwinConfig
 from sglpr_jax.models.circular import CircularDecoder, CircularNet
-from sglpr_jax.models.config import SglprConfig, SwinConfig
 from sglpr_jax.models.layers import LayerNorm, Linear, Seen
 from sglpr_jax.models.swin import MLP_RATIO, PatchEmbed, PatchExpand, PatchMerging, SwinStage
 

@@ -13,7 +13,8 @@ import safetensors
 import safetensors.numpy
 
 from sglpr_jax.files import in_short, naming
-from sglpr_jax.models.config import ModelConfig, SwinConfig
+from sglpr_jax.models.backbone_config import SwinConfig
+from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import SGLPR
 from sglpr_jax.models.weights import as_tree, by_name

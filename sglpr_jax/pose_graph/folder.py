@@ -14,7 +14,7 @@ from sglpr_jax.data.warning import warn
 from sglpr_jax.files import file_name, text_bytes, write_all, write_json
 from sglpr_jax.loops.closure import renumbered
 from sglpr_jax.loops.frame_alignment import AlignedParts, Part
-from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.loops.result import FoundLoops
 from sglpr_jax.pose_graph.files import (
     write_g2o,
     write_kitti,

@@ -18,7 +18,7 @@ from sglpr_jax.data.levelling import mountings_of, upright_from_lidar, upright_o
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.closure import FrameId, Loop, frames_of
 from sglpr_jax.loops.drift import deviations, step_deviations
-from sglpr_jax.loops.search import FoundLoops, Session
+from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import inverse, moved_covariance

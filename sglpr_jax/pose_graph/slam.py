@@ -12,7 +12,8 @@ from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.search import FoundLoops, find_loops
+from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.loops.search import find_loops
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.models.weights_file import load

@@ -2,14 +2,14 @@
 
 import dataclasses
 
-from sglpr_jax.data.density_grid import RESOLUTION_M
+from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
 @dataclasses.dataclass(frozen=True)
 class VerificationConfig:
     """Settings of the comparison of the bird's-eye-view images of two scans."""
 
-    resolution_m: float = RESOLUTION_M
+    resolution_m: float = DENSITY_RESOLUTION_M
     """Edge of an image's cell, in metres."""
     reach_m: float = 25.0
     """Radius of the compared cells around the sensor, in metres. A circle has the same content at every rotation."""

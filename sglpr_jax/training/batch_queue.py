@@ -22,7 +22,7 @@ class BatchSource(abc.ABC):
     def batch(self, step: int) -> Any:
         """Return this host's part of the batch of a step. Repeated calls return the same batch."""
 
-    def refresh(self, step: int, state: TrainState) -> None:
+    def refresh(self, step: int, state: TrainState) -> None:  # noqa: B027 (most sources need no state)
         """Give the source the state before a step. The batches from that step on may depend on it."""
 
     def places(self, step: int) -> str:

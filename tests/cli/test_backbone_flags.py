@@ -3,7 +3,7 @@
 import pytest
 
 from sglpr_jax.cli import reproduce, train
-from sglpr_jax.models.config import CircularConfig, SwinConfig
+from sglpr_jax.models.backbone_config import CircularConfig, SwinConfig
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ MODEL = """
 import dataclasses
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.config import SwinConfig
+from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import TrainConfig

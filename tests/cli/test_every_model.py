@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models.config import CircularConfig, HeadConfig, SglprConfig
+from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig
+from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.sim.dataset import simulate
 
 from .conftest import SENSOR, Ended, assert_one_line_error, run_command

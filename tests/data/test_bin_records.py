@@ -5,8 +5,8 @@ import pytest
 
 from sglpr_jax.data.formats.bin_records import find_record, read_records, unusual_record
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.reader import ReadOptions
 from sglpr_jax.data.readers import kitti, scan_folder
+from sglpr_jax.data.readers.reader import ReadOptions
 from sglpr_jax.data.warning import DataWarning
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.reader import ReadOptions
 from sglpr_jax.data.readers import boreas, helipr, kitti_raw, mulran, open_recording, recording_names
+from sglpr_jax.data.readers.reader import ReadOptions
 from sglpr_jax.data.readers.stamped import read_table
 
 NS = 1561000444390857630

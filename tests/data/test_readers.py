@@ -7,7 +7,7 @@ from sglpr_jax.data import readers
 from sglpr_jax.data.readers import open_recording, recording_names
 
 MULE = """
-from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.readers.reader import Reader
 from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.recording import Recording
 

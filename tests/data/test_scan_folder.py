@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data import readers
-from sglpr_jax.data.reader import ReadOptions
 from sglpr_jax.data.readers import scan_folder
+from sglpr_jax.data.readers.reader import ReadOptions
 from sglpr_jax.data.readers.scan_folder import recording_names
 from sglpr_jax.data.warning import DataWarning
 

@@ -12,7 +12,7 @@ from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.frame_alignment import AlignedParts, FrameAlignment, Part
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.search import FoundLoops, Session
+from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transform
 

@@ -12,7 +12,8 @@ from recordings import of_images
 from sglpr_jax.evaluation import rerun_file
 from sglpr_jax.evaluation.rerun_file import write_rerun
 from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.search import FoundLoops, Session, find_loops
+from sglpr_jax.loops.result import FoundLoops, Session
+from sglpr_jax.loops.search import find_loops
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transform

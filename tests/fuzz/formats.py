@@ -25,7 +25,8 @@ from sglpr_jax.files import read_json
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.models.config import HeadConfig, ModelConfig, SwinConfig, config_from_dict
+from sglpr_jax.models.backbone_config import SwinConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, config_from_dict
 from sglpr_jax.models.weights import hash_of, weight_shapes
 from sglpr_jax.models.weights_file import CHECKSUM, CONFIG_FILE, WEIGHTS_FILE, load
 from sglpr_jax.pose_graph import files as loop_files

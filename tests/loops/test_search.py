@@ -23,7 +23,8 @@ from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.loops.search import FoundLoops, Session, find_loops, why_none
+from sglpr_jax.loops.result import FoundLoops, Session, why_none
+from sglpr_jax.loops.search import find_loops
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 N = 40

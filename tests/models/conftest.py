@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.config import ModelConfig, SwinConfig
+from sglpr_jax.models.backbone_config import SwinConfig
+from sglpr_jax.models.config import ModelConfig
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
 TOLERANCE = 1e-4

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models import sglpr
+from sglpr_jax.models.backbone_config import CircularConfig
 from sglpr_jax.models.circular import CircularNet, block_means
-from sglpr_jax.models.config import CircularConfig, HeadConfig, ModelConfig, model_preset
+from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.place_head import amplitudes
 
 RINGS = CircularConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))

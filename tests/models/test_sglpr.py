@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.config import HeadConfig, ModelConfig, SwinConfig, model_preset
+from sglpr_jax.models.backbone_config import SwinConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.input_image import field_of_view, prepare, to_polar
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import PlaceHead

@@ -12,7 +12,8 @@ import pytest
 
 from sglpr_jax.grid import Grid
 from sglpr_jax.models import shipped
-from sglpr_jax.models.config import HeadConfig, SwinConfig, model_preset
+from sglpr_jax.models.backbone_config import SwinConfig
+from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.shipped import shipped_weights, weights_folder

@@ -11,7 +11,8 @@ import pytest
 
 from sglpr_jax import losses
 from sglpr_jax.models import sglpr
-from sglpr_jax.models.config import CircularConfig, HeadConfig, ModelConfig, SglprConfig, SwinConfig, model_preset
+from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig, SwinConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.layers import LayerNorm
 from sglpr_jax.models.swin import PatchExpand, SwinBlock, WindowAttention
 from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet, drop_path_rates

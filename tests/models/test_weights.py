@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models.config import CircularConfig, HeadConfig, model_preset
+from sglpr_jax.models.backbone_config import CircularConfig
+from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import Whitening
 from sglpr_jax.models.sglpr import describe, init

@@ -13,7 +13,7 @@ from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
 from sglpr_jax.loops.closure import Loop, Rejected
-from sglpr_jax.loops.search import FoundLoops, Session
+from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.pose_graph import folder
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_csv, read_loops_jsonl
 from sglpr_jax.pose_graph.folder import FIRST_VERTEX, unique_names, vertices, write_found

@@ -14,7 +14,7 @@ from session_pairs import found_pair, two_drives
 
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.search import FoundLoops, Session
+from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o
 from sglpr_jax.pose_graph.optimize import (
     MOST_RISEN_M,

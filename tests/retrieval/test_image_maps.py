@@ -16,7 +16,8 @@ from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_raw
-from sglpr_jax.models.config import MODELS, HeadConfig, SwinConfig, model_preset
+from sglpr_jax.models.backbone_config import SwinConfig
+from sglpr_jax.models.config import MODELS, HeadConfig, model_preset
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward, init, segment

@@ -9,7 +9,8 @@ import pytest
 
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
-from sglpr_jax.models.config import CircularConfig, HeadConfig, SwinConfig, model_preset
+from sglpr_jax.models.backbone_config import CircularConfig, SwinConfig
+from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.training.batch_queue import BatchSource
 from sglpr_jax.training.batches import Batch

@@ -11,8 +11,8 @@ from pathlib import Path
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
-from sglpr_jax.data.listing import left_aside
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.listing import left_aside
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.data.formats.png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
-from sglpr_jax.data.listing import files_in, scans_in
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.listing import files_in, scans_in
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, image_record
+from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
@@ -44,7 +44,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         times=None,
         pose_source=f"{name}/pose.txt" if poses.is_file() else None,
         paths=image_paths,
-        resolution_m=RESOLUTION_M,
+        resolution_m=DENSITY_RESOLUTION_M,
         read=partial(image_record, read=read_image),
         label_paths=tuple(labels.get(image) for image in ids),
     )
@@ -68,7 +68,7 @@ def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
 
 def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Scale grey values 0..255 to counts 0..10."""
-    return np.ascontiguousarray(grey) * np.float32(MAX_COUNT / 255)
+    return np.ascontiguousarray(grey) * np.float32(DENSITY_MAX_COUNT / 255)
 
 
 READER = Reader("NN/imgs/*.png (BEV images)", recording_names, open_recording, rank=1)

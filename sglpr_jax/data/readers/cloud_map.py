@@ -17,7 +17,7 @@ from sglpr_jax.data.cloud_map import TiledCloud, tiled_cloud, visible_points
 from sglpr_jax.data.formats.pose_files import read_trajectory
 from sglpr_jax.data.formats.scan_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import warn

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.formats.clouds import Records, TimeField, time_field_of
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.readers.stamped import read_table, sequences, stamped_recording
 from sglpr_jax.data.recording import Recording
 

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import numbers_of
-from sglpr_jax.data.listing import scans_in
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.listing import scans_in
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
 from sglpr_jax.files import in_short
 

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, read_records
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.readers.stamped import stamped_recording
 from sglpr_jax.data.recording import Recording
 

@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from sglpr_jax.data.formats.arrays import read_points
 from sglpr_jax.data.formats.pose_files import check_positions, rotations_of, rows_of
-from sglpr_jax.data.listing import files_in, scans_in
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.listing import files_in, scans_in
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.times import check_order
 from sglpr_jax.files import read_json

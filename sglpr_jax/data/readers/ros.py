@@ -21,9 +21,9 @@ from sglpr_jax.data.formats.ros_messages import (
     times_on_one_clock,
 )
 from sglpr_jax.data.imu import Imu
-from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import interpolate, interpolate_turns, poses_of
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.listing import files_in
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Record, Recording, found_record
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.times import doubt

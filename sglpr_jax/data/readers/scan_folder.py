@@ -13,8 +13,8 @@ from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.bin_records import check_record, described, find_record, is_record
 from sglpr_jax.data.formats.pose_files import POSE_FILES, TIMES_FILE, check_order, folder_trajectory
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id
-from sglpr_jax.data.listing import files_in, left_aside, scans_in
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.listing import files_in, left_aside, scans_in
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.clouds import Records
-from sglpr_jax.data.listing import scans_in
+from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.recording import Record, Recording, found_record
 from sglpr_jax.data.times import check_unit, nearest_rows
 

@@ -10,7 +10,7 @@ and its factor is not stored (docs/decisions.md). Without this reader, a run loo
 
 from pathlib import Path
 
-from sglpr_jax.data.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 
 TABLES = ("pointcloud_locations_*.csv", "pointcloud_centroids_*.csv")

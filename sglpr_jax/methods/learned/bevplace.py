@@ -20,9 +20,9 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Float64, Int32, Num, UInt8
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.density_grid import MAX_COUNT, SIZE
 from sglpr_jax.data.recording import Record, check_cloud
 from sglpr_jax.data.views import check_ready_made, picture
+from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_SIZE
 from sglpr_jax.methods.learned.layers import (
     FEATURES,
     HE,
@@ -215,9 +215,11 @@ def grey_image(record: Record) -> UInt8[np.ndarray, "151 151"]:
         check_cloud(record.points, name=record.name)
     check_ready_made(record, "density")
     counts = picture(record, None)[0]
-    if counts.shape != (SIZE, SIZE):
-        raise ValueError(f"{record.name}: expected a density image of {SIZE} x {SIZE} pixels, found {counts.shape}")
-    return np.rint(counts * (255 / MAX_COUNT)).clip(0, 255).astype(np.uint8)
+    if counts.shape != (DENSITY_SIZE, DENSITY_SIZE):
+        raise ValueError(
+            f"{record.name}: expected a density image of {DENSITY_SIZE} x {DENSITY_SIZE} pixels, found {counts.shape}"
+        )
+    return np.rint(counts * (255 / DENSITY_MAX_COUNT)).clip(0, 255).astype(np.uint8)
 
 
 def turned(key: Array, images: Num[Array, "b h h"]) -> Num[Array, "b h h"]:

@@ -1,0 +1,193 @@
+"""Result of a loop search: sessions, loops within and between them, rejected pairs, and transforms of their frames."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, listed
+from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.frame_alignment import AlignedParts
+from sglpr_jax.loops.probability import LoopModel
+from sglpr_jax.odometry.config import DriftModel
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Session:
+    """A searched recording."""
+
+    recording: Recording
+    frames: int
+    """Number of scans that were searched: all, unless the search was stopped."""
+    odometry: Float[np.ndarray, "n 4 4"] | None = None
+    """Pose of the LiDAR at every scan of the recording."""
+    drift: DriftModel = DriftModel()
+    """Drift of the odometry, estimated from the drive."""
+    skipped: tuple[str, ...] = ()
+    """Ids of scans that cannot be read."""
+    empty: int = 0
+    """Number of searched scans that are almost empty."""
+    unregistered: int = 0
+    """Number of loops within the session that were not registered because the search was stopped."""
+    candidates: tuple[Candidate, ...] = ()
+    """All compared pairs or, with `max_places`, that many of the last ones. Their lengths have the search's scale."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FoundLoops:
+    """Loops within and between sessions."""
+
+    sessions: tuple[Session, ...]
+    loops: tuple[Loop, ...] = ()
+    """Loops within each session, then those between each pair of sessions."""
+    rejected: tuple[Rejected, ...] = ()
+    """All other compared pairs, each with the reason for its rejection."""
+    transforms: tuple[AlignedParts, ...] = ()
+    """Transforms between the frames of sessions. For each pair, the one with most loops is first; none if no common
+    place was found. With odometry there is at most one."""
+    model: LoopModel | None = None
+    """Model of the probabilities."""
+    config: DetectorConfig = DetectorConfig()
+    """Settings of the search."""
+    scale: Scale = 1
+    """Factor for all lengths during the search. The results are in metres."""
+    stopped: bool = False
+    """Whether the search between sessions was stopped before its end."""
+
+    @property
+    def recording(self) -> Recording:
+        """Recording of the first session."""
+        return self.sessions[0].recording
+
+    @property
+    def frames(self) -> int:
+        """Number of scans of the first session that were searched."""
+        return self.sessions[0].frames
+
+    @property
+    def odometry(self) -> Float[np.ndarray, "n 4 4"] | None:
+        """Pose of the LiDAR at every scan of the first session."""
+        return self.sessions[0].odometry
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Compared pairs of the first session."""
+        return self.sessions[0].candidates
+
+    @property
+    def whole(self) -> bool:
+        """Whether the search was completed."""
+        ended = (one.frames == len(one.recording) and not one.unregistered for one in self.sessions)
+        return not self.stopped and all(ended)
+
+    def split(self, poses: Float[np.ndarray, "n 4 4"]) -> list[Float[np.ndarray, "_ 4 4"]]:
+        """Divide the poses of all searched frames by session."""
+        return np.split(poses, np.cumsum([one.frames for one in self.sessions])[:-1])
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Numbers of the two sessions of each pair: first that of the matches, then that of the queries."""
+        return list(itertools.combinations(range(len(self.sessions)), 2))
+
+    def between(self, match: int, query: int) -> "FoundLoops":
+        """The results whose queries and matches are in these sessions, which may be the same."""
+        ends = match, query
+        return dataclasses.replace(
+            self,
+            loops=tuple(one for one in self.loops if _ends(one) == ends),
+            rejected=tuple(one for one in self.rejected if _ends(one.loop) == ends),
+            transforms=tuple(one for one in self.transforms if (one.match.session, one.query.session) == ends),
+        )
+
+    def within(self, session: int) -> "FoundLoops":
+        """The results of one session, as if it had been searched alone."""
+        found, alone = self.between(session, session), {"match_session": 0, "query_session": 0}
+        loops = (dataclasses.replace(loop, **alone) for loop in found.loops)
+        others = (dataclasses.replace(one, loop=dataclasses.replace(one.loop, **alone)) for one in found.rejected)
+        return dataclasses.replace(
+            found, sessions=(self.sessions[session],), loops=tuple(loops), rejected=tuple(others)
+        )
+
+    def without_degenerate(self) -> "FoundLoops":
+        """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction
+        (`is_degenerate`). Transforms stay, because their weights contain this uncertainty.
+        """
+        kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
+        others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
+        return dataclasses.replace(self, loops=kept, rejected=ordered_rejections([*self.rejected, *others]))
+
+    def __str__(self) -> str:
+        within = (self.within(number)._session_in_words() for number in range(len(self.sessions)))
+        return "\n".join([*within, *(self.between(*pair)._pair_in_words(*pair) for pair in self.pairs)])
+
+    def _session_in_words(self) -> str:
+        one = self.sessions[0]
+        degenerate = sum(loop.is_degenerate for loop in self.loops)
+        loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
+        found = f"{loops} in {one.frames} of {len(one.recording)} frames of {one.recording.name}"
+        skipped = f", {len(one.skipped)} scans skipped" if one.skipped else ""
+        left = f", {one.unregistered} not registered" if one.unregistered else ""
+        scale = f", scale {self.scale}" if self.scale != 1 else ""
+        return f"{found}, {len(self.rejected)} rejected{self._reasons()}{left}{skipped}{scale}"
+
+    def _pair_in_words(self, match: int, query: int) -> str:
+        names = f"{self.sessions[match].recording.name} and {self.sessions[query].recording.name}"
+        if not self.transforms:
+            return f"{names}: no common place found{self._reasons()}"
+        transforms = "; ".join(map(str, self.transforms))
+        return f"{names}: {len(self.loops)} loops, {len(self.rejected)} rejected{self._reasons()}; {transforms}"
+
+    def _reasons(self) -> str:
+        return f" ({listed(counted(self.rejected))})" if self.rejected else ""
+
+
+def _ends(loop: Loop) -> tuple[int, int]:
+    """Sessions of match and query."""
+    return loop.match_session, loop.query_session
+
+
+def ordered_rejections(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
+    """Pairs within the sessions, then those between them, in the order of their frames."""
+
+    def order(one: Rejected) -> tuple[bool, tuple[int, int], int, int]:
+        match, query = _ends(one.loop)
+        return match != query, (match, query), one.loop.query, one.loop.match
+
+    return tuple(sorted(rejected, key=order))
+
+
+def why_none(found: FoundLoops) -> list[str]:
+    """Reasons why sessions have no loops of their own, one sentence each. With several, names begin the sentences."""
+    if len(found.sessions) != 1:
+        each = ((one.recording.name, why_none(found.within(k))) for k, one in enumerate(found.sessions))
+        return [f"{name}: {line}" for name, lines in each for line in lines]
+    if found.loops:
+        return []
+    session = found.sessions[0]
+    if not session.frames:
+        return ["The search was stopped before the first scan."]
+    reasons, scans = [], len(session.recording)
+    if session.frames < scans:
+        reasons.append(f"The search was stopped after {session.frames} of {scans} frames.")
+    if 2 * session.empty > session.frames:
+        cells = found.config.candidates.min_cells
+        reasons.append(
+            f"{session.empty} of {session.frames} scans are almost empty (fewer than {cells} occupied cells of the "
+            "image): check the format and the range of the points, and whether the sensor was covered."
+        )
+    if 2 * len(session.skipped) > session.frames:
+        reasons.append(f"{len(session.skipped)} of {session.frames} scans cannot be read.")
+    if found.rejected:
+        reason, count = next(iter(counted(found.rejected).items()))
+        return [*reasons, f"{len(found.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]
+    source = "images" if session.odometry is None else "odometry"
+    return [
+        *reasons,
+        f"No pair was compared: according to the {source}, no scan came back to a place after at least "
+        f"{found.config.candidates.recent_m:g} m of travelled distance.",
+    ]

@@ -1,0 +1,191 @@
+"""Configurations of the backbones: Swin-Unet, circular CNN, and a Swin-Unet on the tokens of the circular CNN."""
+
+import abc
+import dataclasses
+import math
+from typing import Literal
+
+from sglpr_jax.fields import (
+    Depths,
+    Share,
+    Size,
+    Sizes,
+    check_fields,
+)
+
+
+class BackboneSizes(abc.ABC):
+    """What every configuration of a backbone says about it. Sizes are rows and columns of the image that it sees."""
+
+    @property
+    @abc.abstractmethod
+    def token(self) -> tuple[int, int]:
+        """Rows and columns of the image that one feature represents."""
+
+    @property
+    @abc.abstractmethod
+    def width(self) -> int:
+        """Channels of the features."""
+
+    @property
+    def multiple(self) -> tuple[int, int]:
+        """The image's rows and columns must be a multiple of this: the size of one feature of the coarsest map."""
+        return self.token
+
+    @property
+    @abc.abstractmethod
+    def needs_polar(self) -> bool:
+        """Whether the backbone requires a polar image, because its layers wrap around."""
+
+    @property
+    @abc.abstractmethod
+    def pictures(self) -> dict[str, str]:
+        """Maps to draw as heat maps: from the title of each picture to the name of its map in `Seen.named`."""
+
+
+class _Stages(BackboneSizes):
+    """Backbone of Swin stages. Stage i has `embed_dim` * 2**i channels."""
+
+    embed_dim: int
+    depths: tuple[int, ...]
+    heads: tuple[int, ...]
+
+    def __post_init__(self):
+        check_fields(self)
+        if not self.depths or len(self.depths) != len(self.heads):
+            raise ValueError(
+                "expected at least one stage, and a number of heads for each, found "
+                f"depths {self.depths}, heads {self.heads}"
+            )
+        for i, number in enumerate(self.heads):
+            if (channels := self.embed_dim * 2**i) % number:
+                raise ValueError(f"heads: expected a divisor of the {channels} channels of stage {i}, found {number}")
+
+    @property
+    def width(self) -> int:
+        return self.embed_dim
+
+    @property
+    def multiple(self) -> tuple[int, int]:
+        rows, columns = self.token
+        coarsest = 2 ** (len(self.depths) - 1)
+        return rows * coarsest, columns * coarsest
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        # Normalised maps have the same strength everywhere.
+        last = len(self.depths) - 1
+        return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
+
+
+@dataclasses.dataclass(frozen=True)
+class SwinConfig(_Stages):
+    """Swin-Unet with the paper's values as defaults. Stage i has `embed_dim` * 2**i channels."""
+
+    kind: Literal["swin"] = "swin"
+    patch: Size = 4
+    """Edge of a token's patch, in pixels of the image."""
+    embed_dim: Size = 96
+    depths: Depths = (2, 2, 2, 2)
+    """Number of blocks of each stage."""
+    heads: Sizes = (3, 6, 12, 24)
+    """Number of attention heads of each stage."""
+    window: Size = 7
+    """Edge of an attention window, in tokens."""
+    drop_path: Share = 0.2
+    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
+    block."""
+
+    @property
+    def token(self) -> tuple[int, int]:
+        return self.patch, self.patch
+
+    @property
+    def needs_polar(self) -> bool:
+        return False
+
+
+@dataclasses.dataclass(frozen=True)
+class CircularConfig(BackboneSizes):
+    """Circular convolutions on the polar image, with one block for each width."""
+
+    kind: Literal["circular"] = "circular"
+    average: Size = 2
+    """Edge of the squares of polar pixels that are averaged before the first block. Without averaging, the resampling
+    skips cells."""
+    fine: Sizes = ()
+    """Channels of additional blocks at the full number of sectors. The output of the i-th joins the input of the i-th
+    block of `widths`."""
+    widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
+    """Channels of each block."""
+    strides: Sizes = (2, 2, 1, 2, 1, 1, 1)
+    """Stride of each block along the radius."""
+    means: Sizes = (1, 1, 2, 1, 2, 1, 1)
+    """Number of neighbouring sectors that are averaged into one after each block."""
+
+    def __post_init__(self):
+        check_fields(self)
+        if not self.widths:
+            raise ValueError("widths: expected at least one block, found ()")
+        if not len(self.widths) == len(self.strides) == len(self.means):
+            raise ValueError(
+                "expected equal numbers of widths, strides and means of the circular CNN, found "
+                f"widths {self.widths}, strides {self.strides}, means {self.means}"
+            )
+        if len(self.fine) > len(self.widths):
+            raise ValueError(
+                f"fine: expected at most one value for each width of the circular CNN, {self.widths}, found {self.fine}"
+            )
+
+    @property
+    def token(self) -> tuple[int, int]:
+        return self.average * math.prod(self.strides), self.average * math.prod(self.means)
+
+    @property
+    def width(self) -> int:
+        return self.widths[-1]
+
+    @property
+    def needs_polar(self) -> bool:
+        return True
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        last = len(self.widths) - 1  # the first, the middle and the last block
+        return {f"block {i + 1}": f"circular_block{i}" for i in sorted({0, last // 2, last})}
+
+
+@dataclasses.dataclass(frozen=True)
+class SglprConfig(_Stages):
+    """Swin-Unet whose tokens come from circular convolutions on the polar image."""
+
+    kind: Literal["sglpr"] = "sglpr"
+    stem: CircularConfig = CircularConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
+    """Circular CNN that makes the tokens. Its last map has one pixel for each token."""
+    embed_dim: Size = 64
+    depths: Depths = (2, 2)
+    """Number of blocks of each stage."""
+    heads: Sizes = (2, 4)
+    """Number of attention heads of each stage."""
+    window: Size = 4
+    """Edge of an attention window, in tokens."""
+    mlp_ratio: Size = 2
+    """Hidden units of a block's MLP per channel; 4 in the paper."""
+    drop_path: Share = 0.0
+    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
+    block."""
+
+    @property
+    def token(self) -> tuple[int, int]:
+        return self.stem.token
+
+    @property
+    def needs_polar(self) -> bool:
+        return True
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        return {"stem": f"circular_block{len(self.stem.widths) - 1}", **super().pictures}
+
+
+BackboneConfig = SwinConfig | CircularConfig | SglprConfig
