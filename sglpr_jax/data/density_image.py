@@ -64,7 +64,8 @@ def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
     if np.issubdtype(image.dtype, np.floating) and not within:
         raise ValueError(
             f"{name}: expected a density image, floats from 0 to {DENSITY_MAX_COUNT}, found floats from "
-            f"{least:g} to {most:g}; does the image contain grey values (255 instead of {DENSITY_MAX_COUNT}) or uncapped point counts?"
+            f"{least:g} to {most:g}; does the image contain grey values (255 instead of "
+            f"{DENSITY_MAX_COUNT}) or uncapped point counts?"
         )
 
 
