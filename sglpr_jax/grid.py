@@ -34,7 +34,8 @@ class Grid:
 def check_density_grid(grid: Grid) -> None:
     """Raise ValueError if a grid has other cells than density images, or more of them."""
     if grid.resolution_m != DENSITY_RESOLUTION_M or max(grid.height, grid.width) > DENSITY_SIZE:
+        size = f"{DENSITY_SIZE} x {DENSITY_SIZE} cells of {DENSITY_RESOLUTION_M} m"
         raise ValueError(
-            f"density images have {DENSITY_SIZE} x {DENSITY_SIZE} cells of {DENSITY_RESOLUTION_M} m: expected a "
-            f"grid of at most this size with the same cells, found {grid.height} x {grid.width} cells of {grid.resolution_m} m"
+            f"density images have {size}: expected a grid of at most this size with the same cells, found "
+            f"{grid.height} x {grid.width} cells of {grid.resolution_m} m"
         )
