@@ -1,0 +1,95 @@
+"""Twenty wrong lines, each in a copy of the tree: whether the tests notice it."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+
+
+class Mutation(NamedTuple):
+    """One line made wrong, and the tests that should notice it."""
+
+    line: str
+    """Text that only one file of the package contains."""
+    wrong: str
+    """What replaces the text."""
+    tests: tuple[str, ...]
+    """Patterns of paths below `tests`. Some name the places of earlier versions."""
+
+
+MUTATIONS = (
+    Mutation("jnp.where(last >= 0, found", "jnp.where(last > 0, found", ("test_bev*.py",)),
+    Mutation(".astype(jnp.int32) - 1\n", ".astype(jnp.int32)\n", ("test_bev*.py",)),
+    Mutation("hinge.max(-1)", "hinge.min(-1)", ("test_losses.py", "training/test_loss.py")),
+    Mutation("1 - (2 * product", "1 - (product", ("test_losses.py", "training/test_loss.py")),
+    Mutation('clock - excluded, side="right")', 'clock - excluded, side="left")', ("evaluation/*.py", "test_*.py")),
+    Mutation("minlength=len(thresholds) + 1)[1:]", "minlength=len(thresholds) + 1)[:-1]", ("test_metrics.py",)),
+    Mutation("= crossed @ turned", "= turned @ crossed", ("test_se3.py", "loops/test_transforms.py")),
+    Mutation("fresh[None, 1:], fresh[None, :-1]", "fresh[None, :-1], fresh[None, 1:]", ("loops/test_sequence.py",)),
+    Mutation("assignment.sum(1)[:, None, :] * centres", "assignment.mean(1)[:, None, :] * centres", ("models/*.py",)),
+    Mutation("jnp.roll(x, (-down, -right), (1, 2))", "jnp.roll(x, (down, right), (1, 2))", ("models/*.py",)),
+    Mutation("-1, height, width, c)", "-1, width, height, c)", ("models/*.py",)),
+    Mutation("np.asarray(found.H)[order][:, order]", "np.asarray(found.H)", ("*/test_gicp.py", "loops/*regist*.py")),
+    Mutation("fewer = min(len(ours)", "fewer = max(len(ours)", ("*/test_gicp.py", "loops/*regist*.py")),
+    Mutation("bend > drift.max_deviation]] = False", "bend < 0]] = False", ("*/test_optimi*.py",)),
+    Mutation("BetweenFactorPose3(loop.match, loop.query", "BetweenFactorPose3(loop.query, loop.match",
+             ("*/test_optimi*.py",)),
+    Mutation("+ second * (cross @ cross)", "- second * (cross @ cross)", ("data/test_deskew.py", "data/test_pose*.py")),
+    Mutation("np.searchsorted(pose_times, times) - 1", "np.searchsorted(pose_times, times)",
+             ("data/test_deskew.py", "data/test_pose*.py")),
+    Mutation("step - step % every", "step", ("training/test_mining.py", "data/test_descriptor_cache.py")),
+    Mutation("1 / (1 + np.exp(-np.clip(", "1 / (1 + np.exp(np.clip(", ("loops/test_probability.py",)),
+    Mutation("os.replace(", "os.link(", ("test_files.py",)),
+)  # fmt: skip
+
+
+def mutations(*, tree: Path = Path()) -> None:
+    """Make twenty lines wrong, one at a time, and run the tests of their modules until the first failure.
+
+    A mutation that no test notices is printed with the tests that ran.
+
+    Args:
+        tree: Checkout whose package and tests are used. An earlier version can be compared.
+    """
+    console, noticed = Console(), 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "tree"
+        listed = subprocess.run(["git", "ls-files", "-z"], cwd=tree, check=True, capture_output=True, text=True).stdout
+        for name in filter(None, listed.split("\0")):
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(tree / name, copy / name)
+        for one in MUTATIONS:
+            noticed += _noticed(one, copy, console)
+    console.print(f"noticed: {noticed} of {len(MUTATIONS)}")
+
+
+def _noticed(one: Mutation, tree: Path, console: Console) -> bool:
+    """Whether a test of the tree fails with the mutation, and not without it."""
+    files = [path for path in sorted((tree / "sglpr_jax").rglob("*.py")) if one.line in path.read_text()]
+    tests = [str(path) for pattern in one.tests for path in sorted((tree / "tests").glob(pattern))]
+    tests = [name for name in tests if Path(name).name.startswith("test_")]
+    if len(files) != 1 or not tests:
+        raise SystemExit(f"error: expected {one.line!r} in one file and tests of it, found {len(files)}, {len(tests)}")
+    text = files[0].read_text()
+    files[0].write_text(text.replace(one.line, one.wrong))
+    try:
+        failed = _failed(tree, tests)
+    finally:
+        files[0].write_text(text)
+    console.print(f"{'noticed' if failed else 'MISSED'}: {one.wrong.strip()} ({files[0].relative_to(tree)})")
+    return failed
+
+
+def _failed(tree: Path, tests: list[str]) -> bool:
+    """Whether one of the tests fails. Raises RuntimeError if they cannot run."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
+    environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    ended = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)
+    if ended.returncode not in (0, 1):
+        raise RuntimeError(ended.stdout + ended.stderr)
+    return ended.returncode == 1
