@@ -43,9 +43,8 @@ def with_points(recording: Recording, points_of: Callable[[Path], np.ndarray]) -
 
 
 def _recording(paths: tuple[Path, ...], read: Callable[..., Record], **fields: Any) -> Recording:
-    ids = tuple(path.stem for path in paths)
-    unknown = {"name": "08", "ids": ids, "positions": None, "times": None, "pose_source": None}
-    return Recording(**{**unknown, **fields}, paths=paths, read=read)
+    named = {"name": "08", "ids": tuple(path.stem for path in paths)}
+    return Recording(**{**named, **fields}, paths=paths, read=read)
 
 
 def kitti_trajectory(root: Path, name: str, *, pose_source: str) -> tuple[np.ndarray, np.ndarray | None, str]:

@@ -25,11 +25,7 @@ _AROUND = tuple(row * _COLUMNS + column for row in (-1, 0, 1) for column in (-1,
 
 
 def on_trail(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return whether each point belongs to the trail of a moving object.
-
-    Arguments:
-      points: Points of a map in metres, z up.
-    """
+    """Return whether each point of a map (in metres, z up) belongs to the trail of a moving object."""
     if not len(points):
         return np.zeros(0, bool)
     column, row = np.floor(points[:, :2].T / np.float32(CELL_M)).astype(np.int64)
@@ -74,15 +70,12 @@ RAY_DEG = (0.2, 0.4)
 def visible_points(
     points: Float32[np.ndarray, "n 3"], *, spacing_m: float, reach_m: float
 ) -> Float32[np.ndarray, "m 3"]:
-    """Return the points that a LiDAR at the origin measures: the nearest visible point of each ray.
+    """Return the points that a sensor at the origin sees, in their order.
 
     Arguments:
-      points: Point cloud in the LiDAR frame, in metres. Points must be finite.
-      spacing_m: Distance between neighbouring points on a surface, in metres.
-      reach_m: Maximum distance from the sensor, in metres.
-
-    Returns:
-      Some of the points, in their order.
+      points: Points of a map around the sensor, in its frame, in metres.
+      spacing_m: Distance between neighbouring points of the map on a surface, in metres.
+      reach_m: Maximum distance of a point, in metres.
     """
     ranges = np.sqrt(np.einsum("ni,ni->n", points, points))
     within = np.flatnonzero((ranges >= NEAREST_M) & (ranges <= reach_m))
@@ -196,8 +189,7 @@ def tiled_cloud(
       reach_m: Maximum horizontal distance from a position, in metres.
       source: File of the cloud, for messages.
 
-    Raises:
-      ValueError: If the cloud has no finite point, or if more than `MOST_POINTS` points remain.
+    Raises ValueError if the cloud has no finite point, or if more than `MOST_POINTS` points remain.
     """
     origin = np.round(positions[0])
     wanted = _tiles_around(positions[:, :2] - origin[:2], reach_m)

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import naming
 
 GAP_DEG = 0.1
 """Elevation separates the rings if no ring is wider than this angle, in degrees, and all gaps between rings are
@@ -21,23 +23,16 @@ IN_ORDER = 0.9
 def ring_numbers(
     points: Float[np.ndarray, "n 3"], *, lasers: Int[np.ndarray, " n"] | None = None
 ) -> Int32[np.ndarray, " n"]:
-    """Return the ring of every finite point, counted from 0 at the lowest elevation. Rings without points have no
-    number.
+    """Return the ring of every finite point, counted from 0 at the lowest elevation.
 
     The first of these sources that separates the rings is used:
 
-    - `lasers`: the laser numbers in files of nuScenes and NCLT, in any order. If all numbers are equal, as in simulated
-      NCLT files, they are ignored.
+    - `lasers`: laser numbers in any order, unless all are equal as in simulated NCLT files.
     - Elevation, if it separates all rings, as in simulated scans and for sensors with few lasers.
     - The order of the points, if they are stored ring after ring, each counter-clockwise from straight ahead, as in
       KITTI's files. There the elevation varies within a ring by more than the distance between two rings.
 
-    Arguments:
-      points: Finite points in the LiDAR frame.
-      lasers: Laser number of each point, or None.
-
-    Raises:
-      ValueError: If no source separates the rings.
+    Raises ValueError if no source separates the rings.
     """
     if len(points) == 0:
         return np.zeros(0, np.int32)
@@ -54,15 +49,10 @@ def ring_numbers(
 
 
 def keep_rings(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
-    """Return whether each point remains if the sensor has only `beams` lasers: every 2nd of 64 for 32, every 4th for
-    16.
+    """Whether each point remains if the sensor has only `beams` lasers: every 2nd of 64 for 32, every 4th for 16.
 
-    The sensor is assumed to have the number of found rings, rounded up to a power of two, because some lasers may have
-    no returns. A sensor with at most `beams` lasers keeps all points.
-
-    Arguments:
-      rings: Ring of each point, from `ring_numbers`.
-      beams: Number of lasers.
+    The number of found rings is rounded up to a power of two, because some lasers may have no returns. A sensor with at
+    most `beams` lasers keeps all points.
     """
     found = int(rings.max(initial=0)) + 1
     sensor = 2 ** math.ceil(math.log2(found))
@@ -195,11 +185,6 @@ class Corruption:
         """Name on the command line: "occlusion-90"."""
         return f"{self.kind}-{self.strength:g}" if self.strength else self.kind
 
-    @property
-    def needs_lasers(self) -> bool:
-        """Whether `corrupt` needs the laser of each point."""
-        return KINDS[self.kind].needs_lasers
-
 
 CLEAN = Corruption("clean")
 ROTATION = Corruption("rotation")
@@ -210,8 +195,7 @@ CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() f
 def corruption_named(name: str) -> Corruption:
     """Return the corruption of this name: a kind and, except for rotation, any strength, such as "occlusion-60".
 
-    Raises:
-      ValueError: If the name is unknown or the strength is outside its limits.
+    Raises ValueError if the name is unknown or the strength is outside its limits.
     """
     kind, _, strength = name.partition("-")
     if kind not in KINDS or bool(strength) != any(KINDS[kind].strengths):
@@ -242,8 +226,7 @@ def corrupt(
     Returns:
       The remaining points, and a mask of them among the given points.
 
-    Raises:
-      ValueError: If the corruption is a rotation (see `rotation_seed` of `embed`), or if the beams cannot be separated.
+    Raises ValueError for a rotation (see `rotation_seed` of `embed`), or if the beams cannot be separated.
     """
     found = KINDS[corruption.kind].corrupt(Scan(points, lasers, rng), corruption.strength)
     if found.dtype == bool:
@@ -252,39 +235,29 @@ def corrupt(
 
 
 def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:
-    """Return the recording with every scan corrupted on reading. Ids, positions and times do not change.
+    """Return the recording with every scan corrupted on reading, as a function of `seed` and its row.
 
-    The corruption of a scan is a function of `seed` and its row. Labels stay with their points. Points that are not
-    finite are removed.
-
-    Raises:
-      ValueError: If the recording contains only images.
+    Labels stay with their points. Points that are not finite are removed. Raises ValueError for a recording of images.
     """
     if recording.has_images:
         raise ValueError(
             f"{corruption.name} needs points, found only images in sequence {recording.name}, which can only be "
             "rotated (rotation)"
         )
-    row_of = {path: row for row, path in enumerate(recording.paths)}
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
-        row = row_of[path]
-        record = recording.read(path, labels, lasers or corruption.needs_lasers)
-        try:
+    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
+        record = recording.read_row(row, label_path, lasers or KINDS[corruption.kind].needs_lasers)
+        with naming(record.name), naming(corruption.name):
             return corrupt_record(record, corruption, rng=np.random.default_rng((seed, row)))
-        except ValueError as error:
-            scan = f"scan {recording.ids[row]} of sequence {recording.name}"
-            raise ValueError(f"{scan}: {corruption.name}: {error}") from error
 
-    return dataclasses.replace(recording, read=read, on_disk=False)
+    return recording.derived(read)
 
 
 def corrupt_record(record: Record, corruption: Corruption, *, rng: np.random.Generator) -> Record:
     """Corrupt the finite points of a scan, and keep the labels and lasers of the remaining points, but no times."""
-    assert record.points is not None
-    rows = np.flatnonzero(np.isfinite(record.points).all(axis=1))
+    rows = np.flatnonzero(np.isfinite(record.cloud).all(axis=1))
     lasers = None if record.lasers is None else record.lasers[rows]
-    points, kept = corrupt(record.points[rows], corruption, rng=rng, lasers=lasers)
+    points, kept = corrupt(record.cloud[rows], corruption, rng=rng, lasers=lasers)
     left = rows[kept]
     return dataclasses.replace(
         record,

@@ -36,9 +36,6 @@ def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 
     """Compute the density image of a scan in the orientation of eq. 1, as counts from 0 to 10 in cells of 0.4 m.
 
     The result equals writing `density_image` to a PNG and reading it as a ready-made image.
-
-    Arguments:
-      points: Points in the LiDAR frame, in metres.
     """
     return as_counts(np.rot90(density_image(points), -1))
 
@@ -51,13 +48,9 @@ def density_label_bev(
 
 
 def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
-    """Raise ValueError if a float image contains grey values or point counts instead of counts from 0 to 10.
+    """Raise ValueError, which begins with `name`, if a float image has grey values or point counts instead of 0 to 10.
 
     A model would describe a wrong image without an error.
-
-    Arguments:
-      image: Image of any type. Only floats are checked.
-      name: Name of the image for the error message.
     """
     least, most = image.min(initial=0), image.max(initial=0)
     within = least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS  # False for NaN
@@ -74,9 +67,6 @@ def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 
 
     The edge of the voxels is the smallest of 0.10, 0.15, 0.20, ... m that gives at most 6000 voxels. Points that are
     not finite are dropped. The result equals KITTI's ready-made images pixel for pixel.
-
-    Arguments:
-      points: Points in the LiDAR frame, in metres.
     """
     centroids = _voxel_centroids(points.T.take(np.flatnonzero(_in_crop(points)), axis=1))
     counts = np.bincount(_cell_of_point(centroids), minlength=DENSITY_SIZE**2).clip(max=DENSITY_MAX_COUNT)

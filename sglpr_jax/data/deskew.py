@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from sglpr_jax.data.poses import poses_of_scans
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 
 TICK_S = 2e-5
 """Resolution of the times of points, in seconds. A point at 50 m moves by 3 mm in this time if the sensor turns by 180
@@ -41,14 +42,9 @@ def deskew(
       point_times: Time of each point relative to `time`, in seconds.
       time: Time of the scan, in seconds.
       pose_times: Times of the poses in seconds, in increasing order.
-      world_from_lidar: Poses of the LiDAR in a fixed frame. Between two poses, and beyond the first and the last one,
-        the velocity is constant.
+      world_from_lidar: Poses of the LiDAR in a fixed frame. The velocity between two poses is constant.
 
-    Returns:
-      Points in the frame of the LiDAR at `time`.
-
-    Raises:
-      ValueError: If there are less than two poses or their times do not increase.
+    Raises ValueError if there are less than two poses or their times do not increase.
 
     Example:
       still = sglpr_jax.deskew(points, seconds, time=8.3, pose_times=np.array([8.3, 8.4]), world_from_lidar=poses)
@@ -100,56 +96,46 @@ def _mean_rotations(turns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3
 
 
 def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
-    """Return a recording whose scans have no motion within them: scan i is seen from pose i.
+    """Return a recording whose scans are corrected when they are read: scan i is seen from pose i.
 
-    Scans are corrected when they are read. A scan without a neighbour within a second is not changed.
+    A scan without a neighbour within a second is not changed.
 
     Arguments:
       recording: Recording of scans with times, whose points have times (`Record.point_times`).
       world_from_lidar: Pose of the LiDAR at the time of each scan, from odometry or a map.
 
-    Raises:
-      ValueError: If scans or points have no times, if the recording has ready-made images, or if the poses have another
-        length or no rotations.
+    Raises ValueError if scans or points have no times, or if the poses do not fit the scans.
 
     Example:
       recording = sglpr_jax.deskewed(recording, sglpr_jax.read_odometry("odometry.tum"))
     """
-    poses = poses_of_scans(recording, world_from_lidar, use=DESKEWED)
-    if recording.times is None:
+    poses, times = poses_of_scans(recording, world_from_lidar, use=DESKEWED), recording.times
+    if times is None:
         raise ValueError(f"sequence {recording.name}: expected times of the scans to remove their motion, found none")
-    _check_point_times(recording)
-    read = _DeskewedReader(recording, recording.times, poses)
-    alone = sum(len(_neighbours(recording.times, row)) < 2 for row in range(len(recording)))
-    left = f", but {alone} of {len(recording)} scans have no neighbour within {WIDEST_S:g} s" if alone else ""
-    said = f"deskewed: the motion within each scan is removed by its poses{left}"
-    return dataclasses.replace(recording, read=read, on_disk=False, found=(*recording.found, said))
+    first = _first_readable(recording)
+    if first is not None and first.point_times is None:
+        raise ValueError(
+            f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
+        )
 
-
-class _DeskewedReader:
-    """Reads scans without the motion within them."""
-
-    def __init__(self, recording: Recording, times: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"]):
-        self._recording, self._times, self._poses = recording, times, poses
-        self._row_of = {path: row for row, path in enumerate(recording.paths)}
-        digest = hashlib.sha256(times.tobytes() + poses.tobytes()).hexdigest()[:16]
-        self.keywords = {**recording.read_options, DESKEWED: digest}
-        """Read options, which identify a recording (`Recording.read_options`)."""
-
-    def __call__(self, path: Path, label_path: Path | None, lasers: bool) -> Record:
-        """Read the scan at `path`. Its points have no times any more."""
-        row = self._row_of[path]
-        record = self._recording.read(path, label_path, lasers)
-        name, time = f"scan {self._recording.ids[row]} of sequence {self._recording.name}", float(self._times[row])
-        point_times = dataclasses.replace(record, name=name, time=time).point_times
-        if point_times is None or record.points is None:
-            raise ValueError(f"{name}: expected times of the points, found none")
-        rows = _neighbours(self._times, row)
+    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
+        """Read a scan without the motion within it. Its points have no times any more."""
+        record = recording.read_row(row, label_path, lasers)
+        point_times = record.point_times
+        if point_times is None:
+            raise ValueError(f"{record.name}: expected times of the points, found none")
+        rows = _neighbours(times, row)
         if len(rows) < 2:
             return dataclasses.replace(record, time_field=None)
-        trajectory = {"pose_times": self._times[rows], "world_from_lidar": self._poses[rows]}
-        points = deskew(record.points, point_times, time=time, **trajectory)
+        trajectory = {"pose_times": times[rows], "world_from_lidar": poses[rows]}
+        points = deskew(record.cloud, point_times, time=float(times[row]), **trajectory)
         return dataclasses.replace(record, points=points, time_field=None)
+
+    alone = sum(len(_neighbours(times, row)) < 2 for row in range(len(recording)))
+    left = f", but {alone} of {len(recording)} scans have no neighbour within {WIDEST_S:g} s" if alone else ""
+    said = f"deskewed: the motion within each scan is removed by its poses{left}"
+    digest = hashlib.sha256(times.tobytes() + poses.tobytes()).hexdigest()[:16]
+    return recording.derived(read, options={DESKEWED: digest}, found=said)
 
 
 def _neighbours(times: Float[np.ndarray, " n"], row: int) -> list[int]:
@@ -168,15 +154,6 @@ def has_point_times(recording: Recording) -> bool:
         return record is not None and record.point_times is not None
     except ValueError:
         return False
-
-
-def _check_point_times(recording: Recording) -> None:
-    """Raise ValueError if the points of the first readable scan have no times."""
-    record = _first_readable(recording)
-    if record is not None and record.point_times is None:
-        raise ValueError(
-            f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
-        )
 
 
 def _first_readable(recording: Recording) -> Record | None:

@@ -40,13 +40,16 @@ class Imu:
     quaternions: Float[np.ndarray, "n 4"] | None = None
     """Orientations in a frame with z up as x, y, z, w, or None if the IMU does not estimate them."""
 
+    def at(self, times: Float[np.ndarray, " n"]) -> "Imu":
+        """Return the samples in order of other times, such as those of the recorder."""
+        order = np.argsort(times, kind="stable")
+        turned = None if self.quaternions is None else self.quaternions[order]
+        return Imu(times[order], self.rates[order], self.accelerations[order], turned)
+
     def ups(self, times: Float[np.ndarray, " q"]) -> tuple[Float[np.ndarray, "q 3"], str]:
         """Return the direction of up in the frame of the IMU at some times, and a description of its source.
 
-        Rows are NaN at times without samples.
-
-        Raises:
-          ValueError: If the accelerations do not contain gravity and there are no orientations.
+        Rows are NaN at times without samples. Raises ValueError without gravity and without orientations.
         """
         by_gravity, found = None, self._missing_gravity()
         if not found:
@@ -101,13 +104,8 @@ def averaged_up(
 ) -> Float[np.ndarray, "q 3"]:
     """Return up at some times by accelerations that are averaged in a frame that does not turn.
 
-    A line is fitted to `AVERAGED_S` of accelerations, so that a constant bias of the gyroscope cancels.
-
-    Arguments:
-      stamps: Times of the samples in seconds, in increasing order.
-      rates: Angular velocities, in radians per second.
-      accelerations: Accelerations with gravity, in any unit.
-      times: Times in seconds.
+    A line is fitted to `AVERAGED_S` of accelerations, so that a constant bias of the gyroscope cancels. `stamps` are
+    the increasing times of the samples, in seconds, `rates` their angular velocities, in radians per second.
     """
     from scipy.signal import savgol_filter  # imported here because the imports are slow
     from scipy.spatial.transform import Rotation

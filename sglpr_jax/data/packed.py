@@ -15,7 +15,8 @@ from typing import IO, Any
 import numpy as np
 
 from sglpr_jax.data.formats.png import read_label_image
-from sglpr_jax.data.recording import ReadRecord, Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import file_name, in_short, read_json, replacing, writing
 
 
@@ -88,8 +89,7 @@ def map_stacked(
 ) -> Stacked:
     """Map a file written by `StackWriter` into memory. The keyword arguments are those that `finish` returned.
 
-    Raises ValueError if the file has the wrong size, or if the arguments contradict each other. Access to the missing
-    part of a file that is too short would kill the process.
+    Raises ValueError if they contradict the file. Access beyond the end of the file would kill the process.
     """
     if any(type(number) is not int for number in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
         raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
@@ -133,10 +133,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
       folder: Folder of the packs.
       on_progress: Called with the number of packed scans.
 
-    Raises:
-      ValueError: If the pack is damaged, `recording` is not read from its own files, or its images differ in width.
-        Other errors are those of reading.
-      OSError: If the pack cannot be written.
+    Raises ValueError if the pack is damaged, `recording` is not read from its own files, or its images differ in width.
     """
     if not recording.on_disk:
         raise ValueError(
@@ -148,35 +145,24 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     target = folder / f"{file_name(recording.name)}-{identity}"
     if not target.is_dir():
         _make(target, recording, source, on_progress)
-    return dataclasses.replace(
-        recording, read=_reader(recording, open_pack(target, scans=len(recording))), on_disk=False
-    )
+    arrays = open_pack(target, scans=len(recording))
 
-
-def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
-    """Return a function that reads from the arrays of a pack, and everything else from the recording's files."""
-    row_of = {path: row for row, path in enumerate(recording.paths)}
-    points, raw = arrays.get("points"), arrays.get("labels")
-
-    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
-        row = row_of[path]
-        if points is None:
+    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
+        if "images" in arrays:
             image = arrays["images"][row]
-            return Record(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
-        return Record(
-            points=points[row],
-            labels=None if labels is None or raw is None else raw[row].astype(np.int32),
-            lasers=recording.read(path, None, True).lasers if lasers else None,
-        )
+            labels = None if label_path is None else read_label_image(label_path, shape=image.shape)
+            return Record(image=image, labels=labels)
+        labels = arrays["labels"][row].astype(np.int32) if label_path is not None and "labels" in arrays else None
+        numbers = recording.read_row(row, None, True).lasers if lasers else None
+        return Record(points=arrays["points"][row], labels=labels, lasers=numbers)
 
-    return read
+    return recording.derived(read)
 
 
 def _source(recording: Recording) -> dict[str, Any]:
-    """Identify the pack of a recording: its files and their read options.
+    """Identify the pack of a recording by its files and their read options.
 
-    Only options that are strings count. A reader whose points depend on other files adds a hash of these files as an
-    option.
+    A reader whose points depend on other files adds a hash of these files as an option.
     """
     paths = recording.paths if recording.has_images else (*recording.paths, *recording.label_paths)
     files = [(str(path.absolute()), path.stat()) for path in paths if path is not None]
@@ -214,11 +200,10 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
     if recording.has_images:
         return {"images": recording.image(i)}
     record = recording.record(i)
-    assert record.points is not None
     if not recording.has_labels:
-        return {"points": record.points}
+        return {"points": record.cloud}
     labels = np.zeros(0, np.uint16) if record.labels is None else record.labels.astype(np.uint16)
-    return {"points": record.points, "labels": labels}
+    return {"points": record.cloud, "labels": labels}
 
 
 def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import usual_step
-from sglpr_jax.se3 import are_rotations, quaternions
+from sglpr_jax.se3 import are_rotations
 
 WIDEST_S = (1.0, 2.0)
 """Maximum time between two poses for interpolation, in seconds: the least and the greatest value (`widest_gap_s`)."""
@@ -18,7 +18,7 @@ BEYOND_S = 0.1
 SAME_S = 0.001
 """Maximum difference of equal times, in seconds. Programs round times differently."""
 LEAST_SHARE = 0.5
-"""Minimum fraction of scans with a pose. Below it, the pose file belongs to another drive or clock."""
+"""Minimum fraction of scans with a pose. Below it, the poses belong to another drive, another clock or a goal."""
 
 
 def poses_of(
@@ -35,15 +35,9 @@ def poses_of(
 def poses_of_scans(
     recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"], *, use: str
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses that a caller gives for the scans of a recording, as float64.
+    """Return the poses that a caller gives for the scans of a recording, as float64. `use` names their use in messages.
 
-    Arguments:
-      recording: Recording of scans.
-      world_from_lidar: Pose of the LiDAR at each scan.
-      use: What the poses are used for, for messages.
-
-    Raises:
-      ValueError: If the recording has ready-made images, or if the poses have another length or no rotations.
+    Raises ValueError if the recording has ready-made images, or if the poses have another length or no rotations.
     """
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans for {use}, found ready-made images")
@@ -65,15 +59,6 @@ def turned_poses(poses: Float[np.ndarray, "n 4 4"], *, use: str) -> Float[np.nda
     return poses
 
 
-class Interpolated(NamedTuple):
-    """Interpolated positions of the scans."""
-
-    kept: Bool[np.ndarray, " q"]
-    """True for scans with poses near enough in time on both sides."""
-    positions: Float[np.ndarray, "q 3"]
-    """Positions in metres, valid where `kept` is true."""
-
-
 def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
     """Maximum time between two poses for interpolation, in seconds. It follows from the rate of ordered `stamps`.
 
@@ -82,37 +67,31 @@ def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
     return float(np.clip(JITTER * usual_step(stamps), *WIDEST_S))
 
 
-def interpolate(
-    stamps: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " q"]
-) -> Interpolated:
-    """Interpolate positions linearly at `times`. `stamps` and `times` are in seconds and in any order."""
+def have_poses(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
+    """Whether each of `times` is between two poses that are near enough in time. `stamps` may have any order."""
+    stamps = np.unique(stamps)
     if len(stamps) < 2:
-        return Interpolated(np.zeros(len(times), bool), np.zeros((len(times), 3)))
-    order = np.argsort(stamps, kind="stable")
-    stamps, positions = stamps[order], positions[order]
+        return np.zeros(len(times), bool)
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
     near = stamps[later] - stamps[later - 1] <= widest_gap_s(stamps)
-    within = (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
-    return Interpolated(near & within, np.stack([np.interp(times, stamps, axis) for axis in positions.T], axis=1))
+    return near & (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
 
 
-def interpolate_turns(
-    stamps: Float[np.ndarray, " n"], turns: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
-) -> Float[np.ndarray, "q 3 3"]:
-    """Interpolate rotations (quaternions x, y, z, w) at `times` with constant angular velocity.
+def interpolate_poses(
+    stamps: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " q"]
+) -> Float[np.ndarray, "q 4 4"]:
+    """Interpolate poses linearly and with constant angular velocity. They are valid where `have_poses` is true.
 
-    At least two `stamps` are required.
+    `stamps` and `times` are in seconds and in any order. The first and the last pose hold beyond them.
     """
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
+    from scipy.spatial.transform import Rotation, Slerp  # imported here because the import is slow
 
-    order = np.argsort(stamps, kind="stable")
-    stamps, turns = stamps[order], turns[order]
-    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    before, after = Rotation.from_quat(turns[later - 1]), Rotation.from_quat(turns[later])
-    widths = stamps[later] - stamps[later - 1]
-    shares = ((times - stamps[later - 1]) / np.where(widths > 0, widths, 1)).clip(0, 1)
-    turned = before * Rotation.from_rotvec(shares[:, None] * (before.inv() * after).as_rotvec())
-    return turned.as_matrix().reshape(-1, 3, 3)
+    stamps, rows = np.unique(stamps, return_index=True)
+    if len(stamps) < 2:
+        return poses_of(np.zeros((len(times), 3)))
+    turns = Slerp(stamps, Rotation.from_matrix(poses[rows, :3, :3]))(times.clip(stamps[0], stamps[-1]))
+    positions = np.stack([np.interp(times, stamps, axis) for axis in poses[rows, :3, 3].T], axis=1)
+    return poses_of(positions, turns.as_matrix().reshape(-1, 3, 3))
 
 
 class ScanPoses(NamedTuple):
@@ -135,12 +114,10 @@ def poses_at_scans(
     scans: int,
     of: str,
 ) -> ScanPoses:
-    """Assign a pose to each scan.
+    """Assign a pose to each scan: row by row, or interpolated at the scans that have poses near in time (`have_poses`).
 
-    If the numbers of poses and scans are equal and their times do not differ, poses are assigned row by row. This also
-    applies to `stamps` with another origin but the same intervals. Otherwise the poses are interpolated. A scan has no
-    pose if the poses before and after it are too far apart in time (`widest_gap_s`), or if it is more than 0.1 s before
-    the first pose or after the last one.
+    Poses go row by row if there are as many as scans and their times are equal, unknown, or have the same intervals
+    from another origin.
 
     Arguments:
       source: Name of the pose file, for messages.
@@ -150,8 +127,7 @@ def poses_at_scans(
       scans: Number of scans.
       of: What a row belongs to, for messages: "scan of 08".
 
-    Raises:
-      ValueError: If fewer than half of the scans have a pose, or if interpolation is needed and times are missing.
+    Raises ValueError if fewer than half of the scans have a pose, or if interpolation is needed and times are missing.
     """
     if len(poses) == scans and (said := _row_by_row(stamps, times)) is not None:
         return ScanPoses(np.ones(scans, bool), poses, said)
@@ -161,7 +137,7 @@ def poses_at_scans(
         raise ValueError(
             f"{source}: {expected}, {found}, and {why} to interpolate at (row numbers 0, 1, 2, ... are not times)"
         )
-    kept, positions = interpolate(stamps, poses[:, :3, 3], times)
+    kept = have_poses(stamps, times)
     if kept.mean() < LEAST_SHARE:
         by_row = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
         raise ValueError(
@@ -169,11 +145,14 @@ def poses_at_scans(
             f"scans, {times[0]:.1f} to {times[-1]:.1f} s, {found} from {stamps[0]:.1f} to {stamps[-1]:.1f} s"
             f"{by_row if len(stamps) == len(times) else ''}"
         )
+    said = f"interpolated at the times of the scans{left_out(kept)}"
+    return ScanPoses(kept, interpolate_poses(stamps, poses, times)[kept], said)
+
+
+def left_out(kept: Bool[np.ndarray, " n"]) -> str:
+    """Describe how many scans have no pose. The description is empty if all have one."""
     missing = len(kept) - int(kept.sum())
-    left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
-    said = f"interpolated at the times of the scans{left_out}"
-    rotations = interpolate_turns(stamps, quaternions(poses), times)
-    return ScanPoses(kept, poses_of(positions, rotations)[kept], said)
+    return f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
 
 
 def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:

@@ -1,8 +1,9 @@
-"""Scans and recordings: what a reader returns, and how a scan is read from its files."""
+"""Recordings: what a reader returns, and how a scan is read from its files."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,108 +11,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.clouds import Records, TimeField
 from sglpr_jax.data.formats.png import read_label_image
-from sglpr_jax.data.formats.scan_files import read_labels, read_scan_records
+from sglpr_jax.data.formats.scan_files import read_labels, read_scan_record
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.files import naming
-from sglpr_jax.labels import to_classes
-
-FARTHEST_M = 300.0
-"""Limit of the largest coordinate of a point, in metres. No vehicle LiDAR has half of its points beyond it."""
-
-
-def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
-    """Check that a point cloud shows a place.
-
-    Arguments:
-      points: Points in the sensor frame, in metres.
-      name: Name of the scan for the error message.
-
-    Raises:
-      ValueError: If the array is not (n, 3), no point is finite, all points are at the sensor, or half of the points
-        are beyond `FARTHEST_M`.
-    """
-    where = f"{name}: " if name else ""
-    if points.shape[1] != 3:
-        raise ValueError(f"{where}expected points (n, 3) with x, y and z only, found shape {points.shape}")
-    x, y, z = np.abs(points.T)  # Column by column: a reduction over the last axis takes ten times as long.
-    largest = np.maximum(np.maximum(x, y), z)  # Not finite if any coordinate is not finite.
-    near = largest <= FARTHEST_M
-    if 2 * np.count_nonzero(near) > len(points) and (near & (largest > 0)).any():
-        return  # Nearly all scans end here.
-    largest = largest[np.isfinite(largest)]
-    if not len(largest):
-        raise ValueError(f"{where}expected finite points, found none among {len(points)}")
-    if not largest.any():
-        raise ValueError(f"{where}expected points around the sensor, found all {len(largest)} points at (0, 0, 0)")
-    half_are_beyond = 2 * np.count_nonzero(largest > FARTHEST_M) >= len(largest)
-    if half_are_beyond and np.median(largest) > FARTHEST_M:
-        raise ValueError(
-            f"{where}expected metres, with most points within {FARTHEST_M:g}, found half of the points beyond"
-            f" {np.median(largest):.4g} and the farthest at {largest.max():.4g}; are the coordinates in millimetres,"
-            " or is the format of the scan wrong (--format, for .bin files)?"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """One scan (`points`) or one ready-made image (`image`). Missing or unrequested fields hold None."""
-
-    points: Float32[np.ndarray, "n 3"] | None = None
-    """Points in the LiDAR frame, in metres: x forward, y left, z up. Some may not be finite."""
-    image: Float32[np.ndarray, "h w"] | None = None
-    """Image in the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
-    labels: Int32[np.ndarray, "..."] | None = None
-    """Raw SemanticKITTI ids, one per point or pixel. 0 means an unknown class."""
-    labels_file: Path | None = None
-    """File of the labels, for error messages."""
-    lasers: Int32[np.ndarray, " n"] | None = None
-    """Laser number of each point, if the file contains it."""
-    name: str = ""
-    """Name for error messages: "scan 000052 of sequence 08"."""
-    time_field: TimeField | None = None
-    """Times of the points as the file states them, if it does."""
-    time: float | None = None
-    """Time in seconds."""
-    mounting: Mounting | None = None
-    """Mounting of the sensor. None means gravity-aligned, 1.73 m above the ground."""
-
-    @property
-    def upright_points(self) -> Float32[np.ndarray, "n 3"]:
-        """Points as seen by a gravity-aligned sensor 1.73 m above the ground. Models use these points."""
-        assert self.points is not None
-        return self.points if self.mounting is None else self.mounting.level(self.points)
-
-    @property
-    def point_times(self) -> Float32[np.ndarray, " n"] | None:
-        """Time of each point relative to `time`, in seconds, or None if the file has no times of points.
-
-        Raises ValueError if the times of the points cannot be those of a scan (`TimeField.seconds`).
-        """
-        if self.time_field is None or self.points is None:
-            return None
-        valid = np.isfinite(self.points).all(axis=1) & (self.points != 0).any(axis=1)
-        with naming(self.name):
-            return self.time_field.seconds(valid=valid, scan_time=self.time)
-
-    def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
-        """Convert the labels to classes.
-
-        Arguments:
-          categories: Number of classes (docs/reference/labels.md).
-
-        Returns:
-          The class of every point or pixel, or None without labels.
-
-        Raises:
-          ValueError: If a label id does not exist. The message names the label file if it is known.
-        """
-        if self.labels is None:
-            return None
-        with naming(self.labels_file or self.name):
-            return to_classes(self.labels, categories=categories)
-
+from sglpr_jax.data.record import Record
 
 ReadRecord = Callable[[Path, Path | None, bool], Record]
 """Reads a record from the file of a scan or image, its label file (None: no labels), and whether to read lasers."""
@@ -125,36 +28,20 @@ def scan_record(
     format: ScanFormat = "auto",
     records: RecordFormat = "kitti",
 ) -> Record:
-    """Read a scan and its labels, each file once.
+    """Read a scan and its labels, each file once. `lasers` is ignored: the laser numbers are in the file of the points.
 
-    Arguments:
-      path: File of the scan.
-      labels: File of the labels, or None.
-      lasers: Whether to return the laser numbers.
-      format: Format of the scan file.
-      records: Format of a .bin file that "auto" cannot determine from the name.
-
-    Raises:
-      ValueError: If a file is malformed, or the number of labels differs from the number of points. Other errors are
-        those of `read_scan` and `read_labels`.
+    `format` and `records` are those of `read_scan_record`. Raises the errors of `read_scan` and `read_labels`.
     """
-    found = read_scan_records(path, format=format, records=records)
-    raw = None if labels is None else read_labels(labels, points=len(found.points))
-    return found_record(found, lasers=lasers, labels=raw, labels_file=labels)
-
-
-def found_record(found: Records, *, lasers: bool, **fields: Any) -> Record:
-    """Return the record of the points of a scan, with more fields. The lasers are dropped if they are not wanted."""
-    return Record(points=found.points, lasers=found.lasers if lasers else None, time_field=found.times, **fields)
+    found = read_scan_record(path, format=format, records=records)
+    if labels is None:
+        return found
+    return dataclasses.replace(found, labels=read_labels(labels, points=len(found.cloud)), labels_file=labels)
 
 
 def image_record(
     path: Path, labels: Path | None = None, lasers: bool = False, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]
 ) -> Record:
-    """Read a ready-made image with `read`, and its label image. Images have no lasers.
-
-    Errors are those of `read` and `read_label_image`.
-    """
+    """Read a ready-made image with `read`, and its label image. Images have no lasers."""
     image = read(path)
     return Record(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
 
@@ -177,16 +64,16 @@ class Recording:
     name: str
     ids: tuple[str, ...]
     """Name of each scan, the stem of its file: "000052"."""
-    positions: Float[np.ndarray, "n 3"] | None
-    """Positions in metres, z up, or None if unknown."""
-    times: Float[np.ndarray, " n"] | None
-    """Times in seconds, or None if unknown."""
-    pose_source: str | None
-    """Source of the positions, or None."""
     paths: tuple[Path, ...]
     """Files of the scans or images. The scans of a bag have names instead, and the bag is in `containers`."""
     read: ReadRecord
     """Function that reads a record from its files."""
+    positions: Float[np.ndarray, "n 3"] | None = None
+    """Positions in metres, z up, or None if unknown."""
+    times: Float[np.ndarray, " n"] | None = None
+    """Times in seconds, or None if unknown."""
+    pose_source: str | None = None
+    """Source of the positions, or None."""
     label_paths: tuple[Path | None, ...] = ()
     """Label file of each scan or image, None if it has no labels. Empty if the recording has no labels."""
     resolution_m: float | None = None
@@ -230,21 +117,14 @@ class Recording:
 
     @property
     def description(self) -> tuple[str, ...]:
-        """Description in words, one line each: number of scans, their format, times and poses."""
+        """Number of scans, their format, times, poses and extent, one line each. A large height is a wrong frame."""
         times = "none" if self.times is None else f"over {np.ptp(self.times):.1f} s"
-        return (
-            f"{self.name}: {len(self)} {'images' if self.has_images else 'scans'}",
-            *self.found,
-            f"times: {times}; poses: {self.pose_source or 'none'}{self._extent}",
-        )
-
-    @property
-    def _extent(self) -> str:
-        """Extent of the positions in words. A large height indicates a wrong frame."""
-        if self.positions is None or not len(self):
-            return ""
-        x, y, z = np.ptp(self.positions, axis=0)
-        return f", over {x:.0f} x {y:.0f} m and {z:.0f} m of height"
+        poses = self.pose_source or "none"
+        if self.positions is not None and len(self):
+            x, y, z = np.ptp(self.positions, axis=0)
+            poses += f", over {x:.0f} x {y:.0f} m and {z:.0f} m of height"
+        kind = "images" if self.has_images else "scans"
+        return (f"{self.name}: {len(self)} {kind}", *self.found, f"times: {times}; poses: {poses}")
 
     @property
     def has_images(self) -> bool:
@@ -263,28 +143,55 @@ class Recording:
 
     @property
     def read_options(self) -> dict[str, str]:
-        """Read options that are strings, such as the format of the scans."""
+        """Read options that are strings, such as the format of the scans. They identify what `read` returns."""
         options = getattr(self.read, "keywords", {})
         return {name: value for name, value in options.items() if isinstance(value, str)}
 
     def record(self, i: int, *, labels: bool = True, lasers: bool = False) -> Record:
-        """Read scan or image `i`, each of its files once.
+        """Read scan or image `i`, each of its files once, with or without labels and laser numbers.
 
-        Arguments:
-          i: Index of the scan or image.
-          labels: Whether to read the labels.
-          lasers: Whether to return the laser numbers.
-
-        Raises:
-          FileNotFoundError: If a file does not exist.
-          ValueError: If a file is malformed or the labels do not fit.
+        Raises FileNotFoundError, or ValueError if a file is malformed or the labels do not fit.
         """
-        label_path = self.label_paths[i] if labels and self.label_paths else None
+        return self.read_row(i, self.label_paths[i] if labels and self.label_paths else None, lasers)
+
+    def read_row(self, i: int, label_path: Path | None, lasers: bool) -> Record:
+        """Read scan or image `i` with the labels of a file, or without labels. Raises what `record` raises."""
+        record = self.read(self.paths[i], label_path, lasers)
         return dataclasses.replace(
-            self.read(self.paths[i], label_path, lasers),
+            record,
+            lasers=record.lasers if lasers else None,
             name=f"scan {self.ids[i]} of sequence {self.name}",
             time=None if self.times is None else float(self.times[i]),
             mounting=self.mounting_of(i),
+        )
+
+    def derived(
+        self,
+        read: Callable[[int, Path | None, bool], Record],
+        *,
+        options: Mapping[str, str] | None = None,
+        found: str | None = None,
+        **fields: Any,
+    ) -> "Recording":
+        """Return a recording of the same scans with other records, such as corrupted or scaled ones.
+
+        Arguments:
+          read: Function of the row, the label file and whether to read lasers, as `read_row`.
+          options: Read options that identify the change, in addition to those of this recording.
+          found: Line to add to `found`.
+          fields: Other fields that change.
+        """
+        row_of = {path: row for row, path in enumerate(self.paths)}
+
+        def read_path(path: Path, label_path: Path | None, lasers: bool, **options: str) -> Record:
+            return read(row_of[path], label_path, lasers)
+
+        return dataclasses.replace(
+            self,
+            read=partial(read_path, **{**self.read_options, **(options or {})}),
+            on_disk=False,
+            found=(*self.found, *([] if found is None else [found])),
+            **fields,
         )
 
     def mounting_of(self, i: int) -> Mounting | None:
@@ -306,6 +213,5 @@ class Recording:
         return image
 
     def labels(self, i: int) -> Int32[np.ndarray, "..."] | None:
-        """Read the labels of scan or image `i`. This also reads the scan, to check that the labels fit; see
-        `record`."""
+        """Read the labels of scan or image `i`. This also reads the scan, to check that the labels fit."""
         return self.record(i).labels if self.labelled[i] else None

@@ -6,16 +6,14 @@ weights, the descriptors and the model of the probabilities stay as they are.
 
 import contextlib
 import dataclasses
-from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.recording import ReadRecord, Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.fields import check_value
 
 SCALE = "scale"
@@ -31,16 +29,10 @@ NEAR_SCALE: Scale = 4
 
 
 def scaled(recording: Recording, scale: Scale) -> Recording:
-    """Return a recording whose points and sensor heights are multiplied by `scale`.
+    """Return a recording whose points and sensor heights are multiplied by `scale` when scans are read.
 
-    Scans are scaled when they are read. Positions, times and poses are those of the recording.
-
-    Arguments:
-      recording: Recording of scans or of submaps.
-      scale: Factor. 1 returns the recording unchanged.
-
-    Raises:
-      ValueError: If the factor is not 1, 2 or 4, or if a recording of ready-made images has a factor other than 1.
+    Positions, times and poses are those of the recording. Raises ValueError if the factor is not 1, 2 or 4, or if a
+    recording of ready-made images has a factor other than 1.
     """
     check_value(scale, Scale, "scale")
     if scale == 1:
@@ -48,10 +40,9 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans to scale by {scale}, found ready-made images")
     each = recording.mountings
-    return dataclasses.replace(
-        recording,
-        read=partial(_read_scaled, **{**recording.read_options, "read": recording.read, SCALE: str(scale)}),
-        on_disk=False,
+    return recording.derived(
+        lambda row, label_path, lasers: scaled_record(recording.read_row(row, label_path, lasers), scale),
+        options={SCALE: str(scale)},
         mounting=_scaled_mounting(recording.mounting, scale),
         mountings=None if each is None else tuple(_scaled_mounting(mounting, scale) for mounting in each),
     )
@@ -107,11 +98,3 @@ def scaled_poses(poses: Float[np.ndarray, "*n 4 4"], factor: float) -> Float[np.
 def _scaled_mounting(mounting: Mounting | None, scale: Scale) -> Mounting:
     """The mounting of scaled scans. None stands for `MODEL_HEIGHT_M`."""
     return (mounting or Mounting(MODEL_HEIGHT_M)).scaled(scale)
-
-
-def _read_scaled(
-    path: Path, label_path: Path | None, lasers: bool, *, read: ReadRecord, scale: str, **options: Any
-) -> Record:
-    """Read a scan and scale it. The options identify the recording (`Recording.read_options`)."""
-    factor: Any = int(scale)
-    return scaled_record(read(path, label_path, lasers), factor)

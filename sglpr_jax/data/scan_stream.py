@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NoReturn, TypeVar
 
-from sglpr_jax.data.recording import Record, Recording, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.recording import Recording
 
 OnBadScan = Callable[[str, Exception], None]
 """Receives the id and the error of a bad scan."""
@@ -101,17 +102,10 @@ def readable(
     on_bad_scan: OnBadScan,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Recording:
-    """Read every scan or image with its labels, and return the recording without invalid scans.
+    """Read every scan or image with its labels, and return the recording without invalid scans (`scan_stream`).
 
-    A scan is invalid if it cannot be read or shows no place (`check_cloud`).
-
-    Arguments:
-      recording: Recording to read.
-      on_bad_scan: Called with the id and the error of each invalid scan.
-      on_progress: Called with the number of scans read.
-
-    Raises:
-      ValueError: If all scans are invalid.
+    `on_bad_scan` is called with the id and the error of each invalid scan, and `on_progress` with the number of scans
+    read. Raises ValueError if all scans are invalid.
     """
     options = {"labels": True, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
     good = [row for row, read in scan_stream(recording, lambda row, record: True, **options) if read]

@@ -5,7 +5,6 @@ A narrow sensor sees more of a place in several scans than in one. `SubmapBuilde
 does, because the weights are trained on scans (docs/decisions.md).
 """
 
-import dataclasses
 import hashlib
 import math
 from collections import deque
@@ -17,7 +16,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt64
 
 from sglpr_jax.data.poses import poses_of_scans, turned_poses
-from sglpr_jax.data.recording import Record, Recording, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 
 LENGTH_M, KEYFRAME_M = 10.0, 1.0
@@ -44,10 +44,9 @@ Cloud = tuple[Float32[np.ndarray, "_ 3"], Int32[np.ndarray, " _"] | None]
 
 
 class SubmapBuilder:
-    """Builds the submap of each scan of a stream.
+    """Builds the submap of each scan of a stream, from keyframes at least `keyframe_m` or 20 degrees apart.
 
-    The builder stores keyframes: scans at least `keyframe_m` or 20 degrees apart. Its memory is bounded by
-    `length_m / keyframe_m` + 19 scans of one point per voxel.
+    Its memory is bounded by `length_m / keyframe_m` + 19 scans of one point per voxel.
 
     Example:
       builder = sglpr_jax.SubmapBuilder(length_m=10.0)
@@ -56,14 +55,11 @@ class SubmapBuilder:
     """
 
     def __init__(self, *, length_m: float = LENGTH_M, keyframe_m: float = KEYFRAME_M):
-        """Create a builder without scans.
+        """Create a builder without scans. Raises ValueError if a length is not positive or not finite.
 
         Arguments:
           length_m: Travelled distance that a submap covers, in metres.
           keyframe_m: Minimum distance between the scans of a submap, in metres. The newest scan is always included.
-
-        Raises:
-          ValueError: If a length is not positive or not finite.
         """
         self._window = _Window(length_m, keyframe_m)
         self._clouds: dict[int, Float32[np.ndarray, "n 3"]] = {}
@@ -78,8 +74,7 @@ class SubmapBuilder:
           points: Points of the scan in the LiDAR frame, in metres.
           world_from_lidar: Pose of the LiDAR in a fixed frame. It may drift.
 
-        Raises:
-          ValueError: If the scan shows no place (`check_cloud`), or if the pose has no rotation.
+        Raises ValueError if the scan shows no place (`check_cloud`), or if the pose has no rotation.
         """
         check_cloud(points)
         pose = turned_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
@@ -98,8 +93,7 @@ def submaps(
 ) -> Recording:
     """Return a recording whose scan i is the submap that ends at scan i, in the frame of scan i.
 
-    Submaps are built when they are read. Ids, times, positions and mounting are those of the scans. An older scan that
-    cannot be read is left out of the submaps, with a `DataWarning`.
+    Submaps are built when they are read. An older scan that cannot be read is left out, with a `DataWarning`.
 
     Arguments:
       recording: Recording of scans.
@@ -107,9 +101,7 @@ def submaps(
       length_m: Travelled distance that a submap covers, in metres. 0 returns the recording unchanged.
       keyframe_m: Minimum distance between the scans of a submap, in metres.
 
-    Raises:
-      ValueError: If the recording has ready-made images, if a length is not positive or not finite, or if the poses
-        have another length or no rotations.
+    Raises ValueError if a length is not positive, or if the poses do not fit the scans.
 
     Example:
       recording = sglpr_jax.submaps(recording, sglpr_jax.read_odometry("odometry.tum"), length_m=10.0)
@@ -118,9 +110,30 @@ def submaps(
         return recording
     window = _Window(length_m, keyframe_m)
     poses = poses_of_scans(recording, world_from_lidar, use=SUBMAPS)
-    read = _SubmapReader(recording, poses, [window.add(pose) for pose in poses], f"{length_m:g} {keyframe_m:g}")
+    members = [window.add(pose) for pose in poses]
+
+    @lru_cache(maxsize=max(map(len, members), default=1))
+    def cloud(row: int, labelled: bool) -> Cloud:
+        record = recording.record(row, labels=labelled)
+        check_cloud(record.cloud, name=record.name)
+        unknown = np.zeros(len(record.cloud), np.int32) if labelled else None
+        return _thinned((record.cloud, unknown if record.labels is None else record.labels))
+
+    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
+        """Read a submap. Submaps have no laser numbers."""
+        newest, *older = members[row]
+        clouds = {newest: cloud(newest, label_path is not None)}
+        for one in older:
+            try:
+                clouds[one] = cloud(one, label_path is not None)
+            except (ValueError, OSError) as error:
+                warn(f"{recording.ids[one]}: left out of the submaps of later scans: {error}")
+        points, labels = _together(list(clouds.values()), [poses[one] for one in clouds])
+        return Record(points=points, labels=labels, labels_file=label_path)
+
+    digest = hashlib.sha256(poses.tobytes()).hexdigest()[:16]
     said = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
-    return dataclasses.replace(recording, read=read, on_disk=False, found=(*recording.found, said))
+    return recording.derived(read, options={SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}, found=said)
 
 
 class _Window:
@@ -146,44 +159,6 @@ class _Window:
             self._keyframes.append((frame, way))
             self._way, self._last = way, pose
         return rows
-
-
-class _SubmapReader:
-    """Reads submaps from the scans of a recording."""
-
-    def __init__(
-        self,
-        recording: Recording,
-        poses: Float[np.ndarray, "n 4 4"],
-        members: Sequence[tuple[int, ...]],
-        lengths: str,
-    ):
-        self._recording, self._poses, self._members = recording, poses, members
-        self._row_of = {path: row for row, path in enumerate(recording.paths)}
-        digest = hashlib.sha256(poses.tobytes()).hexdigest()[:16]
-        self.keywords = {**recording.read_options, SUBMAPS: f"{lengths} {digest}"}
-        """Read options, which identify a recording (`Recording.read_options`)."""
-        self._cloud = lru_cache(maxsize=max(map(len, members), default=1))(self._read_cloud)
-
-    def __call__(self, path: Path, label_path: Path | None, lasers: bool) -> Record:
-        """Read the submap of the scan at `path`. Submaps have no laser numbers."""
-        rows, labelled = self._members[self._row_of[path]], label_path is not None
-        clouds = {rows[0]: self._cloud(rows[0], labelled)}
-        for row in rows[1:]:
-            try:
-                clouds[row] = self._cloud(row, labelled)
-            except (ValueError, OSError) as error:
-                warn(f"{self._recording.ids[row]}: left out of the submaps of later scans: {error}")
-        points, labels = _together(list(clouds.values()), [self._poses[row] for row in clouds])
-        return Record(points=points, labels=labels, labels_file=label_path)
-
-    def _read_cloud(self, row: int, labelled: bool) -> Cloud:
-        label_path = self._recording.label_paths[row] if labelled else None
-        record = self._recording.read(self._recording.paths[row], label_path, False)
-        assert record.points is not None
-        check_cloud(record.points, name=f"scan {self._recording.ids[row]} of sequence {self._recording.name}")
-        unknown = np.zeros(len(record.points), np.int32) if labelled else None
-        return _thinned((record.points, unknown if record.labels is None else record.labels))
 
 
 def _motion(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:

@@ -1,7 +1,6 @@
 """Times of scans and poses: unit, order, and row numbers that are not times."""
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Num
@@ -32,18 +31,9 @@ ADVICE = "state the unit with --time-unit s, ms, us or ns (Python: time_unit)"
 def times_of(
     values: Float[np.ndarray, " n"], *, source: Path | str, unit: TimeUnit = "auto"
 ) -> Float[np.ndarray, " n"] | None:
-    """Convert times to seconds. With "auto", row numbers 0, 1, 2, ... or 1, 2, 3, ... are not times.
+    """Convert times of a file `source` to seconds. "auto" expects seconds and returns None for row numbers.
 
-    Arguments:
-      values: Times in `unit`, in the order of the rows.
-      source: File of the times, for messages.
-      unit: Unit of the values. "auto" expects seconds and rejects values whose steps contradict this.
-
-    Returns:
-      Times in seconds, or None for row numbers.
-
-    Raises:
-      ValueError: If a time is smaller than the previous one, or if the values are not in this unit.
+    Raises ValueError if a time is smaller than the previous one, or if the steps contradict the unit.
     """
     seconds = values / PER_SECOND[unit]
     check_order(seconds, source=source)
@@ -57,13 +47,12 @@ def times_of(
 
 
 def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
-    """Describe why times cannot be seconds of scans or poses. The description is empty if they can, or if they are too
-    few to judge.
+    """Describe why times cannot be seconds of scans or poses: an empty text if they can, or are too few to judge.
 
     With `numbers`, whole numbers count as numbers of frames. Headers of bags have a unit and may have whole seconds.
     """
     if changed := unit_change(times):
-        return changed.found
+        return changed[1]
     if len(times) and abs(times[-1]) > LATEST_S:
         return f"{times[-1]:g}, after the year 5000"
     if len(times) <= PROOF:
@@ -85,19 +74,13 @@ def usual_step(times: Float[np.ndarray, " n"]) -> float:
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
 
-class UnitChange(NamedTuple):
-    """Row at which the times of a file change to a smaller unit."""
-
-    row: int
-    """Row, from 0."""
-    found: str
-    """Description for messages."""
-
-
-def unit_change(times: Float[np.ndarray, " n"]) -> UnitChange | None:
+def unit_change(times: Float[np.ndarray, " n"]) -> tuple[int, str] | None:
     """Find a row from which both the times and their steps are about 1e3, 1e6 or 1e9 times as large as before.
 
     A pause or another rate alone is no change of the unit. Two steps on either side are required.
+
+    Returns:
+      The row, from 0, and a description for messages; or None.
     """
     before = np.where(times[:-1] > 0, times[:-1], np.inf)
     if not len(before):
@@ -108,8 +91,7 @@ def unit_change(times: Float[np.ndarray, " n"]) -> UnitChange | None:
     grown = np.array([times[row] / before[row - 1], usual_step(times[row:]) / usual_step(times[:row])])
     for factor in FACTORS:
         if (grown > factor / SAME_FACTOR).all() and (grown < factor * SAME_FACTOR).all():
-            found = f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large"
-            return UnitChange(row, found)
+            return row, f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large"
     return None
 
 
@@ -137,7 +119,8 @@ def check_order(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
 def check_unit(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
     """Raise ValueError if the unit of times changes between two rows (`unit_change`)."""
     if changed := unit_change(times):
-        raise ValueError(f"{source}, row {changed.row + 1}: expected times in one unit, found {changed.found}")
+        row, found = changed
+        raise ValueError(f"{source}, row {row + 1}: expected times in one unit, found {found}")
 
 
 def check_jumps(times: Float[np.ndarray, " n"], *, source: str) -> None:

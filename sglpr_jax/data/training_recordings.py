@@ -13,18 +13,15 @@ from sglpr_jax.files import file_name
 def leave_one_out(
     root: Path, test: str, *, train: Sequence[str] = (), **options: Any
 ) -> tuple[list[Recording], Recording]:
-    """Open the training recordings and the test recording of a dataset.
+    """Open the training recordings and the test recording of a dataset. All must have positions.
 
     Arguments:
       root: Folder of the dataset.
       test: Name of the test recording.
-      train: Names of the training recordings. If empty, all recordings except `test` are used.
+      train: Names of the training recordings, by default all except `test`.
       options: Options of `open_recording`.
 
-    Raises:
-      FileNotFoundError: If a recording does not exist.
-      ValueError: If `test` is among the training recordings, no training recording remains, or a recording has no
-        positions.
+    Raises FileNotFoundError, or ValueError if `test` is among the training recordings or no training recording remains.
     """
     tested = open_recording(root, test, **options)
     names = tuple(train) or tuple(name for name in recording_names(root) if name != test)
@@ -52,10 +49,7 @@ def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Re
     """Return the recordings, with label images from `folder` added to recordings of images without labels.
 
     The folder has a label image `06/000000.png` for image 000000 of recording 06, as written by `bin/segment`. An image
-    without a label image stays unlabelled.
-
-    Raises:
-      FileNotFoundError: If `folder` has no label image for any recording.
+    without a label image stays unlabelled. Raises FileNotFoundError if no recording has a label image.
     """
     labelled = [_labelled(recording, folder / file_name(recording.name)) for recording in recordings]
     if not any(new is not old for new, old in zip(labelled, recordings, strict=True)):

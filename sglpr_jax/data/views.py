@@ -20,7 +20,7 @@ from sglpr_jax.bev import (
     rotate_points,
 )
 from sglpr_jax.data.density_image import check_density_counts, density_bev, density_label_bev
-from sglpr_jax.data.recording import Record, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.grid import Grid, ImageKind, check_density_grid
 
 _POINTS_STEP = 16384
@@ -52,9 +52,7 @@ def view(
       categories: Number of classes of the map; 0 for no map.
       angle: Angle by which the place is rotated first, in radians, counter-clockwise.
 
-    Raises:
-      ValueError: If a scan shows no place (`check_cloud`) or has no grid, if a density image is requested but the grid
-        or the ready-made image does not fit, or if requested labels are missing.
+    Raises ValueError if a scan shows no place (`check_cloud`), or if the grid, the kind or the labels do not fit.
     """
     classes = classes_of(record, categories) if categories else None
     if record.points is None:
@@ -125,14 +123,9 @@ def cloud_view(
     grid: Grid,
     angle: Float[Array | np.ndarray, "*b"] | None = None,
 ) -> View:
-    """Return the view of padded clouds: a rotation, then rasterisation by eq. 1.
+    """Return the view of padded clouds: a rotation by `angle` in radians, then rasterisation by eq. 1.
 
-    Arguments:
-      points: Points of each cloud, padded.
-      classes: Class of each point, or None.
-      count: Number of points of each cloud without padding.
-      grid: Grid of the image.
-      angle: Angle of each rotation in radians, or None.
+    `count` is the number of points of each cloud without padding.
     """
     points = points if angle is None else rotate_points(points, angle)
     counts = rasterize(points, grid=grid, count=count).astype(jnp.float32)

@@ -13,14 +13,13 @@ from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import record_of_scan
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rotations_of
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
-from sglpr_jax.data.poses import BEYOND_S, interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.poses import BEYOND_S, have_poses, interpolate_poses, poses_of
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.se3 import quaternions
 
 LOOK_S = 0.05
 """Time between two looks at the folder, in seconds."""
@@ -200,9 +199,7 @@ class GrowingPoses:
             return None
         stamps, poses = np.array([stamp for stamp, _ in known]), np.stack([pose for _, pose in known])
         at = np.array([time])
-        found = interpolate(stamps, poses[:, :3, 3], at)
-        turns = interpolate_turns(stamps, quaternions(poses), at)
-        return poses_of(found.positions, turns)[0] if found.kept.all() else None
+        return interpolate_poses(stamps, poses, at)[0] if have_poses(stamps, at).all() else None
 
     def _add(self, words: list[str], where: str) -> None:
         if self._format == "auto" and len(words) == 12:

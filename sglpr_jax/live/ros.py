@@ -1,5 +1,6 @@
 """ROS topics as source of scans and odometry and as sink of loops, for every transport (DDS, zenoh, rclpy)."""
 
+import dataclasses
 import os
 import threading
 import time
@@ -9,7 +10,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sglpr_jax.data.recording import found_record
 from sglpr_jax.live.endpoints import WAIT_S
 from sglpr_jax.live.messages import FrameStatus, Latest, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
@@ -139,14 +139,14 @@ class RosSource:
     def _frame(self, message: Received) -> LiveFrame | None:
         """Decode a scan and find its pose. Returns None, with a report, for an invalid scan."""
         try:
-            header, records = decode_cloud(message.raw, message.kind)
+            header, record = decode_cloud(message.raw, message.kind)
         except ValueError as error:
             self._report("cloud", f"{self.topic}: {error}")
             return None
         pose = None
         if self._odometry is not None:
             pose = self._odometry.pose(header.time, header.frame.strip("/"), wait_s=WAIT_S)
-        return LiveFrame(found_record(records, lasers=False, time=header.time), header.time, pose, message.at)
+        return LiveFrame(dataclasses.replace(record, time=header.time), header.time, pose, message.at)
 
     def _look(self) -> None:
         """Report which topics exist if no scans arrive."""

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, Header, RosMessage, read_custom_msg, read_point_cloud2
+from sglpr_jax.data.record import Record
 from sglpr_jax.files import in_short
 from sglpr_jax.live.messages import LoopEdge
 from sglpr_jax.se3 import quaternions
@@ -61,7 +61,7 @@ def encode(message: Any) -> bytes:
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
-def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Records]:
+def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Record]:
     """Decode a scan, a message of one of the types `CLOUDS`.
 
     Raises ValueError if the message is damaged, or the cloud has no x, y and z.

@@ -16,7 +16,7 @@ from sglpr_jax.data.formats.ros_messages import (
     read_transforms,
     tracks_of,
 )
-from sglpr_jax.data.poses import interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.poses import have_poses, interpolate_poses
 from sglpr_jax.live.messages import Report
 from sglpr_jax.live.ros_messages import TRANSFORMS, Received
 
@@ -137,7 +137,5 @@ def _at(poses: list[StampedPose], time: float) -> Float[np.ndarray, "4 4"] | Non
     after = [one for one in nearest if one.time > time][:1]
     track = Track.of((0, one) for one in (before + after if before and after else nearest[:2]))
     times = np.array([time])
-    kept, positions = interpolate(track.stamps.own, track.positions, times)
-    if not kept.all():
-        return None
-    return poses_of(positions, interpolate_turns(track.stamps.own, track.quaternions, times))[0]
+    known = have_poses(track.stamps.own, times).all()
+    return interpolate_poses(track.stamps.own, track.poses, times)[0] if known else None

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from sglpr_jax.data.recording import Record, Recording, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import View, check_ready_made, cloud_view, image_view, picture
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.labels import UNLABELLED

@@ -5,7 +5,7 @@ import pytest
 from bags import FILES, TRANSFORMS, header, transforms, typestore, write_bag
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.poses import interpolate, interpolate_turns
+from sglpr_jax.data.poses import have_poses, interpolate_poses, poses_of
 from sglpr_jax.data.readers import open_recording, recording_names
 
 CLOUD, ODOMETRY, POSE = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
@@ -200,7 +200,9 @@ def test_rotations_between_two_are_those_of_an_even_turn():
     stamps = np.array([2.0, 0.0, 1.0, 2.0])
     quaternions = np.stack([turned(t) for t in stamps]) * np.array([[1], [1], [-1], [1]])  # -q turns as q does
     times = np.array([-1.0, 0.0, 0.25, 1.0, 1.9, 2.5])
-    found = interpolate_turns(stamps, quaternions, times)
+    found = interpolate_poses(stamps, poses_of(np.zeros((4, 3)), Rotation.from_quat(quaternions).as_matrix()), times)[
+        :, :3, :3
+    ]
     true = Rotation.from_quat([turned(t) for t in times.clip(0, 2)])
     np.testing.assert_allclose(found, true.as_matrix(), atol=1e-9)
 
@@ -208,7 +210,7 @@ def test_rotations_between_two_are_those_of_an_even_turn():
 def test_between_poses_far_apart_in_time_nothing_is_known():
     stamps, line = np.array([3.0, 0.0, 1.0, 3.5]), np.array([3.0, 0.0, 1.0, 3.5])[:, None] * [1.0, 2.0, 0.0]
     times = np.array([-0.2, -0.05, 0.5, 1.0, 2.0, 3.2, 3.55, 4.0])
-    found = interpolate(stamps, line, times)
-    assert found.kept.tolist() == [False, True, True, True, False, True, True, False]
-    np.testing.assert_allclose(found.positions[[2, 3, 5], 1], [1.0, 2.0, 6.4])
-    assert not interpolate(stamps[:1], line[:1], times).kept.any()
+    assert have_poses(stamps, times).tolist() == [False, True, True, True, False, True, True, False]
+    found = interpolate_poses(stamps, poses_of(line), times)
+    np.testing.assert_allclose(found[[2, 3, 5], 1, 3], [1.0, 2.0, 6.4])
+    assert not have_poses(stamps[:1], times).any()

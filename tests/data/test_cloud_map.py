@@ -240,7 +240,7 @@ def test_damaged_and_too_large_maps(tmp_path, monkeypatch):
     path = tmp_path / "town.pcd"
     write_pcd(path, street()).write_bytes(path.read_bytes()[:-1])
     way = write_tum(tmp_path / "way.tum", along())
-    with pytest.raises(ValueError, match=r"town\.pcd: expected a .pcd file of a map.*points of 24 bytes, found"):
+    with pytest.raises(ValueError, match=r"town\.pcd: expected a readable \.pcd file.*points of 24 bytes, found"):
         open_recording(path, poses=way)
     monkeypatch.setattr("sglpr_jax.data.cloud_map.MOST_POINTS", 100)
     with pytest.raises(ValueError, match=r"town\.pcd: expected at most 100 points in voxels of 0\.1 m .*cut the cloud"):

@@ -18,7 +18,7 @@ from sglpr_jax.data.corruption import (
     ring_numbers,
 )
 from sglpr_jax.data.corruption import corrupted as corrupted_recording
-from sglpr_jax.data.formats.scan_files import read_scan, read_scan_records
+from sglpr_jax.data.formats.scan_files import read_scan, read_scan_record
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.sim.sensor import HDL64E_DEG
 
@@ -171,10 +171,11 @@ def test_real_scans_of_other_sensors(shared):
     samples = shared / "data/samples"
     (nclt,) = (samples / "nclt/velodyne_sync").glob("*.bin")
     for path, expected in ((nclt, 32), (samples / "nuscenes_32_beams.pcd.bin", 32), (samples / "16_beams.pcd", 16)):
-        points, lasers, _ = read_scan_records(path)
+        found = read_scan_record(path)
+        points, lasers = found.points, found.lasers
         finite = np.isfinite(points).all(axis=1)
-        found = ring_numbers(points[finite], lasers=None if lasers is None else lasers[finite])
-        assert set(found) == set(range(expected)), path
+        rings = ring_numbers(points[finite], lasers=None if lasers is None else lasers[finite])
+        assert set(rings) == set(range(expected)), path
 
 
 ON_POINTS = list({one.kind: one for one in CORRUPTIONS if one != ROTATION}.values())

@@ -10,7 +10,7 @@ import pytest
 from recordings import of_images, of_scans
 
 import sglpr_jax
-from sglpr_jax.data.recording import Record, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.data.views import view
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.registry import handcrafted

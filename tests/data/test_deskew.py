@@ -12,7 +12,7 @@ from scipy.linalg import expm, logm
 
 import sglpr_jax
 from sglpr_jax.data.deskew import deskew, deskewed, poses_at
-from sglpr_jax.data.formats.clouds import TimeField
+from sglpr_jax.data.record import TimeField
 from sglpr_jax.data.recording import Record
 from sglpr_jax.data.submap import submaps
 

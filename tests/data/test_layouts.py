@@ -1,96 +1,458 @@
-"""Layouts of other datasets, written here as small files: what is found, in which frame, at what times."""
+"""Layouts of datasets, written here as small trees: what is found, in which frame, at what times, and each flaw."""
+
+import json
+import pickle
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from sglpr_jax.data.readers import boreas, helipr, kitti_raw, mulran, open_recording, recording_names
-from sglpr_jax.data.readers.reader import ReadOptions
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.packed import packed
+from sglpr_jax.data.readers import helipr, kitti_raw, open_recording, recording_names
 from sglpr_jax.data.readers.stamped import read_table
+from sglpr_jax.retrieval.reuse import fingerprint
 
-NS = 1561000444390857630
+NS, US = 1561000444390857630, 1326652795280148
 POINTS = np.array([[5.0, 1.0, -1.5], [7.0, -2.0, 0.5], [-3.0, 4.0, 2.0]], np.float32)
+LEFT = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+"""A quarter turn to the left."""
+QUARTER = [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]
+"""The same: w x y z."""
+IDENTITY = np.eye(3)
 
 
-def write_rows(path, rows, header=""):
+def write(path: Path, content: Any) -> None:
+    """Write bytes, a text, rows of numbers separated by commas, or JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(header + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    if isinstance(content, bytes | np.ndarray):
+        path.write_bytes(bytes(content))
+    elif path.suffix == ".json" and not isinstance(content, str):
+        path.write_text(json.dumps(content))
+    else:
+        rows = content if isinstance(content, str) else "".join(",".join(map(str, row)) + "\n" for row in content)
+        path.write_text(rows)
 
 
-def write_scans(folder, names, columns):
-    folder.mkdir(parents=True, exist_ok=True)
-    for i, name in enumerate(names):
-        np.column_stack([POINTS + i, np.zeros((3, columns - 3))]).astype("<f4").tofile(folder / f"{name}.bin")
+def scan(i: int, columns: int, kind: str = "<f4") -> bytes:
+    """Points shifted by `i`, with more columns of zeros."""
+    return np.column_stack([POINTS + np.float32(i), np.zeros((3, columns - 3))]).astype(kind).tobytes()
 
 
-@pytest.fixture
-def mulran_root(tmp_path):
-    """A sequence whose car stands at (10 i, 20, 3), turned left by a quarter; the third scan has no pose."""
-    folder = tmp_path / "KAIST01"
-    write_scans(folder / "Ouster", [NS, NS + 10**8, NS + 10**9], 4)
-    left = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    poses = [np.column_stack([left, [10.0 * i, 20.0, 3.0]]).reshape(-1).tolist() for i in range(20)]
-    write_rows(folder / "global_pose.csv", [[NS - 10**7 + i * 10**7, *pose] for i, pose in enumerate(poses)])
-    return tmp_path
+def pose(at: Any, turned: Any = IDENTITY) -> list[float]:
+    """12 numbers."""
+    return np.column_stack([turned, at]).ravel().tolist()
 
 
-def test_mulran(mulran_root):
-    assert recording_names(mulran_root) == recording_names(mulran_root / "KAIST01") == ("KAIST01",)
-    for root in (mulran_root, mulran_root / "KAIST01"):
-        recording = open_recording(root, sensor_height=1.8)
-        assert recording.ids == (str(NS), str(NS + 10**8))
-        lidar = [0.021, 1.7042, 1.8047]  # the Ouster's place on the car, turned left
-        np.testing.assert_allclose(recording.positions, [np.add([10, 20, 3], lidar), np.add([110, 20, 3], lidar)])
-        np.testing.assert_allclose(np.diff(recording.times), 0.1, atol=1e-6)
-        np.testing.assert_array_equal(recording.points(0), POINTS * [-1, -1, 1])
-        assert recording.pose_source == "global_pose.csv (1 of 3 scans left out: no pose within 0.1 s)"
-        assert recording.found[0] == "format: MulRan, kitti (16 bytes a point), rotated to x forward"
+def lines(rows: Any) -> str:
+    return "".join(" ".join(map(str, row)) + "\n" for row in rows)
 
 
-PACKED = {
-    "Avia": ("fffBBBI", 19),
-    "Aeva": ("fffffiBf", 29),
-    "Ouster": ("ffffIHHH", 26),
-    "Velodyne": ("ffffHf", 22),
-}
+def kitti(root: Path) -> None:
+    """Frames 0, 2 and 3 of four, labels for 0 and 3, 10 m from frame to frame."""
+    folder = root / "sequences" / "08"
+    for i in (0, 2, 3):
+        write(folder / f"velodyne/{i:06d}.bin", scan(i, 4))
+        if i != 2:
+            write(folder / f"labels/{i:06d}.label", np.array([48, 49, 50], "<u4") + np.uint32(7 << 16))
+    camera = [[1.0, 2.0, 10.0 * i] for i in range(4)]
+    write(folder / "poses.txt", lines(map(pose, camera)))
+    write(root / "poses/08.txt", lines(pose([x, y + 50, z]) for x, y, z in camera))
+    write(folder / "times.txt", lines([[i / 10] for i in range(4)]))
+
+
+def bev(root: Path) -> None:
+    """Images 0 and 2 of three, the second with labels."""
+    (root / "06/imgs").mkdir(parents=True), (root / "06/labels").mkdir()
+    for i in (0, 2):
+        Image.fromarray(np.arange(35, dtype=np.uint8).reshape(5, 7) * 7 + i).save(root / f"06/imgs/{i:06d}.png")
+    Image.fromarray(np.arange(35, dtype=np.uint16).reshape(5, 7) // 34 * 252).save(root / "06/labels/000002.png")
+    write(root / "06/pose.txt", lines(pose([3.0 * i, 3.0 * i + 1, 3.0 * i + 2]) for i in range(3)))
+
+
+def mulran(root: Path) -> None:
+    """The car stands at (10 i, 20, 3), turned left by a quarter; the third scan has no pose."""
+    for i, wait in enumerate((0, 10**8, 10**9)):
+        write(root / f"KAIST01/Ouster/{NS + wait}.bin", scan(i, 4))
+    rows = [[NS - 10**7 + i * 10**7, *pose([10.0 * i, 20.0, 3.0], LEFT)] for i in range(20)]
+    write(root / "KAIST01/global_pose.csv", rows)
+
+
+HELIPR = {"Avia": "fffBBBI", "Aeva": "fffffiBf", "Ouster": "ffffIHHH", "Velodyne": "ffffHf"}
 LINE = {"Avia": 5, "Aeva": 6, "Ouster": 6, "Velodyne": 4}
-"""In which column the line is."""
+"""Columns of the lines."""
 
 
-def helipr_scan(sensor, layout):
-    import struct
-
+def helipr_scan(sensor: str, layout: str, shift: int = 0) -> bytes:
     rows = []
-    for i, point in enumerate(POINTS):
+    for i, point in enumerate(POINTS + np.float32(shift)):
         rest = [7] * (len(layout) - 3)
         rest[LINE[sensor] - 3] = i
         rows.append(struct.pack(f"<{layout}", *point, *rest))
     return b"".join(rows)
 
 
+def helipr_tree(root: Path) -> None:
+    folder = root / "Roundabout01"
+    stamps = [helipr.AEVA_CHANGED + 1 + i * 10**8 for i in range(2)]
+    for sensor, layout in HELIPR.items():
+        for i, stamp in enumerate(stamps):
+            write(folder / f"LiDAR/{sensor}/{stamp}.bin", helipr_scan(sensor, layout, i))
+        write(
+            folder / f"LiDAR_GT/{sensor}_gt.txt", lines([stamp, i, 2, 3, 0, 0, 0, 1] for i, stamp in enumerate(stamps))
+        )
+
+
+def boreas(root: Path) -> None:
+    folder, micro = root / "boreas-2020", NS // 1000
+    for i in range(2):
+        write(folder / f"lidar/{micro + i * 10**5}.bin", scan(i, 6))
+    rows = [["GPSTime", *"abcdefghijkl"], *([micro + i * 10**5, 100.0 + i, 200.0, 70.0, *[0.0] * 9] for i in range(2))]
+    write(folder / "applanix/lidar_poses.csv", rows)
+
+
+def raw(root: Path) -> None:
+    """Drive with scans 0 and 2 of three."""
+    drive = root / "2011_09_26/2011_09_26_drive_0001_sync"
+    for i in (0, 2):
+        write(drive / f"velodyne_points/data/{i:010d}.bin", scan(i, 4))
+        write(drive / f"oxts/data/{i:010d}.txt", lines([[49.0 + i * 1e-5, 8.4 + i * 1e-5, 112.0 + i, *[0.0] * 27]]))
+    write(
+        drive / "velodyne_points/timestamps.txt", "".join(f"2011-09-26 13:02:{25 + i / 10:012.9f}\n" for i in range(3))
+    )
+
+
+def nclt(root: Path) -> None:
+    """A pose is near to the first two scans, the third comes 10 s after the last pose."""
+    records = np.zeros(3, [("xyz", "<u2", 3), ("rest", "u1", 2)])
+    records["xyz"] = np.round((POINTS * [1, -1, -1] + 100) / 0.005)
+    for wait in (0, 100_000, 10_000_000):
+        write(root / f"2012-01-15/velodyne_sync/{US + wait}.bin", records.tobytes())
+    nan = [[US - 30_000_000, *["NaN"] * 6], [US + 160_000, "nan", 1, 1, 0, 0, 0]]
+    known = [[US - 40_000, 1, 2, 3, 0, 0, 0], [US + 10_000, 4, 5, 6, 0.1, 0.2, 0.3], [US + 90_000, 7.5, -8, 9, 0, 0, 0]]
+    write(root / "groundtruth_2012-01-15.csv", [nan[0], *known, nan[1]])
+
+
+def nuscenes(root: Path) -> None:
+    """scene-0061: key frames at 0 and 0.5 s, sweeps at .05 and .1 s, the last not downloaded; scene-0103 has none."""
+    data, poses = [], []
+    for i, (seconds, folder) in enumerate({0.5: "samples", 0.0: "samples", 0.05: "sweeps", 0.1: "sweeps"}.items()):
+        stamp = US + int(seconds * 1e6)
+        file = f"{folder}/LIDAR_TOP/n015__{stamp}.pcd.bin"
+        row = {"token": f"d{i}", "sample_token": f"s{i % 2}", "ego_pose_token": f"e{i}", "calibrated_sensor_token": "c"}
+        data.append({**row, "timestamp": stamp, "filename": file})
+        poses.append({"token": f"e{i}", "rotation": QUARTER, "translation": [100 + 10 * seconds, 200.0, 0.0]})
+        if seconds != 0.1:
+            write(root / file, scan(i - 1, 5))
+    camera = {**data[0], "token": "cam", "filename": "samples/CAM_FRONT/a.jpg"}
+    sensor = {"token": "c", "rotation": QUARTER, "translation": [0.94, 0.0, 1.84]}
+    samples = [("s0", "t0"), ("s1", "t0"), ("s9", "t1")]
+    tables = {
+        "scene": [{"token": "t1", "name": "scene-0103"}, {"token": "t0", "name": "scene-0061"}],
+        "sample": [{"token": sample, "scene_token": scene} for sample, scene in samples],
+        "sample_data": [*data, camera, {**data[0], "token": "dd", "sample_token": "s9"}],
+        "ego_pose": poses,
+        "calibrated_sensor": [{**sensor, "token": "other"}, sensor],
+    }
+    for name, rows in tables.items():
+        write(root / f"v1.0-mini/{name}.json", rows)
+
+
+def pandaset(root: Path) -> None:
+    """The same points around the LiDAR in each scan, written in the world's frame; scan 1 is not converted."""
+    at, headings = [[0.0, 0.0, 0.0], [5.0, 1.0, 0.5], [9.0, 3.0, 0.7]], np.radians([0.0, 30.0, -75.0])
+    heading = [dict(w=np.cos(angle / 2), x=0, y=0, z=np.sin(angle / 2)) for angle in headings]
+    poses = [{"position": dict(zip("xyz", p, strict=True)), "heading": h} for p, h in zip(at, heading, strict=True)]
+    write(root / "001/lidar/poses.json", poses)
+    write(root / "001/lidar/timestamps.json", [1557539924.5 + i / 10 for i in range(3)])
+    for i, angle in enumerate(headings):
+        cos, sin = np.cos(angle), np.sin(angle)
+        world = POINTS @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).T + at[i]
+        write(root / f"001/lidar/{i:02d}.pkl.gz", b"a pickle")
+        if i != 1:
+            np.save(root / f"001/lidar/{i:02d}.npy", np.column_stack([world, [7, 8, 9]]).astype(np.float32))
+
+
+class Layout(NamedTuple):
+    write: Callable[[Path], None]
+    name: str
+    ids: tuple[str, ...]
+    positions: Any
+    steps_s: Any
+    """Differences of the times, or None without times."""
+    points: Any
+    """Points of the last scan."""
+    pose_source: str
+    found: str
+    """Beginning of the first line that the reader found."""
+    lasers: Any = None
+    part: str = "."
+    """Folder in the tree that may be opened, too."""
+
+
+LIDAR = np.array([0.021, 1.7042, 1.8047])
+"""Position of MulRan's Ouster on the car, turned left."""
+DEGREE_M = np.pi / 180 * kitti_raw.EARTH_M
+DRIVE = "2011_09_26/2011_09_26_drive_0001_sync"
+FORWARD = np.array([1, -1, 1], np.float32)
+LAYOUTS = {
+    "kitti": Layout(
+        kitti,
+        "08",
+        ("000000", "000002", "000003"),
+        [[0, -1, -2], [20, -1, -2], [30, -1, -2]],
+        [0.2, 0.1],
+        POINTS + np.float32(3),
+        "sequences/08/poses.txt",
+        "format: kitti (16 bytes a point)",
+    ),
+    "mulran": Layout(
+        mulran,
+        "KAIST01",
+        (str(NS), str(NS + 10**8)),
+        LIDAR + np.array([[10, 20, 3], [110, 20, 3]]),
+        [0.1],
+        (POINTS + 1) * [-1, -1, 1],
+        "global_pose.csv (1 of 3 scans left out: no pose within 0.1 s)",
+        "format: MulRan, kitti (16 bytes a point), rotated to x forward",
+        part="KAIST01",
+    ),
+    **{
+        f"helipr {sensor}": Layout(
+            helipr_tree,
+            f"Roundabout01-{sensor}",
+            (str(helipr.AEVA_CHANGED + 1), str(helipr.AEVA_CHANGED + 1 + 10**8)),
+            [[0, 2, 3], [1, 2, 3]],
+            [0.1],
+            POINTS + 1,
+            f"{sensor}_gt.txt",
+            f"format: HeLiPR's {sensor} ({struct.calcsize('<' + layout)} bytes a point)",
+            [0, 1, 2],
+            "Roundabout01",
+        )
+        for sensor, layout in HELIPR.items()
+    },
+    "boreas": Layout(
+        boreas,
+        "boreas-2020",
+        (str(NS // 1000), str(NS // 1000 + 10**5)),
+        [[100, 200, 70], [101, 200, 70]],
+        [0.1],
+        POINTS + 1,
+        "lidar_poses.csv",
+        "format: Boreas, float32x6 (24 bytes a point)",
+        part="boreas-2020",
+    ),
+    "kitti raw": Layout(
+        raw,
+        "2011_09_26_drive_0001_sync",
+        ("0000000000", "0000000002"),
+        [[0, 0, 0], [2e-5 * DEGREE_M * np.cos(np.radians(49)), 2e-5 * DEGREE_M, 2]],
+        [0.2],
+        POINTS + 2,
+        "oxts (GPS)",
+        "format: KITTI raw",
+        part=DRIVE,
+    ),
+    "nclt": Layout(
+        nclt,
+        "2012-01-15",
+        (str(US), str(US + 100_000)),
+        [[4, -5, -6], [7.5, 8, -9]],  # north, west, up
+        [0.1],
+        POINTS,
+        "groundtruth_2012-01-15.csv (1 of 3 scans left out: no pose within 0.5 s)",
+        "sensor: coordinates are relative to the ground",
+        [0, 0, 0],
+    ),
+    "nuscenes": Layout(
+        nuscenes,
+        "scene-0061",
+        tuple(f"n015__{US + wait}" for wait in (0, 50_000, 500_000)),
+        # the car looks to the left: the LiDAR's .94 m to its front are .94 m to the north
+        [[100 + 10 * t, 200.94, 1.84] for t in (0, 0.05, 0.5)],
+        [0.05, 0.45],
+        (POINTS - 1)[:, [1, 0, 2]] * FORWARD,
+        "v1.0-mini/ego_pose.json",
+        "format: nuscenes (20 bytes a point), rotated to x forward",
+        [0, 0, 0],
+    ),
+    "pandaset": Layout(
+        pandaset,
+        "001",
+        ("00", "02"),
+        [[0, 0, 0], [9, 3, 0.7]],
+        [0.2],
+        POINTS[:, [1, 0, 2]] * FORWARD,
+        "lidar/poses.json",
+        "format: PandaSet as npy, transformed from the world frame to the LiDAR frame, x forward, 1 pickles not",
+        part="001",
+    ),
+}
+
+
 @pytest.fixture
-def helipr_root(tmp_path):
-    folder = tmp_path / "Roundabout01"
-    for sensor, (layout, _) in PACKED.items():
-        (folder / "LiDAR" / sensor).mkdir(parents=True)
-        for i in range(2):
-            stamp = helipr.AEVA_CHANGED + 1 + i * 10**8
-            (folder / "LiDAR" / sensor / f"{stamp}.bin").write_bytes(helipr_scan(sensor, layout))
-        (folder / "LiDAR_GT").mkdir(exist_ok=True)
-        poses = [f"{helipr.AEVA_CHANGED + 1 + i * 10**8} {i} 2 3 0 0 0 1\n" for i in range(2)]
-        (folder / "LiDAR_GT" / f"{sensor}_gt.txt").write_text("".join(poses))
-    return tmp_path
+def tree(tmp_path):
+    def made(layout: str) -> Path:
+        {**{name: one.write for name, one in LAYOUTS.items()}, "bev": bev}[layout](tmp_path)
+        return tmp_path
+
+    return made
 
 
-@pytest.mark.parametrize("sensor", PACKED)
-def test_helipr(helipr_root, sensor):
-    name = f"Roundabout01-{sensor}"
-    assert name in recording_names(helipr_root) and len(recording_names(helipr_root / "Roundabout01")) == 4
-    recording = open_recording(helipr_root, name, sensor_height=1.8)
-    record = recording.record(1, lasers=True)
-    np.testing.assert_array_equal(record.points, POINTS)
-    np.testing.assert_array_equal(record.lasers, [0, 1, 2])
-    np.testing.assert_array_equal(recording.positions, [[0, 2, 3], [1, 2, 3]])
-    assert recording.found[0] == f"format: HeLiPR's {sensor} ({PACKED[sensor][1]} bytes a point)"
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout(tree, layout):
+    expected = LAYOUTS[layout]
+    root = tree(layout)
+    for place in {root, root / expected.part}:
+        assert expected.name in recording_names(place)
+        found = open_recording(place, expected.name, sensor_height=1.8)
+        assert (found.name, found.ids, found.pose_source) == (expected.name, expected.ids, expected.pose_source)
+        np.testing.assert_allclose(found.positions, expected.positions, atol=1e-4)
+        np.testing.assert_allclose(np.diff(found.times), expected.steps_s, atol=1e-6)
+        record = found.record(len(found) - 1, lasers=True)
+        np.testing.assert_allclose(record.points, expected.points, atol=2e-5)
+        assert record.points.dtype == np.float32
+        assert (None if record.lasers is None else record.lasers.tolist()) == expected.lasers
+        assert found.found[0].startswith(expected.found)
+
+
+def edited(file: str, change: Callable[[str], str] | Any) -> Callable[[Path], None]:
+    """A change of one file: of its text, or another content."""
+    return lambda root: write(root / file, change((root / file).read_text()) if callable(change) else change)
+
+
+def renamed(old: str, new: str) -> Callable[[Path], Path]:
+    return lambda root: (root / old).rename((root / old).with_name(new))
+
+
+def late(root: Path) -> None:
+    """Scans of another time."""
+    for path in (root / "boreas-2020/lidar").iterdir():
+        path.rename(path.with_name(f"{int(path.stem) * 2}.bin"))
+
+
+def row_of(table: str, row: int, **values: object) -> Callable[[Path], None]:
+    def change(text: str) -> list[dict[str, object]]:
+        rows = json.loads(text)
+        rows[row].update(values)
+        return rows
+
+    return edited(f"v1.0-mini/{table}.json", change)
+
+
+POSES, SCANS = "KAIST01/global_pose.csv", "KAIST01/Ouster"
+TRUTH, NCLT = "groundtruth_2012-01-15.csv", f"2012-01-15/velodyne_sync/{US}.bin"
+STAMPS = f"{DRIVE}/velodyne_points/timestamps.txt"
+BROKEN = [
+    ("kitti", edited("sequences/08/poses.txt", lambda text: text[:40]), r"poses\.txt, line 1: expected 12 numbers"),
+    ("kitti", edited("sequences/08/times.txt", "0\n0.1\n0.2\n"), r"times\.txt: expected at least 4 rows \(frame 3\)"),
+    ("kitti", edited("simulation.json", '{"sensor": 1}'), r"simulation\.json: expected the settings of a simulated"),
+    ("kitti", edited("simulation.json", '{"sensor": {"height_m": NaN}}'), r"simulation\.json: .*(height|NaN)"),
+    ("mulran", edited(POSES, ""), "expected rows of a time and 12 numbers, found none"),
+    (
+        "mulran",
+        edited(POSES, lambda text: text.replace("20.0", "nan")),
+        "line 1: expected a time and 12 finite numbers",
+    ),
+    ("mulran", edited(POSES, lambda text: text + "9" + ",1_0" * 12), "line 21: .*12 finite numbers, found '9,1_0"),
+    ("mulran", renamed(f"{SCANS}/{NS}.bin", "first.bin"), r"expected scans named by their time, .*found first\.bin"),
+    ("boreas", late, r"expected poses within 0\.1 s of the scans in .*, found the nearest"),
+    ("kitti raw", edited(f"{DRIVE}/oxts/data/0000000002.txt", "49 8 112"), r"02\.txt: expected 30 numbers, found 3"),
+    ("kitti raw", edited(STAMPS, "2011-09-26 13:02:25.9\n"), r"expected a date and time such as .* each of 2 scans"),
+    ("kitti raw", edited(STAMPS, "noon\n" * 3), r"timestamps\.txt: expected a date and time such as"),
+    ("nclt", edited(TRUTH, ""), "expected rows of utime, x, y, z, roll, pitch, yaw, found an empty file"),
+    ("nclt", edited(TRUTH, f"{US},1,2,3,0,0,0\n{US},1,2\n"), "expected rows of utime.*found malformed ones"),
+    ("nclt", edited(TRUTH, f"{US},1,2,3,0,0,0\n{US - 1},1,2,3,0,0,0\n"), f"expected a time >= {US}, found {US - 1}"),
+    ("nclt", edited(TRUTH, "1326600000000000,1,2,3,0,0,0\n"), r"expected poses within 0\.5 s of the scans in .* 52795"),
+    ("nclt", renamed(NCLT, "first.bin"), r"expected scans named by their time, .* found first\.bin"),
+    ("nuscenes", row_of("sample_data", 0, timestamp="noon"), "expected 1 numbers as 'timestamp', found others"),
+    (
+        "nuscenes",
+        row_of("sample_data", 0, ego_pose_token="gone"),
+        r"ego_pose\.json: expected a row with the token 'gone'",
+    ),
+    ("nuscenes", row_of("ego_pose", 1, translation=[1, 2]), r"ego_pose\.json: expected 3 numbers as 'translation'"),
+    ("nuscenes", row_of("ego_pose", 1, translation=[1, 2, 10**400]), "expected 3 numbers as 'translation'"),
+    ("nuscenes", row_of("calibrated_sensor", 1, rotation=[2, 0, 0, 0]), "a rotation qx qy qz qw of length 1 in row 1"),
+    ("nuscenes", row_of("sample_data", 0, filename="../LIDAR_TOP/a.pcd.bin"), "expected paths of files inside"),
+    (
+        "nuscenes",
+        row_of("sample_data", 0, filename=f"samples/LIDAR_TOP/n015__{US}.pcd.bin"),
+        "a unique id for each scan",
+    ),
+    ("nuscenes", edited("v1.0-mini/sample.json", "{"), r"sample\.json: expected a table in JSON, found invalid JSON"),
+    (
+        "pandaset",
+        edited("001/lidar/poses.json", [{"position": {"x": 1}}]),
+        "expected a list of poses, each with position",
+    ),
+    ("pandaset", edited("001/lidar/poses.json", []), r"poses\.json: expected at least 3 rows \(frame 2\), found 0"),
+    ("pandaset", edited("001/lidar/timestamps.json", [3.0, 2.0, 1.0]), r"row 2: expected a time >= 3\.0, found 1\.0"),
+    ("pandaset", edited("001/lidar/timestamps.json", ["noon"]), "expected a list of seconds, found"),
+]
+
+
+@pytest.mark.parametrize(("layout", "change", "message"), BROKEN, ids=range(len(BROKEN)))
+def test_each_flaw_is_named(tree, layout, change, message):
+    root = tree(layout)
+    change(root)
+    with pytest.raises(ValueError, match=message):
+        open_recording(root, LAYOUTS[layout].name, sensor_height=1.8)
+
+
+def test_missing_files_are_named(tree):
+    root = tree("nuscenes")
+    write(root / "v1.0-trainval/scene.json", [{"token": "else", "name": one} for one in ("scene-0061", "scene-0999")])
+    assert recording_names(root) == ("scene-0061", "scene-0103", "scene-0999")
+    assert len(open_recording(root, "scene-0061", sensor_height=1.8)) == 3
+    with pytest.raises(FileNotFoundError, match=r"v1\.0-trainval/sample\.json: expected a table, found none"):
+        open_recording(root, "scene-0999")
+    with pytest.raises(FileNotFoundError, match=r"none\.csv: expected a table of poses, found none"):
+        read_table(root / "none.csv", columns=2)
+
+
+def test_kitti_has_labels_and_two_pose_files(tree):
+    root = tree("kitti")
+    found = open_recording(root)
+    assert found.labels(0).tolist() == [48, 49, 50] and found.labels(1) is None and found.has_labels
+    for choice, height in (("auto", -2), ("semantickitti", -2), ("kitti", -52)):
+        assert open_recording(root, pose_source=choice).positions[0, 2] == height
+    for file in ("sequences/08/poses.txt", "poses/08.txt"):
+        (root / file).unlink()
+    found = open_recording(root)
+    assert found.positions is None and found.pose_source is None and len(found.times) == 3
+    with pytest.raises(FileNotFoundError, match=r"expected poses in poses/08\.txt, found none"):
+        open_recording(root, pose_source="kitti")
+
+
+def test_simulated_drives_know_how_high_their_sensor_stood(tree):
+    root = tree("kitti")
+    write(root / "simulation.json", {"sensor": {"height_m": 0.8}})
+    found = open_recording(root)
+    assert found.mounting == Mounting(0.8) and found.found[-1] == "sensor: 0.80 m above the ground, as simulated"
+    lowered = found.points(0) - [0, 0, MODEL_HEIGHT_M - 0.8]
+    np.testing.assert_allclose(found.record(0).upright_points, lowered, rtol=1e-6)
+    write(root / "simulation.json", {"sensor": {"height_m": MODEL_HEIGHT_M}})
+    assert open_recording(root).mounting is None
+
+
+def test_ready_made_images(tree):
+    root = tree("bev")
+    found = open_recording(root)
+    assert (found.name, found.ids, found.times, found.pose_source) == ("06", ("000000", "000002"), None, "06/pose.txt")
+    np.testing.assert_array_equal(found.positions, [[0, 1, 2], [6, 7, 8]])
+    assert found.image(1).shape == (7, 5) and found.resolution_m == 0.4 and found.labels(0) is None
+    raw_ids = np.asarray(Image.open(root / "06/labels/000002.png"))
+    np.testing.assert_array_equal(found.labels(1), np.rot90(raw_ids, -1))
+    (root / "06/pose.txt").unlink()
+    (root / "06/imgs/000000.png").rename(root / "06/imgs/000000-b.png")  # no row of a pose
+    found = open_recording(root)
+    assert found.positions is None and found.description[-1] == "times: none; poses: none"
 
 
 def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
@@ -102,121 +464,110 @@ def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
         helipr.read_points(path, sensor="Aeva")
 
 
-@pytest.fixture
-def boreas_root(tmp_path):
-    folder = tmp_path / "boreas-2020-12-01-13-26"
-    micro = NS // 1000
-    write_scans(folder / "lidar", [micro, micro + 10**5], 6)
-    header = "GPSTime,easting,northing,altitude,vel_east,vel_north,vel_up,roll,pitch,heading,wz,wy,wx\n"
-    rows = [[micro + i * 10**5, 100.0 + i, 200.0, 70.0, *[0.0] * 9] for i in range(2)]
-    write_rows(folder / "applanix" / "lidar_poses.csv", rows, header)
-    return tmp_path
+def test_kitti_raw_without_gps(tree):
+    root = tree("kitti raw")
+    (root / DRIVE / "oxts/data/0000000002.txt").unlink()
+    assert open_recording(root).positions is None
 
 
-def test_boreas(boreas_root):
-    assert recording_names(boreas_root) == ("boreas-2020-12-01-13-26",)
-    recording = open_recording(boreas_root, sensor_height=2.1)
-    np.testing.assert_array_equal(recording.positions, [[100, 200, 70], [101, 200, 70]])
-    np.testing.assert_array_equal(recording.points(1), POINTS + 1)
-    assert recording.times[0] == pytest.approx(NS / 1e9, abs=1e-5) and recording.pose_source == "lidar_poses.csv"
-    assert len(boreas.open_recording(boreas_root / recording.name, recording.name, ReadOptions())) == 2
-
-
-@pytest.fixture
-def raw_root(tmp_path):
-    folder = tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync"
-    write_scans(folder / "velodyne_points" / "data", ["0000000000", "0000000002"], 4)
-    stamps = [f"2011-09-26 13:02:{25 + i / 10:012.9f}\n" for i in range(3)]
-    (folder / "velodyne_points" / "timestamps.txt").write_text("".join(stamps))
-    (folder / "oxts" / "data").mkdir(parents=True)
-    for i in (0, 2):
-        numbers = [49.0 + i * 1e-5, 8.4 + i * 1e-5, 112.0 + i, *[0.0] * 27]
-        (folder / "oxts" / "data" / f"{i:010d}.txt").write_text(" ".join(map(str, numbers)))
-    return tmp_path
-
-
-def test_kitti_raw(raw_root):
-    drive = raw_root / "2011_09_26" / "2011_09_26_drive_0001_sync"
-    for root in (raw_root, raw_root / "2011_09_26", drive):
-        assert recording_names(root) == (drive.name,)
-    recording = open_recording(raw_root)
-    assert recording.ids == ("0000000000", "0000000002") and recording.mounting is None
-    degree = np.pi / 180 * kitti_raw.EARTH_M
-    np.testing.assert_allclose(recording.positions[0], 0)
-    np.testing.assert_allclose(
-        recording.positions[1], [2e-5 * degree * np.cos(np.radians(49)), 2e-5 * degree, 2], atol=1e-4
-    )
-    np.testing.assert_allclose(np.diff(recording.times), 0.2, atol=1e-6)
-    np.testing.assert_array_equal(recording.points(1), POINTS + 1)
-
-
-def test_kitti_raw_without_gps_and_with_broken_times(raw_root):
-    drive = raw_root / "2011_09_26" / "2011_09_26_drive_0001_sync"
-    (drive / "oxts" / "data" / "0000000002.txt").write_text("49 8 112")
-    with pytest.raises(ValueError, match=r"0000000002\.txt: expected 30 numbers, found 3"):
-        open_recording(raw_root)
-    (drive / "oxts" / "data" / "0000000002.txt").unlink()
-    assert open_recording(raw_root).positions is None
-    for text in ("2011-09-26 13:02:25.9\n", "noon\n" * 3):
-        (drive / "velodyne_points" / "timestamps.txt").write_text(text)
-        with pytest.raises(
-            ValueError, match=r"timestamps\.txt: expected a date and time such as .* for each of 2 scans"
-        ):
-            open_recording(raw_root)
-
-
-@pytest.mark.parametrize("reader", [mulran, boreas])
-def test_what_is_missing_or_malformed_is_named(mulran_root, boreas_root, reader):
-    root = mulran_root / "KAIST01" if reader is mulran else boreas_root / "boreas-2020-12-01-13-26"
-    scans = root / ("Ouster" if reader is mulran else "lidar")
-    poses = root / reader.POSES
-    whole = poses.read_text()
-    for text, message in (
-        ("", "expected rows of a time and 12 numbers, found none"),
-        (whole.replace("20.0", "nan").replace("200.0", "nan"), "line . ?: expected a time and 12 finite numbers"),
-        (whole + "9" + ",1_0" * 12 + "\n", "expected a time and 12 finite numbers, found '9,1_0"),
-        (whole + "1,2,3\n", "expected a time and 12 finite numbers, found '1,2,3'"),
-    ):
-        poses.write_text(text)
-        with pytest.raises(ValueError, match=rf"{poses.name}.*{message.replace(' ?', '')}"):
-            reader.open_recording(root, root.name, ReadOptions())
-    poses.write_text(whole)
-    first = next(iter(sorted(scans.iterdir())))
-    odd = first.rename(scans / "first.bin")
-    with pytest.raises(ValueError, match=r"expected scans named by their time, .*found first\.bin"):
-        reader.open_recording(root, root.name, ReadOptions())
-    odd.unlink()
-    for path in scans.iterdir():
-        path.rename(scans / f"{int(path.stem) * 2}.bin")
-    with pytest.raises(ValueError, match=r"expected poses within 0\.1 s of the scans in .*, found the nearest"):
-        reader.open_recording(root, root.name, ReadOptions())
-    for path in scans.iterdir():
-        path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"expected scans \(\*\.bin\), found none"):
-        reader.open_recording(root, root.name, ReadOptions())
+@pytest.mark.parametrize("place", ["2012-01-15", "ground_truth"])
+def test_the_ground_truth_of_nclt_is_found_in_any_of_three_places(tree, place):
+    root = tree("nclt")
+    (root / place).mkdir(exist_ok=True)
+    (root / TRUTH).rename(root / place / TRUTH)
+    record = open_recording(root).record(0)
+    np.testing.assert_allclose(record.upright_points, record.points - [0, 0, MODEL_HEIGHT_M], rtol=1e-6)
 
 
 def test_long_times_keep_all_their_digits(tmp_path):
-    (tmp_path / "poses.csv").write_text(f"{NS},1\n{NS + 1}.000,2\n1.5e3,3\n")
+    write(tmp_path / "poses.csv", f"{NS},1\n{NS + 1}.000,2\n1.5e3,3\n")
     times, numbers = read_table(tmp_path / "poses.csv", columns=2)
-    np.testing.assert_array_equal(times, [NS, NS + 1, 1500])
-    np.testing.assert_array_equal(numbers, [[1], [2], [3]])
-    with pytest.raises(FileNotFoundError, match="expected a table of poses, found none"):
-        read_table(tmp_path / "none.csv", columns=2)
+    assert times.tolist() == [NS, NS + 1, 1500] and numbers.tolist() == [[1], [2], [3]]
 
 
-OXFORD = ("pointcloud_20m_10overlap", "pointcloud_locations_20m_10overlap.csv")
-DISTRICT = ("pointcloud_25m_25", "pointcloud_centroids_25.csv")
+def test_packs_and_fingerprints_follow_the_poses_of_pandaset(tree, tmp_path):
+    """A heading alone is corrected: points change, while files of scans and positions stay."""
+    root = tree("pandaset")
+    before = open_recording(root, sensor_height=1.8)
+    packed(before, tmp_path / "cache")
+    rows = json.loads((root / "001/lidar/poses.json").read_text())
+    rows[2]["heading"] = dict(w=1.0, x=0, y=0, z=0)
+    write(root / "001/lidar/poses.json", rows)
+    after = open_recording(root, sensor_height=1.8)
+    assert np.abs(after.points(1) - before.points(1)).max() > 1
+    np.testing.assert_array_equal(packed(after, tmp_path / "cache").points(1), after.points(1))
+    assert fingerprint(after) != fingerprint(before)
 
 
-@pytest.mark.parametrize(("folder", "table"), [OXFORD, DISTRICT])
+class Bomb:
+    """What runs when it is unpickled."""
+
+    def __reduce__(self):
+        return (Path.touch, (Path("exploded"),))
+
+
+def test_no_pickle_is_opened(tree, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    root = tree("pandaset")
+    for path in (root / "001/lidar").glob("*.npy"):
+        path.unlink()
+    (root / "001/lidar/00.pkl.gz").write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(
+        ValueError, match=r"expected scans as \.npy, found 3 pickles .* docs/reference/files\.md says how"
+    ):
+        open_recording(root)
+    np.save(root / "001/lidar/00.npy", np.array([Bomb()]), allow_pickle=True)
+    with pytest.raises(ValueError, match=r"00\.npy: expected a readable \.npy file"):
+        open_recording(root, sensor_height=1.8).points(0)
+    assert not Path("exploded").exists()
+
+
+@pytest.mark.parametrize(
+    ("folder", "table"),
+    [
+        ("pointcloud_20m_10overlap", "pointcloud_locations_20m_10overlap.csv"),
+        ("pointcloud_25m_25", "pointcloud_centroids_25.csv"),
+    ],
+)
 def test_submaps_are_refused_with_the_reason(tmp_path, folder, table):
     run = tmp_path / "oxford" / "2014-05-19-13-20-57"
-    (run / folder).mkdir(parents=True)
-    submap = np.random.default_rng(0).uniform(-1, 1, (4096, 3))
-    submap.tofile(run / folder / "1400505794141322.bin")
-    (run / table).write_text("timestamp,northing,easting\n1400505794141322,5735712.8,620084.4\n")
+    write(run / folder / "1400505794141322.bin", np.random.default_rng(0).uniform(-1, 1, (4096, 3)))
+    write(run / table, "timestamp,northing,easting\n1400505794141322,5735712.8,620084.4\n")
     for root in (run / folder, run, run.parent, tmp_path):
         assert recording_names(root) == (run.name,)
         with pytest.raises(ValueError, match=r"expected scans in metres, found submaps .* by an unknown factor"):
             open_recording(root)
+
+
+def test_the_real_layouts(shared):
+    root = shared / "data/kitti_odometry"
+    assert recording_names(root) == ("00", "08")
+    found = open_recording(root, "00")
+    assert (len(found), found.ids[-1], found.pose_source) == (11, "004501", "sequences/00/poses.txt")
+    labelled = [scan for scan, known in zip(found.ids, found.labelled, strict=True) if known]
+    assert labelled == ["000000", "000001", "000002", "000052", "000088", "000850", "004501"]
+    loop = [found.ids.index(name) for name in ("000052", "004501")]
+    assert len(found.points(loop[0])) > 100_000
+    assert np.linalg.norm(np.diff(found.positions[loop], axis=0)) == pytest.approx(3.00, abs=0.01)
+    images = open_recording(shared / "data/kitti_bev", "06")
+    assert images.positions.shape == (1101, 3)
+    image = images.image(500)
+    assert image.shape == (151, 151) and image.max() == pytest.approx(10.0)
+    inner = np.zeros((151, 151), bool)
+    inner[13:138, 13:138] = True  # the renderer's crop at 25 m
+    assert not image[~inner].any()
+
+
+def test_the_real_images_look_along_their_scans(shared):
+    """The image of frame 0 of 00 and a rasterised scan of it, both in eq. 1's orientation, show the same walls."""
+    image = open_recording(shared / "data/kitti_bev", "00").image(0) > 0
+    points = open_recording(shared / "data/kitti_odometry", "00").points(0)
+    points = points[points[:, 2] > -1.2]
+    edges = (np.arange(152) - 75.5) * 0.4
+    occupied = np.histogram2d(-points[:, 1], points[:, 0], bins=[edges, edges])[0] > 0
+    covered = {
+        (turns, mirrored): (occupied & np.rot90(image[::mirrored], turns)).sum() / image.sum()
+        for turns in range(4)
+        for mirrored in (1, -1)
+    }
+    assert max(covered, key=lambda seen: covered[seen]) == (0, 1) and covered[0, 1] > 0.75

@@ -42,8 +42,8 @@ def test_points_and_lines_are_those_of_rosbags(n, frame, kind):
     found = read_custom_msg(RosMessage(raw, cdr=kind == "ros2"))
     np.testing.assert_array_equal(found.points, points)
     np.testing.assert_array_equal(found.lasers, np.arange(n) % 6)
-    assert found.times.name == "offset_time"
-    np.testing.assert_array_equal(found.times.values, 7 * np.arange(n))
+    assert found.time_field.name == "offset_time"
+    np.testing.assert_array_equal(found.time_field.values, 7 * np.arange(n))
     if kind == "ros2":
         swapped = bytes(types.serialize_cdr(message_of(kind, points, frame=frame), name, little_endian=False))
         np.testing.assert_array_equal(read_custom_msg(RosMessage(swapped, cdr=True)).points, points)

@@ -6,9 +6,9 @@ from bags import CLOUD, FILES, cloud, write_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.formats.clouds import TimeField
-from sglpr_jax.data.formats.pcd import pcd_records
+from sglpr_jax.data.formats.scan_files import read_scan_record as pcd_records
 from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.record import TimeField
 from sglpr_jax.data.recording import Record, scan_record
 
 POINTS, EPOCH_S = 200, 1_700_000_000.25
@@ -98,5 +98,5 @@ def test_pcd(tmp_path, encoding):
     path.write_bytes(f"{head}WIDTH {POINTS}\nHEIGHT 1\nPOINTS {POINTS}\nDATA {encoding}\n".encode() + body)
     found = pcd_records(path)
     np.testing.assert_array_equal(found.points, points)
-    np.testing.assert_allclose(found.times.values, EPOCH_S + WITHIN, rtol=1e-15)
+    np.testing.assert_allclose(found.time_field.values, EPOCH_S + WITHIN, rtol=1e-15)
     np.testing.assert_allclose(scan_record(path).point_times, WITHIN, atol=1e-6)

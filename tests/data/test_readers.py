@@ -18,7 +18,7 @@ def names(root):
 
 def open_recording(root, name, options):
     paths = tuple(sorted((root / name).glob("*.bin")))
-    return Recording(name, tuple(p.stem for p in paths), None, None, options.pose_source, paths, scan_record)
+    return Recording(name, tuple(p.stem for p in paths), paths, scan_record, pose_source=options.pose_source)
 
 
 READER = Reader(layout="NN/scans.here (MulRan)", recording_names=names, open=open_recording, rank=3)

@@ -128,7 +128,7 @@ def pack() -> dict[str, bytes]:
         read = dict(zip(paths, clouds, strict=True))
         names = tuple(path.stem for path in paths)
         packed(
-            Recording("08", names, None, None, None, paths, lambda path, *_: Record(points=read[path])),
+            Recording("08", names, paths, lambda path, *_: Record(points=read[path])),
             Path(folder) / "packs",
         )
         return {path.name: path.read_bytes() for path in (Path(folder) / "packs").glob("*/*")}

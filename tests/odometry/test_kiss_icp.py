@@ -9,7 +9,7 @@ import pytest
 from recordings import of_images, of_scans, with_points
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.formats.clouds import TimeField
+from sglpr_jax.data.record import TimeField
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning

@@ -4,48 +4,33 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
 
-from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes
-from sglpr_jax.files import in_short
+from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_record
+from sglpr_jax.data.record import Record
 from sglpr_jax.numpy_files import read_array
 
 NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 """Names of the array with the points in an .npz file with several arrays, in order of preference."""
 
 
-def read_points(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the points (n, 3) of an .npy or .npz file.
+def array_record(path: Path) -> Record:
+    """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields.
 
-    An array has rows of numbers that begin with x, y, z, or records with the fields x, y and z. In an .npz file, it is
-    the first array of `NAMES`, or the only one. Pickled objects are not read.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file contains something else.
+    In an .npz file, they are the first array of `NAMES`, or the only one. Pickled objects are not read. Raises
+    ValueError if the file contains something else; numpy and zlib raise many types for broken files.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a numpy file, found none")
-    try:
-        array = _archived(path) if path.suffix.lower() == ".npz" else _lone(path)
-    except Exception as error:  # numpy, tokenize, zipfile and zlib raise many types for broken files
-        raise ValueError(f"{path}: expected a numpy array, found none ({in_short(error)})") from error
+    array = _archived(path) if path.suffix.lower() == ".npz" else _lone(path)
     if {"x", "y", "z"} <= set(array.dtype.names or ()):
         array = np.stack([array[axis].reshape(-1) for axis in "xyz"], axis=1)
     numbers = array.dtype.kind in "fiu"
     if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not 0 < len(array) <= MOST_POINTS:
-        raise ValueError(
-            f"{path}: expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}"
-        )
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.ascontiguousarray(array[:, :3], dtype=np.float32)
+        raise ValueError(f"expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}")
+    return cloud_record(dict(zip("xyz", array.T, strict=False)))
 
 
 def _lone(path: Path) -> np.ndarray:
-    size = path.stat().st_size
-    check_bytes(size)
     with path.open("rb") as stream:
-        return read_array(stream, size=size)
+        return read_array(stream, size=path.stat().st_size)
 
 
 def _archived(path: Path) -> np.ndarray:

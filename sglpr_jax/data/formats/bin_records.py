@@ -5,6 +5,7 @@ nearly all coordinates are plausible, and if the rows do not differ periodically
 float32x4, for example, only every third row begins with x. If several formats fit, the user has to name one.
 """
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeGuard, get_args
@@ -13,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat
-from sglpr_jax.data.formats.clouds import Records, TimeField, check_points
+from sglpr_jax.data.formats.clouds import check_points
+from sglpr_jax.data.record import Record, TimeField
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import naming
 
@@ -51,19 +53,15 @@ scans."""
 
 
 def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
-    """Detect the format of headerless scans from a few files, spread over the recording.
+    """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
-    Empty and unreadable files are ignored. Fewer than half of the files may be broken. If the record of one format
-    consists of several records of another one that fits, too, it combines several points and does not count.
+    Empty and unreadable files are ignored. Fewer than half of the files may be broken. A format whose record consists
+    of several records of another one that fits does not count. With too few points, the format is None.
 
-    Returns:
-      The format, or None if there are too few points; and a description of how it was detected.
-
-    Raises:
-      ValueError: If no format fits, or several do. The message lists all formats that were tried.
+    Raises ValueError, with all formats that were tried, if no format fits, or several do.
     """
     chosen = _some(paths)
-    if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
+    if not _enough(chosen, "kitti"):
         return None, "too few points to detect it"
     misfits: dict[RecordFormat, str] = {name: _misfit(chosen, name) for name in CANDIDATES}
     fits: list[RecordFormat] = [name for name in CANDIDATES if not misfits[name]]
@@ -84,7 +82,7 @@ def record_of_scan(path: Path) -> RecordFormat:
 
     Raises ValueError if no format fits, or several others do, like `find_record`.
     """
-    return "kitti" if fits_record([path], "kitti") else find_record([path])[0] or "kitti"
+    return "kitti" if _fits_kitti([path]) else find_record([path])[0] or "kitti"
 
 
 def unusual_record(paths: Sequence[Path]) -> RecordFormat | None:
@@ -92,26 +90,27 @@ def unusual_record(paths: Sequence[Path]) -> RecordFormat | None:
 
     Returns None if the scans fit KITTI's format or no single format is detected.
     """
-    if fits_record(paths, "kitti"):
-        return None
-    try:
-        return find_record(paths)[0]
-    except ValueError:
-        return None
+    with contextlib.suppress(ValueError):
+        return None if _fits_kitti(paths) else find_record(paths)[0]
+    return None
 
 
-def fits_record(paths: Sequence[Path], format: RecordFormat) -> bool:
-    """Whether the files look like scans in the given format, or tell nothing."""
+def _fits_kitti(paths: Sequence[Path]) -> bool:
+    """Whether the files look like scans in KITTI's format, or tell nothing."""
     chosen = _some(paths)
-    return not chosen or not _misfit(chosen, format)
+    return not chosen or not _misfit(chosen, "kitti")
 
 
 def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
     """Warn if the files have enough points and do not look like scans in the given format."""
     chosen = _some(paths)
-    enough = sum(path.stat().st_size for path in chosen) >= FEWEST * record_type(format).itemsize
-    if enough and (misfit := _misfit(chosen, format)):
+    if _enough(chosen, format) and (misfit := _misfit(chosen, format)):
         warn(f"{paths[0].parent}: expected scans of {described(format)}, found {misfit}")
+
+
+def _enough(paths: Sequence[Path], format: RecordFormat) -> bool:
+    """Whether the files have enough points to judge a format."""
+    return sum(path.stat().st_size for path in paths) >= FEWEST * record_type(format).itemsize
 
 
 def _some(paths: Sequence[Path]) -> list[Path]:
@@ -126,7 +125,7 @@ def _misfit(paths: Sequence[Path], format: RecordFormat) -> str:
     for path in paths:
         try:
             with np.errstate(invalid="ignore"):  # of numbers of another type
-                points = read_records(path, format).points[:MOST].astype(np.float64)
+                points = read_records(path, format).cloud[:MOST].astype(np.float64)
         except (OSError, ValueError):
             reasons.append(f"a size that is not a multiple of {width} bytes, or an unreadable file")
             continue
@@ -208,19 +207,10 @@ def described(format: RecordFormat) -> str:
     return f"{format} ({record_type(format).itemsize} bytes a point)"
 
 
-def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Records:
-    """Read a file of records.
+def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Record:
+    """Read a file of records. With `last_is_time`, the last column is the time of the point.
 
-    Arguments:
-      path: The file.
-      format: Format of one point.
-      last_is_time: Whether the last of the columns after x, y, z is the time of the point.
-
-    Raises:
-      ValueError: If the file is empty or too large, or its size is not a multiple of the record size.
-
-    Example:
-      points = read_records(path, "float32x6").points
+    Raises ValueError if the file is empty or too large, or its size is not a multiple of the record size.
     """
     dtype = record_type(format)
     size = path.stat().st_size
@@ -242,4 +232,4 @@ def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False
         elif format == "nclt":
             xyz = (xyz.astype(np.float64) * NCLT_UNIT_M + NCLT_OFFSET_M) * Z_UP_FROM_Z_DOWN
         # Column-major order: the copy takes half the time, and later steps work along the axes.
-        return Records(np.asfortranarray(xyz, dtype=np.float32), lasers, times)
+        return Record(points=np.asfortranarray(xyz, dtype=np.float32), lasers=lasers, time_field=times)

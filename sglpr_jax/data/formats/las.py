@@ -8,8 +8,8 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float64
 
-from sglpr_jax.data.formats.clouds import BLOCK_POINTS, Records, check_points, records_of, time_field_of
-from sglpr_jax.files import in_short, naming
+from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_record
+from sglpr_jax.data.record import Record, time_field_of
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
 """Minimum size of a variable-length record before and after the points, in bytes."""
@@ -17,59 +17,37 @@ _COMPRESSED = 0x80
 """Bit of the point format in the header of a .laz file."""
 
 
-def las_records(path: Path) -> Records:
-    """Return the points of a .las file in metres, scaled by the header, and their times. The axes are not changed.
+def las_record(path: Path) -> Record:
+    """Read the points of a .las file in metres, scaled by the header, and their times. The axes are not changed.
 
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ImportError: If the extra `las` is not installed.
-      ValueError: If the file is not a readable .las file, is truncated, or has no points.
+    Raises ImportError without the extra `las`. laspy raises many types of errors for damaged files.
     """
-    laspy = _laspy(path, one_scan=True)
-    try:
-        with laspy.open(path) as stream:
-            found = stream.read()
-        time = time_field_of(list(found.point_format.dimension_names))
-        columns = [np.asarray(axis) for axis in (found.x, found.y, found.z, *([] if time is None else [found[time]]))]
-        return records_of(columns, time)
-    except Exception as error:  # laspy raises struct.error, MemoryError and others
-        raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
+    with _laspy(path, one_scan=True).open(path) as stream:
+        found = stream.read()
+    time = time_field_of(list(found.point_format.dimension_names))
+    columns = {"x": found.x, "y": found.y, "z": found.z} | ({} if time is None else {time: found[time]})
+    return cloud_record({name: np.asarray(column) for name, column in columns.items()}, time=time)
 
 
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the points of a .las or .laz file of any size in parts, in metres, scaled by the header.
-
-    Raises the errors of `las_records`, and ImportError if a .laz file is given and lazrs is not installed.
-    """
+    """Yield the points of a .las or .laz file of any size in parts. .laz files need lazrs."""
     laspy = _laspy(path, one_scan=False)
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
-        raise ImportError(f"{path}: .laz files need lazrs (pip install 'sglpr-jax[las]')")
-    try:
-        with laspy.open(path) as stream:
-            for block in stream.chunk_iterator(BLOCK_POINTS):
-                yield np.stack([np.asarray(axis, np.float64) for axis in (block.x, block.y, block.z)], axis=1)
-    except Exception as error:  # laspy and lazrs raise many types
-        raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
+        raise ImportError(".laz files need lazrs (pip install 'sglpr-jax[las]')")
+    with laspy.open(path) as stream:
+        for block in stream.chunk_iterator(BLOCK_POINTS):
+            yield np.stack([np.asarray(axis, np.float64) for axis in (block.x, block.y, block.z)], axis=1)
 
 
 def _laspy(path: Path, *, one_scan: bool) -> ModuleType:
-    """The library, after a check of the sizes in the header. Raises ImportError without the extra."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a .las file, found none")
+    """The library, after a check of the sizes in the header. laspy would read 2**32 missing records.
+
+    Raises ValueError if the file is shorter than its header declares, or larger than a scan if it is one.
+    """
     try:
         import laspy
     except ImportError as error:
-        raise ImportError(f"{path}: .las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
-    with naming(path):
-        _check_sizes(path, one_scan=one_scan)
-    return laspy
-
-
-def _check_sizes(path: Path, *, one_scan: bool) -> None:
-    """Raise ValueError if the file is shorter than its header declares, or larger than a scan if it is one.
-
-    laspy would read 2**32 missing records.
-    """
+        raise ImportError(".las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
     size = path.stat().st_size
     with path.open("rb") as stream:
         header = stream.read(375).ljust(375, b"\0")
@@ -88,3 +66,4 @@ def _check_sizes(path: Path, *, one_scan: bool) -> None:
     # The size of compressed points is not known. Versions from 1.3 on may have records behind the points.
     if not kind & _COMPRESSED and (points > held or (points < held and header[25] < 3)):
         raise ValueError(f"expected {points} points by the header, found {held}")
+    return laspy

@@ -9,18 +9,16 @@ import numpy as np
 from jaxtyping import Float64
 
 from sglpr_jax.data.formats.clouds import (
-    Records,
     blocks_of,
     check_points,
-    mapped_content,
+    cloud_record,
+    mapped,
     number_rows,
     packed_type,
-    read_content,
-    records_of,
     text_lines,
-    time_field_of,
     whole_number,
 )
+from sglpr_jax.data.record import Record, time_field_of
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -38,11 +36,6 @@ class _Element(NamedTuple):
     """Number of instances in the file."""
     properties: list[tuple[str, str]]
     """Name and type of each property. The type of a list begins with "list"."""
-
-    @property
-    def is_list(self) -> bool:
-        """Whether the size of an instance varies."""
-        return any(kind.startswith("list ") for _, kind in self.properties)
 
     def fields(self, order: str) -> list[tuple[str, str, int]]:
         """Name, numpy type and size of each property. Raises ValueError if one is not a number."""
@@ -65,33 +58,25 @@ class _Header(NamedTuple):
     behind: list[_Element]
 
 
-def ply_records(path: Path) -> Records:
-    """Return the vertices of a .ply file and their times, NaN included. The axes are not changed.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the header, the properties or the number of points are invalid.
-    """
-    try:
-        return _decode(read_content(path))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected a readable .ply file, found an invalid one: {error}") from error
+def ply_record(path: Path) -> Record:
+    """Decode the vertices of a file. Raises ValueError if the header, the properties or the points are invalid."""
+    header, body = _split(path.read_bytes())
+    properties = [name for name, _ in header.vertices.properties]
+    time = time_field_of([name for name in properties if properties.count(name) == 1])
+    check_points(header.vertices.count, bytes_each=sum(size for _, _, size in header.vertices.fields("<")))
+    if header.order:
+        return cloud_record(_binary_records(header, body, ("x", "y", "z", *([time] if time else []))), time=time)
+    rows = _text_rows(header, bytes(body))
+    return cloud_record({name: rows[:, properties.index(name)] for name in properties}, time=time)
 
 
 def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the vertices of a .ply file in parts. The file may have any size if it is binary.
-
-    Raises ValueError if the file is invalid, or is in text and exceeds the size of a scan.
-    """
-    try:
-        content = mapped_content(path)
-        header, body = _split(content)
-        if header.order:
-            yield from blocks_of(_binary_records(header, body, "xyz"))
-        else:
-            yield _decode(content).points.astype(np.float64)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected a .ply file of a map, preferably binary, found {error}") from error
+    """Yield the vertices in parts. The file may have any size if it is binary. Raises ValueError as above."""
+    header, body = _split(mapped(path))
+    if header.order:
+        yield from blocks_of(_binary_records(header, body, "xyz"))
+    else:
+        yield ply_record(path).cloud.astype(np.float64)
 
 
 def _split(content: bytes | memoryview) -> tuple[_Header, bytes | memoryview]:
@@ -132,25 +117,13 @@ def _parse_header(lines: Sequence[str]) -> _Header:
     return _Header(_ORDERS[orders[0]], elements[:at], elements[at], elements[at + 1 :])
 
 
-def _decode(content: bytes | memoryview) -> Records:
-    header, body = _split(content)
-    properties = [name for name, _ in header.vertices.properties]
-    time = time_field_of([name for name in properties if properties.count(name) == 1])
-    names = (*"xyz", *([] if time is None else [time]))
-    check_points(header.vertices.count, bytes_each=sum(size for _, _, size in header.vertices.fields("<")))
-    if header.order:
-        records = _binary_records(header, body, names)
-        return records_of([records[name] for name in names], time)
-    rows = _text_rows(header, bytes(body))
-    return records_of([rows[:, properties.index(name)] for name in names], time)
-
-
 def _binary_records(header: _Header, body: bytes | memoryview, names: Sequence[str]) -> np.ndarray:
     record = packed_type(header.vertices.fields(header.order), names)
     body = body[sum(element.bytes for element in header.before) :]
     if len(body) < header.vertices.bytes:
         raise ValueError(f"expected {header.vertices.count} points of {record.itemsize} bytes, found {len(body)} bytes")
-    if not any(element.is_list for element in header.behind):  # the size of lists is not known
+    lists = [kind for element in header.behind for _, kind in element.properties if kind.startswith("list ")]
+    if not lists:  # their size is not known
         _check_end(len(body), header.vertices.bytes + sum(element.bytes for element in header.behind), unit="bytes")
     return np.frombuffer(body, record, count=header.vertices.count)
 

@@ -19,15 +19,9 @@ LARGEST_SIDE = 1 << 13
 
 
 def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
-    """Return an image (h, w) in the orientation of eq. 1.
+    """Return a greyscale image of 8 or 16 bits per pixel in the orientation of eq. 1.
 
-    Arguments:
-      path: PNG file.
-      bits: Bits per pixel, 8 or 16.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file is not a complete greyscale image with this number of bits.
+    Raises FileNotFoundError, or ValueError if the file is not a complete greyscale image with this number of bits.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an image, found none")
@@ -49,15 +43,9 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
 
 
 def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
-    """Return the raw ids (h, w) in the orientation of eq. 1.
+    """Return the raw ids (h, w) of a 16-bit label image in the orientation of eq. 1.
 
-    Arguments:
-      path: Label image.
-      shape: Expected shape (h, w), that of the BEV image.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file is not a complete 16-bit greyscale image, has another shape, or contains unknown ids.
+    Raises the errors of `read_grey_png`, and ValueError if the image has another shape (h, w) or unknown ids.
     """
     raw = read_grey_png(path, bits=16).astype(np.int32)
     if raw.shape != shape:

@@ -1,7 +1,7 @@
 """Reads text files with one row of numbers per frame: poses (KITTI, TUM, csv) and timestamps."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +13,7 @@ from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.times import ADVICE, times_of
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value
-from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations
+from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations, from_quaternions
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
@@ -36,9 +36,7 @@ TIMES_FILE = "times.txt"
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
     """Return the poses (n, 3, 4) of a file with 12 numbers a line: rotation and translation in metres, row-major.
 
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If a line does not have 12 finite numbers or is not a pose. The message names the first one.
+    Raises FileNotFoundError, or ValueError, with the line or row, if a line does not have 12 finite numbers or a pose.
     """
     poses = read_rows(path, columns=12).reshape(-1, 3, 4)
     wrong = np.flatnonzero(~are_rotations(poses[:, :, :3]))
@@ -53,10 +51,8 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
     """Raise ValueError if a coordinate exceeds `FARTHEST_M`. The message names its row in `path`."""
     far = np.flatnonzero(np.abs(positions).max(axis=1, initial=0) > FARTHEST_M)
     if far.size:
-        raise ValueError(
-            f"{path}: expected positions in metres, up to {FARTHEST_M:g}, found {positions[far[0]].tolist()} in row "
-            f"{far[0] + 1}"
-        )
+        found = f"{positions[far[0]].tolist()} in row {far[0] + 1}"
+        raise ValueError(f"{path}: expected positions in metres, up to {FARTHEST_M:g}, found {found}")
 
 
 def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
@@ -64,23 +60,19 @@ def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.
 
     Raises ValueError if a quaternion does not have length 1. The message names its row in `path`.
     """
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
-
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
     if wrong.size:
         found = " ".join(f"{value:g}" for value in quaternions[wrong[0]])
         raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
-    return Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3) if len(quaternions) else np.zeros((0, 3, 3))
+    return from_quaternions(np.zeros((len(quaternions), 3)), quaternions)[:, :3, :3]
 
 
 def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
-    """Return the times (n,) in seconds of a file with one number a line. Warns and returns None for row numbers.
+    """Return the times in seconds of a file with one number a line. Warns and returns None for row numbers.
 
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If a line is not a finite number, or `times_of` fails. The message names the line or row.
+    Raises FileNotFoundError, or ValueError, with the line or row, if a line is not a number or `times_of` fails.
     """
     times = times_of(read_rows(path, columns=1)[:, 0], source=path, unit=unit)
     if times is None:
@@ -93,9 +85,7 @@ def read_tum(
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
     """Read the poses of a TUM file (`time x y z qx qy qz qw`), and their times in seconds or None (`times_of`).
 
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If a line is invalid. The message names the line or row.
+    Raises FileNotFoundError, or ValueError, with the line or row, if a line is invalid.
     """
     rows = read_rows(path, columns=8)
     times = times_of(rows[:, 0], source=path, unit=time_unit)
@@ -114,15 +104,9 @@ def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]
 
 
 def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
-    """Return the row of each frame in a file. Frame "000052" is row 52.
+    """Return the row of each frame in a file with a number of `rows`. Frame "000052" is row 52.
 
-    Arguments:
-      ids: Names of the frames.
-      rows: Number of rows in the file.
-      path: Path of the file, for messages.
-
-    Raises:
-      ValueError: If an id is not a number, or the file has too few rows.
+    Raises ValueError if an id is not a number, or the file has too few rows.
     """
     strange = [name for name in ids if not name.isdecimal()]
     if strange:
@@ -138,15 +122,8 @@ def read_rows(
 ) -> Float[np.ndarray, "n {columns}"]:
     """Return the numbers (n, columns) of a text file with one row a line. Lines that start with # are skipped.
 
-    Arguments:
-      path: Text file.
-      columns: Number of columns.
-      header_lines: Number of header lines to skip.
-      separator: Separator of the columns. By default, white space.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If a line does not have `columns` finite numbers. The message names the first one.
+    The first `header_lines` are skipped, too. Columns are separated by white space or by `separator`. Raises
+    FileNotFoundError, or ValueError for the first line that does not have `columns` finite numbers.
     """
     if not path.is_file():
         raise FileNotFoundError(
@@ -204,6 +181,15 @@ class Trajectory:
         return poses_of(self.positions, self.rotations)
 
 
+FORMATS: dict[str, tuple[str, Callable[[Path, TimeUnit], tuple[np.ndarray, np.ndarray | None]]]] = {
+    "kitti": ("camera", lambda path, unit: (read_kitti(path), None)),
+    "lidar": ("z up", lambda path, unit: (read_kitti(path, camera=False), None)),
+    "tum": ("TUM", lambda path, unit: read_tum(path, time_unit=unit)),
+    "csv": ("csv", lambda path, unit: _read_csv(path, unit)),
+}
+"""Description of each format, and a function that reads poses and times. csv has no rotations."""
+
+
 def read_trajectory(
     path: Path,
     *,
@@ -219,27 +205,28 @@ def read_trajectory(
       format: Format of the pose file. "auto" recognises csv by its ending and tum by its 8 numbers a line.
       times: File of timestamps, one number a line. They replace the times of the pose file.
       time_unit: Unit of the times in both files (`times_of`).
-      twelve_numbers: Format of files with 12 numbers a line, for "auto". It cannot be detected, and horizontal
-        distances depend on it.
+      twelve_numbers: Format of files with 12 numbers a line, for "auto". It cannot be detected.
 
-    Raises:
-      FileNotFoundError: If a file does not exist.
-      ValueError: If a file is malformed or empty, the numbers of poses and times differ, or "auto" cannot determine the
-        format.
+    Raises FileNotFoundError, or ValueError if a file is malformed, or "auto" cannot determine the format.
     """
     check_value(format, PoseFormat, f"{path}, format")
     check_value(time_unit, TimeUnit, f"{path}, time_unit")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a pose file, found none")
     unit = "s" if times is not None and time_unit == "auto" else time_unit  # times that are replaced are not judged
-    trajectory = _read(path, _format_of(path, twelve_numbers) if format == "auto" else format, unit)
-    if len(trajectory.positions) == 0:
+    known = _format_of(path, twelve_numbers) if format == "auto" else format
+    said, read = FORMATS[known]
+    poses, clock = read(path, unit)
+    positions = poses[:, :3, 3]
+    if not len(positions):
         raise ValueError(f"{path}: expected at least one pose, found none")
-    check_height(trajectory.positions, path=path)
-    if times is None:
-        return trajectory
-    clock = read_times(times, unit=time_unit)
-    if clock is not None and len(clock) != len(trajectory.positions):
-        raise ValueError(f"{times}: expected {len(trajectory.positions)} times, one per pose, found {len(clock)}")
-    return replace(trajectory, times=clock, by_row=True)
+    check_height(positions, path=path)
+    if times is not None:
+        clock = read_times(times, unit=time_unit)
+        if clock is not None and len(clock) != len(positions):
+            raise ValueError(f"{times}: expected {len(positions)} times, one per pose, found {len(clock)}")
+    rotations, source = None if known == "csv" else poses[:, :3, :3], f"{Path(*path.parts[-2:])} ({said})"
+    return Trajectory(positions, clock, source, times is not None, rotations)
 
 
 def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
@@ -274,8 +261,6 @@ def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path
 
 def _format_of(path: Path, twelve_numbers: str | None) -> str:
     """Return the format by the ending or the first line."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a pose file, found none")
     if path.suffix == ".csv":
         return "csv"
     columns = columns_of(path)
@@ -291,26 +276,13 @@ def _format_of(path: Path, twelve_numbers: str | None) -> str:
     return "tum"
 
 
-def _read(path: Path, format: str, unit: TimeUnit) -> Trajectory:
-    place = Path(*path.parts[-2:])  # for tables
-    if format == "csv":
-        return Trajectory(*_read_csv(path, unit), f"{place} (csv)")
-    poses, times = (
-        read_tum(path, time_unit=unit) if format == "tum" else (read_kitti(path, camera=format == "kitti"), None)
-    )
-    said = {"tum": "TUM", "kitti": "camera", "lidar": "z up"}[format]
-    return Trajectory(poses[:, :3, 3], times, f"{place} ({said})", rotations=poses[:, :3, :3])
-
-
-def _read_csv(path: Path, unit: TimeUnit) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"] | None]:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a pose file, found none")
+def _read_csv(path: Path, unit: TimeUnit) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
     names, clock = _header(path)
     columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
     times = None if clock is None else times_of(columns[clock], source=path, unit=unit)
     positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
     check_positions(path, positions)
-    return positions, times
+    return poses_of(positions), times
 
 
 def _header(path: Path) -> tuple[list[str], str | None]:
@@ -339,26 +311,21 @@ def folder_trajectory(
     times: Path | None = None,
     time_unit: TimeUnit = "auto",
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
-    """Read the positions and times of the scans in a plain folder.
+    """Read positions (n, 3) in metres, times in seconds and a description of the pose source; each is None if unknown.
 
-    If the poses have other times than the scans, or another number of rows, they are interpolated (`poses_at_scans`).
+    Poses with other times than the scans, or another number of rows, are interpolated (`poses_at_scans`).
 
     Arguments:
       root: Folder of the scans.
       scans: Number of scans.
-      poses: Pose file. By default, the file of `POSE_FILES` beside the scans. In a file beside the scans, 12 numbers a
-        line are poses of the LiDAR, z up.
+      poses: Pose file. By default, the file of `POSE_FILES` beside the scans, where 12 numbers a line are z up.
       pose_format: Format of the pose file.
       times: File of timestamps. By default, `TIMES_FILE` beside the scans, or else the times of the poses.
-      time_unit: Unit of the times in both files. With "auto", row numbers are not times (`times_of`).
-
-    Returns:
-      Positions in metres, times in seconds, and a description of the pose source. Each is `None` if unknown.
+      time_unit: Unit of the times in both files.
 
     Raises:
       FileNotFoundError: If `poses` or `times` does not exist.
-      ValueError: If the folder has several pose files, a file is malformed, `times` has another number of rows, or a
-        scan has no pose.
+      ValueError: If there are several pose files, a file is malformed, or a scan has no time or no pose.
     """
     beside = [root / name for name in POSE_FILES if (root / name).is_file()]
     if poses is None and len(beside) > 1:

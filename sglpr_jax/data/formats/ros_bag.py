@@ -1,30 +1,32 @@
 """Reads bags of ROS 1 and ROS 2 with rosbags (extra `ros`): topics, times, clouds, poses and IMU."""
 
+import contextlib
 import itertools
 import threading
 import weakref
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.formats.ros_messages import (
     CUSTOM_MSG,
     POINT,
     POSES,
     TRANSFORMS,
-    ImuMessages,
     RosMessage,
     Stamps,
     Track,
     described_fields,
     read_custom_msg,
+    read_imu,
     read_point_cloud2,
     read_transforms,
     tracks_of,
 )
+from sglpr_jax.data.imu import Imu
+from sglpr_jax.data.record import Record
 from sglpr_jax.files import in_short
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
@@ -34,10 +36,14 @@ METADATA = "metadata.yaml"
 COMPRESSED = (".db3.zstd", ".mcap.zstd")
 """Endings of compressed files, which only their metadata describe."""
 REINDEX = "ros2 bag reindex writes it"
+T = TypeVar("T")
 
 
 class RosBag:
-    """An open bag. It is closed when the object is garbage-collected."""
+    """An open bag. It is closed when the object is garbage-collected.
+
+    Each method that reads messages raises ValueError if the bag is broken.
+    """
 
     def __init__(self, paths: Sequence[Path]):
         self.paths = tuple(paths)
@@ -77,45 +83,40 @@ class RosBag:
             )
         return clouds
 
-    def imu(self, topic: str) -> ImuMessages:
-        """Read the messages of an IMU topic, in one pass over the bag. Raises ValueError if the bag is broken."""
-        with self._lock, _broken(self.paths[0]):
-            return ImuMessages.of(self._messages(topic))
+    def imu(self, topic: str) -> tuple[Stamps, str, Imu]:
+        """Read the messages of an IMU topic in one pass over the bag (`read_imu`)."""
+        return self._read(topic, read_imu)
 
     def stamps(self, topic: str) -> Stamps:
-        """Read the timestamps of a topic, in one pass over the bag. Raises ValueError if the bag is broken."""
-        with self._lock, _broken(self.paths[0]):
-            found = [(time, message.header().time) for time, message in self._messages(topic)]
+        """Read the timestamps of a topic in one pass over the bag."""
+        found = self._read(topic, lambda messages: [(time, message.header().time) for time, message in messages])
         return Stamps(np.array([time for time, _ in found], np.int64), np.array([time for _, time in found], float))
 
     def track(self, topic: str) -> Track:
-        """Read the poses of a pose topic, in one pass over the bag. Poses with non-finite positions are dropped."""
+        """Read the poses of a pose topic in one pass over the bag."""
         read = POSES[self.topics[topic]]
-        with self._lock, _broken(self.paths[0]):
-            return Track.of((time, read(message)) for time, message in self._messages(topic))
+        return self._read(topic, lambda messages: Track.of((time, read(message)) for time, message in messages))
 
     def transforms(self) -> list[Track]:
         """Read the tf transforms: the poses of each frame in its parent frame. Needs one pass for each tf topic."""
-        with self._lock, _broken(self.paths[0]):
-            messages = [pair for topic in self.topics_of(TRANSFORMS) for pair in self._messages(topic)]
-            return tracks_of((time, pose) for time, message in messages for pose in read_transforms(message))
+        return tracks_of(
+            (time, pose)
+            for topic in self.topics_of(TRANSFORMS)
+            for time, poses in self._read(topic, lambda found: [(t, [*read_transforms(one)]) for t, one in found])
+            for pose in poses
+        )
 
     def frame(self, topic: str, time: int) -> str:
         """Return the frame in the header of the message recorded at `time` (ns)."""
-        with self._lock, _broken(self.paths[0]):
-            return next(self._messages(topic, time))[1].header().frame
+        return self._read(topic, lambda messages: next(messages)[1].header().frame, time)
 
-    def cloud(self, topic: str, time: int, nth: int) -> Records:
-        """Return the `nth` cloud among those of a topic recorded at `time` (ns).
-
-        Raises ValueError if the bag or the cloud is broken, or the cloud is empty.
-        """
+    def cloud(self, topic: str, time: int, nth: int) -> Record:
+        """Return the `nth` cloud among those of a topic recorded at `time` (ns). Raises ValueError if it is empty."""
         livox = self.topics[topic] in CUSTOM_MSG
-        with self._lock, _broken(self.paths[0]):
-            if livox:
-                message = next(itertools.islice(self._messages(topic, time), nth, None))[1]
-            else:
-                message = self._point_cloud2(topic, time, nth)
+        if livox:
+            message = self._read(topic, lambda found: next(itertools.islice(found, nth, None))[1], time)
+        else:
+            message = self._point_cloud2(topic, time, nth)
         try:
             return read_custom_msg(message) if livox else read_point_cloud2(message, name=str(self.paths[0]))
         except Exception as error:  # the bag defines the types and names of the fields
@@ -127,14 +128,15 @@ class RosBag:
         """Return a description of the fields of a cloud."""
         if self.topics[topic] in CUSTOM_MSG:
             return f"Livox, {' '.join(POINT)}"
+        return described_fields(self._point_cloud2(topic, time, 0))
+
+    def _read(self, topic: str, decode: Callable[[Iterator[tuple[int, RosMessage]]], T], time: int | None = None) -> T:
+        """Decode the messages of a topic with their times (ns), or only those recorded at one time."""
         with self._lock, _broken(self.paths[0]):
-            return described_fields(self._point_cloud2(topic, time, 0))
+            return decode(self._messages(topic, time))
 
-    def _messages(self, topic: str, time: int | None = None) -> Iterator[tuple[int, RosMessage]]:
-        """Messages of a topic, or only those recorded at one time (ns), with their times.
-
-        Raises ValueError after the last message if the bag declares more.
-        """
+    def _messages(self, topic: str, time: int | None) -> Iterator[tuple[int, RosMessage]]:
+        """Messages with their times. Raises ValueError after the last message if the bag declares more."""
         found = 0
         for _, recorded, raw in self._raw(topic, time):
             found += 1
@@ -151,25 +153,22 @@ class RosBag:
         return [connection for connection in self._reader.connections if connection.topic == topic]
 
     def _point_cloud2(self, topic: str, time: int, nth: int) -> Any:
-        connection, _, raw = next(itertools.islice(self._raw(topic, time), nth, None))
-        return self._reader.deserialize(raw, connection.msgtype)
+        with self._lock, _broken(self.paths[0]):
+            connection, _, raw = next(itertools.islice(self._raw(topic, time), nth, None))
+            return self._reader.deserialize(raw, connection.msgtype)
 
 
-class _broken:
-    """Converts exceptions of rosbags to a ValueError that names the bag."""
-
-    def __init__(self, path: Path):
-        self._path = path
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, Exception) and not isinstance(error, ImportError | FileNotFoundError):
-            raise ValueError(
-                f"{self._path}: expected an intact ROS bag, found a broken one ({in_short(error)})"
-                f"{_about_metadata(self._path)}"
-            ) from error
+@contextlib.contextmanager
+def _broken(path: Path) -> Iterator[None]:
+    """Convert exceptions of rosbags to a ValueError that names the bag."""
+    try:
+        yield
+    except (ImportError, FileNotFoundError):
+        raise
+    except Exception as error:
+        raise ValueError(
+            f"{path}: expected an intact ROS bag, found a broken one ({in_short(error)}){_about_metadata(path)}"
+        ) from error
 
 
 def _about_metadata(path: Path) -> str:

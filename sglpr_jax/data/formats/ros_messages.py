@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.clouds import TIME_FIELDS, Records, TimeField, check_points, time_field_of
-from sglpr_jax.data.poses import interpolate
+from sglpr_jax.data.formats.clouds import check_points, cloud_record
+from sglpr_jax.data.imu import Imu
+from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
+from sglpr_jax.data.record import TIME_FIELDS, Record, time_field_of
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
 from sglpr_jax.se3 import from_quaternions
@@ -25,18 +27,8 @@ _LEAST_M, _MOST_M = 1e-3, 1e4
 _LASERS = ("ring", "channel", "line", "laser_id", "laser")
 """Field names that drivers use for the laser number of a point."""
 CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-POINT = {
-    "offset_time": "u4",
-    "x": "f4",
-    "y": "f4",
-    "z": "f4",
-    "reflectivity": "u1",
-    "tag": "u1",
-    "line": "u1",
-}
+POINT = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 """Fields of a point, and their numpy types."""
-LEAST_SHARE = 0.5
-"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
 UNIT = 0.01
 """Maximum deviation of the length of a quaternion from 1."""
 IMU = "sensor_msgs/msg/Imu"
@@ -98,19 +90,12 @@ class RosMessage:
         return found
 
 
-def read_point_cloud2(message: Any, *, name: str = "cloud") -> Records:
-    """Return the points (n, 3) in the axes of the message, and their lasers and times if the message has such fields.
+def read_point_cloud2(message: Any, *, name: str = "cloud") -> Record:
+    """Return the points in the axes of a sensor_msgs/PointCloud2, and their lasers and times if it has such fields.
 
     Some drivers set `is_bigendian` for little-endian data. If only the little-endian numbers are metres, they are
-    returned, with a warning.
-
-    Arguments:
-      message: Object with the attributes of sensor_msgs/PointCloud2.
-      name: Name of the message for the warning.
-
-    Raises:
-      ValueError: If x, y or z is missing or not numeric, or the data is shorter than its width, height and steps
-        require.
+    returned, with a warning that begins with `name`. Raises ValueError if x, y or z is missing or the data is too
+    short.
     """
     data = _point_bytes(message)
     records = data.view(_record(message, ">" if message.is_bigendian else "<"))
@@ -120,11 +105,8 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Records:
             warn(f"{name}: expected big-endian points, as is_bigendian states, found little-endian points")
             records = others
     names = records.dtype.names or ()
-    laser, time = next((field for field in _LASERS if field in names), None), time_field_of(names)
-    times = None if time is None else TimeField(time, records[time].copy())
-    with np.errstate(over="ignore", invalid="ignore"):
-        points = np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
-        return Records(points, None if laser is None else records[laser].astype(np.int32), times)
+    laser = next((field for field in _LASERS if field in names), None)
+    return cloud_record(records, time=time_field_of(names), laser=laser)
 
 
 def described_fields(message: Any) -> str:
@@ -159,34 +141,25 @@ def _record(message: Any, order: str) -> np.dtype:
     types = [_TYPES.get(fields[name].datatype) for name in wanted]
     if None in types:
         raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in wanted]}")
+    formats, offsets = [f"{order}{kind}" for kind in types], [fields[name].offset for name in wanted]
     try:
-        return np.dtype(
-            {
-                "names": wanted,
-                "formats": [f"{order}{kind}" for kind in types],
-                "offsets": [fields[name].offset for name in wanted],
-                "itemsize": message.point_step,
-            }
-        )
+        return np.dtype({"names": wanted, "formats": formats, "offsets": offsets, "itemsize": message.point_step})
     except (ValueError, OverflowError) as error:
         raise ValueError(f"expected fields within {message.point_step} bytes, found others ({error})") from error
 
 
-def read_custom_msg(message: RosMessage) -> Records:
-    """Return the points (n, 3) in the axes of the message, their line numbers and their times.
+def read_custom_msg(message: RosMessage) -> Record:
+    """Return the points in the axes of the message, their line numbers and their times.
 
-    Raises:
-      ValueError: If the message is truncated or has no points.
+    Raises ValueError if the message is truncated or has no points.
     """
     message.header()
-    message.numbers("u8")
-    message.numbers("u4")
-    message.numbers("u1", 4)
+    for kind, count in (("u8", 1), ("u4", 1), ("u1", 4)):  # time base, number of points, LiDAR and reserved bytes
+        message.numbers(kind, count)
     points = message.records(POINT)
     if not len(points):
         raise ValueError("expected at least one point, found none")
-    xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    return Records(xyz, points["line"].astype(np.int32), TimeField("offset_time", points["offset_time"].copy()))
+    return cloud_record(points, time="offset_time", laser="line")
 
 
 class StampedPose(NamedTuple):
@@ -289,7 +262,14 @@ class Track:
     @property
     def turned(self) -> bool:
         """Whether the quaternions are valid rotations that change. A GPS receiver writes zeros or a constant."""
-        return bool(len(self) and are_unit(self.quaternions).all() and np.ptp(self.quaternions, axis=0).any())
+        return _turn(self.quaternions)
+
+    @property
+    def poses(self) -> Float[np.ndarray, "n 4 4"]:
+        """Poses, with identity rotations if not all quaternions are valid."""
+        if are_unit(self.quaternions).all():
+            return from_quaternions(self.positions, self.quaternions)
+        return poses_of(self.positions)
 
     @property
     def moves(self) -> bool:
@@ -308,6 +288,11 @@ def are_unit(quaternions: ArrayLike) -> Bool[np.ndarray, " n"]:
         return np.abs(lengths - 1) <= UNIT
 
 
+def _turn(quaternions: Float[np.ndarray, "n 4"]) -> bool:
+    """Whether the quaternions are valid rotations that change."""
+    return bool(len(quaternions) and are_unit(quaternions).all() and np.ptp(quaternions, axis=0).any())
+
+
 def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
     """Group tf transforms into one track for each pair of child and parent frame."""
     found: dict[tuple[str, str], list[tuple[int, StampedPose]]] = defaultdict(list)
@@ -319,10 +304,8 @@ def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
 
 def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
     """Times of messages and of scans in seconds: header times, or recorder times if the headers do not overlap."""
-    if scans.orderly and stamps.orderly:
-        own = interpolate(stamps.own, np.zeros((len(stamps.own), 3)), scans.own)
-        if own.kept.mean() >= LEAST_SHARE:
-            return stamps.own, scans.own
+    if scans.orderly and stamps.orderly and have_poses(stamps.own, scans.own).mean() >= LEAST_SHARE:
+        return stamps.own, scans.own
     return stamps.recorded / 1e9, scans.recorded / 1e9
 
 
@@ -330,8 +313,8 @@ def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np
     """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
     steps: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:
-        if len(track) and not track.moves and abs(np.linalg.norm(track.quaternions[0]) - 1) <= UNIT:
-            frame_from_child = from_quaternions(track.positions[:1], track.quaternions[:1])[0]
+        if len(track) and not track.moves and are_unit(track.quaternions[0]).all():
+            frame_from_child = track.poses[0]
             steps[track.frame].append((track.child, frame_from_child))
             steps[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
     reached, queue = {frame: np.eye(4)}, [frame]
@@ -343,31 +326,20 @@ def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np
     return reached.get(other)
 
 
-class ImuMessages(NamedTuple):
-    """Messages of an IMU."""
+def read_imu(messages: Iterable[tuple[int, RosMessage]]) -> tuple[Stamps, str, Imu]:
+    """Decode timestamps, frame and samples of an IMU from its messages and the times (ns) of their recorder.
 
-    stamps: Stamps
-    frame: str
-    """Frame of the IMU."""
-    rates: Float[np.ndarray, "n 3"]
-    """Angular velocities, in radians per second."""
-    accelerations: Float[np.ndarray, "n 3"]
-    """Accelerations, in m/s^2 or in multiples of gravity."""
-    quaternions: Float[np.ndarray, "n 4"] | None
-    """Orientations x, y, z, w, or None if the messages have none."""
-
-    @classmethod
-    def of(cls, messages: Iterable[tuple[int, RosMessage]]) -> "ImuMessages":
-        """Decode messages with the times (ns) of their recorder."""
-        recorded, own, numbers, frame = [], [], [], ""
-        for time, message in messages:
-            header = message.header()
-            recorded.append(time)
-            own.append(header.time)
-            frame = frame or header.frame
-            numbers.append(message.numbers("f8", 37))
-        found = np.array(numbers, np.float64).reshape(-1, 37)
-        turned, covariance, rates, accelerations = found[:, :4], found[:, 4], found[:, 13:16], found[:, 25:28]
-        valid = len(found) and covariance[0] != -1 and are_unit(turned).all() and np.ptp(turned, axis=0).any()
-        stamps = Stamps(np.array(recorded, np.int64), np.array(own, float))
-        return cls(stamps, frame, rates, accelerations, turned if valid else None)
+    The times of the samples are those of the headers.
+    """
+    recorded, own, numbers, frame = [], [], [], ""
+    for time, message in messages:
+        header = message.header()
+        recorded.append(time)
+        own.append(header.time)
+        frame = frame or header.frame
+        numbers.append(message.numbers("f8", 37))
+    found = np.array(numbers, np.float64).reshape(-1, 37)
+    turned, covariance, rates, accelerations = found[:, :4], found[:, 4], found[:, 13:16], found[:, 25:28]
+    known = _turn(turned) and covariance[0] != -1
+    stamps = Stamps(np.array(recorded, np.int64), np.array(own, float))
+    return stamps, frame, Imu(stamps.own, rates, accelerations, turned if known else None)

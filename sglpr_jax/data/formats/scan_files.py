@@ -1,5 +1,6 @@
 """Reads single scans in all supported formats, point cloud maps in parts, and SemanticKITTI labels."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -7,20 +8,22 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.arrays import read_points
+from sglpr_jax.data.formats.arrays import array_record
 from sglpr_jax.data.formats.bin_records import is_record, read_records, record_of_scan
-from sglpr_jax.data.formats.clouds import Records
-from sglpr_jax.data.formats.las import las_blocks, las_records
-from sglpr_jax.data.formats.pcd import pcd_blocks, pcd_records
-from sglpr_jax.data.formats.ply import ply_blocks, ply_records
+from sglpr_jax.data.formats.clouds import check_bytes
+from sglpr_jax.data.formats.las import las_blocks, las_record
+from sglpr_jax.data.formats.pcd import pcd_blocks, pcd_record
+from sglpr_jax.data.formats.ply import ply_blocks, ply_record
+from sglpr_jax.data.record import Record
 from sglpr_jax.fields import check_value
+from sglpr_jax.files import in_short
 
-READERS: dict[ScanFormat, Callable[[Path], Records]] = {
-    "pcd": pcd_records,
-    "ply": ply_records,
-    "npy": lambda path: Records(read_points(path)),
-    "npz": lambda path: Records(read_points(path)),
-    "las": las_records,
+READERS: dict[ScanFormat, Callable[[Path], Record]] = {
+    "pcd": pcd_record,
+    "ply": ply_record,
+    "npy": array_record,
+    "npz": array_record,
+    "las": las_record,
 }
 """Readers of formats with a header. The name of each format is also its file ending."""
 BLOCKS: dict[str, Callable[[Path], Iterator[Float64[np.ndarray, "_ 3"]]]] = {
@@ -56,17 +59,14 @@ def named_format(path: Path) -> ScanFormat | None:
 
 
 def found_format(path: Path) -> ScanFormat:
-    """Return the format of one scan by its name or its content.
-
-    Raises ValueError if the content fits no format, as for a folder of scans.
-    """
+    """Return the format of one scan by its name or its content. Raises ValueError if the content fits no format."""
     return named_format(path) or record_of_scan(path)
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
     """Return the points (n, 3) of one scan in metres: x forward, y left, z up. Intensities are dropped.
 
-    Points that are not finite are kept, so that labels still match. The rasteriser drops them.
+    Points that are not finite are kept, so that labels still match.
 
     - kitti: float32 x, y, z, intensity.
     - nuscenes: float32 x, y, z, intensity, ring. Its x points right and its y forward, so (x, y, z) becomes (y, -x, z).
@@ -77,8 +77,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
 
     Arguments:
       path: File of the scan.
-      format: Format of the scan. "auto" uses the name of the file. If the name does not define the format of a .bin
-        file, the content does (`found_format`), as for a folder of scans.
+      format: Format of the scan. "auto" uses the name of the file, or the content of a .bin file (`found_format`).
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -86,21 +85,14 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
       ImportError: If the file is a .las file and the extra `las` is not installed.
     """
     path = Path(path)
-    return read_scan_records(path, format=found_format(path) if format == "auto" else format).points
+    return read_scan_record(path, format=found_format(path) if format == "auto" else format).cloud
 
 
-def read_scan_records(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Records:
-    """Return the points of a scan of a recording in metres, with their laser numbers and times.
+def read_scan_record(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Record:
+    """Read the points of a scan, with the laser numbers and times that the file contains.
 
-    Raises what `read_scan` raises, except that `format` "auto" does not use the content.
-
-    Arguments:
-      path: File of the scan.
-      format: Format of the scan.
-      records: Format of .bin files whose name does not define it, for "auto".
-
-    Returns:
-      Points, laser numbers from the file (nuscenes, nclt) or None, and times from the file (pcd, ply, las) or None.
+    Unlike in `read_scan`, the format "auto" does not use the content: `records` is the format of .bin files whose name
+    does not define it.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a scan, found none")
@@ -108,7 +100,9 @@ def read_scan_records(path: Path, *, format: ScanFormat = "auto", records: Recor
     known = (named_format(path) or records) if format == "auto" else format
     if is_record(known):
         return read_records(path, known)
-    return READERS[known](path)
+    with _naming(path, known):
+        check_bytes(path.stat().st_size)
+        return READERS[known](path)
 
 
 def is_cloud_file(path: Path) -> bool:
@@ -117,20 +111,27 @@ def is_cloud_file(path: Path) -> bool:
 
 
 def cloud_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the points of a map in parts, in metres. Raises the errors of the readers."""
-    return BLOCKS[path.suffix.lower()](path)
+    """Yield the points of a map in parts, in metres. Raises the errors of `read_scan`."""
+    with _naming(path, path.suffix.lower()[1:]):
+        yield from BLOCKS[path.suffix.lower()](path)
+
+
+@contextlib.contextmanager
+def _naming(path: Path, format: str) -> Iterator[None]:
+    """Name the file in each error of a block. Libraries raise many types for damaged files."""
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f"{path}: {error}") from error
+    except Exception as error:
+        why = in_short(error, most=300)
+        raise ValueError(f"{path}: expected a readable .{format} file, found an invalid one: {why}") from error
 
 
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:
     """Return the raw SemanticKITTI ids (n,) of a .label file. The instance number in the upper 16 bits is dropped.
 
-    Arguments:
-      path: File of the labels.
-      points: Number of points of the scan.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file does not have 4 bytes for each point.
+    Raises FileNotFoundError, or ValueError if the file does not have 4 bytes for each of the `points` of the scan.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected labels, found none")

@@ -29,10 +29,8 @@ def readers() -> tuple[Reader, ...]:
 def recording_names(root: Path | str) -> tuple[str, ...]:
     """Return the names of the sequences in `root`, in order.
 
-    Raises:
-      FileNotFoundError: If `root` has no supported layout. The message lists the layouts.
-      ValueError: If a table or bag that names the sequences is malformed.
-      ImportError: If `root` is a bag and the extra `ros` is not installed.
+    Raises FileNotFoundError, with the supported layouts, if `root` has none of them; ValueError if a table or bag that
+    names the sequences is malformed; ImportError if `root` is a bag and the extra `ros` is not installed.
     """
     return _reader_of(Path(root))[1]
 
@@ -67,13 +65,12 @@ def open_recording(
       pose_format: Format of the pose file.
       times: File of timestamps of a plain folder, if it is not beside the scans.
       time_unit: Unit of the times in text files of a plain folder or of KITTI's layout. "auto" expects seconds.
-      pose_topic: Pose topic of a bag. By default, the topic that covers the largest number of scans is used.
-      imu_topic: IMU topic of a bag, for the gravity of each scan. By default, the one beside the LiDAR's topic is used.
+      pose_topic: Pose topic of a bag, by default the topic that covers the largest number of scans.
+      imu_topic: IMU topic of a bag, for the gravity of each scan, by default the one beside the LiDAR's topic.
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.
-      ValueError: If a file is malformed, if times decrease, or if `poses`, `times` or a topic does not apply to the
-        layout.
+      ValueError: If a file is malformed, times decrease, or `poses`, `times` or a topic does not apply to the layout.
       ImportError: If `root` is a bag and the extra `ros` is not installed.
 
     Example:

@@ -5,12 +5,11 @@
 - `00/pose.txt`: poses of the LiDAR, 12 numbers a line, one line per frame (optional).
 """
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from sglpr_jax.data.formats.png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
@@ -28,41 +27,31 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open `root/<name>`. Without the file of poses, `positions` is `None`.
 
-    Raises:
-      FileNotFoundError: If the images are missing.
-      ValueError: If the poses are malformed, or the name of an image is not the number of a row of poses.
+    Raises FileNotFoundError without images, and ValueError if an image is not named by the number of a valid pose.
     """
     folder = root / name
     image_paths = scans_in(folder / "imgs", ".png", kind="images")
     ids = tuple(path.stem for path in image_paths)
-    poses = folder / "pose.txt"
     labels = {path.stem: path for path in files_in(folder / "labels", ".png")}
+    poses, positions, source = folder / "pose.txt", None, None
+    if poses.is_file():
+        world_from_lidar = read_poses(poses)
+        positions = world_from_lidar[rows_of(ids, rows=len(world_from_lidar), path=poses), :, 3]
+        source = f"{name}/pose.txt"
     return Recording(
         name=name,
         ids=ids,
-        positions=_positions(poses, ids) if poses.is_file() else None,
-        times=None,
-        pose_source=f"{name}/pose.txt" if poses.is_file() else None,
         paths=image_paths,
-        resolution_m=DENSITY_RESOLUTION_M,
         read=partial(image_record, read=read_image),
+        positions=positions,
+        pose_source=source,
         label_paths=tuple(labels.get(image) for image in ids),
+        resolution_m=DENSITY_RESOLUTION_M,
     )
 
 
-def _positions(path: Path, ids: Sequence[str]) -> Float[np.ndarray, "n 3"]:
-    """Positions of the frames in metres. Raises ValueError if an id is not the number of a row of poses."""
-    world_from_lidar = read_poses(path)
-    return world_from_lidar[rows_of(ids, rows=len(world_from_lidar), path=path), :, 3]
-
-
 def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Return an image (h, w) in the orientation of eq. 1. Grey values 0..255 are scaled to counts 0..10.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file is not a complete 8-bit greyscale image.
-    """
+    """Return an 8-bit image in the orientation of eq. 1, in counts 0..10. Raises what `read_grey_png` raises."""
     return as_counts(read_grey_png(path, bits=8))
 
 

@@ -18,7 +18,8 @@ from sglpr_jax.data.formats.pose_files import read_trajectory
 from sglpr_jax.data.formats.scan_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import warn
 
@@ -40,10 +41,8 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Read a map, and open the scans that its LiDAR would measure at each pose. Warns if the poses look wrong.
 
-    Raises:
-      FileNotFoundError: If `options.poses` or `options.times` does not exist.
-      ValueError: If there are no poses, a file is malformed, no pose has points around it, or the map is too large.
-      ImportError: If the map is a .las or .laz file and the extra `las` is not installed.
+    Raises FileNotFoundError, ValueError if there are no poses, a file is malformed, no pose has points around it, or
+    the map is too large, and ImportError without the extra `las` for .las and .laz files.
     """
     poses = options.poses
     if poses is None:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.clouds import Records, TimeField, time_field_of
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.readers.stamped import read_table, sequences, stamped_recording
+from sglpr_jax.data.record import Record, TimeField, time_field_of
 from sglpr_jax.data.recording import Recording
 
 RECORDS = {
@@ -62,12 +62,8 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     )
 
 
-def read_points(path: Path, *, sensor: str) -> Records:
-    """Read the points of a scan, their line numbers and their times.
-
-    Raises:
-      ValueError: If the file is empty or its size is not a multiple of the record size.
-    """
+def read_points(path: Path, *, sensor: str) -> Record:
+    """Read the points of a scan, their line numbers and their times. Raises ValueError if the file has a wrong size."""
     before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
     record = AEVA_BEFORE if before else RECORDS[sensor]
     size = path.stat().st_size
@@ -76,7 +72,8 @@ def read_points(path: Path, *, sensor: str) -> Records:
     found = np.fromfile(path, record)
     time = time_field_of(record.names or ())
     times = None if time is None else TimeField(time, found[time].copy())
-    return Records(np.ascontiguousarray(found["xyz"], np.float32), found["line"].astype(np.int32), times)
+    lasers = found["line"].astype(np.int32)
+    return Record(points=np.ascontiguousarray(found["xyz"], np.float32), lasers=lasers, time_field=times)
 
 
 READER = Reader(

@@ -11,7 +11,6 @@ Both pose files contain poses of the left camera. Positions are computed without
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import described, unusual_record
@@ -19,7 +18,7 @@ from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.listing import files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.data.recording import ReadRecord, Recording, scan_record
 from sglpr_jax.files import naming, read_json
 from sglpr_jax.se3 import positions_from_camera
 
@@ -33,14 +32,11 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open `root/sequences/<name>`.
+    """Open `root/sequences/<name>`. Without poses, `positions` is `None`.
 
-    Without poses, `positions` is `None`, unless `options.pose_source` names a pose file. With the format "auto", scans
-    that do not fit KITTI's record but clearly fit another record are read as the other one (`unusual_record`).
-
-    Raises:
-      FileNotFoundError: If the scans or the named pose file are missing.
-      ValueError: If a file is malformed, has too few rows, or a scan is not named by its row.
+    With the format "auto", scans that do not fit KITTI's record but clearly fit another record are read as the other
+    one (`unusual_record`). Raises FileNotFoundError without scans or the named pose file, and ValueError if a file is
+    malformed, has too few rows, or a scan is not named by its row.
     """
     folder = root / "sequences" / name
     scan_paths = scans_in(folder / "velodyne", ".bin")
@@ -49,19 +45,18 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     positions = None if poses is None else positions_from_camera(read_poses(root / poses))
     times = read_times(clock, unit=options.time_unit) if clock.is_file() else None
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
-    reading, mounting = _read(scan_paths, options.format), _mounting(root)
-    if mounting is not None:
-        reading["found"] += (f"sensor: {mounting}, as simulated",)
+    (read, found), mounting = _format(scan_paths, options.format), _mounting(root)
     return Recording(
         name=name,
         ids=ids,
+        paths=scan_paths,
+        read=read,
         positions=None if positions is None else positions[rows_of(ids, rows=len(positions), path=root / str(poses))],
         times=None if times is None else times[rows_of(ids, rows=len(times), path=clock)],
         pose_source=poses,
-        paths=scan_paths,
         label_paths=tuple(labels.get(scan) for scan in ids),
         mounting=mounting,
-        **reading,
+        found=(f"format: {found}", *([] if mounting is None else [f"sensor: {mounting}, as simulated"])),
     )
 
 
@@ -79,14 +74,14 @@ def _mounting(root: Path) -> Mounting | None:
         return None if height == MODEL_HEIGHT_M else Mounting(float(height))
 
 
-def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
-    """Values for the fields `read` and `found` of the recording."""
+def _format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:
+    """Function that reads a scan, and its format in words."""
     if format != "auto":
-        return {"read": partial(scan_record, format=format), "found": (f"format: {format}, as given",)}
+        return partial(scan_record, format=format), f"{format}, as given"
     unusual = unusual_record(paths)
     if unusual is None:
-        return {"read": scan_record, "found": (f"format: {described('kitti')}",)}
-    return {"read": partial(scan_record, format=unusual), "found": (f"format: {described(unusual)}, not KITTI's",)}
+        return scan_record, described("kitti")
+    return partial(scan_record, format=unusual), f"{described(unusual)}, not KITTI's"
 
 
 def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:

@@ -35,11 +35,8 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a drive.
 
     Scans, GPS positions and timestamps are matched by number. Without the file of timestamps, `times` is `None`. If a
-    GPS file is missing, `positions` is `None`.
-
-    Raises:
-      FileNotFoundError: If there are no scans.
-      ValueError: If the timestamps or GPS positions are malformed or invalid.
+    GPS file is missing, `positions` is `None`. Raises FileNotFoundError without scans, and ValueError if the timestamps
+    or GPS positions are invalid.
     """
     folder = next(folder for folder in _drives(root) if folder.name == name)
     paths = scans_in(folder / "velodyne_points" / "data", ".bin")
@@ -48,11 +45,11 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     return Recording(
         name=name,
         ids=tuple(path.stem for path in paths),
+        paths=paths,
+        read=partial(scan_record, format="kitti"),
         positions=_positions(oxts) if has_gps else None,
         times=_times(folder / "velodyne_points" / "timestamps.txt", paths),
         pose_source="oxts (GPS)" if has_gps else None,
-        paths=paths,
-        read=partial(scan_record, format="kitti"),
         found=("format: KITTI raw",),
     )
 
@@ -67,9 +64,8 @@ def _drives(root: Path) -> tuple[Path, ...]:
 
 def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
     """Positions relative to the first GPS position, in metres east, north and up."""
-    texts = (file.read_text(errors="replace") for file in files)
     numbers = [
-        numbers_of(text.split(), columns=OXTS_COLUMNS, where=str(file)) for file, text in zip(files, texts, strict=True)
+        numbers_of(file.read_text(errors="replace").split(), columns=OXTS_COLUMNS, where=str(file)) for file in files
     ]
     latitude, longitude, altitude = np.array(numbers)[:, :3].T
     wrong = np.flatnonzero(np.abs(latitude) >= POLE_DEG)

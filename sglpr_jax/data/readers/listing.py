@@ -11,13 +11,10 @@ _DECIMAL = re.compile(r"(\d+\.\d+)(\.[A-Za-z]\w*)*$")
 
 
 def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
-    """Return the files of a folder with one of the given extensions, in natural order.
+    """Return the files of a folder with one of some extensions in lower case, in natural order. Case is ignored.
 
-    Hidden files are skipped: macOS writes a `._000003.bin` beside each scan that it copies.
-
-    Arguments:
-      folder: Folder to list. If it does not exist, the result is empty.
-      endings: Extensions in lower case. The case of the file names is ignored.
+    A missing folder has no files. Hidden files are skipped: macOS writes a `._000003.bin` beside each scan that it
+    copies.
     """
     if not folder.is_dir():
         return ()

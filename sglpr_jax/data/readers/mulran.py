@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.formats.bin_records import described, read_records
-from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.readers.stamped import read_table, sequences, stamped_recording
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 
 LIDAR_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
@@ -40,14 +40,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         positions=world_from_base[:, :, :3] @ LIDAR_IN_BASE_M + world_from_base[:, :, 3],
         pose_file=folder / POSES,
         tick_s=1e-9,
-        read_points=read_points,
+        read_points=lambda path: Record(points=read_records(path, "kitti").cloud * FORWARD_FROM_LIDAR),
         found=(f"format: MulRan, {described('kitti')}, rotated to x forward",),
     )
-
-
-def read_points(path: Path) -> Records:
-    """Read a scan and rotate its points so that x points forward."""
-    return Records(read_records(path, "kitti").points * FORWARD_FROM_LIDAR, None)
 
 
 READER = Reader(

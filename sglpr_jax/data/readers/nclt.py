@@ -43,7 +43,11 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the session `root/<name>`. Raises what `stamped_recording` and `read_ground_truth` raise."""
-    truth = _truth_path(root, name)
+    file = f"groundtruth_{name}.csv"
+    places = (root / file, root / name / file, root / "ground_truth" / file)
+    truth = next((path for path in places if path.is_file()), None)
+    if truth is None:
+        raise FileNotFoundError(f"{root}: expected {' or '.join(str(p.relative_to(root)) for p in places)}, found none")
     stamps, positions = read_ground_truth(truth)
     return stamped_recording(
         root / name / "velodyne_sync",
@@ -60,15 +64,18 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Read a ground truth file. Rows with NaN, which occur at the start of the files, are dropped.
+    """Read times in microseconds, in order, and positions in metres (north, west, up). Rows with NaN are dropped.
 
-    Returns:
-      Times in microseconds, in order, and positions in metres (north, west, up).
-
-    Raises:
-      ValueError: If the table is malformed, all rows are NaN, or a time is smaller than the previous one.
+    Raises ValueError if the table is malformed, all rows are NaN, or a time is smaller than the previous one.
     """
-    rows = _read_table(path)
+    if not path.read_bytes().strip():
+        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found an empty file")
+    try:
+        rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found malformed ones ({error})") from error
+    if rows.shape[1] != len(_COLUMNS):
+        raise ValueError(f"{path}: expected {len(_COLUMNS)} columns, {', '.join(_COLUMNS)}, found {rows.shape[1]}")
     known = np.isfinite(rows).all(axis=1)
     if not known.any():
         raise ValueError(f"{path}: expected poses, found NaN in all {len(rows)} rows")
@@ -81,27 +88,6 @@ def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.nda
         first = int(backwards[0])
         raise ValueError(f"{path}: expected a time >= {stamps[first]}, found {stamps[first + 1]} in the next row")
     return stamps, rows[known, 1:4] * Z_UP_FROM_Z_DOWN
-
-
-def _truth_path(root: Path, name: str) -> Path:
-    file = f"groundtruth_{name}.csv"
-    places = (root / file, root / name / file, root / "ground_truth" / file)
-    found = next((path for path in places if path.is_file()), None)
-    if found is None:
-        raise FileNotFoundError(f"{root}: expected {' or '.join(str(p.relative_to(root)) for p in places)}, found none")
-    return found
-
-
-def _read_table(path: Path) -> Float[np.ndarray, "n 7"]:
-    if not path.read_bytes().strip():
-        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found an empty file")
-    try:
-        rows = np.loadtxt(path, delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found malformed ones ({error})") from error
-    if rows.shape[1] != len(_COLUMNS):
-        raise ValueError(f"{path}: expected {len(_COLUMNS)} columns, {', '.join(_COLUMNS)}, found {rows.shape[1]}")
-    return rows
 
 
 READER = Reader(

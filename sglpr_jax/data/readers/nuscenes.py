@@ -19,6 +19,7 @@ from jaxtyping import Float
 from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.pose_files import rotations_of
 from sglpr_jax.data.formats.scan_files import scan_id
+from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
 from sglpr_jax.files import in_short, naming, path_inside
@@ -34,9 +35,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a scene: its key frames and sweeps in order of time. Listed scans without a file are skipped.
 
-    Raises:
-      FileNotFoundError: If a table is missing, or no scan has a file.
-      ValueError: If a table is malformed, refers to a missing row, or lists a file outside the dataset.
+    Raises FileNotFoundError without a table or scans, and ValueError if a table is malformed.
     """
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
@@ -60,11 +59,11 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         return Recording(
             name=name,
             ids=tuple(map(scan_id, paths)),
+            paths=paths,
+            read=scan_record,
             positions=positions,
             times=ticks[order] / 1e6,
             pose_source=f"{tables.name}/ego_pose.json",
-            paths=paths,
-            read=scan_record,
             found=(
                 f"format: {described('nuscenes')}, rotated to x forward",
                 f"{keys} key frames and {len(paths) - keys} sweeps{missing}",
@@ -90,15 +89,13 @@ def _scenes(tables: Path) -> dict[str, str]:
 
 def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
     """Positions of the LiDAR in the map frame, in metres."""
-    world_from_car, cars = _poses(tables / "ego_pose.json", rows, "ego_pose_token")
-    _, lidars_in_car = _poses(tables / "calibrated_sensor.json", rows, "calibrated_sensor_token")
-    return (world_from_car @ lidars_in_car[:, :, None])[:, :, 0] + cars
+    world_from_car = _poses(tables / "ego_pose.json", rows, "ego_pose_token")
+    car_from_lidar = _poses(tables / "calibrated_sensor.json", rows, "calibrated_sensor_token")
+    return (world_from_car[:, :3, :3] @ car_from_lidar[:, :3, 3:])[:, :, 0] + world_from_car[:, :3, 3]
 
 
-def _poses(
-    path: Path, rows: Sequence[dict[str, Any]], column: str
-) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Rotations and translations of the table rows that a column of `rows` refers to."""
+def _poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> Float[np.ndarray, "n 4 4"]:
+    """Poses in the table rows that a column of `rows` refers to."""
     tokens = _texts(path.with_name("sample_data.json"), rows, column)
     found = {row["token"]: row for row in _rows(path, "token", set(tokens))}
     lost = [token for token in tokens if token not in found]
@@ -108,17 +105,13 @@ def _poses(
         )
     named = [found[token] for token in tokens]
     quaternions = _numbers(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
-    return rotations_of(path, quaternions), _numbers(path, named, "translation", 3)
+    return poses_of(_numbers(path, named, "translation", 3), rotations_of(path, quaternions))
 
 
 def _rows(path: Path, column: str = "", among: Container[Any] = ()) -> list[dict[str, Any]]:
     """Return the rows of a table. With `column`, only the rows whose value in this column is in `among`.
 
     Other rows are dropped while the file is parsed, because some tables have millions of rows.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file is not a list of rows.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table, found none")

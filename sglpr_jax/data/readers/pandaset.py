@@ -12,37 +12,38 @@ world frame has z up.
 import hashlib
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.arrays import read_points
 from sglpr_jax.data.formats.pose_files import check_positions, rotations_of, rows_of
+from sglpr_jax.data.formats.scan_files import read_scan
+from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.readers.listing import files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_order
 from sglpr_jax.files import read_json
 
 PICKLES = ".pkl.gz"
+POSES = Path("lidar") / "poses.json"
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return the names of the sequences in `root`, converted or not. `root` may be a sequence itself."""
-    if (root / "lidar" / "poses.json").is_file():
+    if (root / POSES).is_file():
         return (root.resolve().name,)
-    return tuple(sorted(path.parent.parent.name for path in root.glob("*/lidar/poses.json")))
+    return tuple(sorted(path.parent.parent.name for path in root.glob(f"*/{POSES}")))
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a sequence.
 
-    Raises:
-      FileNotFoundError: If the scans or the timestamps are missing.
-      ValueError: If the scans are not converted, or the poses or timestamps are malformed or too few.
+    Raises FileNotFoundError without scans or timestamps, and ValueError if the scans are not converted, or the poses or
+    timestamps are malformed or too few.
     """
-    folder = root / "lidar" if (root / "lidar" / "poses.json").is_file() else root / name / "lidar"
+    folder = root / "lidar" if (root / POSES).is_file() else root / name / "lidar"
     pickles = files_in(folder, PICKLES)
     if pickles and not files_in(folder, ".npy"):
         raise ValueError(
@@ -51,38 +52,31 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         )
     paths = scans_in(folder, ".npy")
     ids = tuple(path.stem for path in paths)
-    rotations, positions = read_poses(folder / "poses.json")
-    rows = rows_of(ids, rows=len(positions), path=folder / "poses.json")
-    times = _times(folder / "timestamps.json")
-    seconds = times[rows_of(ids, rows=len(times), path=folder / "timestamps.json")]
-    check_order(seconds, source=folder / "timestamps.json")
-    poses = {path: (rotations[row], positions[row]) for path, row in zip(paths, rows, strict=True)}
+    pose_file, clock = folder / "poses.json", folder / "timestamps.json"
+    poses, times = read_poses(pose_file), _times(clock)
+    poses = poses[rows_of(ids, rows=len(poses), path=pose_file)]
+    seconds = times[rows_of(ids, rows=len(times), path=clock)]
+    check_order(seconds, source=clock)
     left = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
+    digest = hashlib.sha256(pose_file.read_bytes()).hexdigest()
     return Recording(
         name=name,
         ids=ids,
-        positions=positions[rows],
-        times=seconds,
-        pose_source="lidar/poses.json",
         paths=paths,
-        read=partial(_read, poses=poses, poses_hash=_hash(folder / "poses.json")),
+        read=partial(_read, poses=dict(zip(paths, poses, strict=True)), poses_hash=digest),
+        positions=poses[:, :3, 3],
+        times=seconds,
+        pose_source=str(POSES),
         found=(f"format: PandaSet as npy, transformed from the world frame to the LiDAR frame, x forward{left}",),
     )
 
 
-def read_poses(path: Path) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Read a file of poses.
-
-    Returns:
-      Rotations (world from LiDAR), and positions in metres.
-
-    Raises:
-      ValueError: If the poses are malformed.
-    """
-    poses = read_json(path)
+def read_poses(path: Path) -> Float[np.ndarray, "n 4 4"]:
+    """Read a file of poses (world from LiDAR). Raises ValueError if the poses are malformed."""
+    rows = read_json(path)
     try:
-        turned = np.array([[pose["heading"][axis] for axis in "xyzw"] for pose in poses], np.float64).reshape(-1, 4)
-        positions = np.array([[pose["position"][axis] for axis in "xyz"] for pose in poses], np.float64).reshape(-1, 3)
+        turned = np.array([[pose["heading"][axis] for axis in "xyzw"] for pose in rows], np.float64).reshape(-1, 4)
+        positions = np.array([[pose["position"][axis] for axis in "xyz"] for pose in rows], np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path}: expected a list of poses, each with position (x, y, z) and heading (w, x, y, z), found another"
@@ -91,12 +85,12 @@ def read_poses(path: Path) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray
     if not np.isfinite(positions).all():
         raise ValueError(f"{path}: expected finite positions, found NaN or infinite ones")
     check_positions(path, positions)
-    return rotations_of(path, turned), positions
+    return poses_of(positions, rotations_of(path, turned))
 
 
 def _times(path: Path) -> Float[np.ndarray, " n"]:
     """Timestamps in seconds, one for each scan."""
-    values: Any = read_json(path)
+    values = read_json(path)
     try:
         times = np.array(values, np.float64)
     except (TypeError, ValueError):
@@ -106,21 +100,12 @@ def _times(path: Path) -> Float[np.ndarray, " n"]:
     return times
 
 
-def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _read(
-    path: Path,
-    labels: Path | None,
-    lasers: bool,
-    *,
-    poses: dict[Path, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]],
-    poses_hash: str,
+    path: Path, labels: Path | None, lasers: bool, *, poses: dict[Path, Float[np.ndarray, "4 4"]], poses_hash: str
 ) -> Record:
     """Read a scan. Caches of its points use `poses_hash` to detect changed poses."""
-    world_from_lidar, position = poses[path]
-    x, y, z = ((read_points(path) - position) @ world_from_lidar).T
+    world_from_lidar = poses[path]
+    x, y, z = ((read_scan(path, format="npy") - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]).T
     return Record(points=np.stack([y, -x, z], axis=1).astype(np.float32))
 
 

@@ -4,95 +4,22 @@ import dataclasses
 import itertools
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import check_height, check_order
 from sglpr_jax.data.formats.ros_bag import CLOUDS, COMPRESSED, METADATA, RosBag
-from sglpr_jax.data.formats.ros_messages import (
-    IMU,
-    LEAST_SHARE,
-    POSES,
-    Stamps,
-    Track,
-    fixed_transform,
-    times_on_one_clock,
-)
-from sglpr_jax.data.imu import Imu
-from sglpr_jax.data.poses import interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.formats.ros_messages import IMU, POSES, Stamps, Track, fixed_transform, times_on_one_clock
+from sglpr_jax.data.poses import LEAST_SHARE, have_poses, interpolate_poses, left_out
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Record, Recording, found_record
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import naming
-
-
-def imu_topic_of(bag: RosBag, lidar_topic: str, imu_topic: str | None) -> str | None:
-    """Return `imu_topic`, or else the IMU topic whose name has most in common with the topic of the LiDAR, or None.
-
-    Raises ValueError if `imu_topic` does not exist.
-    """
-    topics = bag.topics_of((IMU,))
-    if imu_topic is None:
-        return max(topics, key=lambda topic: _shared(topic, lidar_topic), default=None)
-    if imu_topic not in topics:
-        raise ValueError(f"{bag.paths[0]}: expected the IMU topic {imu_topic}, found {', '.join(topics) or 'none'}")
-    return imu_topic
-
-
-def _shared(topic: str, other: str) -> int:
-    """Number of parts that two topics have in common: 1 for /livox/imu and /livox/lidar."""
-    parts = (name.strip("/").split("/") for name in (topic, other))
-    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
-
-
-def ups_of_scans(
-    bag: RosBag, topic: str, scans: Stamps, lidar: str, *, required: bool
-) -> tuple[Float[np.ndarray, "n 3"], str] | None:
-    """Return up in the frame of the LiDAR at each scan by an IMU, and the source in words. This reads the topic once.
-
-    Arguments:
-      bag: Bag of the scans.
-      topic: Topic of the IMU.
-      scans: Times of the scans.
-      lidar: Frame of the LiDAR.
-      required: Whether an IMU without gravity is an error. Otherwise the function warns and returns None.
-
-    Raises:
-      ValueError: If the bag is broken, or if `required` and the IMU does not measure gravity.
-    """
-    found = bag.imu(topic)
-    source = f"{bag.paths[0]}, {topic}"
-    stamps, times = times_on_one_clock(found.stamps, scans)
-    order = np.argsort(stamps, kind="stable")
-    turned = None if found.quaternions is None else found.quaternions[order]
-    try:
-        with naming(source):
-            ups, how = Imu(stamps[order], found.rates[order], found.accelerations[order], turned).ups(times)
-    except ValueError as error:
-        if required:
-            raise
-        warn(f"{error}; the ground of the scans is used")
-        return None
-    return ups @ _lidar_from_imu(bag, found.frame.strip("/"), lidar, source).T, f"{topic}, by {how}"
-
-
-def _lidar_from_imu(bag: RosBag, imu: str, lidar: str, source: str) -> Float[np.ndarray, "3 3"]:
-    """Rotation from the IMU to the LiDAR by tf, or none with a warning."""
-    if imu == lidar:
-        return np.eye(3)
-    found = fixed_transform(bag.transforms(), lidar, imu)
-    if found is None:
-        warn(
-            f"{source}: expected a static transform from {imu} to {lidar}, found none; their axes are taken as parallel"
-        )
-        return np.eye(3)
-    return found[:3, :3]
-
 
 ENDINGS = (".bag", ".mcap", ".db3")
 PAUSE_NS = 60 * 10**9
@@ -102,24 +29,19 @@ PAUSE_NS = 60 * 10**9
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return a name for each point cloud topic, or an empty tuple if `root` is not a bag.
 
-    Raises:
-      ValueError: If a bag has no point cloud topic or is broken.
-      ImportError: If the extra `ros` is not installed.
+    Raises ValueError if a bag has no point cloud topic or is broken, and ImportError without the extra `ros`.
     """
     return tuple(_recordings(root)) if bag_files(root) else ()
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open the point clouds of one topic, with poses if the bag has them.
+    """Open the point clouds of one topic, with poses if the bag has them. Scans without a pose are skipped then.
 
-    The bag is read once for the times and once for each topic of poses and of tf. If a pose topic is used, scans
-    without a pose are skipped. By default, this is the pose topic that covers the largest number of scans, and the IMU
-    is the one whose name has most in common with that of the LiDAR.
+    The bag is read once for the times and once for each topic of poses and of tf. By default, the pose topic is the one
+    that covers most scans, and the IMU is the one whose name has most in common with that of the LiDAR.
 
-    Raises:
-      ValueError: If the bag is broken, the topic has no messages, the given pose topic covers less than half of the
-        scans, or the given IMU topic does not exist.
-      ImportError: If the extra `ros` is not installed.
+    Raises ValueError if the bag is broken, the topic has no messages, or a given topic does not exist or does not cover
+    half of the scans; ImportError without the extra `ros`.
     """
     bag, topic = _recordings(root)[name]
     stamps = bag.stamps(topic)
@@ -127,30 +49,25 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     if not len(recorded):
         raise ValueError(f"{root}: expected point clouds on {topic}, found no message")
     ids = tuple(f"{i:06d}" for i in range(len(recorded)))
-    first = np.searchsorted(recorded, recorded)  # `nth` numbers the messages with equal times
-    nth = np.arange(len(recorded)) - first
+    nth = np.arange(len(recorded)) - np.searchsorted(recorded, recorded)  # number among messages with equal times
     where = dict(zip(ids, zip(recorded.tolist(), nth.tolist(), strict=True), strict=True))
     recording = Recording(
         name=name,
         ids=ids,
-        positions=None,
-        times=_times(stamps, f"{root}, {topic}"),
-        pose_source=None,
         paths=tuple(Path(scan) for scan in ids),
         read=partial(_read, bag=bag, topic=topic, where=where),
+        times=_times(stamps, f"{root}, {topic}"),
         on_disk=False,
         containers=bag.files,
         found=(f"format: {topic} of {bag.name}, {bag.fields(topic, int(recorded[0]))}",),
     )
     lidar = bag.frame(topic, int(recorded[0])).strip("/")
     posed = _with_poses(recording, bag, stamps, options.pose_topic, lidar)
-    imu = imu_topic_of(bag, topic, options.imu_topic)
+    imu = _imu_topic(bag, topic, options.imu_topic)
     if imu is None:
         return posed
     scans, required = stamps.of(posed.numbers), options.imu_topic is not None
-    return dataclasses.replace(
-        posed, read_ups=partial(ups_of_scans, bag, imu, scans=scans, lidar=lidar, required=required)
-    )
+    return dataclasses.replace(posed, read_ups=partial(_ups, bag, imu, scans=scans, lidar=lidar, required=required))
 
 
 def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
@@ -197,117 +114,124 @@ def _drives(bag: RosBag) -> list[RosBag]:
     return [bag] if len(drives) < 2 else [RosBag(paths) for paths in drives]
 
 
-class _Placed(NamedTuple):
-    """A track, and its positions at the times of the scans."""
-
-    track: Track
-    clocks: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]
-    """Times of the poses and of the scans, in seconds of one clock."""
-    kept: Bool[np.ndarray, " q"]
-    """True for scans with a pose."""
-    positions: Float[np.ndarray, "q 3"]
-    """Positions in metres, valid where `kept` is true."""
-
-    @classmethod
-    def at(cls, scans: Stamps, track: Track) -> "_Placed":
-        """Interpolate the track at the times of the scans."""
-        clocks = times_on_one_clock(track.stamps, scans)
-        return cls(track, clocks, *interpolate(clocks[0], track.positions, clocks[1]))
-
-    @property
-    def share(self) -> float:
-        """Fraction of scans with a pose."""
-        return float(self.kept.mean())
-
-
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
     """Add the poses of `topic`, or else of the topic that covers the largest number of scans, to the recording.
 
     `lidar` is the frame of the scans. The unused topics are listed in `found`.
     """
     transforms = bag.transforms()
-    tracks = {one: bag.track(one) for one in bag.topics_of(POSES)} | _tracks_of_lidar(transforms, lidar)
-    placed = {one: _Placed.at(scans, track) for one, track in tracks.items()}
-    used = _chosen(placed, topic, bag.paths[0])
-    others = [f"{one} (poses for {found.share:.0%} of the scans)" for one, found in placed.items() if one != used]
+    tracks = {one: bag.track(one) for one in bag.topics_of(POSES)} | {
+        f"/tf/{track.frame}/{track.child}": track
+        for track in transforms
+        if track.moves and fixed_transform(transforms, track.child, lidar) is not None
+    }
+    clocks = {one: times_on_one_clock(track.stamps, scans) for one, track in tracks.items()}
+    kept = {one: have_poses(*clock) for one, clock in clocks.items()}
+    shares = {one: float(found.mean()) for one, found in kept.items()}
+    used = _chosen(shares, topic, bag.paths[0])
+    others = [f"{one} (poses for {share:.0%} of the scans)" for one, share in shares.items() if one != used]
     said = (*recording.found, *([f"poses not used: {', '.join(others)}"] if others else []))
     recording = dataclasses.replace(recording, found=said)
     if not used:
         return recording
-    kept, positions = placed[used].kept, placed[used].positions
-    check_height(positions[kept], path=bag.paths[0])
-    check_order(positions[kept], [recording.ids[i] for i in np.flatnonzero(kept)], path=bag.paths[0])
-    if dropped := tracks[used].dropped:
-        found = f"{dropped} of {len(tracks[used]) + dropped} without finite position or without rotation"
+    track, rows = tracks[used], np.flatnonzero(kept[used])
+    if track.dropped:
+        found = f"{track.dropped} of {len(track) + track.dropped} without finite position or without rotation"
         warn(f"{bag.paths[0]}: expected valid poses on {used}, found {found}; these are dropped")
-    poses, how = _of_lidar(placed[used], transforms, lidar)
-    missing = len(kept) - int(kept.sum())
-    left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
-    chosen = recording if not missing else only(recording, np.flatnonzero(kept).tolist())
+    stamps, times = clocks[used]
+    poses = interpolate_poses(stamps, track.poses, times[rows])
+    check_height(poses[:, :3, 3], path=bag.paths[0])
+    check_order(poses[:, :3, 3], [recording.ids[i] for i in rows], path=bag.paths[0])
+    child_from_lidar, how = _of_lidar(track, transforms, lidar)
+    poses = poses @ child_from_lidar
     return dataclasses.replace(
-        chosen,
-        positions=positions[kept] if poses is None else poses[kept, :3, 3],
-        pose_source=f"{used} ({tracks[used]}, {how}{left_out})",
-        world_from_lidar=None if poses is None else poses[kept],
+        recording if len(rows) == len(recording) else only(recording, rows.tolist()),
+        positions=poses[:, :3, 3],
+        pose_source=f"{used} ({track}, {how}{left_out(kept[used])})",
+        world_from_lidar=poses if track.turned else None,
     )
 
 
-def _chosen(placed: dict[str, _Placed], topic: str | None, bag: Path) -> str:
-    """Return `topic`, or else the topic that covers the largest number of scans; "" if it covers less than half of
-    them.
+def _chosen(shares: dict[str, float], topic: str | None, bag: Path) -> str:
+    """Return `topic`, or else the topic that covers most scans; "" if it covers less than half of them.
 
     Raises ValueError if `topic` does not exist or does not cover enough scans.
     """
     if topic is None:
-        best = max(placed, key=lambda one: placed[one].share, default="")
-        return best if best and placed[best].share >= LEAST_SHARE else ""
-    if topic not in placed:
-        raise ValueError(f"{bag}: expected the pose topic {topic}, found {', '.join(placed) or 'none'}")
-    if placed[topic].share < LEAST_SHARE:
-        raise ValueError(
-            f"{bag}: expected poses for at least half of the scans on {topic}, found {placed[topic].share:.0%}"
-        )
+        best = max(shares, key=lambda one: shares[one], default="")
+        return best if best and shares[best] >= LEAST_SHARE else ""
+    if topic not in shares:
+        raise ValueError(f"{bag}: expected the pose topic {topic}, found {', '.join(shares) or 'none'}")
+    if shares[topic] < LEAST_SHARE:
+        raise ValueError(f"{bag}: expected poses for at least half of the scans on {topic}, found {shares[topic]:.0%}")
     return topic
 
 
-def _tracks_of_lidar(transforms: list[Track], lidar: str) -> dict[str, Track]:
-    """Return the tf transforms in which the LiDAR moves, with names like those of topics."""
-    moving = (track for track in transforms if track.moves)
-    return {
-        f"/tf/{track.frame}/{track.child}": track
-        for track in moving
-        if fixed_transform(transforms, track.child, lidar) is not None
-    }
-
-
-def _of_lidar(placed: _Placed, transforms: list[Track], lidar: str) -> tuple[Float[np.ndarray, "q 4 4"] | None, str]:
-    """Poses of the LiDAR, or None if the track has no rotations; and a description of how they were computed."""
-    track, (poses_s, scans_s) = placed.track, placed.clocks
+def _of_lidar(track: Track, transforms: list[Track], lidar: str) -> tuple[Float[np.ndarray, "4 4"], str]:
+    """Transform from the LiDAR to the body of a track, and a description of how the poses were computed."""
     if not track.turned:
-        return None, "interpolated; its rotations are constant or missing"
-    poses = poses_of(placed.positions, interpolate_turns(poses_s, track.quaternions, scans_s))
+        return np.eye(4), "interpolated; its rotations are constant or missing"
     child = track.child.strip("/")
     if not child or child == lidar:
-        return poses, "interpolated"
+        return np.eye(4), "interpolated"
     child_from_lidar = fixed_transform(transforms, child, lidar)
     if child_from_lidar is None:
-        return poses, f"interpolated; used as poses of {lidar or 'the LiDAR'}, since tf does not connect the two frames"
-    return poses @ child_from_lidar, f"interpolated, moved to {lidar} by tf"
+        used = f"used as poses of {lidar or 'the LiDAR'}, since tf does not connect the two frames"
+        return np.eye(4), f"interpolated; {used}"
+    return child_from_lidar, f"interpolated, moved to {lidar} by tf"
+
+
+def _imu_topic(bag: RosBag, lidar_topic: str, imu_topic: str | None) -> str | None:
+    """Return `imu_topic`, or else the IMU topic whose name has most in common with the topic of the LiDAR, or None.
+
+    Raises ValueError if `imu_topic` does not exist.
+    """
+
+    def shared(topic: str) -> int:
+        """Number of parts in common: 1 for /livox/imu and /livox/lidar."""
+        parts = (name.strip("/").split("/") for name in (topic, lidar_topic))
+        return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
+
+    topics = bag.topics_of((IMU,))
+    if imu_topic is None:
+        return max(topics, key=shared, default=None)
+    if imu_topic not in topics:
+        raise ValueError(f"{bag.paths[0]}: expected the IMU topic {imu_topic}, found {', '.join(topics) or 'none'}")
+    return imu_topic
+
+
+def _ups(
+    bag: RosBag, topic: str, scans: Stamps, lidar: str, *, required: bool
+) -> tuple[Float[np.ndarray, "n 3"], str] | None:
+    """Return up in the frame of the LiDAR at each scan by an IMU, and the source in words. This reads the topic once.
+
+    If the IMU does not measure gravity, raises ValueError if it is `required`, or else warns and returns None.
+    """
+    found, frame, imu = bag.imu(topic)
+    source = f"{bag.paths[0]}, {topic}"
+    stamps, times = times_on_one_clock(found, scans)
+    try:
+        with naming(source):
+            ups, how = imu.at(stamps).ups(times)
+    except ValueError as error:
+        if required:
+            raise
+        warn(f"{error}; the ground of the scans is used")
+        return None
+    frame = frame.strip("/")
+    lidar_from_imu = np.eye(4) if frame == lidar else fixed_transform(bag.transforms(), lidar, frame)
+    if lidar_from_imu is None:
+        expected = f"a static transform from {frame} to {lidar}"
+        warn(f"{source}: expected {expected}, found none; their axes are taken as parallel")
+        lidar_from_imu = np.eye(4)
+    return ups @ lidar_from_imu[:3, :3].T, f"{topic}, by {how}"
 
 
 def _read(
-    path: Path,
-    labels: Path | None,
-    lasers: bool,
-    *,
-    bag: RosBag,
-    topic: str,
-    where: dict[str, tuple[int, int]],
+    path: Path, labels: Path | None, lasers: bool, *, bag: RosBag, topic: str, where: dict[str, tuple[int, int]]
 ) -> Record:
-    time, nth = where[path.name]
     with naming(f"scan {path.name}"):
-        found = bag.cloud(topic, time, nth)
-    return found_record(found, lasers=lasers)
+        return bag.cloud(topic, *where[path.name])
 
 
 READER = Reader(

@@ -26,13 +26,10 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the folder `root`. Warns if the format looks wrong or consecutive poses are far apart.
 
-    If neither `options.format` nor the name defines the record of a .bin file, it is detected (`find_record`). Without
-    poses (`folder_trajectory`), `positions` is `None`.
+    If neither `options.format` nor the name defines the record of a .bin file, it is detected (`find_record`).
 
-    Raises:
-      FileNotFoundError: If the folder has no scans, or `options.poses` or `options.times` does not exist.
-      ValueError: If two files differ only by their ending, the record cannot be detected, or the poses or timestamps
-        are malformed.
+    Raises FileNotFoundError without scans, poses or times (`folder_trajectory`), and ValueError if two files differ
+    only by their ending, the record cannot be detected, or the poses or timestamps are malformed.
     """
     paths = _scans(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
     ids = _ids(root, paths)
@@ -45,17 +42,18 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         time_unit=options.time_unit,
     )
     records, kinds = _formats(paths, options.format)
+    aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
     if positions is not None:
         check_order(positions, ids, path=options.poses or root / str(source))
     return Recording(
         name=root.resolve().name,
         ids=ids,
+        paths=paths,
+        read=partial(scan_record, format=options.format, records=records),
         positions=positions,
         times=seconds,
         pose_source=source,
-        paths=paths,
-        read=partial(scan_record, format=options.format, records=records),
-        found=(f"format: {kinds}", *_left_aside(root, paths)),
+        found=(f"format: {kinds}", *([f"left aside: {aside}"] if aside else [])),
     )
 
 
@@ -85,12 +83,6 @@ def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat,
     said = {name: described(name) if is_record(name) else name for name in counts}
     kinds = ", ".join(said[name] if len(counts) == 1 else f"{count} {said[name]}" for name, count in counts.items())
     return records, f"{kinds}, {how}" if unsaid else kinds
-
-
-def _left_aside(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
-    """Description of the other files in the folder."""
-    aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
-    return (f"left aside: {aside}",) if aside else ()
 
 
 READER = Reader(

@@ -1,16 +1,15 @@
 """Shared code of MulRan, HeLiPR, Boreas and NCLT: scans that are named by their time, and poses with other times."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.readers.listing import scans_in
-from sglpr_jax.data.recording import Record, Recording, found_record
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_unit, nearest_rows
 
 MAX_GAP_S = 0.1
@@ -37,28 +36,24 @@ def stamped_recording(
     positions: Float[np.ndarray, "n 3"],
     pose_file: Path,
     tick_s: float,
-    read_points: Callable[[Path], Records],
+    read_points: Callable[[Path], Record],
     max_gap_s: float = MAX_GAP_S,
     **fields: Any,
 ) -> Recording:
-    """Open the `.bin` files of `folder`. Each scan gets the pose nearest in time.
-
-    Scans without a pose within `max_gap_s` are skipped. `pose_source` contains their number.
+    """Open the `.bin` files of a folder, which are named by their time in ticks, each with the nearest pose in time.
 
     Arguments:
-      folder: Folder of the scans, which are named by their time in ticks.
+      folder: Folder of the scans.
       name: Name of the recording.
       stamps: Time of each pose, in ticks.
       positions: Position of each pose, in metres.
       pose_file: Pose file, for messages.
       tick_s: Duration of a tick, in seconds.
       read_points: Function that reads a scan.
-      max_gap_s: Maximum time between a scan and its pose, in seconds.
+      max_gap_s: Maximum time between a scan and its pose, in seconds. Other scans are skipped.
       fields: More fields of the recording.
 
-    Raises:
-      FileNotFoundError: If there are no scans.
-      ValueError: If a scan is not named by its time, no scan has a pose, or the unit of times changes.
+    Raises FileNotFoundError without scans, and ValueError for a scan with another name, no poses or a change of units.
     """
     paths = scans_in(folder, ".bin")
     strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
@@ -81,29 +76,21 @@ def stamped_recording(
     return Recording(
         name=name,
         ids=tuple(paths[row].stem for row in rows),
+        paths=tuple(paths[row] for row in rows),
+        read=lambda path, labels, lasers: read_points(path),
         positions=positions[nearest[rows]],
         times=times[rows] * tick_s,
         pose_source=f"{pose_file.name}{said}",
-        paths=tuple(paths[row] for row in rows),
-        read=partial(_read, read_points=read_points),
         rows=rows,
         **fields,
     )
 
 
-def _read(path: Path, labels: Path | None, lasers: bool, *, read_points: Callable[[Path], Records]) -> Record:
-    return found_record(read_points(path), lasers=lasers)
-
-
 def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:
-    """Read a table of poses. Columns are separated by commas or white space.
+    """Read the first column, times as integers of up to 19 digits, and the other columns (float64) of a table of poses.
 
-    Returns:
-      First column, the times, as integers of up to 19 digits; and the other columns as float64.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If a line is malformed. The message names the first one.
+    Columns are separated by commas or white space. Raises FileNotFoundError, or ValueError with the first malformed
+    line.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table of poses, found none")

@@ -20,10 +20,8 @@ def recording_names(root: Path) -> tuple[str, ...]:
     """Return the names of the runs in `root`, which is a folder of submaps, a run, or a folder of runs or districts."""
     if not root.is_dir():
         return ()
-    folders = [root.resolve().parent] if root.name.startswith("pointcloud_") else []
-    patterns = [f"{above}{table}" for table in TABLES for above in ("", "*/", "*/*/")]
-    tables = [path for folder in folders for table in TABLES for path in folder.glob(table)]
-    tables += [path for pattern in patterns for path in root.glob(pattern)]
+    top = root.resolve().parent if root.name.startswith("pointcloud_") else root
+    tables = [path for table in TABLES for above in ("", "*/", "*/*/") for path in top.glob(f"{above}{table}")]
     return tuple(sorted({path.resolve().parent.name for path in tables}))
 
 

@@ -20,7 +20,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Float64, Int32, Num, UInt8
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.recording import Record, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.data.views import check_ready_made, picture
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_SIZE
 from sglpr_jax.methods.learned.layers import (

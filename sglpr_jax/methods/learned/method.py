@@ -10,7 +10,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Shaped
 
-from sglpr_jax.data.recording import Record, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.losses import descriptor_distance, lazy_triplet
 from sglpr_jax.methods.method import Takes
 from sglpr_jax.methods.recipe import Recipe

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from sglpr_jax.bev import rotate_points
-from sglpr_jax.data.recording import Record, check_cloud
+from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.methods.learned.layers import batch_norm, maximum
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables

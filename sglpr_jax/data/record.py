@@ -1,0 +1,153 @@
+"""A scan or ready-made image as it is read from its files, the times of its points, and the check of its points.
+
+Drivers write times of points in several units, relative to the scan or to an epoch. A field of times does not state its
+unit. A scan takes 2 ms to 1 s, so the span of the values has one possible unit.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, Shaped
+
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.files import naming
+from sglpr_jax.labels import to_classes
+
+FARTHEST_M = 300.0
+"""Limit of the largest coordinate of a point, in metres. No vehicle LiDAR has half of its points beyond it."""
+TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "stamps", "offset_time", "ts", "gps_time")
+"""Names of the field that drivers use for the time of a point."""
+UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+"""Possible units, in seconds."""
+SHORTEST_S, LONGEST_S = 0.002, 1.0
+"""Range of the duration of a scan, in seconds. It is narrower than the ratio of two units."""
+ABSOLUTE_S = 10.0
+"""Minimum time of a point since an epoch, in seconds. Smaller times are relative to the scan."""
+SAME_CLOCK_S = 1.0
+"""Maximum time between a scan and its points, in seconds, if both have the same clock."""
+
+
+def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
+    """Raise ValueError, which begins with `name`, if a point cloud shows no place.
+
+    It must be (n, 3), with a finite point that is not at the sensor, and at least half within `FARTHEST_M`.
+    """
+    where = f"{name}: " if name else ""
+    if points.shape[1] != 3:
+        raise ValueError(f"{where}expected points (n, 3) with x, y and z only, found shape {points.shape}")
+    x, y, z = np.abs(points.T)  # Column by column: a reduction over the last axis takes ten times as long.
+    largest = np.maximum(np.maximum(x, y), z)  # Not finite if any coordinate is not finite.
+    near = largest <= FARTHEST_M
+    if 2 * np.count_nonzero(near) > len(points) and (near & (largest > 0)).any():
+        return  # Nearly all scans end here.
+    largest = largest[np.isfinite(largest)]
+    if not len(largest):
+        raise ValueError(f"{where}expected finite points, found none among {len(points)}")
+    if not largest.any():
+        raise ValueError(f"{where}expected points around the sensor, found all {len(largest)} points at (0, 0, 0)")
+    half_are_beyond = 2 * np.count_nonzero(largest > FARTHEST_M) >= len(largest)
+    if half_are_beyond and np.median(largest) > FARTHEST_M:
+        raise ValueError(
+            f"{where}expected metres, with most points within {FARTHEST_M:g}, found half of the points beyond"
+            f" {np.median(largest):.4g} and the farthest at {largest.max():.4g}; are the coordinates in millimetres,"
+            " or is the format of the scan wrong (--format, for .bin files)?"
+        )
+
+
+def time_field_of(names: Collection[str]) -> str | None:
+    """Return the name of the field of times among the fields of a point, or None."""
+    return next((name for name in TIME_FIELDS if name in names), None)
+
+
+class TimeField(NamedTuple):
+    """Times of the points of a scan, as a file or message states them."""
+
+    name: str
+    """Name of the field."""
+    values: Shaped[np.ndarray, " n"]
+    """Numbers of the field, one per point, in an unknown unit."""
+
+    def seconds(self, *, valid: Bool[np.ndarray, " n"], scan_time: float | None) -> Float32[np.ndarray, " n"]:
+        """Return the time of each point relative to the time of its scan, in seconds.
+
+        Times since an epoch are compared with the scan's time. If that has another clock or is unknown, the first point
+        has the time of the scan. Points that are not `valid` may have any time, and get 0.
+
+        Raises ValueError if the span of the times is not that of a scan in any unit.
+        """
+        values = np.where(valid & np.isfinite(self.values), self.values, np.nan).astype(np.float64)
+        if np.isnan(values).all():
+            raise ValueError(f"expected times of points in the field {self.name}, found no finite ones")
+        first, last = np.nanmin(values), np.nanmax(values)
+        unit_s = next((unit for unit in UNITS_S if SHORTEST_S <= (last - first) * unit <= LONGEST_S), None)
+        if unit_s is None:
+            raise ValueError(
+                f"expected times of points over {SHORTEST_S:g} to {LONGEST_S:g} s in the field {self.name}, found "
+                f"{first:.10g} to {last:.10g}, which no unit from s to ns makes so"
+            )
+        first_s = origin_s = first * unit_s
+        if abs(first_s) < ABSOLUTE_S:
+            origin_s = 0.0
+        elif scan_time is not None and abs(first_s - scan_time) <= SAME_CLOCK_S:
+            origin_s = scan_time
+        return np.nan_to_num(values * unit_s - origin_s).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One scan (`points`) or one ready-made image (`image`). Missing or unrequested fields hold None."""
+
+    points: Float32[np.ndarray, "n 3"] | None = None
+    """Points in the LiDAR frame, in metres: x forward, y left, z up. Some may not be finite."""
+    image: Float32[np.ndarray, "h w"] | None = None
+    """Image in the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
+    labels: Int32[np.ndarray, "..."] | None = None
+    """Raw SemanticKITTI ids, one per point or pixel. 0 means an unknown class."""
+    labels_file: Path | None = None
+    """File of the labels, for error messages."""
+    lasers: Int32[np.ndarray, " n"] | None = None
+    """Laser number of each point, if the file contains it."""
+    name: str = ""
+    """Name for error messages: "scan 000052 of sequence 08"."""
+    time_field: TimeField | None = None
+    """Times of the points as the file states them, if it does."""
+    time: float | None = None
+    """Time in seconds."""
+    mounting: Mounting | None = None
+    """Mounting of the sensor. None means gravity-aligned, 1.73 m above the ground."""
+
+    @property
+    def cloud(self) -> Float32[np.ndarray, "n 3"]:
+        """Points of a scan."""
+        assert self.points is not None
+        return self.points
+
+    @property
+    def upright_points(self) -> Float32[np.ndarray, "n 3"]:
+        """Points as seen by a gravity-aligned sensor 1.73 m above the ground. Models use these points."""
+        return self.cloud if self.mounting is None else self.mounting.level(self.cloud)
+
+    @property
+    def point_times(self) -> Float32[np.ndarray, " n"] | None:
+        """Time of each point relative to `time`, in seconds, or None if the file has no times of points.
+
+        Raises ValueError if the times of the points cannot be those of a scan (`TimeField.seconds`).
+        """
+        if self.time_field is None or self.points is None:
+            return None
+        valid = np.isfinite(self.points).all(axis=1) & (self.points != 0).any(axis=1)
+        with naming(self.name):
+            return self.time_field.seconds(valid=valid, scan_time=self.time)
+
+    def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
+        """Return the class (docs/reference/labels.md) of every point or pixel, or None without labels.
+
+        Raises ValueError if a label id does not exist. The message names the label file if it is known.
+        """
+        if self.labels is None:
+            return None
+        with naming(self.labels_file or self.name):
+            return to_classes(self.labels, categories=categories)
