@@ -15,10 +15,12 @@ LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflec
 LIVOX = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 )
-CODES = {"u4": 6, "f4": 7, "f8": 8}
+LIVOX_DRIVERS = ("livox_ros_driver", "livox_ros_driver2")
+CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7, "f8": 8}
 """Codes of PointField by numpy type."""
 CLOUD = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 FILES = {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}
 """What a bag of each kind is called."""
 
@@ -27,7 +29,7 @@ FILES = {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}
 def typestore(kind: str) -> Any:
     """The messages of a ROS, with those of tf and of both drivers of Livox."""
     types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-    for package in ("livox_ros_driver", "livox_ros_driver2"):
+    for package in LIVOX_DRIVERS:
         types.register(get_types_from_msg(LIVOX_POINT, f"{package}/msg/CustomPoint"))
         types.register(get_types_from_msg(LIVOX, f"{package}/msg/CustomMsg"))
     if kind == "ros1":
@@ -81,11 +83,53 @@ def cloud(kind: str, seconds: float, points: np.ndarray, **more: np.ndarray) -> 
     )
 
 
-def write_bag(path: Path, kind: str, messages: Iterable[tuple[str, str, float, Any]]) -> Path:
+def livox(
+    kind: str, seconds: float, points: np.ndarray, *, driver: str = LIVOX_DRIVERS[0], frame: str = "livox"
+) -> Any:
+    """Livox's own message, with six lines."""
+    store = typestore(kind).types
+    point = store[f"{driver}/msg/CustomPoint"]
+    return store[f"{driver}/msg/CustomMsg"](
+        header=header(kind, seconds, frame),
+        timebase=12345678901234,
+        point_num=len(points),
+        lidar_id=1,
+        rsvd=np.zeros(3, np.uint8),
+        points=[
+            point(offset_time=7 * i, x=float(x), y=float(y), z=float(z), reflectivity=250, tag=16, line=i % 6)
+            for i, (x, y, z) in enumerate(points)
+        ],
+    )
+
+
+def pose(kind: str, seconds: float, position: Any, quaternion: Any = (0, 0, 0, 1), name: str = ODOMETRY) -> Any:
+    """A pose of base_link in odom, or a PoseStamped in map, at this time."""
+    store = typestore(kind).types
+    at = store["geometry_msgs/msg/Point"](*map(float, position))
+    turned = store["geometry_msgs/msg/Quaternion"](*map(float, quaternion))
+    plain = store["geometry_msgs/msg/Pose"](position=at, orientation=turned)
+    if name == POSE:
+        return store[POSE](header=header(kind, seconds, "map"), pose=plain)
+    zero = store["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    twist = store["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
+    return store[ODOMETRY](
+        header=header(kind, seconds, "odom"),
+        child_frame_id="base_link",
+        pose=store["geometry_msgs/msg/PoseWithCovariance"](pose=plain, covariance=np.zeros(36)),
+        twist=store["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+    )
+
+
+def write_bag(
+    path: Path, kind: str, messages: Iterable[tuple[str, str, float, Any]], *, compression: tuple[Any, ...] = ()
+) -> Path:
     """Write messages (topic, type, seconds at which it was recorded, message) into a bag of a kind of `FILES`."""
     types = typestore(kind)
     storage = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-    with Writer1(path) if kind == "ros1" else Writer2(path, version=9, storage_plugin=storage) as bag:
+    writer = Writer1(path) if kind == "ros1" else Writer2(path, version=9, storage_plugin=storage)
+    if compression:
+        writer.set_compression(*compression)
+    with writer as bag:
         serialize = types.serialize_ros1 if kind == "ros1" else types.serialize_cdr
         connections = {}
         for topic, name, seconds, message in messages:
