@@ -48,46 +48,10 @@ class Stacked:
         return array
 
 
-class StackWriter:
-    """Writes arrays one after another into a new file. All arrays must have rows like those of `first`."""
-
-    def __init__(self, path: Path, first: np.ndarray):
-        self._path, self._dtype, self._row = path, first.dtype, first.shape[1:]
-        self._offsets: list[int] = [0]
-        self._checksums: list[int] = []
-        with writing(path):
-            self._stream = path.open("xb")
-
-    def append(self, array: np.ndarray, *, of: str) -> None:
-        """Append an array. Raises ValueError, whose message names `of`, if the rows do not fit."""
-        if (array.dtype, array.shape[1:]) != (self._dtype, self._row):
-            raise ValueError(
-                f"{of}: expected {self._dtype} with rows of shape {self._row}, like the first array of the pack, "
-                f"found {array.dtype} {array.shape[1:]}"
-            )
-        array = np.ascontiguousarray(array)
-        with writing(self._path):
-            self._stream.write(array.data)
-        self._checksums.append(_checksum(array))
-        self._offsets.append(self._offsets[-1] + len(array))
-
-    def finish(self) -> dict[str, Any]:
-        """Flush the file to disk and return its layout, the keyword arguments of `map_stacked`."""
-        with writing(self._path):
-            sync(self._stream)
-        rows = {"dtype": self._dtype.str, "row": self._row}
-        return {**rows, "offsets": self._offsets, "checksums": self._checksums}
-
-    def close(self) -> None:
-        """Close the file, whether finished or not."""
-        with contextlib.suppress(OSError):  # An earlier write error is already being raised.
-            self._stream.close()
-
-
 def map_stacked(
     path: Path, *, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int] | None = None
 ) -> Stacked:
-    """Map a file written by `StackWriter` into memory. The keyword arguments are those that `finish` returned.
+    """Map a file of `_write_arrays` into memory. The keyword arguments are those that it returned.
 
     Raises ValueError if they contradict the file. Access beyond the end of the file would kill the process.
     """
@@ -184,16 +148,39 @@ def _make(target: Path, recording: Recording, source: dict[str, Any], on_progres
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
-    """Write the arrays of all scans or images, and return their layout."""
+    """Write the arrays of all scans or images one after another, and return their layout, as for `map_stacked`."""
+    streams: dict[str, IO] = {}
+    about: dict[str, Any] = {}
     with contextlib.ExitStack() as opened:
-        files: dict[str, StackWriter] = {}
         for i in range(len(recording)):
             for name, array in _arrays(recording, i).items():
-                if name not in files:
-                    files[name] = opened.enter_context(contextlib.closing(StackWriter(folder / f"{name}.bin", array)))
-                files[name].append(array, of=f"scan {recording.ids[i]} of sequence {recording.name}")
+                path, rows = folder / f"{name}.bin", {"dtype": array.dtype.str, "row": array.shape[1:]}
+                if name not in about:
+                    with writing(path):
+                        streams[name] = path.open("xb")
+                    opened.callback(_close, streams[name])
+                    about[name] = {**rows, "offsets": [0], "checksums": []}
+                lies = about[name]
+                if any(lies[part] != value for part, value in rows.items()):
+                    raise ValueError(
+                        f"scan {recording.ids[i]} of sequence {recording.name}: expected {lies['dtype']} with rows of "
+                        f"shape {lies['row']}, like the first array of the pack, found {array.dtype} {rows['row']}"
+                    )
+                array = np.ascontiguousarray(array)
+                with writing(path):
+                    streams[name].write(array.data)
+                lies["checksums"].append(_checksum(array))
+                lies["offsets"].append(lies["offsets"][-1] + len(array))
             on_progress(i + 1)
-        return {name: file.finish() for name, file in files.items()}
+        for name, stream in streams.items():
+            with writing(folder / f"{name}.bin"):
+                sync(stream)
+    return about
+
+
+def _close(stream: IO) -> None:
+    with contextlib.suppress(OSError):  # An earlier write error is already being raised.
+        stream.close()
 
 
 def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:

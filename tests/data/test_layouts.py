@@ -13,8 +13,7 @@ from PIL import Image
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.packed import packed
-from sglpr_jax.data.readers import helipr, kitti_raw, open_recording, recording_names
-from sglpr_jax.data.readers.stamped import read_table
+from sglpr_jax.data.readers import kitti_raw, open_recording, recording_names, stamped
 from sglpr_jax.retrieval.reuse import fingerprint
 
 NS, US = 1561000444390857630, 1326652795280148
@@ -98,7 +97,7 @@ def helipr_scan(sensor: str, layout: str, shift: int = 0) -> bytes:
 
 def helipr_tree(root: Path) -> None:
     folder = root / "Roundabout01"
-    stamps = [helipr.AEVA_CHANGED + 1 + i * 10**8 for i in range(2)]
+    stamps = [stamped.AEVA_CHANGED + 1 + i * 10**8 for i in range(2)]
     for sensor, layout in HELIPR.items():
         for i, stamp in enumerate(stamps):
             write(folder / f"LiDAR/{sensor}/{stamp}.bin", helipr_scan(sensor, layout, i))
@@ -225,7 +224,7 @@ LAYOUTS = {
         f"helipr {sensor}": Layout(
             helipr_tree,
             f"Roundabout01-{sensor}",
-            (str(helipr.AEVA_CHANGED + 1), str(helipr.AEVA_CHANGED + 1 + 10**8)),
+            (str(stamped.AEVA_CHANGED + 1), str(stamped.AEVA_CHANGED + 1 + 10**8)),
             [[0, 2, 3], [1, 2, 3]],
             [0.1],
             POINTS + 1,
@@ -413,7 +412,7 @@ def test_missing_files_are_named(tree):
     with pytest.raises(FileNotFoundError, match=r"v1\.0-trainval/sample\.json: expected a table, found none"):
         open_recording(root, "scene-0999")
     with pytest.raises(FileNotFoundError, match=r"none\.csv: expected a table of poses, found none"):
-        read_table(root / "none.csv", columns=2)
+        stamped.read_table(root / "none.csv", columns=2)
 
 
 def test_kitti_has_labels_and_two_pose_files(tree):
@@ -456,12 +455,12 @@ def test_ready_made_images(tree):
 
 
 def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
-    path = tmp_path / f"{helipr.AEVA_CHANGED}.bin"
+    path = tmp_path / f"{stamped.AEVA_CHANGED}.bin"
     path.write_bytes(helipr_scan("Aeva", "fffffiB"))
-    np.testing.assert_array_equal(helipr.read_points(path, sensor="Aeva").points, POINTS)
+    np.testing.assert_array_equal(stamped.read_helipr(path, sensor="Aeva").points, POINTS)
     path.write_bytes(bytes(29))
     with pytest.raises(ValueError, match=r"expected 25 bytes a point \(Aeva\), found 29 bytes in total"):
-        helipr.read_points(path, sensor="Aeva")
+        stamped.read_helipr(path, sensor="Aeva")
 
 
 def test_kitti_raw_without_gps(tree):
@@ -481,7 +480,7 @@ def test_the_ground_truth_of_nclt_is_found_in_any_of_three_places(tree, place):
 
 def test_long_times_keep_all_their_digits(tmp_path):
     write(tmp_path / "poses.csv", f"{NS},1\n{NS + 1}.000,2\n1.5e3,3\n")
-    times, numbers = read_table(tmp_path / "poses.csv", columns=2)
+    times, numbers = stamped.read_table(tmp_path / "poses.csv", columns=2)
     assert times.tolist() == [NS, NS + 1, 1500] and numbers.tolist() == [[1], [2], [3]]
 
 

@@ -1,4 +1,4 @@
-"""Readers of datasets on disk, one module for each layout. Modules that define `READER` are found automatically.
+"""Readers of datasets on disk. Modules that define `READER`, or several as `READERS`, are found automatically.
 
 To support a new layout, add a module to this folder and a test.
 """
@@ -22,8 +22,8 @@ def readers() -> tuple[Reader, ...]:
     """Return all readers, in the order in which they are tried."""
     names = sorted(module.name for module in pkgutil.iter_modules(__path__))
     modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
-    found = [module.READER for module in modules if isinstance(getattr(module, "READER", None), Reader)]
-    return tuple(sorted(found, key=lambda reader: reader.rank))
+    found = [reader for module in modules for reader in getattr(module, "READERS", [getattr(module, "READER", None)])]
+    return tuple(sorted(filter(None, found), key=lambda reader: reader.rank))
 
 
 def recording_names(root: Path | str) -> tuple[str, ...]:

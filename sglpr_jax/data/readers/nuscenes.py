@@ -140,9 +140,9 @@ def _column(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
 def _texts(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[str]:
     """Return a column of names or tokens. Raises ValueError if a value is missing, empty or no text."""
     values = _column(path, rows, name)
-    strange = next((value for value in values if not isinstance(value, str) or not value), values)
-    if strange is not values:
-        raise ValueError(f"{path}: expected text as {name!r} in every row, found {strange!r:.80}")
+    for value in values:
+        if not isinstance(value, str) or not value:
+            raise ValueError(f"{path}: expected text as {name!r} in every row, found {value!r:.80}")
     return values
 
 
@@ -153,9 +153,8 @@ def _numbers(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int) -
         numbers = np.array(values, np.float64).reshape(len(rows), size)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{path}: expected {size} numbers as {name!r}, found others ({in_short(error)})") from error
-    strange = ~np.isfinite(numbers).all(axis=1)
-    if strange.any():
-        raise ValueError(f"{path}: expected finite numbers as {name!r}, found {values[int(strange.argmax())]}")
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{path}: expected finite numbers as {name!r}, found NaN or infinite ones")
     return numbers
 
 

@@ -1,31 +1,163 @@
-"""Shared code of MulRan, HeLiPR, Boreas and NCLT: scans that are named by their time, and poses with other times."""
+"""Reader of MulRan, HeLiPR and Boreas: scans that are named by their time, and a table of poses with other times.
+
+- MulRan, an Ouster OS1-64: `KAIST01/Ouster/1561000444390857630.bin`, float32 x, y, z, intensity; `global_pose.csv`:
+  time and 12 numbers (world_from_base, in axes east, north, up). The Ouster is rotated by 180 degrees about z relative
+  to the car (179.67 degrees by its calibration). The points are rotated so that x points forward.
+- HeLiPR, four LiDARs, each a recording: `Roundabout01/LiDAR/Ouster/1689519060427055360.bin`, in a record of its own
+  without padding; `LiDAR_GT/Ouster_gt.txt`: time x y z qx qy qz qw of that sensor, in axes east, north, up.
+- Boreas, a Velodyne Alpha Prime: `boreas-2020-12-01-13-26/lidar/1606847163437292.bin`, float32 x, y, z, intensity,
+  laser, time; `applanix/lidar_poses.csv`: GPSTime, easting, northing, altitude and nine other columns.
+
+Names and times of MulRan and HeLiPR are in nanoseconds, those of Boreas in microseconds. Positions are those of the
+LiDAR. A new layout of this kind is one more row of `LAYOUTS`.
+"""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
 
+from sglpr_jax.data.formats.bin_records import described, read_records
 from sglpr_jax.data.readers.listing import scans_in
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
+from sglpr_jax.data.record import Record, TimeField, time_field_of
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_unit, nearest_rows
 
 MAX_GAP_S = 0.1
 """Maximum time between a scan and its pose, in seconds: the duration of one sweep."""
+OUSTER_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
+"""Position of MulRan's Ouster in the car's frame by the dataset's calibration, in metres."""
+FORWARD_FROM_OUSTER = np.array([-1, -1, 1], np.float32)
+HELIPR = {
+    "Avia": np.dtype(
+        [("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"), ("offset_time", "<u4")]
+    ),
+    "Aeva": np.dtype(
+        [("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1"), ("intensity", "<f4")]
+    ),
+    "Ouster": np.dtype(
+        [("xyz", "<f4", 3), ("intensity", "<f4"), ("t", "<u4"), ("reflectivity", "<u2"), ("line", "<u2"), ("a", "<u2")]
+    ),
+    "Velodyne": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("line", "<u2"), ("time", "<f4")]),
+}
+"""Record of one point, for each sensor."""
+AEVA_BEFORE = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1")])
+AEVA_CHANGED = 1691936557946849179
+"""Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
 
 
-def sequences(root: Path, *parts: Path | str) -> dict[str, Path]:
-    """Folder of each sequence by name: those in `root` that contain all `parts`, or `root` itself if it does."""
+def read_helipr(path: Path, *, sensor: str) -> Record:
+    """Read the points of a scan, their line numbers and their times. Raises ValueError if the file has a wrong size."""
+    before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
+    record = AEVA_BEFORE if before else HELIPR[sensor]
+    size = path.stat().st_size
+    if size == 0 or size % record.itemsize:
+        raise ValueError(f"{path}: expected {record.itemsize} bytes a point ({sensor}), found {size} bytes in total")
+    found = np.fromfile(path, record)
+    time = time_field_of(record.names or ())
+    times = None if time is None else TimeField(time, found[time].copy())
+    lasers = found["line"].astype(np.int32)
+    return Record(points=np.ascontiguousarray(found["xyz"], np.float32), lasers=lasers, time_field=times)
 
-    def contains_all(folder: Path) -> bool:
-        return all((folder / part).exists() for part in parts)
 
-    if contains_all(root):
-        return {root.resolve().name: root}
-    found = sorted(path for path in root.glob("*") if contains_all(path)) if root.is_dir() else []
-    return {path.name: path for path in found}
+def _ouster_positions(numbers: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 3"]:
+    world_from_base = numbers.reshape(-1, 3, 4)
+    return world_from_base[:, :, :3] @ OUSTER_IN_BASE_M + world_from_base[:, :, 3]
+
+
+class Layout(NamedTuple):
+    """Files of a sequence, and how they are read."""
+
+    scans: str
+    """Folder of the scans."""
+    poses: str
+    columns: int
+    """Number of columns of the table of poses."""
+    tick_s: float
+    """Unit of the names and times, in seconds."""
+    read: Callable[[Path], Record]
+    found: str
+    """Format in words."""
+    positions: Callable[[np.ndarray], np.ndarray] = lambda numbers: numbers[:, :3]
+    """Returns positions of the LiDAR by the columns after the time."""
+    header_lines: int = 0
+    suffix: str = ""
+    """End of the name of the recording, after that of the sequence."""
+
+
+LAYOUTS: dict[str, tuple[Layout, ...]] = {
+    "mulran": (
+        Layout(
+            "Ouster",
+            "global_pose.csv",
+            13,
+            1e-9,
+            lambda path: Record(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
+            f"MulRan, {described('kitti')}, rotated to x forward",
+            _ouster_positions,
+        ),
+    ),
+    "helipr": tuple(
+        Layout(
+            f"LiDAR/{sensor}",
+            f"LiDAR_GT/{sensor}_gt.txt",
+            8,
+            1e-9,
+            partial(read_helipr, sensor=sensor),
+            f"HeLiPR's {sensor} ({record.itemsize} bytes a point)",
+            suffix=f"-{sensor}",
+        )
+        for sensor, record in HELIPR.items()
+    ),
+    "boreas": (
+        Layout(
+            "lidar",
+            "applanix/lidar_poses.csv",
+            13,
+            1e-6,
+            partial(read_records, format="float32x6", last_is_time=True),
+            f"Boreas, {described('float32x6')}",
+            header_lines=1,
+        ),
+    ),
+}
+"""Layouts of the sequences of each dataset."""
+
+
+def _recordings(root: Path, dataset: str) -> dict[str, tuple[Path, Layout]]:
+    """Folder and layout of each recording by name: those in `root`, or `root` itself if it is a sequence."""
+    found = {}
+    for layout in LAYOUTS[dataset]:
+        for folder in (root, *(sorted(root.glob("*")) if root.is_dir() else ())):
+            if (folder / layout.scans).is_dir() and (folder / layout.poses).is_file():
+                found[f"{folder.resolve().name}{layout.suffix}"] = folder, layout
+    return dict(sorted(found.items(), key=lambda one: one[1][0].name))
+
+
+def recording_names(root: Path, *, dataset: str) -> tuple[str, ...]:
+    """Return the names of the recordings in `root`. `root` may be a sequence itself."""
+    return tuple(_recordings(root, dataset))
+
+
+def open_recording(root: Path, name: str, options: ReadOptions, *, dataset: str) -> Recording:
+    """Open a recording. Raises what `stamped_recording` and `read_table` raise."""
+    folder, layout = _recordings(root, dataset)[name]
+    poses = folder / layout.poses
+    stamps, numbers = read_table(poses, columns=layout.columns, header_lines=layout.header_lines)
+    return stamped_recording(
+        folder / layout.scans,
+        name,
+        stamps=stamps,
+        positions=np.ascontiguousarray(layout.positions(numbers)),
+        pose_file=poses,
+        tick_s=layout.tick_s,
+        read_points=layout.read,
+        found=(f"format: {layout.found}",),
+    )
 
 
 def stamped_recording(
@@ -112,3 +244,22 @@ def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int6
     if not rows:
         raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
     return np.array(times, np.int64), np.array(rows, np.float64)
+
+
+READERS = tuple(
+    Reader(
+        layout,
+        partial(recording_names, dataset=dataset),
+        partial(open_recording, dataset=dataset),
+        knows_mounting=False,
+        rank=rank,
+    )
+    for rank, (dataset, layout) in enumerate(
+        {
+            "mulran": "NAME/Ouster/*.bin with NAME/global_pose.csv (MulRan)",
+            "helipr": "NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)",
+            "boreas": "NAME/lidar/*.bin with NAME/applanix/lidar_poses.csv (Boreas)",
+        }.items(),
+        start=3,
+    )
+)
