@@ -1,4 +1,4 @@
-"""Clouds that show no place are refused on every road to an image, in one line that says what was found."""
+"""Scans and images that show no place are refused or skipped by embedding and by the model."""
 
 import dataclasses
 from pathlib import Path
@@ -10,43 +10,13 @@ import pytest
 from recordings import of_images, of_scans
 
 import sglpr_jax
-from sglpr_jax.data.record import Record, check_cloud
-from sglpr_jax.data.views import view
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.registry import handcrafted
 from sglpr_jax.models.config import model_preset
 
 GOOD = np.random.default_rng(0).uniform(-15, 15, (400, 3)).astype(np.float32)
-BAD = {
-    "NaN": (np.full_like(GOOD, np.nan), "expected finite points, found none among 400"),
-    "infinite": (np.full_like(GOOD, np.inf), "expected finite points, found none among 400"),
-    "zeros": (np.zeros_like(GOOD), r"found all 400 points at \(0, 0, 0\)"),
-    "millimetres": (GOOD * 5000, "expected metres, .*found half of the points beyond .*millimetres"),
-    "1e30": (np.full_like(GOOD, 1e30), "the farthest at 1e[+]30"),
-    "random bytes": (
-        np.frombuffer(np.random.default_rng(0).bytes(4800), "<f4").reshape(-1, 3),
-        "expected (metres|finite points)",
-    ),
-    "none": (GOOD[:0], "expected finite points, found none among 0"),
-}
 OUTSIDE = {"far": GOOD + np.float32([200, 0, 0]), "one point": GOOD[:1]}
 CONFIG = model_preset("tiny")
-
-
-def test_rows_of_a_file_are_no_points():
-    with pytest.raises(ValueError, match=r"scan 7: expected points \(n, 3\) with x, y and z only.*shape \(400, 4\)"):
-        check_cloud(np.column_stack([GOOD, GOOD[:, 0]]), name="scan 7")
-
-
-@pytest.mark.parametrize("kind", BAD)
-def test_no_place_is_refused(kind):
-    points, found = BAD[kind]
-    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=f"^scan 7: .*{found}"):
-        check_cloud(points, name="scan 7")
-    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=found):
-        view(Record(points=points), Grid())
-    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=found):
-        sglpr_jax.scan_image(points, CONFIG)
 
 
 @pytest.mark.parametrize("kind", OUTSIDE)
@@ -60,10 +30,9 @@ def recording(*clouds):
 
 
 def test_embedding_refuses_or_skips_them():
-    kind = "millimetres"
-    scans = recording(GOOD, BAD[kind][0], GOOD + 1)
+    scans = recording(GOOD, GOOD * 5000, GOOD + 1)
     method = handcrafted("scan-context", scans, CONFIG.grid)
-    with pytest.raises(ValueError, match=f"scan 1 of sequence 08: .*{BAD[kind][1]}"):
+    with pytest.raises(ValueError, match=r"scan 1 of sequence 08: expected metres, .*millimetres"):
         sglpr_jax.embed(method, scans)
     skipped = []
     file = sglpr_jax.embed(method, scans, on_bad_scan=lambda scan, error: skipped.append(scan))
@@ -106,9 +75,8 @@ def test_integers_are_no_density_image_but_its_bytes_are(random_params):
             sglpr_jax.describe(params, counts.astype(other))
 
 
-@pytest.mark.parametrize("dtype", [np.int32, np.uint8])
-def test_counts_of_points_may_be_any_number(random_params, dtype):
+def test_counts_of_points_may_be_any_number(random_params):
     params = random_params(CONFIG)
-    counts = np.random.default_rng(0).integers(0, 99, (CONFIG.grid.height, CONFIG.grid.width)).astype(dtype)
+    counts = np.random.default_rng(0).integers(0, 99, (CONFIG.grid.height, CONFIG.grid.width)).astype(np.int32)
     expected = sglpr_jax.describe(params, counts.astype(np.float32))
     np.testing.assert_array_equal(sglpr_jax.describe(params, counts), expected)
