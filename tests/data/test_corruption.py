@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from recordings import of_scans
 
 from sglpr_jax.data.corruption import (
     CORRUPTIONS,
@@ -171,39 +172,24 @@ by_name = pytest.mark.parametrize("corruption", ON_POINTS, ids=lambda corruption
 
 @pytest.fixture(scope="module")
 def rings_recording(tmp_path_factory):
-    """Four scans of 64 rings of 30 points in KITTI's layout, each point with a label of its own."""
-    root = tmp_path_factory.mktemp("rings")
-    folder = root / "sequences" / "00"
-    for part in ("velodyne", "labels"):
-        (folder / part).mkdir(parents=True)
-    elevation, azimuth = np.radians(np.linspace(2, -24, 64)), np.arange(0.05, 2 * np.pi, 2 * np.pi / 30)
-    ray = [np.outer(np.cos(elevation), axis(azimuth)).ravel() for axis in (np.cos, np.sin)]
-    ray = np.stack([*ray, np.repeat(np.sin(elevation), 30)], axis=1)
-    for scan in range(4):
-        points = ray * np.random.default_rng(scan).uniform(5, 50, (len(ray), 1))
-        np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(folder / "velodyne" / f"{scan:06d}.bin")
-        np.arange(len(ray), dtype="<u4").tofile(folder / "labels" / f"{scan:06d}.label")
-    np.savetxt(folder / "poses.txt", np.tile(np.eye(3, 4).ravel(), (4, 1)))
-    return open_recording(root, "00")
+    """Four scans of 64 rings of 30 points, each point with a label of its own."""
+    folder, (ray, _) = tmp_path_factory.mktemp("rings"), turn(np.linspace(2, -24, 64), azimuths=30)
+    paths = tuple(folder / f"{i}.label" for i in range(4))
+    for path in paths:
+        np.arange(len(ray), dtype="<u4").tofile(path)
+    scale = [np.random.default_rng(i).uniform(0.5, 1.5, (len(ray), 1)) for i in range(4)]
+    return of_scans({path: (ray * s).astype("f4") for path, s in zip(paths, scale, strict=True)}, label_paths=paths)
 
 
 @by_name
-def test_labels_stay_with_their_points(rings_recording, corruption):
+def test_a_scan_is_corrupted_by_seed_and_row_alone_and_labels_stay_with_their_points(rings_recording, corruption):
     points, labels = rings_recording.points(1), rings_recording.labels(1)
     found = corrupted_recording(rings_recording, corruption, seed=3)
-    left, kept = found.points(1), found.labels(1)
-    assert len(left) == len(kept)
+    forwards = [found.points(i) for i in range(4)]
+    left, kept = forwards[1], found.labels(1)
     assert not np.array_equal(left, points)
-    if len(left) < len(points):
-        np.testing.assert_array_equal(left, points[kept])  # a label is its point's row
-    else:
-        np.testing.assert_array_equal(kept, labels)
-
-
-@by_name
-def test_a_scan_is_corrupted_by_seed_and_row_alone(rings_recording, corruption):
-    first = corrupted_recording(rings_recording, corruption, seed=3)
-    forwards = [first.points(i) for i in range(4)]
+    # A label is its point's row.
+    np.testing.assert_array_equal(*((left, points[kept]) if len(left) < len(points) else (kept, labels)))
     again = corrupted_recording(rings_recording, corruption, seed=3)
     for i in reversed(range(4)):
         np.testing.assert_array_equal(again.points(i), forwards[i])

@@ -39,21 +39,17 @@ def recording(kitti_root) -> Recording:
     return open_recording(kitti_root, "08")
 
 
-def test_points_and_labels_are_those_of_the_files(recording, tmp_path):
+def test_points_and_labels_are_those_of_the_files_and_packed_once(recording, tmp_path, monkeypatch):
     told = []
     found = packed(recording, tmp_path / "cache", on_progress=told.append)
     assert told == [1, 2, 3]
     require_same_scans(found, recording)
     np.testing.assert_array_equal(found.positions, recording.positions)
+    monkeypatch.setattr(packing, "_make", lambda *_: pytest.fail("packed again"))
+    require_same_scans(packed(recording, tmp_path / "cache"), recording)
     assert not found.points(0).flags.writeable
     shutil.rmtree(recording.paths[0].parents[1])
     np.testing.assert_array_equal(found.points(1), 100 + np.arange(20, dtype=np.float32).reshape(5, 4)[:, :3])
-
-
-@pytest.mark.slow
-def test_real_scans_are_those_of_the_files(shared, tmp_path):
-    recording = open_recording(shared / "data/kitti_odometry", "08")
-    require_same_scans(packed(recording, tmp_path), recording)
 
 
 def test_a_scan_whose_bytes_have_changed_is_refused_and_the_others_are_not(recording, tmp_path):
@@ -86,25 +82,18 @@ def test_images_are_those_of_the_files(bev_root, tmp_path):
         np.testing.assert_array_equal(found.image(i), recording.image(i), strict=True)
 
 
-def test_a_pack_is_made_once(recording, tmp_path, monkeypatch):
-    packed(recording, tmp_path / "cache")
-    monkeypatch.setattr(packing, "_make", lambda *_: pytest.fail("packed again"))
-    require_same_scans(packed(recording, tmp_path / "cache"), recording)
+CHANGES = {
+    "points": lambda scan, label: np.ones((2, 4), "<f4").tofile(scan),
+    "time": lambda scan, label: (np.ones((5, 4), "<f4").tofile(scan), os.utime(scan, ns=(0, 0))),  # as many points
+    "label": lambda scan, label: label.unlink(),
+    "fewer": lambda scan, label: scan.unlink(),
+}
 
 
-@pytest.mark.parametrize("change", ["points", "time", "label", "fewer"])
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_changed_source_is_packed_anew(recording, kitti_root, tmp_path, change):
     packed(recording, tmp_path / "cache")
-    scan, label = recording.paths[1], recording.label_paths[0]
-    if change == "points":
-        np.ones((2, 4), "<f4").tofile(scan)
-    elif change == "time":  # as many points as before
-        np.ones((5, 4), "<f4").tofile(scan)
-        os.utime(scan, ns=(0, 0))
-    elif change == "label":
-        label.unlink()
-    else:
-        scan.unlink()
+    CHANGES[change](recording.paths[1], recording.label_paths[0])
     changed = open_recording(kitti_root, "08")
     require_same_scans(packed(changed, tmp_path / "cache"), changed)
     assert len(packs(tmp_path / "cache")) == 2

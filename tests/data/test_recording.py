@@ -48,11 +48,6 @@ def test_a_record_opens_each_of_its_files_once(recording, opened):
     assert (record.name, record.time) == ("scan 000000 of sequence 08", 0.0)
 
 
-def test_a_corrupted_record_opens_each_of_its_files_once(recording, opened):
-    corrupted(recording, Corruption("dropout", 0.5), seed=0).record(0)
-    assert opened == {"000000.bin": 1, "000000.label": 1}  # 3 when points and labels were read apart
-
-
 def test_lasers_come_from_the_read_of_the_points(tmp_path, opened):
     points = np.random.default_rng(0).normal(scale=10, size=(64, 5)).astype("<f4")
     points[:, 4] = np.arange(64) % 32

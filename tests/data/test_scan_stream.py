@@ -85,25 +85,12 @@ def test_this_thread_reads_and_others_look_ahead(ahead):
     assert (here in looking) == (not ahead)
 
 
-READ = {Path(f"{i}.bin"): np.full((5, 3), i + 1, np.float32) for i in range(4)}
-
-
-def broken(path: Path) -> np.ndarray:
-    if path.stem == "1":
-        raise ValueError("1.bin: expected points, found none")
-    return np.full((5, 3), np.nan, np.float32) if path.stem == "3" else READ[path]
-
-
 def test_what_belongs_to_a_bad_scan_goes_with_it():
-    whole = of_scans(READ, positions=np.arange(12.0).reshape(4, 3), times=np.arange(4.0))
+    whole = of_scans(CLOUDS, positions=np.arange(18.0).reshape(6, 3), times=np.arange(6.0))
     bad = []
-    found = readable(with_points(whole, broken), on_bad_scan=lambda scan, error: bad.append((scan, str(error))))
-    assert found.ids == ("0", "2") and found.times.tolist() == [0, 2] and found.positions[:, 0].tolist() == [0, 6]
-    np.testing.assert_array_equal(found.points(1), READ[Path("2.bin")])
-    assert [scan for scan, _ in bad] == ["1", "3"]
-    assert "1.bin: expected points" in bad[0][1] and "scan 3 of sequence 08: expected finite points" in bad[1][1]
-
-
-def test_nothing_to_read_is_an_error():
+    found = readable(with_points(whole, points_with_bad_ones), on_bad_scan=lambda scan, error: bad.append(scan))
+    assert found.ids == ("0", "3", "4", "5") and bad == ["1", "2"]
+    assert found.times.tolist() == [0, 3, 4, 5] and found.positions[:, 0].tolist() == [0, 9, 12, 15]
+    np.testing.assert_array_equal(found.points(1), CLOUDS[Path("3.bin")])
     with pytest.raises(ValueError, match="sequence 08: expected at least one readable scan, found none"):
-        readable(with_points(of_scans({Path("1.bin"): READ[Path("1.bin")]}), broken), on_bad_scan=lambda *_: None)
+        readable(of_scans({Path("1.bin"): FAR}), on_bad_scan=lambda *_: None)

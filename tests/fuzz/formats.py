@@ -1,7 +1,6 @@
 """One intact file of each format that the package reads, and the function that reads it."""
 
 import dataclasses
-import io
 import json
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
@@ -9,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import bags
-import laspy
 import numpy as np
 import safetensors.numpy
+from clouds import las, pcd, ply, records_of, stream_of
 from PIL import Image
 
 from sglpr_jax.data.formats.png import read_label_image
@@ -41,6 +40,8 @@ RNG = np.random.default_rng(0)
 POSITIONS, TIMES = np.round(RNG.normal(scale=30, size=(N, 3)), 3), np.arange(N) * 0.5
 DESCRIPTORS = RNG.normal(size=(N, 4)).astype(np.float32)
 POINTS = RNG.normal(scale=9, size=(N, 4)).astype("<f4")
+PCD = ("binary", "ascii", "binary_compressed")
+RECORDS = records_of(POINTS[:, :3], i=POINTS[:, 3])
 TRAJECTORY = Trajectory(POSITIONS, TIMES, "poses")
 
 
@@ -66,41 +67,9 @@ def text(rows: Iterable[Iterable[float]], separator: str = " ") -> bytes:
     return "".join(separator.join(f"{value:.17g}" for value in row) + "\n" for row in rows).encode()
 
 
-def stream_of(save: Callable[..., Any], *arguments: Any, **named: Any) -> bytes:
-    """Bytes that a function writes into a stream, its first argument."""
-    stream = io.BytesIO()
-    save(stream, *arguments, **named)
-    return stream.getvalue()
-
-
 def png(pixels: np.ndarray) -> bytes:
     """A PNG image."""
     return stream_of(lambda stream: Image.fromarray(pixels).save(stream, "PNG"))
-
-
-def pcd(data: str) -> bytes:
-    """The points as a .pcd file."""
-    header = f"VERSION .7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {N}\nHEIGHT 1\nPOINTS {N}\n"
-    columns = b"".join(bytes([column.nbytes - 1]) + column.tobytes() for column in POINTS.T.copy())
-    sizes = np.array([len(columns), POINTS.nbytes], "<u4").tobytes()
-    body = {"binary": POINTS.tobytes(), "ascii": text(POINTS), "binary_compressed": sizes + columns}[data]
-    return f"{header}DATA {data}\n".encode() + body
-
-
-def ply(order: str) -> bytes:
-    """The points as a .ply file: in text, or in one of two byte orders."""
-    named = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
-    properties = "".join(f"property float {name}\n" for name in "xyzi")
-    header = f"ply\nformat {named} 1.0\nelement vertex {N}\n{properties}end_header\n"
-    return header.encode() + (POINTS.astype(f"{order}f4").tobytes() if order else text(POINTS))
-
-
-def las(stream: io.BytesIO) -> None:
-    """Write the points as a .las file."""
-    cloud = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
-    cloud.header.scales = [0.001] * 3
-    cloud.x, cloud.y, cloud.z = POINTS[:, :3].astype(np.float64).T
-    cloud.write(stream)
 
 
 def bag(kind: str, file: str) -> bytes:
@@ -193,11 +162,14 @@ def read_scenes(path: Path) -> Recording:
 
 FORMATS = {
     "scan .bin": Format("1.bin", POINTS.tobytes(), read_scan),
-    **{f"scan .pcd {data}": Format("1.pcd", pcd(data), read_scan) for data in ("binary", "ascii", "binary_compressed")},
-    **{f"scan .ply {order}": Format("1.ply", ply(order), read_scan) for order in ("", "<", ">")},
+    **{
+        f"scan .pcd {data}": Format("1.pcd", pcd(RECORDS, data), read_scan)
+        for data in ("binary", "ascii", "binary_compressed")
+    },
+    **{f"scan .ply {order}": Format("1.ply", ply(RECORDS, order), read_scan) for order in ("", "<", ">")},
     "scan .npy": Format("1.npy", stream_of(np.save, POINTS), read_scan),
     "scan .npz": Format("1.npz", stream_of(np.savez, points=POINTS), read_scan),
-    "scan .las": Format("1.las", stream_of(las), read_scan),
+    "scan .las": Format("1.las", las(POINTS), read_scan),
     "bag .bag": Format("1.bag", bag("ros1", ""), read_bag),
     "bag .mcap": Format("1.mcap", bag("mcap", "drive.mcap"), read_bag),
     "bag .db3": Format("1.db3", bag("ros2", "drive.db3"), read_bag),

@@ -13,15 +13,10 @@ from jaxtyping import Float32, UInt8
 
 from sglpr_jax.data.formats.png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
-from sglpr_jax.data.readers.listing import files_in, scans_in
+from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, image_record
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
-
-
-def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the sequences in `root`, in order."""
-    return tuple(sorted(folder.parent.name for folder in root.glob("*/imgs") if folder.is_dir()))
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
@@ -60,4 +55,4 @@ def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     return np.ascontiguousarray(grey) * np.float32(DENSITY_MAX_COUNT / 255)
 
 
-READER = Reader("NN/imgs/*.png (BEV images)", recording_names, open_recording, rank=1)
+READER = Reader("NN/imgs/*.png (BEV images)", partial(names_of, pattern="*/imgs/"), open_recording, rank=1)

@@ -16,7 +16,7 @@ from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import described, unusual_record
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.readers.listing import files_in, scans_in
+from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import ReadRecord, Recording, scan_record
 from sglpr_jax.files import naming, read_json
@@ -24,11 +24,6 @@ from sglpr_jax.se3 import positions_from_camera
 
 SIMULATION = "simulation.json"
 """File with the settings of a simulated dataset, written by `bin/simulate`."""
-
-
-def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the sequences in `root` that have a folder `velodyne`, in order."""
-    return tuple(sorted(folder.parent.name for folder in root.glob("sequences/*/velodyne")))
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
@@ -94,4 +89,9 @@ def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
     return found
 
 
-READER = Reader("sequences/NN/velodyne/*.bin (KITTI)", recording_names, open_recording, rank=0)
+READER = Reader(
+    "sequences/NN/velodyne/*.bin (KITTI)",
+    partial(names_of, pattern="sequences/*/velodyne/"),
+    open_recording,
+    rank=0,
+)

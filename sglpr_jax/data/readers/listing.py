@@ -1,4 +1,4 @@
-"""Lists the scan files of a folder in natural order."""
+"""Lists the recordings of a folder, and its scan files in natural order."""
 
 import re
 from collections import Counter
@@ -28,6 +28,12 @@ def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ..
         expected = ", ".join(f"*{ending}" for ending in endings)
         raise FileNotFoundError(f"{folder}: expected {kind} ({expected}), found none")
     return paths
+
+
+def names_of(root: Path, *, pattern: str) -> tuple[str, ...]:
+    """Return the names of the folders in `root` that a pattern such as "sequences/*/velodyne/" finds, in order."""
+    at = next(i for i, part in enumerate(Path(pattern).parts) if "*" in part or "[" in part)
+    return tuple(sorted({found.relative_to(root).parts[at] for found in root.glob(pattern)}))
 
 
 def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:

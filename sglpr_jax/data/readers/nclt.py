@@ -20,6 +20,7 @@ from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, read_records
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.readers.listing import names_of
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.readers.stamped import stamped_recording
 from sglpr_jax.data.recording import Recording
@@ -34,11 +35,6 @@ BODY = Mounting(0.0)
 """Mounting of the body frame: the origin of the points is on the ground, not at the sensor."""
 _DATE = "[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]"
 _COLUMNS = ("utime", "x", "y", "z", "roll", "pitch", "yaw")
-
-
-def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the dates of the sessions in `root` that have a folder `velodyne_sync`, in order."""
-    return tuple(sorted(folder.parent.name for folder in root.glob(f"{_DATE}/velodyne_sync") if folder.is_dir()))
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
@@ -92,7 +88,7 @@ def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.nda
 
 READER = Reader(
     "YYYY-MM-DD/velodyne_sync/*.bin (NCLT)",
-    recording_names,
+    partial(names_of, pattern=f"{_DATE}/velodyne_sync/"),
     open_recording,
     rank=2,
 )
