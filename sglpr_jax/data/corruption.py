@@ -5,6 +5,7 @@ import difflib
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
@@ -88,23 +89,15 @@ def _from_the_lowest(groups: Int[np.ndarray, " n"], elevation: Float[np.ndarray,
 Cloud = Float32[np.ndarray, "n 3"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Scan:
-    """Input of a corruption: the finite points of one scan, the laser of each point if known, and a random
-    generator."""
-
-    points: Cloud
-    lasers: Int[np.ndarray, " n"] | None
-    rng: np.random.Generator
+Corrupt = Callable[[Cloud, float, np.random.Generator, Int[np.ndarray, " n"] | None], Cloud | Bool[np.ndarray, " n"]]
+"""Function of finite points, strength, random generator and lasers if known. Returns a mask of the remaining points, or
+all points at new positions."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """Kind of corruption."""
 
-    corrupt: Callable[[Scan, float], Cloud | Bool[np.ndarray, " n"]]
-    """Function of the scan and the strength. It returns a mask of the remaining points, or all points at new
-    positions."""
+    corrupt: Corrupt
     strengths: tuple[float, ...]
     """Usual strengths, from weak to strong. Only 0 for a kind without a strength."""
     limits: tuple[float, float] = (0.0, np.inf)
@@ -113,54 +106,51 @@ class Kind:
     """Whether `corrupt` needs the laser of each point."""
 
 
-def occlude(scan: Scan, degrees: float) -> Bool[np.ndarray, " n"]:
+def occlude(points: Cloud, degrees: float, rng: np.random.Generator, lasers: object) -> Bool[np.ndarray, " n"]:
     """Remove the points in a sector of the given width, in degrees, about a random heading."""
-    heading, width = scan.rng.uniform(-np.pi, np.pi), np.radians(degrees)
-    azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
+    heading, width = rng.uniform(-np.pi, np.pi), np.radians(degrees)
+    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
     return np.abs((azimuth - heading + np.pi) % (2 * np.pi) - np.pi) >= width / 2
 
 
-def fewer_beams(scan: Scan, beams: float) -> Bool[np.ndarray, " n"]:
-    """Keep the given number of lasers (`keep_rings`). Raises ValueError if the rings are unknown."""
-    return keep_rings(ring_numbers(scan.points, lasers=scan.lasers), int(beams))
-
-
-def add_noise(scan: Scan, metres: float) -> Cloud:
+def add_noise(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
     """Add Gaussian noise along each ray, with the given standard deviation in metres. A point at the sensor stays."""
-    distance = np.linalg.norm(scan.points.astype(np.float64), axis=1)
-    steps = metres * scan.rng.standard_normal(len(scan.points))
+    distance = np.linalg.norm(points.astype(np.float64), axis=1)
+    steps = metres * rng.standard_normal(len(points))
     share = np.divide(steps, distance, out=np.zeros_like(distance), where=distance > 0)
-    return (scan.points * (1 + share[:, None])).astype(np.float32)
+    return (points * (1 + share[:, None])).astype(np.float32)
 
 
-def drop_out(scan: Scan, share: float) -> Bool[np.ndarray, " n"]:
-    """Remove each point with the given probability."""
-    return scan.rng.random(len(scan.points)) >= share
-
-
-def offset(scan: Scan, metres: float) -> Cloud:
+def offset(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
     """Move the sensor by the given distance, in metres, to the left or to the right at random.
 
     Only the points move. A sensor at the new place would see other occlusions, which one scan does not show.
     """
-    return scan.points - np.array([0, scan.rng.choice((-1, 1)) * metres, 0], np.float32)
+    return points - np.array([0, rng.choice((-1, 1)) * metres, 0], np.float32)
 
 
-def rotate_elsewhere(scan: Scan, strength: float) -> Cloud:
+def rotate_elsewhere(*_: object) -> Cloud:
     """Raise ValueError. Embedding rotates the scans, because it can rotate images, too."""
     raise ValueError("expected a corruption other than rotation; for rotation use the rotation_seed of embed")
 
 
 KINDS: dict[str, Kind] = {
-    "clean": Kind(lambda scan, strength: scan.points, strengths=()),
+    "clean": Kind(lambda points, *_: points, strengths=()),
     "rotation": Kind(rotate_elsewhere, strengths=(0.0,)),
     "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), limits=(0.0, 360.0)),
-    "beams": Kind(fewer_beams, strengths=(32.0, 16.0), limits=(1.0, np.inf), needs_lasers=True),
+    "beams": Kind(
+        lambda points, beams, rng, lasers: keep_rings(ring_numbers(points, lasers=lasers), int(beams)),
+        strengths=(32.0, 16.0),
+        limits=(1.0, np.inf),
+        needs_lasers=True,
+    ),
     "noise": Kind(add_noise, strengths=(0.05, 0.1, 0.2)),
-    "dropout": Kind(drop_out, strengths=(0.5, 0.9), limits=(0.0, 1.0)),
+    "dropout": Kind(
+        lambda points, share, rng, lasers: rng.random(len(points)) >= share, strengths=(0.5, 0.9), limits=(0.0, 1.0)
+    ),
     "offset": Kind(offset, strengths=(0.5, 1.0, 2.0)),
 }
-"""All kinds by name."""
+"""All kinds by name: "beams" keeps a number of lasers, and "dropout" removes each point with a probability."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,7 +218,7 @@ def corrupt(
 
     Raises ValueError for a rotation (see `rotation_seed` of `embed`), or if the beams cannot be separated.
     """
-    found = KINDS[corruption.kind].corrupt(Scan(points, lasers, rng), corruption.strength)
+    found = KINDS[corruption.kind].corrupt(points, corruption.strength, rng, lasers)
     if found.dtype == bool:
         return points[found], found
     return found, np.ones(len(points), bool)

@@ -112,7 +112,9 @@ def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2
     voxels = _fewest_voxels(points)
     if not len(voxels):
         return np.zeros((2, 0))
-    voxel = _numbered(voxels)
+    found = _found(voxels)
+    numbered = None if found is None else (np.cumsum(found) - 1)[voxels - voxels.min()]
+    voxel = np.unique(voxels, return_inverse=True)[1] if numbered is None else numbered  # without gaps, in order
     return np.stack([np.bincount(voxel, weights=axis) for axis in points[:2]]) / np.bincount(voxel)
 
 
@@ -133,14 +135,6 @@ def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"
 def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
     found = _found(voxels)
     return int(len(np.unique(voxels)) if found is None else np.count_nonzero(found)) > MAX_VOXELS
-
-
-def _numbered(voxels: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Renumber voxels in ascending order without gaps."""
-    found = _found(voxels)
-    if found is None:
-        return np.unique(voxels, return_inverse=True)[1]
-    return (np.cumsum(found) - 1)[voxels - voxels.min()]
 
 
 def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:

@@ -72,28 +72,26 @@ def _results(
 
     This thread reads the files, because not every file can be read in parallel. Other threads call `look`.
     """
+
+    def checked(row: int, record: Record) -> T:
+        if record.points is not None:
+            check_cloud(record.points, name=record.name)
+        return look(row, record)
+
+    def fail(error: Exception) -> NoReturn:
+        raise error
+
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         waiting: deque[tuple[int, Callable[[], T]]] = deque()
         for row in rows:
             try:
-                record = recording.record(row, labels=labels)
-                compute = functools.partial(_checked, look, row, record)
+                compute = functools.partial(checked, row, recording.record(row, labels=labels))
                 waiting.append((row, threads.submit(compute).result if ahead else compute))
             except (ValueError, OSError) as error:
-                waiting.append((row, functools.partial(_fail, error)))
+                waiting.append((row, functools.partial(fail, error)))
             if len(waiting) > ahead:
                 yield waiting.popleft()
         yield from waiting
-
-
-def _checked(look: Look[T], row: int, record: Record) -> T:
-    if record.points is not None:
-        check_cloud(record.points, name=record.name)
-    return look(row, record)
-
-
-def _fail(error: Exception) -> NoReturn:
-    raise error
 
 
 def readable(

@@ -51,28 +51,6 @@ def lines(rows: Any) -> str:
     return "".join(" ".join(map(str, row)) + "\n" for row in rows)
 
 
-def kitti(root: Path) -> None:
-    """Frames 0, 2 and 3 of four, labels for 0 and 3, 10 m from frame to frame."""
-    folder = root / "sequences" / "08"
-    for i in (0, 2, 3):
-        write(folder / f"velodyne/{i:06d}.bin", scan(i, 4))
-        if i != 2:
-            write(folder / f"labels/{i:06d}.label", np.array([48, 49, 50], "<u4") + np.uint32(7 << 16))
-    camera = [[1.0, 2.0, 10.0 * i] for i in range(4)]
-    write(folder / "poses.txt", lines(map(pose, camera)))
-    write(root / "poses/08.txt", lines(pose([x, y + 50, z]) for x, y, z in camera))
-    write(folder / "times.txt", lines([[i / 10] for i in range(4)]))
-
-
-def bev(root: Path) -> None:
-    """Images 0 and 2 of three, the second with labels."""
-    (root / "06/imgs").mkdir(parents=True), (root / "06/labels").mkdir()
-    for i in (0, 2):
-        Image.fromarray(np.arange(35, dtype=np.uint8).reshape(5, 7) * 7 + i).save(root / f"06/imgs/{i:06d}.png")
-    Image.fromarray(np.arange(35, dtype=np.uint16).reshape(5, 7) // 34 * 252).save(root / "06/labels/000002.png")
-    write(root / "06/pose.txt", lines(pose([3.0 * i, 3.0 * i + 1, 3.0 * i + 2]) for i in range(3)))
-
-
 def mulran(root: Path) -> None:
     """The car stands at (10 i, 20, 3), turned left by a quarter; the third scan has no pose."""
     for i, wait in enumerate((0, 10**8, 10**9)):
@@ -177,7 +155,7 @@ def pandaset(root: Path) -> None:
 
 
 class Layout(NamedTuple):
-    write: Callable[[Path], None]
+    write: Callable[[Path], None] | None
     name: str
     ids: tuple[str, ...]
     positions: Any
@@ -200,12 +178,12 @@ DRIVE = "2011_09_26/2011_09_26_drive_0001_sync"
 FORWARD = np.array([1, -1, 1], np.float32)
 LAYOUTS = {
     "kitti": Layout(
-        kitti,
+        None,
         "08",
         ("000000", "000002", "000003"),
         [[0, -1, -2], [20, -1, -2], [30, -1, -2]],
         [0.2, 0.1],
-        POINTS + np.float32(3),
+        150 + np.arange(20.0).reshape(5, 4)[:, :3],
         "sequences/08/poses.txt",
         "format: kitti (16 bytes a point)",
     ),
@@ -295,10 +273,12 @@ LAYOUTS = {
 
 
 @pytest.fixture
-def tree(tmp_path):
+def tree(tmp_path, kitti_root):
     def made(layout: str) -> Path:
-        {**{name: one.write for name, one in LAYOUTS.items()}, "bev": bev}[layout](tmp_path)
-        return tmp_path
+        if layout == "kitti":
+            return kitti_root
+        LAYOUTS[layout].write(tmp_path / "data")
+        return tmp_path / "data"
 
     return made
 
@@ -418,7 +398,7 @@ def test_missing_files_are_named(tree):
 def test_kitti_has_labels_and_two_pose_files(tree):
     root = tree("kitti")
     found = open_recording(root)
-    assert found.labels(0).tolist() == [48, 49, 50] and found.labels(1) is None and found.has_labels
+    assert found.labels(0).tolist() == [48, 49, 50, 51, 52] and found.labels(1) is None and found.has_labels
     for choice, height in (("auto", -2), ("semantickitti", -2), ("kitti", -52)):
         assert open_recording(root, pose_source=choice).positions[0, 2] == height
     for file in ("sequences/08/poses.txt", "poses/08.txt"):
@@ -440,17 +420,19 @@ def test_simulated_drives_know_how_high_their_sensor_stood(tree):
     assert open_recording(root).mounting is None
 
 
-def test_ready_made_images(tree):
-    root = tree("bev")
-    found = open_recording(root)
+def test_ready_made_images(bev_root):
+    (bev_root / "06/imgs/000001.png").unlink()
+    (bev_root / "06/labels").mkdir()
+    Image.fromarray(np.arange(35, dtype=np.uint16).reshape(5, 7) // 34 * 252).save(bev_root / "06/labels/000002.png")
+    found = open_recording(bev_root)
     assert (found.name, found.ids, found.times, found.pose_source) == ("06", ("000000", "000002"), None, "06/pose.txt")
     np.testing.assert_array_equal(found.positions, [[0, 1, 2], [6, 7, 8]])
     assert found.image(1).shape == (7, 5) and found.resolution_m == 0.4 and found.labels(0) is None
-    raw_ids = np.asarray(Image.open(root / "06/labels/000002.png"))
+    raw_ids = np.asarray(Image.open(bev_root / "06/labels/000002.png"))
     np.testing.assert_array_equal(found.labels(1), np.rot90(raw_ids, -1))
-    (root / "06/pose.txt").unlink()
-    (root / "06/imgs/000000.png").rename(root / "06/imgs/000000-b.png")  # no row of a pose
-    found = open_recording(root)
+    (bev_root / "06/pose.txt").unlink()
+    (bev_root / "06/imgs/000000.png").rename(bev_root / "06/imgs/000000-b.png")  # no row of a pose
+    found = open_recording(bev_root)
     assert found.positions is None and found.description[-1] == "times: none; poses: none"
 
 

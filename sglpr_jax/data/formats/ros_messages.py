@@ -7,6 +7,7 @@ order. After them, each number is aligned to its size.
 import dataclasses
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,25 +176,20 @@ class StampedPose(NamedTuple):
     """Position x, y, z in metres, and quaternion x, y, z, w."""
 
 
-def _odometry(message: RosMessage) -> StampedPose:
-    header, child = message.header(), message.text()
+def _pose(message: RosMessage, *, with_child: bool = True) -> StampedPose:
+    header, child = message.header(), message.text() if with_child else ""
     return StampedPose(header.time, child, header.frame, message.numbers("f8", 7))
-
-
-def _pose_stamped(message: RosMessage) -> StampedPose:
-    header = message.header()
-    return StampedPose(header.time, "", header.frame, message.numbers("f8", 7))
 
 
 def read_transforms(message: RosMessage) -> Iterator[StampedPose]:
     """Read the transforms of a tf message. Each is the pose of its child frame in the frame of its header."""
     for _ in range(int(message.numbers("u4")[0])):
-        yield _odometry(message)  # header, child, and the same seven numbers
+        yield _pose(message)
 
 
 POSES: dict[str, Callable[[RosMessage], StampedPose]] = {
-    "nav_msgs/msg/Odometry": _odometry,
-    "geometry_msgs/msg/PoseStamped": _pose_stamped,
+    "nav_msgs/msg/Odometry": _pose,
+    "geometry_msgs/msg/PoseStamped": partial(_pose, with_child=False),
 }
 """Message types with poses of the vehicle, and their readers."""
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

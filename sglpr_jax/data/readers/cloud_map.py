@@ -56,6 +56,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     _check_kept(kept, cloud, path.positions, root, poses)
     world_from_lidar = _raised(cloud, path.poses, np.flatnonzero(kept), poses)
     ids = tuple(f"{row:06d}" for row in range(len(kept)))
+    used = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
     recording = Recording(
         name=root.stem,
         ids=ids,
@@ -67,14 +68,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         on_disk=False,
         world_from_lidar=world_from_lidar,
         containers=(root,),
-        found=(f"format: {_described(root, cloud)}",),
+        found=(f"format: point cloud map {root.name}, {used}, {cloud.spacing_m:.2f} m apart; scans computed from it",),
     )
     return recording if kept.all() else only(recording, np.flatnonzero(kept).tolist())
-
-
-def _described(root: Path, cloud: TiledCloud) -> str:
-    points = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
-    return f"point cloud map {root.name}, {points}, {cloud.spacing_m:.2f} m apart; scans computed from it"
 
 
 def _read(
