@@ -14,9 +14,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from sglpr_jax.data.formats.png import read_label_image
 from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Recording, image_record
 from sglpr_jax.files import file_name, in_short, read_json, replacing, writing
 
 
@@ -113,9 +112,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
 
     def read(row: int, label_path: Path | None, lasers: bool) -> Record:
         if "images" in arrays:
-            image = arrays["images"][row]
-            labels = None if label_path is None else read_label_image(label_path, shape=image.shape)
-            return Record(image=image, labels=labels)
+            return image_record(recording.paths[row], label_path, read=lambda _: arrays["images"][row])
         labels = arrays["labels"][row].astype(np.int32) if label_path is not None and "labels" in arrays else None
         numbers = recording.read_row(row, None, True).lasers if lasers else None
         return Record(points=arrays["points"][row], labels=labels, lasers=numbers)

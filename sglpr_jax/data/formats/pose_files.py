@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
-from sglpr_jax.data.poses import poses_at_scans, poses_of
+from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.times import ADVICE, times_of
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value
@@ -29,8 +29,6 @@ TIME_COLUMNS = ("t", "time", "timestamp")
 TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
 """Names with a unit, used if none of `TIME_COLUMNS` exists."""
 KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
-POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
-TIMES_FILE = "times.txt"
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
@@ -300,54 +298,3 @@ def _header(path: Path) -> tuple[list[str], str | None]:
     if unused:
         warn(f"{path}: expected seconds in one of {', '.join(KNOWN_CLOCKS)}, found {', '.join(unused)}, not used")
     return names, clocks[0] if clocks else None
-
-
-def folder_trajectory(
-    root: Path,
-    *,
-    scans: int,
-    poses: Path | None = None,
-    pose_format: PoseFormat = "auto",
-    times: Path | None = None,
-    time_unit: TimeUnit = "auto",
-) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
-    """Read positions (n, 3) in metres, times in seconds and a description of the pose source; each is None if unknown.
-
-    Poses with other times than the scans, or another number of rows, are interpolated (`poses_at_scans`).
-
-    Arguments:
-      root: Folder of the scans.
-      scans: Number of scans.
-      poses: Pose file. By default, the file of `POSE_FILES` beside the scans, where 12 numbers a line are z up.
-      pose_format: Format of the pose file.
-      times: File of timestamps. By default, `TIMES_FILE` beside the scans, or else the times of the poses.
-      time_unit: Unit of the times in both files.
-
-    Raises:
-      FileNotFoundError: If `poses` or `times` does not exist.
-      ValueError: If there are several pose files, a file is malformed, or a scan has no time or no pose.
-    """
-    beside = [root / name for name in POSE_FILES if (root / name).is_file()]
-    if poses is None and len(beside) > 1:
-        raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")
-    path = poses or next(iter(beside), None)
-    clock = times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
-    seconds = None if clock is None else read_times(clock, unit=time_unit)
-    if seconds is not None and len(seconds) != scans:
-        raise ValueError(f"{clock}: expected {scans} rows, one per scan, found {len(seconds)}")
-    if path is None:
-        return None, seconds, None
-    given = read_trajectory(
-        path, format=pose_format, time_unit=time_unit, twelve_numbers="lidar" if poses is None else None
-    )
-    of = f"scan of {root.resolve().name}"
-    found = poses_at_scans(str(path), poses_of(given.positions), given.times, seconds, scans=scans, of=of)
-    if seconds is not None and not found.kept.all():
-        late = seconds[~found.kept]
-        raise ValueError(
-            f"{path}: expected poses at the times of all {scans} scans, found none for {len(late)}, the first at "
-            f"{late[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
-        )
-    source = given.source if poses is not None else path.name
-    said = f"{source}, {found.said}" if found.said else source
-    return found.poses[:, :3, 3], given.times if seconds is None else seconds, said

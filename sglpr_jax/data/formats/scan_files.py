@@ -50,9 +50,8 @@ def named_format(path: Path) -> ScanFormat | None:
 
     `*.pcd.bin` is nuscenes, and a file in a folder `velodyne_sync` is nclt.
     """
-    for format in READERS:
-        if path.suffix.lower() == f".{format}":
-            return format
+    if (ending := path.suffix.lower()[1:]) in READERS:
+        return ending
     if path.name.lower().endswith(".pcd.bin"):
         return "nuscenes"
     return "nclt" if path.parent.name == "velodyne_sync" else None

@@ -1,4 +1,4 @@
-"""Reader of a plain folder of scans, one file each. Poses and timestamps are optional (`folder_trajectory`).
+"""Reader of a plain folder of scans, one file each. Poses and timestamps are optional.
 
 - `my_scans/full0.bin`, `full1.bin`, ..., `full10.bin`: scans in the order of their numbers. Hidden files are ignored.
 - `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `poses.tum` and `poses.csv` work, too.
@@ -9,13 +9,21 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.bin_records import check_record, described, find_record, is_record
-from sglpr_jax.data.formats.pose_files import POSE_FILES, TIMES_FILE, check_order, folder_trajectory
+from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id
+from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.readers.listing import files_in, left_aside, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
+
+POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
+"""Pose files beside the scans. 12 numbers a line are poses of the LiDAR, z up."""
+TIMES_FILE = "times.txt"
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
@@ -28,19 +36,12 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
     If neither `options.format` nor the name defines the record of a .bin file, it is detected (`find_record`).
 
-    Raises FileNotFoundError without scans, poses or times (`folder_trajectory`), and ValueError if two files differ
+    Raises FileNotFoundError without scans or the given poses or times, and ValueError if two files differ
     only by their ending, the record cannot be detected, or the poses or timestamps are malformed.
     """
     paths = _scans(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
     ids = _ids(root, paths)
-    positions, seconds, source = folder_trajectory(
-        root,
-        scans=len(paths),
-        poses=options.poses,
-        pose_format=options.pose_format,
-        times=options.times,
-        time_unit=options.time_unit,
-    )
+    positions, seconds, source = _trajectory(root, len(paths), options)
     records, kinds = _formats(paths, options.format)
     aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
     if positions is not None:
@@ -60,6 +61,38 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 def _scans(root: Path) -> tuple[Path, ...]:
     """Scan files in a folder. Arrays count as scans if there are no other scans."""
     return files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
+
+
+def _trajectory(
+    root: Path, scans: int, options: ReadOptions
+) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
+    """Positions in metres, times in seconds and the source of the poses; each is None if unknown.
+
+    Poses with other times than the scans, or another number of rows, are interpolated (`poses_at_scans`).
+    """
+    beside = [root / name for name in POSE_FILES if (root / name).is_file()]
+    if options.poses is None and len(beside) > 1:
+        raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")
+    path = options.poses or next(iter(beside), None)
+    clock = options.times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
+    seconds = None if clock is None else read_times(clock, unit=options.time_unit)
+    if seconds is not None and len(seconds) != scans:
+        raise ValueError(f"{clock}: expected {scans} rows, one per scan, found {len(seconds)}")
+    if path is None:
+        return None, seconds, None
+    twelve = "lidar" if options.poses is None else None
+    given = read_trajectory(path, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve)
+    of = f"scan of {root.resolve().name}"
+    found = poses_at_scans(str(path), poses_of(given.positions), given.times, seconds, scans=scans, of=of)
+    if seconds is not None and not found.kept.all():
+        late = seconds[~found.kept]
+        raise ValueError(
+            f"{path}: expected poses at the times of all {scans} scans, found none for {len(late)}, the first at "
+            f"{late[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
+        )
+    source = given.source if options.poses is not None else path.name
+    said = f"{source}, {found.said}" if found.said else source
+    return found.poses[:, :3, 3], given.times if seconds is None else seconds, said
 
 
 def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
