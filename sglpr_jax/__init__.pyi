@@ -24,7 +24,7 @@ from .data.mounting import Mounting as Mounting
 from .data.mounting import estimate_mounting as estimate_mounting
 from .data.readers import open_recording as open_recording
 from .data.readers import recording_names as recording_names
-from .data.recording import Record as Record
+from .data.record import Record as Record
 from .data.recording import Recording as Recording
 from .data.scaled import scaled as scaled
 from .data.submap import SubmapBuilder as SubmapBuilder

@@ -51,24 +51,17 @@ class Imu:
 
         Rows are NaN at times without samples. Raises ValueError without gravity and without orientations.
         """
-        by_gravity, found = None, self._missing_gravity()
-        if not found:
-            by_gravity = self._ups_by_gravity(times)
+        norms = np.linalg.norm(self.accelerations, axis=1)
+        size = float(np.median(norms[np.isfinite(norms)])) if np.isfinite(norms).any() else 0.0
+        with_gravity = any(abs(size / unit - 1) <= SAME_GRAVITY for unit in (STANDARD_GRAVITY, 1.0))
+        by_gravity = self._ups_by_gravity(times) if with_gravity else None
         if self.quaternions is not None:
             by_orientation = self._ups_by_orientation(times)
             if by_gravity is None or _median_angle_deg(by_orientation, by_gravity) <= SAME_UP_DEG:
                 return by_orientation, "its orientation"
         if by_gravity is None:
-            raise ValueError(found)
+            raise ValueError(f"expected accelerations with gravity, of 9.8 m/s^2 or 1 g, found a median of {size:.3g}")
         return by_gravity, "its accelerometer and gyroscope"
-
-    def _missing_gravity(self) -> str:
-        """Why the accelerations do not show gravity, or an empty string if they do."""
-        norms = np.linalg.norm(self.accelerations, axis=1)
-        size = float(np.median(norms[np.isfinite(norms)])) if np.isfinite(norms).any() else 0.0
-        if any(abs(size / unit - 1) <= SAME_GRAVITY for unit in (STANDARD_GRAVITY, 1.0)):
-            return ""
-        return f"expected accelerations with gravity, of 9.8 m/s^2 or 1 g, found a median of {size:.3g}"
 
     def _ups_by_orientation(self, times: Float[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
         from scipy.spatial.transform import Rotation  # imported here because the import is slow

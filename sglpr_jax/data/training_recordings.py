@@ -29,9 +29,8 @@ def leave_one_out(
         raise ValueError(
             f"{root}: expected training recordings other than {test!r}, found {', '.join(names) or 'none'}"
         )
-    return [_with_positions(root, open_recording(root, name, **options)) for name in names], _with_positions(
-        root, tested
-    )
+    recordings = [_with_positions(root, open_recording(root, name, **options)) for name in names]
+    return recordings, _with_positions(root, tested)
 
 
 def all_recordings(root: Path, **options: Any) -> list[Recording]:

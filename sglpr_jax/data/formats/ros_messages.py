@@ -37,10 +37,9 @@ IMU = "sensor_msgs/msg/Imu"
 
 
 class Header(NamedTuple):
-    """std_msgs/Header."""
+    """std_msgs/Header: time in seconds, and frame."""
 
     time: float
-    """Timestamp in seconds."""
     frame: str
 
 

@@ -11,26 +11,19 @@ from sglpr_jax.fields import check_value, field_types
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """User options for reading a dataset. A reader ignores options that do not apply to it.
+    """Options of `open_recording` for a reader, which ignores those that do not apply to it.
 
     Raises ValueError if a choice is unknown.
     """
 
     pose_source: PoseChoice = "auto"
-    """Pose file of KITTI's layout, which may contain two."""
     format: ScanFormat = "auto"
-    """Format of the points in a .bin file, for a plain folder or KITTI's layout."""
     poses: Path | None = None
-    """Pose file of a point cloud map, or of a plain folder if it is not beside the scans."""
     pose_format: PoseFormat = "auto"
     times: Path | None = None
-    """File with one time per line."""
     time_unit: TimeUnit = "auto"
-    """Unit of the times in text files."""
     pose_topic: str | None = None
-    """Topic of the poses in a bag that has several."""
     imu_topic: str | None = None
-    """Topic of the IMU in a bag that has several."""
 
     def __post_init__(self):
         for name in ("pose_source", "format", "pose_format", "time_unit"):
