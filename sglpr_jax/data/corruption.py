@@ -245,14 +245,6 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
 
 def corrupt_record(record: Record, corruption: Corruption, *, rng: np.random.Generator) -> Record:
     """Corrupt the finite points of a scan, and keep the labels and lasers of the remaining points, but no times."""
-    rows = np.flatnonzero(np.isfinite(record.cloud).all(axis=1))
-    lasers = None if record.lasers is None else record.lasers[rows]
-    points, kept = corrupt(record.cloud[rows], corruption, rng=rng, lasers=lasers)
-    left = rows[kept]
-    return dataclasses.replace(
-        record,
-        points=points,
-        labels=None if record.labels is None else record.labels[left],
-        lasers=None if record.lasers is None else record.lasers[left],
-        time_field=None,
-    )
+    finite = record.only(np.flatnonzero(np.isfinite(record.cloud).all(axis=1)))
+    points, kept = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
+    return dataclasses.replace(finite.only(kept), points=points)

@@ -5,12 +5,12 @@ unit. A scan takes 2 ms to 1 s, so the span of the values has one possible unit.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Shaped
+from jaxtyping import Bool, Float32, Int, Int32, Shaped
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.files import naming
@@ -141,6 +141,12 @@ class Record:
         valid = np.isfinite(self.points).all(axis=1) & (self.points != 0).any(axis=1)
         with naming(self.name):
             return self.time_field.seconds(valid=valid, scan_time=self.time)
+
+    def only(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Record":
+        """Return the scan with some of its points, their labels and laser numbers, but without times of the points."""
+        labels = None if self.labels is None else self.labels[rows]
+        lasers = None if self.lasers is None else self.lasers[rows]
+        return replace(self, points=self.cloud[rows], labels=labels, lasers=lasers, time_field=None)
 
     def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
         """Return the class (docs/reference/labels.md) of every point or pixel, or None without labels.

@@ -5,6 +5,7 @@ A narrow sensor sees more of a place in several scans than in one. `SubmapBuilde
 does, because the weights are trained on scans (docs/decisions.md).
 """
 
+import dataclasses
 import hashlib
 import math
 from collections import deque
@@ -13,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32, UInt64
+from jaxtyping import Float, Float32, Int, UInt64
 
 from sglpr_jax.data.poses import poses_of_scans, turned_poses
 from sglpr_jax.data.record import Record, check_cloud
@@ -39,9 +40,6 @@ HALF = 2**13
 SUBMAPS = "submaps"
 """Name of the read option that describes the submaps of a recording."""
 
-Cloud = tuple[Float32[np.ndarray, "_ 3"], Int32[np.ndarray, " _"] | None]
-"""Points and their labels, or None without labels."""
-
 
 class SubmapBuilder:
     """Builds the submap of each scan of a stream, from keyframes at least `keyframe_m` or 20 degrees apart.
@@ -62,7 +60,7 @@ class SubmapBuilder:
           keyframe_m: Minimum distance between the scans of a submap, in metres. The newest scan is always included.
         """
         self._window = _Window(length_m, keyframe_m)
-        self._clouds: dict[int, Float32[np.ndarray, "n 3"]] = {}
+        self._clouds: dict[int, Record] = {}
         self._poses: dict[int, Float[np.ndarray, "4 4"]] = {}
 
     def add(
@@ -79,9 +77,9 @@ class SubmapBuilder:
         check_cloud(points)
         pose = turned_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
         rows = self._window.add(pose)
-        self._clouds = {row: self._clouds[row] for row in rows[1:]} | {rows[0]: _thinned((points, None))[0]}
+        self._clouds = {row: self._clouds[row] for row in rows[1:]} | {rows[0]: _thinned(Record(points=points))}
         self._poses = {row: self._poses[row] for row in rows[1:]} | {rows[0]: pose}
-        return _together([(self._clouds[row], None) for row in rows], [self._poses[row] for row in rows])[0]
+        return _together([self._clouds[row] for row in rows], [self._poses[row] for row in rows]).cloud
 
 
 def submaps(
@@ -113,11 +111,12 @@ def submaps(
     members = [window.add(pose) for pose in poses]
 
     @lru_cache(maxsize=max(map(len, members), default=1))
-    def cloud(row: int, labelled: bool) -> Cloud:
+    def cloud(row: int, labelled: bool) -> Record:
         record = recording.record(row, labels=labelled)
         check_cloud(record.cloud, name=record.name)
-        unknown = np.zeros(len(record.cloud), np.int32) if labelled else None
-        return _thinned((record.cloud, unknown if record.labels is None else record.labels))
+        if labelled and record.labels is None:
+            record = dataclasses.replace(record, labels=np.zeros(len(record.cloud), np.int32))
+        return _thinned(record)
 
     def read(row: int, label_path: Path | None, lasers: bool) -> Record:
         """Read a submap. Submaps have no laser numbers."""
@@ -128,8 +127,8 @@ def submaps(
                 clouds[one] = cloud(one, label_path is not None)
             except (ValueError, OSError) as error:
                 warn(f"{recording.ids[one]}: left out of the submaps of later scans: {error}")
-        points, labels = _together(list(clouds.values()), [poses[one] for one in clouds])
-        return Record(points=points, labels=labels, labels_file=label_path)
+        found = _together(list(clouds.values()), [poses[one] for one in clouds])
+        return dataclasses.replace(found, labels_file=label_path)
 
     digest = hashlib.sha256(poses.tobytes()).hexdigest()[:16]
     said = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
@@ -167,38 +166,36 @@ def _motion(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -
     return float(np.linalg.norm(after[:3, 3] - before[:3, 3])), math.degrees(math.acos(np.clip(cosine, -1, 1)))
 
 
-def _together(clouds: Sequence[Cloud], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Cloud:
+def _together(scans: Sequence[Record], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Record:
     """One cloud in the frame of the first one, as its sensor would see it."""
     turned, position = poses[0][:3, :3], poses[0][:3, 3]
     moved = [
-        (points @ (turned.T @ pose[:3, :3]).T + turned.T @ (pose[:3, 3] - position)).astype(np.float32)
-        for (points, _), pose in zip(clouds[1:], poses[1:], strict=True)
+        (scan.cloud @ (turned.T @ pose[:3, :3]).T + turned.T @ (pose[:3, 3] - position)).astype(np.float32)
+        for scan, pose in zip(scans[1:], poses[1:], strict=True)
     ]
-    labels = [labels for _, labels in clouds if labels is not None]
-    return _visible((np.concatenate([clouds[0][0], *moved]), np.concatenate(labels) if labels else None))
+    labels = [scan.labels for scan in scans if scan.labels is not None]
+    points = np.concatenate([scans[0].cloud, *moved])
+    return _visible(Record(points=points, labels=np.concatenate(labels) if labels else None))
 
 
-def _visible(cloud: Cloud) -> Cloud:
+def _visible(record: Record) -> Record:
     """The nearest point of each direction. A scan also shows nothing behind it, and weights are trained on scans."""
-    points, labels = cloud
-    x, y, z = points.T
+    x, y, z = record.cloud.T
     distance = np.sqrt(x * x + y * y + z * z)
     scale = np.float32(AZIMUTHS / (2 * np.pi))
     azimuth = np.floor(np.arctan2(y, x) * scale).astype(np.int64) + AZIMUTHS
     elevation = np.floor(np.arctan2(z, np.hypot(x, y)) * scale).astype(np.int64) + AZIMUTHS
     direction = (elevation * 2 * AZIMUTHS + azimuth).astype(np.uint64)
-    kept = _first_of(direction << np.uint64(20) | (distance * 500).clip(max=2**20 - 1).astype(np.uint64), shift=20)
-    return points[kept], None if labels is None else labels[kept]
+    keys = direction << np.uint64(20) | (distance * 500).clip(max=2**20 - 1).astype(np.uint64)
+    return record.only(_first_of(keys, shift=20))
 
 
-def _thinned(cloud: Cloud) -> Cloud:
+def _thinned(record: Record) -> Record:
     """The first point of each voxel. Points that are not finite are dropped."""
-    points, labels = cloud
     with np.errstate(over="ignore", invalid="ignore"):
-        inside = np.flatnonzero((np.abs(points) < (HALF - 1) * VOXEL_M).all(axis=1))  # false for NaN
-    x, y, z = (np.floor(points[inside].T / np.float32(VOXEL_M)) + HALF).astype(np.uint64)
-    kept = inside[_first_of((z * np.uint64(2 * HALF) + y) * np.uint64(2 * HALF) + x, shift=0)]
-    return points[kept], None if labels is None else labels[kept]
+        inside = np.flatnonzero((np.abs(record.cloud) < (HALF - 1) * VOXEL_M).all(axis=1))  # false for NaN
+    x, y, z = (np.floor(record.cloud[inside].T / np.float32(VOXEL_M)) + HALF).astype(np.uint64)
+    return record.only(inside[_first_of((z * np.uint64(2 * HALF) + y) * np.uint64(2 * HALF) + x, shift=0)])
 
 
 def _first_of(keys: UInt64[np.ndarray, " n"], *, shift: int) -> Int[np.ndarray, " m"]:
