@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.clouds import check_points, cloud_record
+from sglpr_jax.data.formats.clouds import check_points, cloud_record, packed_type
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
 from sglpr_jax.data.record import TIME_FIELDS, Record, time_field_of
@@ -71,11 +71,10 @@ class RosMessage:
     def records(self, fields: dict[str, str]) -> np.ndarray:
         """Read the next sequence of records. Fields of 4 bytes must precede fields of 1 byte."""
         count = int(self.numbers("u4")[0])
-        packed = np.dtype([(name, f"{self._order}{kind}") for name, kind in fields.items()])
+        layout = [(name, f"{self._order}{kind}", int(kind[1:])) for name, kind in fields.items()]
+        packed = packed_type(layout, list(fields))
         padding = -packed.itemsize % 4 if self._cdr else 0
-        names, offsets = list(fields), [packed.fields[name][1] for name in fields]  # pyright: ignore
-        formats, size = [packed[name] for name in names], packed.itemsize + padding
-        padded = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
+        padded = packed_type([*layout, ("", "u1", padding)], list(fields))
         found = self._next(padded, max(count - 1, 0))  # the last record has no padding
         return np.concatenate([found, self._next(packed, min(count, 1)).astype(found.dtype)])
 
