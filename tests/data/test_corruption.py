@@ -83,15 +83,8 @@ def test_names_say_kind_and_strength():
         corruption_named("beams")
     with pytest.raises(ValueError, match="noise-loud: could not convert"):
         corruption_named("noise-loud")
-
-
-@pytest.mark.parametrize(
-    ("kind", "strength"),
-    [("beams", 0.0), ("dropout", 1.5)],
-)
-def test_a_strength_that_cannot_be_is_refused(kind, strength):
-    with pytest.raises(ValueError, match=f"expected {kind} with a strength from . to .*, found {strength:g}"):
-        Corruption(kind, strength)
+    with pytest.raises(ValueError, match=r"expected dropout with a strength from . to .*, found 1\.5"):
+        Corruption("dropout", 1.5)
 
 
 def turn(elevations_deg, *, azimuths=90, wobble_deg=0.0, seed=0):
