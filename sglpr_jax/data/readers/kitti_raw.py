@@ -102,9 +102,4 @@ def _seconds(line: str) -> float:
     return float(stamp.astype(np.int64) / 1e9)
 
 
-READER = Reader(
-    "DATE/DRIVE/velodyne_points/data/*.bin (KITTI raw)",
-    recording_names,
-    open_recording,
-    rank=6,
-)
+READER = Reader("DATE/DRIVE/velodyne_points/data/*.bin (KITTI raw)", recording_names, open_recording, rank=6)

@@ -33,9 +33,4 @@ def refuse(root: Path, name: str, options: ReadOptions) -> Recording:
     )
 
 
-READER = Reader(
-    "",
-    recording_names,
-    refuse,
-    rank=2,
-)
+READER = Reader("", recording_names, refuse, rank=2)
