@@ -56,7 +56,7 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
     Empty and unreadable files are ignored. Fewer than half of the files may be broken. A format whose record consists
-    of several records of another one that fits does not count. With too few points, the format is None.
+    of several records of another one that fits does not count. With too few points, the function returns None.
 
     Raises ValueError, with all formats that were tried, if no format fits, or several do.
     """

@@ -22,7 +22,7 @@ BLOCK_POINTS = 1 << 21
 def cloud_record(
     columns: Mapping[str, np.ndarray] | np.ndarray, *, time: str | None = None, laser: str | None = None
 ) -> Record:
-    """Return the record of the columns x, y and z, and of those of times and laser numbers if there are any."""
+    """Return the record of the columns x, y and z, and of the columns of times and laser numbers, if any."""
     with np.errstate(over="ignore", invalid="ignore"):  # invalid points are dropped by the callers
         return Record(
             points=np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float32),

@@ -29,8 +29,8 @@ def readers() -> tuple[Reader, ...]:
 def recording_names(root: Path | str) -> tuple[str, ...]:
     """Return the names of the sequences in `root`, in order.
 
-    Raises FileNotFoundError, with the supported layouts, if `root` has none of them; ValueError if a table or bag that
-    names the sequences is malformed; ImportError if `root` is a bag and the extra `ros` is not installed.
+    Raises FileNotFoundError, with the supported layouts, if `root` has no such layout, and ValueError if a table or bag
+    is malformed. Bags without the extra `ros` raise ImportError.
     """
     return _reader_of(Path(root))[1]
 

@@ -66,7 +66,7 @@ def _scans(root: Path) -> tuple[Path, ...]:
 def _trajectory(
     root: Path, scans: int, options: ReadOptions
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
-    """Positions in metres, times in seconds and the source of the poses; each is None if unknown.
+    """Positions in metres, times in seconds and the source of the poses; each may be unknown (None).
 
     Poses with other times than the scans, or another number of rows, are interpolated (`poses_at_scans`).
     """
