@@ -13,9 +13,9 @@ from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, ConsistencyConfig, DetectorConfig, SequenceConfig
+from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT, DriftModel
+from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT
 from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
@@ -63,9 +63,6 @@ class LiveCommand(LiveOptions):
     """Maximum number of stored scans, to limit memory. By default all are stored."""
     candidates: CandidateConfig = DetectorConfig.candidates
     verification: VerificationConfig = DetectorConfig.verification
-    consistency: ConsistencyConfig = DetectorConfig.consistency
-    sequence: SequenceConfig = DetectorConfig.sequence
-    motion_drift: DriftModel = DetectorConfig.motion_drift
 
     @property
     def expects_odometry(self) -> bool:

@@ -25,17 +25,14 @@ from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.loops.config import (
     MIN_PROBABILITY,
     CandidateConfig,
-    ConsistencyConfig,
     Degenerate,
     DetectorConfig,
-    SequenceConfig,
 )
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import (
     DRIFT_DEG_PER_100M,
     DRIFT_HEIGHT_PERCENT,
     DRIFT_PERCENT,
-    DriftModel,
     OdometryConfig,
     OdometryFormat,
 )
@@ -124,9 +121,6 @@ class LoopsCommand:
     """Maximum number of stored scans, to limit memory. By default all are stored."""
     candidates: CandidateConfig = DetectorConfig.candidates
     verification: VerificationConfig = DetectorConfig.verification
-    consistency: ConsistencyConfig = DetectorConfig.consistency
-    sequence: SequenceConfig = DetectorConfig.sequence
-    motion_drift: DriftModel = DetectorConfig.motion_drift
 
     @property
     def recordings(self) -> tuple[Path, ...]:

@@ -139,7 +139,7 @@ def test_the_file_may_name_the_preset_and_overrides_it(name, file):
             {"sensor-height": "high"},
             ["sensor-height: expected a value of type float or one of 'auto', 'estimate', found 'high'"],
         ),
-        ("loops", {"motion-drift.yaw-deg": -1}, ["motion-drift: expected yaw_deg > 0, found -1"]),
+        ("loops", {"verification.turns": 3}, ["verification: expected turns to be a multiple of 4, found 3"]),
         ("embed", {"batch": 0}, ["batch: expected a number from 1 up to 1048576, found 0"]),
         ("evaluate", {"protocol": "all"}, ["protocol: expected a list, found 'all'"]),
         ("train", {"chunk": 7}, ["chunk must divide the"]),

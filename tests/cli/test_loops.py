@@ -101,10 +101,10 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
 def test_every_setting_of_the_detector_is_a_flag():
     command = parse_command(LoopsCommand, "loops", ["scans", "--out", "found"])
     assert detector_config(command) == DetectorConfig()
-    flags = ["--candidates.candidates", "10", "--sequence.window-m", "60", "--candidates.motion.keyframe-m", "4"]
+    flags = ["--candidates.candidates", "10", "--verification.reach-m", "20"]
     changed = detector_config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
-    found = changed.candidates.candidates, changed.sequence.window_m, changed.candidates.motion.keyframe_m
-    assert found == (10, 60, 4)
+    found = changed.candidates.candidates, changed.verification.reach_m
+    assert found == (10, 20)
     flags = ["--keyframe-m", "1.5", "--max-places", "100"]
     limited = detector_config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
     assert (limited.keyframe_m, limited.max_places) == (1.5, 100)
