@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.detector_config import detector_config
+from sglpr_jax.cli.detector_config import DetectorFlags
 from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT
-from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
     from sglpr_jax.live.endpoints import Sink, Source
@@ -25,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class LiveCommand(LiveOptions):
+class LiveCommand(LiveOptions, DetectorFlags):
     """Find loop closures while the robot drives, and publish them at once.
 
     Sources: `folder:PATH` (a folder into which scans are written), `bag:PATH` (a bag at its own pace), `dds` or
@@ -49,30 +46,11 @@ class LiveCommand(LiveOptions):
     """Receivers of loops and of the status after each scan."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
-    drift_percent: float = DRIFT_PERCENT
-    """Position drift of the odometry: one standard deviation, in percent of the travelled distance."""
-    drift_deg_per_100m: float = DRIFT_DEG_PER_100M
-    """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
-    drift_height_percent: float = DRIFT_HEIGHT_PERCENT
-    """Height drift of the odometry: one standard deviation, in percent of the travelled distance."""
-    min_probability: float = MIN_PROBABILITY
-    """Minimum probability of a loop."""
-    keyframe_m: float = DetectorConfig.keyframe_m
-    """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
-    max_places: int | None = DetectorConfig.max_places
-    """Maximum number of stored scans, to limit memory. By default all are stored."""
-    candidates: CandidateConfig = DetectorConfig.candidates
-    verification: VerificationConfig = DetectorConfig.verification
 
     @property
     def expects_odometry(self) -> bool:
         """Whether the user asked for odometry."""
         return self.odometry_topic is not None or self.poses is not None
-
-    @property
-    def detector(self) -> DetectorConfig:
-        """Settings of the detector."""
-        return detector_config(self)
 
 
 def live(command: LiveCommand) -> int:

@@ -91,7 +91,7 @@ def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
         raise ValueError(
             f"expected poses in the world frame of the existing map, found {found.places} places that are "
             f"{found.apart_m:.1f} m away from where the existing map has them (median); with --frame align the poses "
-            "are moved to the existing map, with --frame same they are taken as they are"
+            "are moved to the existing map"
         )
 
 

@@ -174,8 +174,3 @@ def on_all_hosts(work: Callable[[], T]) -> T:
     if on_any_host(error is not None):
         raise error or ConnectionError("another host ended with an error; see the message that it printed")
     return done
-
-
-def of_first_host(value: float) -> float:
-    """Return the first host's value on every host. All hosts must call this function."""
-    return value if jax.process_count() == 1 else float(multihost_utils.broadcast_one_to_all(np.float32(value)))

@@ -20,6 +20,8 @@ from sglpr_jax.files import alone_in, read_json, remove_half_written, write_json
 CONFIG_FILE = "config.json"
 ENVIRONMENT_FILE = "environment.json"
 PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy")
+REMOVED = {"config.select": "last"}
+"""Settings of earlier versions with the only value that runs have today."""
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
@@ -80,7 +82,11 @@ def _as_json(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
     if not (isinstance(a, dict) and isinstance(b, dict)):
         return set() if a == b else {prefix.removesuffix(".")}
-    return {name for key in a.keys() | b.keys() for name in _differences(a.get(key), b.get(key), f"{prefix}{key}.")}
+    return {
+        name
+        for key in a.keys() | b.keys()
+        for name in _differences(a.get(key), b.get(key, REMOVED.get(prefix + key)), f"{prefix}{key}.")
+    }
 
 
 def note_environment(folder: Path, *, seed: int) -> None:
