@@ -11,7 +11,7 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import DetectorFlags
-from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
+from sglpr_jax.cli.runtime import parse_command, print_error, run, stop_on_signal
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -68,7 +68,7 @@ def live(command: LiveCommand) -> int:
         return (open_sink(text, command, report) for text in command.sinks)
 
     with stop_on_signal() as stop:
-        run_node(command, source, sinks, report=report, say=_say, should_stop=stop)
+        run_node(command, source, sinks, report=report, say=print_error, should_stop=stop)
     return stop.exit_status
 
 
@@ -83,17 +83,10 @@ def run_node(
 ) -> None:
     """Find loops until the source ends or `should_stop` is true, and write the results.
 
-    Arguments:
-      command: Settings. Source and sinks are those of the functions.
-      open_source: Function that opens the source for a map.
-      open_sinks: Function that opens the sinks.
-      report: Function for trouble.
-      say: Function for lines about the progress.
-      should_stop: Whether the node ends.
+    The functions open the source for a map and the sinks. `report` receives trouble, `say` lines about the progress.
 
-    Raises:
-      ValueError: If a setting is invalid, or the folder has a map of other settings.
-      WriteError: If the folder cannot be written.
+    Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
+    cannot be written.
     """
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.results import corrected_trajectory, write_results
@@ -157,10 +150,6 @@ def _close(sink: "Sink", report: "Report") -> None:
         sink.close()
     except Exception as error:  # a sink may use any library
         report("close", f"{type(sink).__name__}: {error}")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def main() -> None:

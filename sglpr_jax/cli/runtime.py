@@ -182,6 +182,11 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
         sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
+def print_error(text: str) -> None:
+    """Print a line on stderr at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def console() -> Console:
     """Return a console for standard output. Without a terminal it is wide enough for the tables."""
     return Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, highlight=False)
@@ -200,6 +205,11 @@ class StopRequest:
     def exit_status(self) -> int:
         """130 after Ctrl-C, as in shells. 0 after SIGTERM, which ends a run that will be resumed later."""
         return 130 if self.signal == signal.SIGINT else 0
+
+    def exit(self, text: str) -> None:
+        """Print a text on stderr and exit."""
+        print_error(text)
+        sys.exit(self.exit_status)
 
 
 @contextlib.contextmanager

@@ -120,10 +120,9 @@ def _progress() -> Progress:
 
 
 class EventFiles(Callback):
-    """Writes all measurements into event files in a folder, without delay.
+    """Writes all measurements into event files in a folder. Their first record hides later ones of interrupted runs.
 
-    The first record hides what an interrupted run wrote for this step and later ones. Raises ImportError if the extra
-    is not installed. Writing raises OSError if the files cannot be written.
+    Raises ImportError if the extra is not installed. Writing raises OSError if the files cannot be written.
     """
 
     def __init__(self, folder: Path):
@@ -134,14 +133,6 @@ class EventFiles(Callback):
         self._folder = folder
         self._writer: Any = None
 
-    def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Write the measurements of a step."""
-        self._write(step, values)
-
-    def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        """Write the scores after a step."""
-        self._write(step, scores)
-
     def close(self) -> None:
         """Close the file."""
         if self._writer is not None:
@@ -149,7 +140,8 @@ class EventFiles(Callback):
                 self._writer.close()
             self._writer = None
 
-    def _write(self, step: int, values: Mapping[str, float]) -> None:
+    def on_step(self, step: int, values: Mapping[str, float]) -> None:
+        """Write the measurements of a step."""
         from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - generated
         from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -159,6 +151,10 @@ class EventFiles(Callback):
                 self._writer = _new_writer(self._folder, step)
             self._writer.write_event(Event(wall_time=time.time(), step=step, summary=Summary(value=scalars)))
             self._writer.flush()
+
+    def on_score(self, step: int, scores: Mapping[str, float]) -> None:
+        """Write the scores after a step."""
+        self.on_step(step, scores)
 
 
 def _new_writer(folder: Path, step: int) -> Any:

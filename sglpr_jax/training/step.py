@@ -8,7 +8,7 @@ import jax
 import optax
 from jaxtyping import Array, Float
 
-from sglpr_jax.training.devices import keep_replicated
+from sglpr_jax.training.devices import keep_placed
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -45,20 +45,25 @@ class PlaceNetwork(Protocol):
     @property
     def seed(self) -> int:
         """Seed of the random choices of a step."""
+        ...
 
     @property
     def images(self) -> int:
         """Images per step."""
+        ...
 
     @property
     def optimizer(self) -> optax.GradientTransformation:
         """Optimiser of the parameters."""
+        ...
 
     def new_state(self) -> TrainState:
         """Return the state before the first step, with random weights."""
+        ...
 
     def gradient(self, state: TrainState, batch: Any, key: Array) -> Gradient:
         """Return the gradient of the loss of a batch. `key` differs from step to step."""
+        ...
 
 
 @functools.partial(jax.jit, static_argnames="network", donate_argnames="state")
@@ -70,4 +75,4 @@ def train_step(state: TrainState, batch: Any, *, network: PlaceNetwork) -> tuple
     params = optax.apply_updates(state.params, updates)
     norms = {"gradient_norm": gradient, "update_norm": updates, "weight_norm": params}
     metrics = metrics | {name: optax.tree.norm(tree) for name, tree in norms.items()}
-    return keep_replicated(TrainState(state.step + 1, params, optimizer, statistics)), metrics
+    return keep_placed(TrainState(state.step + 1, params, optimizer, statistics)), metrics

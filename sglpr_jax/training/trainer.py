@@ -72,10 +72,6 @@ class Schedule:
                 yield due
             due *= 2
 
-    def with_costs(self, run: Trained, values: Mapping[str, float]) -> dict[str, float]:
-        """Add images and seconds to measurements, if they are wanted."""
-        return {"images": float(run.images), "seconds": round(run.seconds, 3), **values} if self.costs else dict(values)
-
 
 KeepFn = Callable[[Trained, list[int]], Mapping[str, float]]
 """Scores the weights, and keeps those of the snapshots that are due."""
@@ -214,7 +210,8 @@ class _Run:
         self._callback.on_checkpoint(step)
 
     def _log(self, name: str, values: Mapping[str, float]) -> dict[str, float]:
-        measured = self._schedule.with_costs(self.run, values)
+        costs = {"images": float(self.run.images), "seconds": round(self.run.seconds, 3)}
+        measured = {**(costs if self._schedule.costs else {}), **values}
         if name in self._logs:
             self._logs[name].append(int(self.run.state.step), measured)
         return measured

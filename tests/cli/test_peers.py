@@ -65,18 +65,6 @@ def test_trained_weights_describe_a_recording_and_compare_it(run, town, tmp_path
         assert (other.descriptors != file.descriptors).any() and other.distance != file.distance
 
 
-def test_a_distance_whose_weights_are_gone_is_an_error(run, town, tmp_path):
-    weights = tmp_path / "weights-1"
-    shutil.copytree(run / "weights-1000", weights)
-    options = ("--method", "rinet", "--data", town, "--seq", "08", "--weights", weights)
-    assert embed(tmp_path / "08.npz", *options).status == 0
-    shutil.rmtree(weights)
-    shutil.copytree(run / "weights-2000", weights)
-    assert_one_line_error(run_command("evaluate", tmp_path / "08.npz"), weights, "found others")
-    shutil.rmtree(weights)
-    assert_one_line_error(run_command("evaluate", tmp_path / "08.npz"), weights, "config.json is missing")
-
-
 def test_unfitting_weights_are_errors(run, trained, town, tmp_path):
     options = ("--data", town, "--seq", "08")
     out = tmp_path / "08.npz"

@@ -212,7 +212,7 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
 
     weights, metrics = run(steps=25)
     losses = [m["loss"] for m in metrics]
-    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
+    assert np.mean(losses[-5:]) < 0.98 * np.mean(losses[:5])
     assert metrics[0]["gradient_norm"] > 0 and metrics[0]["update_norm"] > 0
     squares = sum(np.square(leaf).sum() for leaf in jax.tree.leaves(weights))
     np.testing.assert_allclose(metrics[-1]["weight_norm"], np.sqrt(squares), rtol=1e-5)
