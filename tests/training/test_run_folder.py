@@ -7,6 +7,7 @@ import sys
 
 import jax
 import numpy as np
+import pytest
 
 from sglpr_jax.training.run_folder import git_commit, note_environment, require_same_settings
 
@@ -56,5 +57,5 @@ def test_a_checkout_has_a_commit_and_may_differ_from_it(tmp_path):
 def test_a_setting_that_every_run_has_today_may_be_stored(tmp_path):
     for stored, fits in (("last", True), ("best", False)):
         (tmp_path / "config.json").write_text(json.dumps({"config": {"select": stored, "steps": 3}}))
-        with contextlib.nullcontext() if fits else pytest.raises(ValueError, match="others: config.select"):
+        with contextlib.nullcontext() if fits else pytest.raises(ValueError, match=r"others: config\.select"):
             require_same_settings(tmp_path, {"config": {"steps": 3}}, limits=())
