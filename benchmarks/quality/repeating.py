@@ -39,6 +39,7 @@ from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.models.params import Params
+from sglpr_jax.odometry.config import MOTION_DRIFT
 from sglpr_jax.se3 import travelled
 from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING
@@ -191,7 +192,7 @@ def compared(
 
 def _settings(finder: CandidateFinder, odometry: Odometry) -> str:
     """Hash of all that decides the comparisons."""
-    parts = [finder.config, finder.verification, finder.motion_drift if odometry == "none" else finder.drift]
+    parts = [finder.config, finder.verification, MOTION_DRIFT if odometry == "none" else finder.drift]
     about = json.dumps([finder.index.weights_hash, odometry, *map(dataclasses.asdict, parts)])
     return hashlib.sha256(about.encode()).hexdigest()[:16]
 

@@ -6,6 +6,7 @@ results record them as command.json.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import difflib
 import json
@@ -17,7 +18,8 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from sglpr_jax.fields import field_types, read_value, require
+from sglpr_jax.fields import field_types, is_config, read_value, require
+from sglpr_jax.files import naming, read_json, write_json
 
 T = TypeVar("T")
 COMMAND_FILE = "command.json"
@@ -39,17 +41,15 @@ def flag_values(command: Any) -> dict[str, Any]:
     values = {}
 
     def note(flag: str, _annotation: Any, value: Any) -> Any:
-        values[flag] = _as_json(value)
+        values[flag] = value
         return value
 
     _visit(type(command), vars(command), note)
-    return values
+    return json.loads(json.dumps(values, default=str))
 
 
 def record_command(command: Any, folder: Path) -> Path:
     """Write the values of all flags to `folder`. Returns the path. Raises WriteError if the file cannot be written."""
-    from sglpr_jax.files import write_json  # slow import, not needed for --help
-
     write_json(folder / COMMAND_FILE, flag_values(command))
     return folder / COMMAND_FILE
 
@@ -72,17 +72,21 @@ def with_defaults(
       ValueError: If the file, the preset or a setting is invalid. The message names the file or the setting.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    file, preset = _early_flags(arguments)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # the two that set the other flags' defaults
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--preset")
+    early, _ = parser.parse_known_args(arguments)
+    file: Any = early.config
+    values = {} if file is None else read_json(file)
+    require(values, isinstance(values, dict), "an object with a value for each flag", str(file))
     fields = {field.name: _default(field) for field in dataclasses.fields(command)}  # type: ignore[arg-type]
-    values = {} if file is None else _read_values(file)
-    if load_preset is not None and preset is None and "preset" in values:
-        fields["config"] = _preset_in_file(values["preset"], load_preset, source=file)
-    elif load_preset is not None:
-        fields["config"] = load_preset(preset or fields["preset"])
-    if file is not None:
-        from sglpr_jax.files import naming  # slow import, not needed for --help
-
-        with naming(file):
+    if load_preset is not None:
+        in_file = early.preset is None and "preset" in values
+        with naming(f"{file}: preset") if in_file else contextlib.nullcontext():
+            preset = read_value(values["preset"], str, "") if in_file else early.preset or fields["preset"]
+            fields["config"] = load_preset(preset)
+    if values:
+        with naming(str(file)):
             fields = _with_values(command, fields, values)
     settings, others = _split_settings(arguments, command, fields)
     if settings:
@@ -103,37 +107,11 @@ def hide_nested(command: Any) -> None:
                 tyro.conf.configure(tyro.conf.Suppress)(type(value))
 
 
-def _early_flags(arguments: list[str]) -> tuple[Path | None, str | None]:
-    """Read --config and --preset before the other flags, because they set the defaults of the other flags."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config", type=Path)
-    parser.add_argument("--preset")
-    early, _ = parser.parse_known_args(arguments)
-    return early.config, early.preset
-
-
 def _default(field: dataclasses.Field) -> Any:
     """Return the default of a field, or `tyro.MISSING` if it is required."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return tyro.MISSING if field.default is dataclasses.MISSING else field.default
-
-
-def _preset_in_file(preset: Any, load_preset: Callable[[str], Any], *, source: Path | None) -> Any:
-    """Load the preset that a file of --config names. The message of an error names the file."""
-    from sglpr_jax.files import naming  # slow import, not needed for --help
-
-    with naming(f"{source}: preset"):
-        return load_preset(read_value(preset, str, ""))
-
-
-def _read_values(path: Path) -> dict[str, Any]:
-    """Read values by setting. Raises FileNotFoundError, or ValueError if the file has other content."""
-    from sglpr_jax.files import read_json  # slow import, not needed for --help
-
-    values = read_json(path)
-    require(values, isinstance(values, dict), "an object with a value for each flag", str(path))
-    return values
 
 
 def _split_settings(arguments: list[str], command: type, fields: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -153,30 +131,19 @@ def _split_settings(arguments: list[str], command: type, fields: Mapping[str, An
             others.append(first)
             continue
         texts = [given] if "=" in first else []
-        annotation = annotations.get(flag)
-        while rest and not rest[0].startswith("--") and (not texts or _is_list(annotation)):
+        is_list = typing.get_origin(annotations.get(flag)) is tuple
+        while rest and not rest[0].startswith("--") and (not texts or is_list):
             texts.append(rest.pop(0))
-        values[flag] = _value_of(texts, annotation)
+        words = [_json_value(text) for text in texts]
+        values[flag] = words if is_list or len(words) != 1 else words[0]
     return values, others
 
 
-def _is_list(annotation: Any) -> bool:
-    """Whether a setting takes several values."""
-    return typing.get_origin(annotation) is tuple
-
-
-def _value_of(texts: list[str], annotation: Any) -> Any:
-    """JSON value of the words of a setting."""
-    words = {"True": True, "False": False, "None": None}
-
-    def read(text: str) -> Any:
-        try:
-            return words[text] if text in words else json.loads(text)
-        except ValueError:
-            return text
-
-    values = [read(text) for text in texts]
-    return values if _is_list(annotation) or len(values) != 1 else values[0]
+def _json_value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return {"True": True, "False": False, "None": None}.get(text, text)
 
 
 def _with_values(
@@ -194,7 +161,11 @@ def _with_values(
         return read_value(values[flag], annotation, dashes + flag) if flag in values else value
 
     changed = _visit(command, fields, read)
-    _check_known(values, known, dashes)
+    unknown = next((flag for flag in values if flag not in known), None)
+    if unknown is not None:
+        near = difflib.get_close_matches(unknown, known, n=1)
+        hint = f"; did you mean {dashes + near[0]!r}?" if near else ""
+        raise ValueError(f"expected flags of the command, found {dashes + unknown!r}{hint}")
     return changed
 
 
@@ -205,38 +176,17 @@ def _visit(
     visited = {}
     for name, annotation in field_types(config).items():
         flag, value = prefix + name.replace("_", "-"), fields[name]
-        if dataclasses.is_dataclass(value):
+        if is_config(type(value)):
             inner = prefix if _is_flat(annotation) else f"{flag}."
             nested = _visit(type(value), vars(value), visit, inner)
-            visited[name] = _replaced(value, nested, inner)
+            with naming(inner.removesuffix(".")) if inner else contextlib.nullcontext():  # fields may be inconsistent
+                visited[name] = dataclasses.replace(value, **nested)
         else:
             visited[name] = visit(flag, annotation, value)
     return visited
-
-
-def _replaced(config: Any, fields: dict[str, Any], prefix: str) -> Any:
-    """Replace the fields of a nested configuration. The message of an error begins with the prefix of its flags."""
-    try:
-        return dataclasses.replace(config, **fields)
-    except ValueError as error:  # the fields are inconsistent
-        raise ValueError(f"{prefix.removesuffix('.')}: {error}" if prefix else str(error)) from error
 
 
 def _is_flat(annotation: Any) -> bool:
     """Whether the flags of a nested configuration do not begin with the name of its field."""
     marks = getattr(annotation, "__metadata__", ())
     return tyro.conf.OmitArgPrefixes in marks or any(getattr(mark, "name", None) == "" for mark in marks)
-
-
-def _check_known(values: Mapping[str, Any], known: list[str], dashes: str) -> None:
-    unknown = next((flag for flag in values if flag not in known), None)
-    if unknown is not None:
-        near = difflib.get_close_matches(unknown, known, n=1)
-        hint = f"; did you mean {dashes + near[0]!r}?" if near else ""
-        raise ValueError(f"expected flags of the command, found {dashes + unknown!r}{hint}")
-
-
-def _as_json(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_as_json(one) for one in value]
-    return str(value) if isinstance(value, Path) else value

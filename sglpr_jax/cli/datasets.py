@@ -57,20 +57,13 @@ def simulate(root: Path, **options: Any) -> "Simulated":
         bars = []
 
         def start(dataset: "Simulated") -> None:
-            _announce(dataset)
+            if dataset.missing:
+                what = "images" if dataset.layout == "images" else "scans"
+                size = f"{dataset.scans} {what}, about {dataset.missing_bytes / 1e6:.0f} MB"
+                print(f"simulating {len(dataset.missing)} recordings of {size}", file=sys.stderr)
             bars.append(opened.enter_context(progress_bar("simulate", dataset.scans * len(dataset.names))))
 
         return simulation.simulate(root, **options, on_start=start, on_progress=lambda done: bars[0](done))
-
-
-def _announce(dataset: "Simulated") -> None:
-    if dataset.missing:
-        what = "images" if dataset.layout == "images" else "scans"
-        print(
-            f"simulating {len(dataset.missing)} recordings of {dataset.scans} {what}, "
-            f"about {dataset.missing_bytes / 1e6:.0f} MB",
-            file=sys.stderr,
-        )
 
 
 def open_recording(root: Path, name: str | None, **options: Any) -> Recording:

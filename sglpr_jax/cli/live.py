@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.detector_config import detector_config
-from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
+from sglpr_jax.cli.detector_config import DetectorFlags
+from sglpr_jax.cli.runtime import parse_command, print_error, run, stop_on_signal
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, ConsistencyConfig, DetectorConfig, SequenceConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT, DriftModel
-from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
     from sglpr_jax.live.endpoints import Sink, Source
@@ -25,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class LiveCommand(LiveOptions):
+class LiveCommand(LiveOptions, DetectorFlags):
     """Find loop closures while the robot drives, and publish them at once.
 
     Sources: `folder:PATH` (a folder into which scans are written), `bag:PATH` (a bag at its own pace), `dds` or
@@ -49,33 +46,11 @@ class LiveCommand(LiveOptions):
     """Receivers of loops and of the status after each scan."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
-    drift_percent: float = DRIFT_PERCENT
-    """Position drift of the odometry: one standard deviation, in percent of the travelled distance."""
-    drift_deg_per_100m: float = DRIFT_DEG_PER_100M
-    """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
-    drift_height_percent: float = DRIFT_HEIGHT_PERCENT
-    """Height drift of the odometry: one standard deviation, in percent of the travelled distance."""
-    min_probability: float = MIN_PROBABILITY
-    """Minimum probability of a loop."""
-    keyframe_m: float = DetectorConfig.keyframe_m
-    """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
-    max_places: int | None = DetectorConfig.max_places
-    """Maximum number of stored scans, to limit memory. By default all are stored."""
-    candidates: CandidateConfig = DetectorConfig.candidates
-    verification: VerificationConfig = DetectorConfig.verification
-    consistency: ConsistencyConfig = DetectorConfig.consistency
-    sequence: SequenceConfig = DetectorConfig.sequence
-    motion_drift: DriftModel = DetectorConfig.motion_drift
 
     @property
     def expects_odometry(self) -> bool:
         """Whether the user asked for odometry."""
         return self.odometry_topic is not None or self.poses is not None
-
-    @property
-    def detector(self) -> DetectorConfig:
-        """Settings of the detector."""
-        return detector_config(self)
 
 
 def live(command: LiveCommand) -> int:
@@ -93,7 +68,7 @@ def live(command: LiveCommand) -> int:
         return (open_sink(text, command, report) for text in command.sinks)
 
     with stop_on_signal() as stop:
-        run_node(command, source, sinks, report=report, say=_say, should_stop=stop)
+        run_node(command, source, sinks, report=report, say=print_error, should_stop=stop)
     return stop.exit_status
 
 
@@ -108,17 +83,10 @@ def run_node(
 ) -> None:
     """Find loops until the source ends or `should_stop` is true, and write the results.
 
-    Arguments:
-      command: Settings. Source and sinks are those of the functions.
-      open_source: Function that opens the source for a map.
-      open_sinks: Function that opens the sinks.
-      report: Function for trouble.
-      say: Function for lines about the progress.
-      should_stop: Whether the node ends.
+    The functions open the source for a map and the sinks. `report` receives trouble, `say` lines about the progress.
 
-    Raises:
-      ValueError: If a setting is invalid, or the folder has a map of other settings.
-      WriteError: If the folder cannot be written.
+    Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
+    cannot be written.
     """
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.results import corrected_trajectory, write_results
@@ -182,10 +150,6 @@ def _close(sink: "Sink", report: "Report") -> None:
         sink.close()
     except Exception as error:  # a sink may use any library
         report("close", f"{type(sink).__name__}: {error}")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def main() -> None:

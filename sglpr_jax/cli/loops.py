@@ -8,43 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.detector_config import detector_config
-from sglpr_jax.cli.recording import (
-    AUTO,
-    PosedRecordingOptions,
-    SubmapOptions,
-    check_auto,
-    open_with_poses,
-    open_with_scan_odometry,
-    remove_odometry,
-    report_bad_scan,
-    resolved_scale,
-)
+from sglpr_jax.cli.detector_config import DetectorFlags
+from sglpr_jax.cli.recording import AUTO, PosedRecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
-from sglpr_jax.loops.config import (
-    MIN_PROBABILITY,
-    CandidateConfig,
-    ConsistencyConfig,
-    Degenerate,
-    DetectorConfig,
-    SequenceConfig,
-)
+from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.odometry.config import (
-    DRIFT_DEG_PER_100M,
-    DRIFT_HEIGHT_PERCENT,
-    DRIFT_PERCENT,
-    DriftModel,
-    OdometryConfig,
-    OdometryFormat,
-)
-from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 
 if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float
-
     from sglpr_jax.data.recording import Recording
 
 UNFINISHED = "unfinished"
@@ -52,7 +24,7 @@ UNFINISHED = "unfinished"
 
 
 @dataclasses.dataclass(frozen=True)
-class LoopsCommand:
+class LoopsCommand(DetectorFlags):
     """Find the loop closures of a recording: pairs of scans of one place, their relative poses and probabilities.
 
     With several recordings, the command finds the loops within and between them, and the transforms between their
@@ -87,14 +59,6 @@ class LoopsCommand:
     recognises tum and .g2o."""
     scan_odometry: OdometryConfig = OdometryConfig()
     """Settings of --odometry auto."""
-    drift_percent: float = DRIFT_PERCENT
-    """Position drift of the odometry: one standard deviation, in percent of the travelled distance. Loops that need
-    more than four standard deviations are rejected."""
-    drift_deg_per_100m: float = DRIFT_DEG_PER_100M
-    """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
-    drift_height_percent: float = DRIFT_HEIGHT_PERCENT
-    """Height drift of the odometry: one standard deviation, in percent of the travelled distance. A loop with another
-    floor is rejected if four standard deviations are less than the difference in height."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
@@ -111,22 +75,11 @@ class LoopsCommand:
     rerun: Path | None = None
     """Also write trajectories, scans, loops and image pairs of one recording to this .rrd file, for the rerun viewer
     (extra view)."""
-    min_probability: float = MIN_PROBABILITY
-    """Minimum probability of a loop."""
     degenerate: Degenerate = "keep"
     """Loops whose position has a standard deviation of more than 1 m in one horizontal direction, for example between
     plain walls: `keep` writes these loops with that information matrix, and `drop` rejects them."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
-    keyframe_m: float = DetectorConfig.keyframe_m
-    """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
-    max_places: int | None = DetectorConfig.max_places
-    """Maximum number of stored scans, to limit memory. By default all are stored."""
-    candidates: CandidateConfig = DetectorConfig.candidates
-    verification: VerificationConfig = DetectorConfig.verification
-    consistency: ConsistencyConfig = DetectorConfig.consistency
-    sequence: SequenceConfig = DetectorConfig.sequence
-    motion_drift: DriftModel = DetectorConfig.motion_drift
 
     @property
     def recordings(self) -> tuple[Path, ...]:
@@ -147,7 +100,7 @@ def loops_of_recording(command: LoopsCommand) -> int:
 
     _check(command)
     with alone(command.out / UNFINISHED):
-        return _search(command, detector_config(command))
+        return _search(command)
 
 
 def _check(command: LoopsCommand) -> None:
@@ -168,26 +121,19 @@ def _check(command: LoopsCommand) -> None:
         rerun_file.check_installed()
     if len(recordings) > 1 and (command.source.poses or command.source.times):
         raise ValueError("--poses and --times are those of one recording, found several recordings")
-    written = {(command.out / name).resolve() for name in TRAJECTORIES}
     if command.odometry is None and command.optimize:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
-    if command.odometry == AUTO:
-        check_auto()
     if command.optimize:
         check_installed()
-    for path in (*files, command.source.poses, command.source.times):
-        if path is not None and (path.resolve() in written or _is_trajectory(path, command.out)):
+    for path in filter(None, (*files, command.source.poses, command.source.times)):
+        is_ours = path.name in TRAJECTORIES or path.name.startswith("trajectory-")
+        if is_ours and path.resolve().parent == command.out.resolve():
             raise ValueError(
                 f"{path}: expected inputs that this run does not overwrite, found an output file; choose another --out"
             )
 
 
-def _is_trajectory(path: Path, out: Path) -> bool:
-    """Whether a file has the name of an output file with the trajectory of one of several recordings."""
-    return path.resolve().parent == out.resolve() and path.name.startswith("trajectory-")
-
-
-def _search(command: LoopsCommand, config: DetectorConfig) -> int:
+def _search(command: LoopsCommand) -> int:
     from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.checkpoint import remove
@@ -198,12 +144,10 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.pose_graph.folder import write_found
     from sglpr_jax.pose_graph.optimize import optimize_trajectory
 
-    params = load(command.weights)
-    if command.odometry == AUTO:
-        command, recordings, odometry = open_with_scan_odometry(command)
-    else:
-        recordings, odometry = _opened(command)
-    scale = resolved_scale(command.scale, *recordings)
+    params, config, kept_in = load(command.weights), command.detector, command.out / UNFINISHED
+    odometry = AUTO if command.odometry == AUTO else command.odometry_files
+    options = {"format": command.odometry_format, "kept_in": lambda number: _odometry_kept_in(command.out, number)}
+    effective, recordings, odometry = open_with_odometry(command, command.recordings, odometry, **options)
     register = command.register and all(map(can_register, recordings))
     if command.register and not register:
         left_out = next(one for one in recordings if not can_register(one))
@@ -214,12 +158,12 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
         found = find_loops(
             recordings,
             params,
-            odometry=odometry,
+            odometry=odometry or None,
             config=config,
             registered=register,
-            scale=scale,
+            scale=effective.scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
-            kept_in=command.out / UNFINISHED,
+            kept_in=kept_in,
             should_stop=stop,
             on_progress=show,
         )
@@ -228,7 +172,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     corrected = optimize_trajectory(found) if command.optimize else None
     page = {PAGE: loops_page(found, optimized=corrected)}
     paths = write_found(found, command.out, optimized=corrected, texts=page)
-    paths.append(record_command(dataclasses.replace(command, scale=scale), command.out))
+    paths.append(record_command(effective, command.out))
     if command.rerun is not None:
         write_rerun(found, command.rerun, optimized=corrected)
     print(found, *why_none(found), *why_rejected(found.rejected), sep="\n")
@@ -238,22 +182,17 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     if not found.whole:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
-    for number in range(len(recordings) if len(recordings) > 1 else 0):
-        remove(command.out / UNFINISHED / f"{number}")
-    remove(command.out / UNFINISHED)
-    remove_odometry(command)
+    for number in range(len(recordings)):
+        if len(recordings) > 1:
+            remove(kept_in / f"{number}")
+        _odometry_kept_in(command.out, number).unlink(missing_ok=True)
+    remove(kept_in)
     return 0
 
 
-def _opened(command: LoopsCommand) -> "tuple[list[Recording], list[Float[np.ndarray, 'n 4 4']] | None]":
-    """Open the recordings, with their odometry if there is one."""
-    if not command.odometry_files:
-        return [command.submap.prepared(command.source.open(path), None) for path in command.recordings], None
-    opened = [
-        open_with_poses(command.source, path, file, format=command.odometry_format)
-        for path, file in zip(command.recordings, command.odometry_files, strict=True)
-    ]
-    return [command.submap.prepared(*one) for one in opened], [poses for _, poses in opened]
+def _odometry_kept_in(out: Path, number: int) -> Path:
+    """Checkpoint file of --odometry auto of a recording."""
+    return out / f"unfinished-{number}.odometry.npz"
 
 
 def _why_not(recording: "Recording") -> str:

@@ -7,18 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.recording import (
-    AUTO,
-    ENDING,
-    RecordingOptions,
-    SubmapOptions,
-    check_auto,
-    odometry_of,
-    open_with_poses,
-    report_bad_scan,
-    resolved_scale,
-    with_deskew,
-)
+from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
@@ -28,17 +17,14 @@ from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 
 if TYPE_CHECKING:
     import numpy as np
-    from jaxtyping import Float
 
-    from sglpr_jax.data.choices import Scale
-    from sglpr_jax.data.recording import Recording
     from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.models.params import Params
 
 UNFINISHED = ".unfinished"
 """Suffix of the checkpoint directory of a running command, beside the map."""
-TRAJECTORY = ".odometry.tum"
-"""Suffix of the odometry of --poses auto, beside the map."""
+TRAJECTORY, ODOMETRY = ".odometry.tum", ".odometry.npz"
+"""Suffixes of the odometry of --poses auto and of its checkpoint, beside the map."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,10 +57,9 @@ class MapCommand:
     """Settings of --poses auto."""
     add_to: Path | None = None
     """Existing map, made with the same weights. The new map also contains its places."""
-    frame: Literal["check", "same", "align"] = "check"
-    """World frame of --poses, with --add-to. `check`: that of the existing map, and common places must agree. `same`:
-    that of the existing map, without a check. `align`: any frame; the transform to the existing map is estimated from
-    common places."""
+    frame: Literal["check", "align"] = "check"
+    """World frame of --poses, with --add-to. `check`: that of the existing map, and common places must agree. `align`:
+    any frame; the transform to the existing map is estimated from common places."""
     spacing_m: NotNegative = SPACING_M
     """Minimum distance between places, in metres. Scans closer to the last place are skipped."""
     weights: str = DEFAULT_WEIGHTS
@@ -110,15 +95,21 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.maps.place_names import poses_by_id
     from sglpr_jax.models.weights import weights_hash
+    from sglpr_jax.pose_graph.files import write_tum
     from sglpr_jax.retrieval.index import check_scale
 
     before = None
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
-    recording, poses, scale = _opened(command)
+    files = AUTO if command.poses == AUTO else (command.poses,)
+    options = {"format": command.pose_format, "kept_in": lambda _: command.out.with_suffix(ODOMETRY)}
+    effective, (recording,), (poses,) = open_with_odometry(command, (command.recording,), files, **options)
+    if command.poses == AUTO:
+        times = recording.numbers.astype(float) if recording.times is None else recording.times
+        write_tum(command.out.with_suffix(TRAJECTORY), poses, times)
     if before is not None:
         with naming(f"{command.add_to}"):
-            check_scale(scale, before.scale)
+            check_scale(effective.scale, before.scale)
     unfinished = command.out.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         places, scans, skipped = map_recording(
@@ -126,7 +117,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
             params,
             poses,
             spacing_m=command.spacing_m,
-            scale=scale,
+            scale=effective.scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=unfinished,
             should_stop=stop,
@@ -149,37 +140,17 @@ def _add_places(command: MapCommand, params: "Params") -> int:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     remove(unfinished)
-    command.out.with_suffix(ENDING).unlink(missing_ok=True)
+    command.out.with_suffix(ODOMETRY).unlink(missing_ok=True)
     return 0
-
-
-def _opened(command: MapCommand) -> "tuple[Recording, Float[np.ndarray, 'n 4 4'], Scale]":
-    """The recording, deskewed and with submaps, the poses of its scans and the scale. Odometry of scans is written."""
-    from sglpr_jax.pose_graph.files import write_tum
-
-    if command.poses != AUTO:
-        given = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
-        recording = command.submap.prepared(*given)
-        return recording, given[1], resolved_scale(command.scale, recording)
-    check_auto()
-    opened = command.source.open(command.recording)
-    scale = resolved_scale(command.scale, opened)
-    kept_in = command.out.with_suffix(ENDING)
-    poses = odometry_of(opened, command.scan_odometry, scale=scale, kept_in=kept_in, skip_bad=command.skip_bad)
-    times = opened.numbers.astype(float) if opened.times is None else opened.times
-    write_tum(command.out.with_suffix(TRAJECTORY), poses, times)
-    return with_deskew(command.submap, [opened]).prepared(opened, poses), poses, scale
 
 
 def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]) -> "PlaceMap":
     """The existing map with the places of the new one, in the frame that the flag states."""
     from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
 
-    if command.frame != "same":
-        print("comparing up to 300 of the new places with the existing map", file=sys.stderr)
+    print("comparing up to 300 of the new places with the existing map", file=sys.stderr)
     if command.frame == "check":
         check_one_frame(before, new)
-    if command.frame != "align":
         return before.merged(new, drive=drive)
     new = without_known_places(before, new)
     if not len(new):

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import StopRequest, cache_folder, console, parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import (
+    StopRequest,
+    cache_folder,
+    console,
+    parse_command,
+    print_error,
+    progress_bar,
+    run,
+    stop_on_signal,
+)
 from sglpr_jax.fields import CountOrNone, NotNegative, Positive
 from sglpr_jax.methods.names import LearnedName
 
@@ -64,10 +73,7 @@ class PeersCommand:
 
 def run_peers(command: PeersCommand) -> None:
     """Run the command."""
-    if command.action == "list":
-        _print_methods()
-    else:
-        print(f"run: {train_peer(command)}")
+    _print_methods() if command.action == "list" else print(f"run: {train_peer(command)}")
 
 
 def train_peer(command: PeersCommand) -> Path:
@@ -84,16 +90,16 @@ def train_peer(command: PeersCommand) -> Path:
         rate = _learning_rate(command, method, data, score, out, stopped)
         settings = RunSettings(rate, seed=command.seed, seconds=command.seconds, images=command.images)
         record_command(dataclasses.replace(command, learning_rate=rate), out)
-        options = {"stopped": stopped, "report": _report, "progress": progress_bar, "resume": resume}
+        options = {"stopped": stopped, "report": print_error, "progress": progress_bar, "resume": resume}
         found = train_learned(method, data, settings, out, score=score, **options)
     print(f"{out}: {found.images} images in {found.seconds:.0f} s", file=sys.stderr)
-    _exit_if_stopped(stopped)
+    if stopped():
+        stopped.exit("stopped; continue with --resume")
     return out
 
 
 def _has_run(out: Path, *, resume: bool) -> bool:
-    """Return whether a training in the folder is to be continued. A stopped search of the learning rate is not a
-    training yet.
+    """Return whether the folder has a training, which is more than a stopped search of the learning rate.
 
     Raises FileExistsError or FileNotFoundError if the folder does not fit `resume`.
     """
@@ -139,23 +145,12 @@ def _learning_rate(
         return command.learning_rate
     if score is None:
         return method.recipe.learning_rates[1]
-    options = {"stopped": stopped, "report": _report, "progress": progress_bar}
+    options = {"stopped": stopped, "report": print_error, "progress": progress_bar}
     try:
         return best_rate(method, data, score, out / RATES, seconds=command.search_seconds, seed=command.seed, **options)
     except Stopped:
-        _exit_if_stopped(stopped)
+        stopped.exit("stopped; continue with --resume")
         raise
-
-
-def _exit_if_stopped(stopped: StopRequest) -> None:
-    """Exit if the training was asked to stop: with status 0 after SIGTERM, with 130 after Ctrl-C."""
-    if stopped():
-        print("stopped; continue with --resume", file=sys.stderr)
-        sys.exit(stopped.exit_status)
-
-
-def _report(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def _print_methods() -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
 from sglpr_jax.data.choices import (
@@ -16,10 +16,12 @@ from sglpr_jax.data.choices import (
     SensorHeight,
     TimeUnit,
 )
-from sglpr_jax.fields import NotNegative, Positive
+from sglpr_jax.fields import NotNegative
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     import numpy as np
     from jaxtyping import Float
 
@@ -27,9 +29,6 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 """Value of a flag for poses that are computed from the scans."""
-ENDING = ".odometry.npz"
-"""End of the name of a checkpoint file."""
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,12 +87,9 @@ class SubmapOptions:
     deskew: bool = False
     """Remove the motion within each scan, before submaps are built. The points need times, and the scans need times and
     poses with rotations."""
-
     submap_m: NotNegative = 0.0
     """Travelled distance of a submap, in metres. 0 uses single scans. The scans of a submap are laid together in the
     frame of the newest one, which needs poses with rotations."""
-    submap_keyframe_m: Positive = 1.0
-    """Minimum distance between the scans of a submap, in metres."""
 
     @property
     def flag(self) -> str | None:
@@ -117,7 +113,7 @@ class SubmapOptions:
                 "--odometry"
             )
         still = deskewed(recording, poses) if self.deskew else recording
-        found = submaps(still, poses, length_m=self.submap_m, keyframe_m=self.submap_keyframe_m)
+        found = submaps(still, poses, length_m=self.submap_m)
         print(*found.found[len(recording.found) :], sep="\n", file=sys.stderr)
         return found
 
@@ -181,46 +177,56 @@ def report_bad_scan(scan: str, error: Exception) -> None:
     print(f"skipped {scan}: {error}", file=sys.stderr)
 
 
-def check_auto() -> None:
-    """Raise ImportError if the extra `odometry` is not installed."""
-    from sglpr_jax.odometry.kiss_icp import check_installed  # slow import, not needed for --help
+def open_with_odometry(
+    command: Any,
+    paths: "Sequence[Path]",
+    odometry: "Literal['auto'] | Sequence[Path]",
+    *,
+    format: OdometryFormat,
+    kept_in: "Callable[[int], Path]",
+) -> "tuple[Any, list[Recording], list[Float[np.ndarray, 'n 4 4']]]":
+    """Open the recordings of a `LoopsCommand` or `MapCommand`, with odometry.
 
-    check_installed()
-
-
-def open_with_scan_odometry(command: T) -> "tuple[T, list[Recording], list[Float[np.ndarray, 'n 4 4']]]":
-    """Open the recordings of a `LoopsCommand` and compute their odometry.
-
-    If the command is interrupted before all odometry is complete, it ends.
-
-    Returns:
-      The command with the settings that are in effect, the recordings, deskewed and with submaps, and their odometry.
-    """
-    given: Any = command
-    opened = [given.source.open(path) for path in given.recordings]
-    scale = resolved_scale(given.scale, *opened)
-    odometry = [
-        odometry_of(one, given.scan_odometry, scale=scale, kept_in=_kept_in(given.out, number), skip_bad=given.skip_bad)
-        for number, one in enumerate(opened)
-    ]
-    submap = with_deskew(given.submap, opened)
-    recordings = [submap.prepared(one, poses) for one, poses in zip(opened, odometry, strict=True)]
-    effective = given.scan_odometry.effective
-    return dataclasses.replace(given, scale=scale, submap=submap, scan_odometry=effective), recordings, odometry
-
-
-def odometry_of(
-    recording: "Recording", config: OdometryConfig, *, scale: Scale, kept_in: Path, skip_bad: bool
-) -> "Float[np.ndarray, 'n 4 4']":
-    """Odometry of a recording, with progress on stderr. If it is interrupted, the command ends.
+    If the command is interrupted before all odometry of scans is complete, it ends.
 
     Arguments:
-      recording: The scans.
-      config: Settings of the odometry.
-      scale: Factor for all lengths.
-      kept_in: Checkpoint file.
-      skip_bad: Whether unreadable scans are reported and skipped.
+      command: Command with its flags.
+      paths: Recordings.
+      odometry: `auto`, a file for each recording, or none.
+      format: Format of the files.
+      kept_in: Checkpoint file of the odometry of a recording, given its number.
+
+    Returns:
+      The command with the settings in effect, the recordings, deskewed and with submaps, and their odometry (or none).
     """
+    from sglpr_jax.data.deskew import has_point_times  # slow imports, not needed for --help
+    from sglpr_jax.odometry.kiss_icp import check_installed
+
+    poses = []
+    if odometry == AUTO:
+        check_installed()
+        opened = [command.source.open(path) for path in paths]
+        scale, config = resolved_scale(command.scale, *opened), command.scan_odometry
+        options = {"scale": scale, "skip_bad": command.skip_bad}
+        poses = [_odometry_of(one, config, kept_in=kept_in(number), **options) for number, one in enumerate(opened)]
+        deskew = command.submap.deskew or all(map(has_point_times, opened))
+        submap = dataclasses.replace(command.submap, deskew=deskew)
+        command = dataclasses.replace(command, scale=scale, submap=submap, scan_odometry=config.effective)
+    elif odometry:
+        files = zip(paths, odometry, strict=True)
+        both = [open_with_poses(command.source, path, file, format=format) for path, file in files]
+        opened, poses = [one for one, _ in both], [one for _, one in both]
+    else:
+        opened = [command.source.open(path) for path in paths]
+    recordings = [command.submap.prepared(*one) for one in zip(opened, poses or [None] * len(opened), strict=True)]
+    scale = resolved_scale(command.scale, *recordings)
+    return dataclasses.replace(command, scale=scale), recordings, poses
+
+
+def _odometry_of(
+    recording: "Recording", config: OdometryConfig, *, scale: Scale, kept_in: Path, skip_bad: bool
+) -> "Float[np.ndarray, 'n 4 4']":
+    """Compute the odometry of a recording, with progress on stderr. If it is interrupted, the command ends."""
     from sglpr_jax.odometry.kiss_icp import about, scan_odometry
 
     if not recording.has_images:
@@ -239,21 +245,3 @@ def odometry_of(
         print(f"odometry of {len(poses)} of {len(recording)} scans; run the same command again to continue")
         sys.exit(stop.exit_status)
     return poses
-
-
-def with_deskew(submap: T, recordings: "list[Recording]") -> T:
-    """`SubmapOptions` that remove the motion within scans, if the points of all recordings have times."""
-    from sglpr_jax.data.deskew import has_point_times
-
-    chosen: Any = submap
-    return dataclasses.replace(chosen, deskew=chosen.deskew or all(map(has_point_times, recordings)))
-
-
-def remove_odometry(command: Any) -> None:
-    """Delete the checkpoint files of a `LoopsCommand`."""
-    for number in range(len(command.recordings)):
-        _kept_in(command.out, number).unlink(missing_ok=True)
-
-
-def _kept_in(out: Path, number: int) -> Path:
-    return out / f"unfinished-{number}{ENDING}"

@@ -7,7 +7,6 @@ import gc
 import inspect
 import io
 import json
-import logging
 import os
 import re
 import signal
@@ -26,7 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, with_defaults
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.fields import check_value, field_types, has_bounds
-from sglpr_jax.files import printable
+from sglpr_jax.files import in_short, printable
 
 _TABLE_WIDTH = 140
 _INSTALLED_AS = "sglpr-"
@@ -64,15 +63,9 @@ def own_names(text: str) -> str:
     """
     if not Path(sys.argv[0]).name.startswith(_INSTALLED_AS):
         return text
-    names = "|".join(map(re.escape, _installed_commands()))
-    return re.sub(rf"(?<![\w/.~-])bin/({names})(?![\w/-]|\.\w)", rf"{_INSTALLED_AS}\1", text)
-
-
-@functools.cache
-def _installed_commands() -> tuple[str, ...]:
-    """Return the names of the commands that `pip install` creates, without their prefix."""
     scripts = distribution("sglpr-jax").entry_points.select(group="console_scripts")
-    return tuple(script.name.removeprefix(_INSTALLED_AS) for script in scripts)
+    names = "|".join(re.escape(script.name.removeprefix(_INSTALLED_AS)) for script in scripts)
+    return re.sub(rf"(?<![\w/.~-])bin/({names})(?![\w/-]|\.\w)", rf"{_INSTALLED_AS}\1", text)
 
 
 def parse_command(
@@ -125,15 +118,8 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     """Parse a command line and run the command. Invalid input gives one line on stderr and exit status 1, Ctrl-C gives
     130. If the reader of the output ends early, as `head` does, the command ends without a message."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    for chatty in ("absl", "asyncio"):  # they log pages about a failed checkpoint, which orbax also raises
-        logging.getLogger(chatty).setLevel(logging.CRITICAL)
-    warnings.filterwarnings(
-        "ignore", "coroutine .* was never awaited", RuntimeWarning
-    )  # a failed checkpoint again, at exit
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", DataWarning)
-    if sys.unraisablehook is sys.__unraisablehook__:
-        sys.unraisablehook = _show_unraisable
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
     try:
@@ -145,10 +131,8 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
         sys.exit(_one_line(error))
     except (RuntimeError, AssertionError):  # JAX raises these for a missing device
-        missing = _missing_device()
-        if missing is None:
-            raise
-        sys.exit(_one_line(missing))
+        _check_devices()
+        raise
     except KeyboardInterrupt:
         sys.exit(130)
     finally:
@@ -159,20 +143,18 @@ def _one_line(error: Exception) -> str:
     return own_names(f"error: {printable(' '.join(str(error).split()), most=_MOST_OF_AN_ERROR)}")
 
 
-def _missing_device() -> ValueError | None:
-    """Return an error if JAX does not find the devices of JAX_PLATFORMS."""
+def _check_devices() -> None:
+    """Exit with one line if JAX does not find the devices of JAX_PLATFORMS."""
     asked = os.environ.get("JAX_PLATFORMS")
     if not asked:
-        return None
-    import jax  # slow imports, not needed for --help
-
-    from sglpr_jax.files import in_short
+        return
+    import jax  # slow import, not needed for --help
 
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:
-        return ValueError(f"JAX_PLATFORMS={asked}: expected a device that JAX finds, found none ({in_short(error)})")
-    return None
+        reason = f"expected a device that JAX finds, found none ({in_short(error)})"
+        sys.exit(_one_line(ValueError(f"JAX_PLATFORMS={asked}: {reason}")))
 
 
 def _flush_stdout() -> None:
@@ -200,10 +182,9 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
         sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
-def _show_unraisable(unraisable) -> None:
-    """Report errors as Python does, except those of the pending writes of a failed checkpoint."""
-    if str(unraisable.exc_value) != "Event loop is closed":
-        sys.__unraisablehook__(unraisable)
+def print_error(text: str) -> None:
+    """Print a line on stderr at once."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def console() -> Console:
@@ -224,6 +205,11 @@ class StopRequest:
     def exit_status(self) -> int:
         """130 after Ctrl-C, as in shells. 0 after SIGTERM, which ends a run that will be resumed later."""
         return 130 if self.signal == signal.SIGINT else 0
+
+    def exit(self, text: str) -> None:
+        """Print a text on stderr and exit."""
+        print_error(text)
+        sys.exit(self.exit_status)
 
 
 @contextlib.contextmanager

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.recording import report_bad_scan
-from sglpr_jax.cli.runtime import (
-    StopRequest,
-    console,
-    parse_command,
-    progress_bar,
-    run,
-    stop_on_signal,
-)
+from sglpr_jax.cli.runtime import StopRequest, console, parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.files import file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
@@ -171,8 +164,7 @@ def _train(
 def exit_unless_finished(result: "TrainResult", stopped: StopRequest, *, go_on: str) -> None:
     """Exit if the training was asked to stop: with status 0 after SIGTERM, with 130 after Ctrl-C."""
     if not result.finished:
-        print(f"stopped at step {result.steps} of {result.config.steps}; {go_on}", file=sys.stderr)
-        sys.exit(stopped.exit_status)
+        stopped.exit(f"stopped at step {result.steps} of {result.config.steps}; {go_on}")
 
 
 def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":

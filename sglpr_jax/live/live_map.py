@@ -296,12 +296,19 @@ def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
     found = read_json(path)
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise ValueError(f"{path}: expected the settings of a live map ({FORMAT}), found others; use another --out")
-    other = [name for name, value in wanted.items() if found.get(name) != value]
+    other = [name for name, value in wanted.items() if not _holds(found.get(name), value)]
     if other:
         raise ValueError(
             f"{path}: expected a map with the same settings, found another {', '.join(other)}; "
             "use the flags and weights of the map, or another --out"
         )
+
+
+def _holds(found: Any, wanted: Any) -> bool:
+    """Whether a stored setting is the wanted one. Maps of earlier versions have fields that are constants today."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        return all(_holds(found.get(name), value) for name, value in wanted.items())
+    return found == wanted
 
 
 def _pairs(path: Path) -> set[tuple[int, int]]:

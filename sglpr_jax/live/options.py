@@ -3,6 +3,8 @@
 import dataclasses
 from pathlib import Path
 
+import tyro
+
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.fields import NotNegative
 
@@ -29,9 +31,9 @@ class LiveOptions:
     """Format of the scan files of a folder."""
     sensor_height: SensorHeight = "auto"
     """Height of the sensor above the ground, in metres. `auto` estimates height and tilt from the first scans."""
-    topic_prefix: str = "/sglpr"
-    """Beginning of the names of published topics."""
-    map_frame: str = "map"
+    topic_prefix: tyro.conf.Suppress[str] = "/sglpr"
+    """Beginning of the names of published topics. A setting of --config, as the next two."""
+    map_frame: tyro.conf.Suppress[str] = "map"
     """Name of the map's frame in published messages."""
-    odometry_frame: str = "odom"
+    odometry_frame: tyro.conf.Suppress[str] = "odom"
     """Name of the odometry's frame in published messages."""

@@ -13,7 +13,7 @@ from sglpr_jax.data.levelling import AnyMounting, mountings_of, upright_from_lid
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, Loop, Reason, Rejected, frames_of, scaled_drift
-from sglpr_jax.loops.config import ConsistencyConfig, DetectorConfig
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.odometry.config import DriftModel
@@ -39,7 +39,6 @@ def accepted(
     *,
     mounting: AnyMounting = None,
     drift: DriftModel = DriftModel(),
-    config: ConsistencyConfig = ConsistencyConfig(),
 ) -> tuple[list[Loop], list[Rejected]]:
     """Accept the loops of a whole drive jointly against the odometry.
 
@@ -52,7 +51,7 @@ def accepted(
     path = DrivenPath.of(odometry, mounting=mounting)
     fits = deviations(loops, path, drift=drift, mounting=mounting) <= drift.max_deviation
     left = np.flatnonzero(fits).tolist()
-    pairs = agree([loops[i] for i in left], path, mounting=mounting, drift=drift, config=config)
+    pairs = agree([loops[i] for i in left], path, mounting=mounting, drift=drift)
     members = {left[i] for i in largest_consistent_set(pairs)}
     reasons: tuple[Reason, Reason] = ("contradicts the odometry", "contradicts other loops")
     rejected = [Rejected(loop, reasons[int(fits[i])]) for i, loop in enumerate(loops) if i not in members]
@@ -113,7 +112,7 @@ def _readings(
     path = DrivenPath.of(odometry, mounting=mounting)
     found = deviations(against, path, drift=config.drift, mounting=mounting)
     drift = config.drift.scaled(float(f"{np.median(found):.2g}"))
-    pairs = agree(against, path, mounting=mounting, drift=drift, config=config.consistency)
+    pairs = agree(against, path, mounting=mounting, drift=drift)
     members = [against[i] for i in largest_consistent_set(pairs)]
     stated, drift = (scaled_drift(one, 1 / scale) for one in (config.drift, drift))
     percent, degrees = 100 * drift.metres_per_metre, 100 * drift.degrees_per_metre
@@ -145,8 +144,7 @@ def settled(
     """
     kept, rejected = list(loops), []
     if odometry is not None:
-        rules = {"mounting": mountings_of(recording), "drift": config.drift, "config": config.consistency}
-        kept, rejected = accepted(loops, odometry, **rules)
+        kept, rejected = accepted(loops, odometry, mounting=mountings_of(recording), drift=config.drift)
     if registered:
         options = {"knows_height": knows_height, "should_stop": should_stop}
         kept, others = registered_loops(recording, recording, kept, **options)

@@ -12,11 +12,11 @@ from sglpr_jax.data.recording import Record
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query
-from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.config import MIN_CELLS, CandidateConfig
 from sglpr_jax.loops.keyframes import Seen, StoredScans, described, image_spectrum
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
-from sglpr_jax.odometry.bev_odometry import Link, Motion
+from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, Link, Motion
 from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.registration.background import Background
@@ -64,7 +64,6 @@ class CandidateFinder:
         config: CandidateConfig = CandidateConfig(),
         verification: VerificationConfig = VerificationConfig(),
         drift: DriftModel = DriftModel(),
-        motion_drift: DriftModel = MOTION_DRIFT,
         keyframe_m: float = 0.0,
         max_places: int | None = None,
     ):
@@ -73,7 +72,7 @@ class CandidateFinder:
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
         self.params, self.config, self.verification = params, config, verification
-        self.drift, self.motion_drift = drift, motion_drift
+        self.drift = drift
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.stored = StoredScans(index, verification=verification, keyframe_m=keyframe_m, max_places=max_places)
         """Descriptors, and centres of the images without the background, for comparison."""
@@ -84,9 +83,9 @@ class CandidateFinder:
         self.mountings = Mountings()
         """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
-        self.motion = Motion(config.motion)
+        self.motion = Motion()
         self._joined = GrowingArray(np.empty((0, 2), np.int64))
-        self.background = Background(frames=config.background_frames, least=config.min_background_frames)
+        self.background = Background()
         self.missing: list[int] = []
         """Frames whose scans cannot be read."""
         self._times = GrowingArray(np.empty(0))
@@ -215,7 +214,7 @@ class CandidateFinder:
     @property
     def present_drift(self) -> DriftModel:
         """Drift of the odometry or, without odometry, of the motion estimated from the images."""
-        return self.odometry_check.drift(self.drift) if self.has_odometry else self.motion_drift
+        return self.odometry_check.drift(self.drift) if self.has_odometry else MOTION_DRIFT
 
     @property
     def knows_height(self) -> bool:
@@ -233,7 +232,7 @@ class CandidateFinder:
 
     def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
         """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""
-        return bool(np.count_nonzero(image) < self.config.min_cells)
+        return bool(np.count_nonzero(image) < MIN_CELLS)
 
     def _link(self, query: Query | None, clock: float) -> Link | None:
         """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
@@ -251,7 +250,7 @@ class CandidateFinder:
             if self.motion.is_trusted(best, prior):
                 return self._from_keyframe(best, frame)
             near = best if expected is None else self._refined(expected, image, query)
-            shown = near.correlation >= self.config.motion.min_expected * best.correlation
+            shown = near.correlation >= MIN_EXPECTED * best.correlation
             if self.motion.is_ridge(best) and shown and np.isfinite(prior).all():
                 x, y, yaw = prior
                 ridge = self._from_keyframe(best._replace(x=x, y=y, yaw=yaw), frame)

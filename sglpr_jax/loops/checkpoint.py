@@ -26,6 +26,7 @@ from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.odometry.config import MOTION_DRIFT
 from sglpr_jax.registration.bev_search import Peak
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.reuse import each_mounting, fingerprint, scans_sample
@@ -65,7 +66,7 @@ def settings(
         "times": _digest(recording.times),
         "weights": finder.index.weights_hash,
         "candidates": dataclasses.asdict(finder.config),
-        "drift": [dataclasses.asdict(one) for one in (finder.drift, finder.motion_drift)],
+        "drift": [dataclasses.asdict(one) for one in (finder.drift, MOTION_DRIFT)],
         "verification": dataclasses.asdict(finder.verification),
         **{name: _digest(value) if isinstance(value, np.ndarray) else value for name, value in given.items()},
     }

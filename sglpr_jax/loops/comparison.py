@@ -26,6 +26,10 @@ from sglpr_jax.registration.config import VerificationConfig
 
 BATCH, COARSE_BATCH = 8, 32
 """Number of matches of a batch, of the exact and of the coarse comparison."""
+BESIDE_M = 10.0
+"""Minimum travelled distance from query and match to the scans that show other places, in metres."""
+EXACT_COHORT, EXACT_NEAR_COHORT = 6, 3
+"""Numbers of scans of the two cohorts, the best by the coarse comparison, whose images are compared exactly."""
 EVERY = np.array(True)
 SURROUNDINGS_M, SYMMETRIES = 300.0, 4
 """Side of the square in which a lookalike may stand, in metres, and number of rotations at which it may fit."""
@@ -224,13 +228,13 @@ class Comparer:
         those near enough to contradict the motion by their fit."""
         config, frames = self.config, store.frames
         ways = np.stack([self.way_m(frames, frame) for frame in (query.frame, match)])
-        beside = (ways >= config.beside_m).all(axis=0)
+        beside = (ways >= BESIDE_M).all(axis=0)
         other = self.elsewhere(frames, query.frame) | self.elsewhere(frames, match)
         near = (ways < 2 * config.recent_m).any(axis=0) & ~other
         found = []
         for count, exact, flags in (
-            (config.cohort, config.exact_cohort, other & beside),
-            (config.near_cohort, config.exact_near_cohort, near & beside),
+            (config.cohort, EXACT_COHORT, other & beside),
+            (config.near_cohort, EXACT_NEAR_COHORT, near & beside),
         ):
             rows = store.nearest(query.descriptor, count, flags)
             order = np.argsort(-self.coarse(query.spectra, store.spectra(rows)), kind="stable")

@@ -7,8 +7,8 @@ import dataclasses
 import math
 from typing import Annotated, Literal
 
-from sglpr_jax.fields import Bounds, NotNegative, Positive, check_fields
-from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel, MotionConfig
+from sglpr_jax.fields import Bounds, Positive, check_fields
+from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.config import VerificationConfig
 
 Degenerate = Literal["keep", "drop"]
@@ -21,6 +21,8 @@ SPACING_M = 1.0
 PlaceCount = Annotated[int, Bounds(1, 1000)]
 PlaceCountOrNone = Annotated[int, Bounds(0, 1000)]
 """Number of places whose images are compared with a query. Each takes milliseconds."""
+MIN_CELLS = 20
+"""Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
 CANDIDATES = 5
 """Number of nearest places of a map that a query is compared with."""
 
@@ -43,45 +45,8 @@ class CandidateConfig:
     """Number of nearest descriptors among the scans that show another place than the query or the match."""
     near_cohort: PlaceCountOrNone = 8
     """Number of nearest descriptors among other scans of the same passes, whose fits may contradict the motion."""
-    exact_cohort: PlaceCountOrNone = 6
-    exact_near_cohort: PlaceCountOrNone = 3
-    """Numbers of these scans, the best by the coarse comparison, whose images are compared exactly."""
     recent_m: Positive = 30.0
     """Minimum travelled distance between a match and its query, in metres. Nearer scans belong to the same pass."""
-    beside_m: NotNegative = 10.0
-    """Minimum travelled distance from query and match to the scans that show other places, in metres."""
-    min_cells: int = 20
-    """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
-    background_frames: int = 16
-    """Number of keyframes in the average image, which is subtracted before comparisons (`registration.background`)."""
-    min_background_frames: int = 4
-    """Minimum number of keyframes before the average is subtracted."""
-    motion: MotionConfig = MotionConfig()
-
-    def __post_init__(self):
-        """Raises ValueError if a field has an invalid value."""
-        check_fields(self)
-
-
-@dataclasses.dataclass(frozen=True)
-class ConsistencyConfig:
-    """Thresholds for the consistency of two loops."""
-
-    position_m: float = 0.5
-    yaw_deg: float = 1.5
-    """Standard deviations of a cycle in addition to the covariances of its loops, in metres and degrees."""
-    deviations: float = 3.0
-    """Maximum closure error of the cycle of two consistent loops, in standard deviations."""
-
-
-@dataclasses.dataclass(frozen=True)
-class SequenceConfig:
-    """Selection and weights of neighbouring pairs."""
-
-    window_m: Positive = 50.0
-    """Travelled distance before and after a query within which other queries are its neighbours, in metres."""
-    independent_m: Positive = 25.0
-    """Travelled distance after which two frames are nearly independent, in metres: the reach of an image."""
 
     def __post_init__(self):
         """Raises ValueError if a field has an invalid value."""
@@ -102,10 +67,6 @@ class DetectorConfig:
     oldest. None stores all."""
     candidates: CandidateConfig = CandidateConfig()
     verification: VerificationConfig = VerificationConfig()
-    consistency: ConsistencyConfig = ConsistencyConfig()
-    sequence: SequenceConfig = SequenceConfig()
-    motion_drift: DriftModel = MOTION_DRIFT
-    """Drift of the motion that is used if there is no odometry (`odometry.bev_odometry`)."""
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""
 

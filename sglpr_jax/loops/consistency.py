@@ -12,13 +12,16 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.levelling import AnyMounting
 from sglpr_jax.loops.closure import Loop, Reason, Rejected, compose, frames_of, inverted, planar, planar_loops, relative
-from sglpr_jax.loops.config import ConsistencyConfig
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 
 BLOCK = 64
 """Number of loops compared with all others at a time, to limit memory."""
+CYCLE_M, CYCLE_DEG = 0.5, 1.5
+"""Standard deviations of a cycle in addition to the covariances of its loops, in metres and degrees."""
+CYCLE_DEVIATIONS = 3.0
+"""Maximum closure error of the cycle of two consistent loops, in standard deviations."""
 
 
 def agree(
@@ -29,7 +32,6 @@ def agree(
     way: Float[np.ndarray, " n"] | None = None,
     mounting: AnyMounting = None,
     drift: DriftModel = DriftModel(),
-    config: ConsistencyConfig = ConsistencyConfig(),
 ) -> Bool[np.ndarray, "a b"]:
     """Pairs of loops that are consistent, given the path of all frames. The length of the path does not cost time.
 
@@ -40,7 +42,6 @@ def agree(
       way: Travelled distance at each frame in metres, by default that of the path.
       mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
       drift: Drift model of the path.
-      config: Thresholds.
 
     Returns:
       Whether loop i of `loops` is consistent with loop j of `others`.
@@ -50,7 +51,7 @@ def agree(
     pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)
     for start in range(0, len(pairs), BLOCK):
         rows = slice(start, start + BLOCK)
-        pairs[rows] = _closes({name: values[rows] for name, values in a.items()}, b, drift, config)
+        pairs[rows] = _closes({name: values[rows] for name, values in a.items()}, b, drift)
     return pairs
 
 
@@ -105,9 +106,7 @@ def _columns(
     }
 
 
-def _closes(
-    a: dict[str, np.ndarray], b: dict[str, np.ndarray], drift: DriftModel, config: ConsistencyConfig
-) -> Bool[np.ndarray, "a b"]:
+def _closes(a: dict[str, np.ndarray], b: dict[str, np.ndarray], drift: DriftModel) -> Bool[np.ndarray, "a b"]:
     """Whether the cycle of each loop of a with each loop of b closes, from their `_columns`."""
     # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: should equal loop a.
     query_from_query = relative(a["query_pose"][:, None], b["query_pose"][None])
@@ -116,12 +115,12 @@ def _closes(
     apart = relative(a["pose"][:, None], around)
     length = np.abs(a["query_way"][:, None] - b["query_way"]) + np.abs(a["match_way"][:, None] - b["match_way"])
     lever = np.hypot(query_from_query[..., 0], query_from_query[..., 1])
-    turn = np.radians(config.yaw_deg) ** 2 + a["turn"][:, None] + b["turn"][None]
+    turn = np.radians(CYCLE_DEG) ** 2 + a["turn"][:, None] + b["turn"][None]
     turn = turn + (np.radians(drift.degrees_per_metre) * length) ** 2
-    place = config.position_m**2 + a["place"][:, None] + b["place"][None] + (drift.metres_per_metre * length) ** 2
+    place = CYCLE_M**2 + a["place"][:, None] + b["place"][None] + (drift.metres_per_metre * length) ** 2
     place = place + turn * lever**2
-    close = apart[..., 0] ** 2 + apart[..., 1] ** 2 <= config.deviations**2 * place
-    return close & (np.abs(apart[..., 2]) <= config.deviations * np.sqrt(turn))
+    close = apart[..., 0] ** 2 + apart[..., 1] ** 2 <= CYCLE_DEVIATIONS**2 * place
+    return close & (np.abs(apart[..., 2]) <= CYCLE_DEVIATIONS * np.sqrt(turn))
 
 
 MIN_LOOPS = 5
@@ -133,7 +132,7 @@ MAX_RIVAL = 0.5
 
 
 def accepted_between(
-    loops: Sequence[Loop], motion: Motion, *, mounting: AnyMounting, drift: DriftModel, config: ConsistencyConfig
+    loops: Sequence[Loop], motion: Motion, *, mounting: AnyMounting, drift: DriftModel
 ) -> tuple[list[list[Loop]], list[Rejected]]:
     """Accept sets of consistent loops between two sessions, at most one for each segment of each session.
 
@@ -142,7 +141,6 @@ def accepted_between(
       motion: Motion of both sessions (`Motion.joined`). Poses of different segments are not comparable.
       mounting: Mounting of the LiDAR at each row.
       drift: Drift model of the motion.
-      config: Thresholds of the consistency of two loops.
 
     Returns:
       The accepted sets, the largest one first, and the rejected loops.
@@ -152,7 +150,7 @@ def accepted_between(
     found, rejected = [], []
     for pair in np.unique(segments, axis=0):
         some = [loops[row] for row in np.flatnonzero((segments == pair).all(axis=1)).tolist()]
-        rules = {"way": motion.travelled, "mounting": mounting, "drift": drift, "config": config}
+        rules = {"way": motion.travelled, "mounting": mounting, "drift": drift}
         pairs = agree(some, motion.path, **rules)
         members = largest_consistent_set(pairs).tolist()
         others = np.setdiff1d(np.arange(len(some)), members)

@@ -15,7 +15,7 @@ from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.loops.sequence import Pair, pair_of, probable_loops, verdict
+from sglpr_jax.loops.sequence import WINDOW_M, Pair, pair_of, probable_loops, verdict
 from sglpr_jax.models.params import Params
 
 MAX_WAITING = 240
@@ -56,7 +56,6 @@ class LoopDetector:
             config=config.candidates,
             verification=config.verification,
             drift=config.drift,
-            motion_drift=config.motion_drift,
             keyframe_m=config.keyframe_m,
             max_places=config.max_places,
         )
@@ -134,7 +133,7 @@ class LoopDetector:
             del self.candidates[: -self.config.max_places]
         about = self.model, self.finder.motion, self.finder.mountings
         self._waiting += [pair_of(one, *about, knows_height=self.finder.knows_height) for one in candidates]
-        oldest_m = self.finder.motion.travelled[len(self) - 1] - self.config.sequence.window_m
+        oldest_m = self.finder.motion.travelled[len(self) - 1] - WINDOW_M
         old = [one.way_m < oldest_m for one in self._waiting]
         count = max(sum(old), len(self._waiting) - MAX_WAITING)
         self.rejected += self._verdicts(self._waiting[:count])

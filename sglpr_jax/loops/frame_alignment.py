@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.loops.closure import Loop, covariance_in_metres, frames_of
-from sglpr_jax.loops.config import SequenceConfig
+from sglpr_jax.loops.sequence import INDEPENDENT_M
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import adjoint, inverse, moved_covariance, yaw_of
 
@@ -137,12 +137,12 @@ def _drifted(
 
 
 def _fresh(way: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Weight of each loop: its share of the travelled distance, in units of `independent_m`, at most 1."""
+    """Weight of each loop: its share of the travelled distance, in units of `INDEPENDENT_M`, at most 1."""
     order = np.argsort(way)
     gaps = np.diff(way[order])
     around = (np.append(gaps, gaps[-1:]) + np.append(gaps[:1], gaps)) / 2 if len(gaps) else np.array([np.inf])
     weights = np.empty(len(way))
-    weights[order] = np.clip(around / SequenceConfig().independent_m, 1e-3, 1)
+    weights[order] = np.clip(around / INDEPENDENT_M, 1e-3, 1)
     return weights
 
 

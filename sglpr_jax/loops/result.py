@@ -11,7 +11,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, listed
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.frame_alignment import AlignedParts
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.odometry.config import DriftModel
@@ -175,9 +175,8 @@ def why_none(found: FoundLoops) -> list[str]:
     if session.frames < scans:
         reasons.append(f"The search was stopped after {session.frames} of {scans} frames.")
     if 2 * session.empty > session.frames:
-        cells = found.config.candidates.min_cells
         reasons.append(
-            f"{session.empty} of {session.frames} scans are almost empty (fewer than {cells} occupied cells of the "
+            f"{session.empty} of {session.frames} scans are almost empty (fewer than {MIN_CELLS} occupied cells of the "
             "image): check the format and the range of the points, and whether the sensor was covered."
         )
     if 2 * len(session.skipped) > session.frames:

@@ -273,7 +273,7 @@ def search_pair(
         if loop is None
     ]
     likely = [loop for loop in probable if loop is not None]
-    sets, contradicting = accepted_between(likely, motion, config=config.consistency, **rules)
+    sets, contradicting = accepted_between(likely, motion, **rules)
     offset, ends = len(finders[0]), {"match_session": match, "query_session": query}
 
     def of_sessions(loop: Loop) -> Loop:

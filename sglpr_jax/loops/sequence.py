@@ -16,13 +16,17 @@ from scipy.special import expit, logit
 from sglpr_jax.data.levelling import AnyMounting, Mountings
 from sglpr_jax.loops.closure import Loop, Reason, planar_loop
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.config import DetectorConfig, SequenceConfig
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 
+WINDOW_M = 50.0
+"""Travelled distance before and after a query within which other queries are its neighbours, in metres."""
+INDEPENDENT_M = 25.0
+"""Travelled distance after which two frames are nearly independent, in metres: the reach of an image."""
 BLOCK = 64
 """Number of pairs that are tested at a time, to limit memory."""
 
@@ -97,32 +101,27 @@ def tested_log_odds(
     evidence = Evidence.stack([one.evidence for one in pairs])
     strength, support = model.strength(evidence), np.empty(len(pairs))
     loops, way_m = [one.loop for one in pairs], np.maximum.accumulate([one.way_m for one in pairs])
-    window_m = config.sequence.window_m
     for start in range(0, len(pairs), BLOCK):
         end = min(start + BLOCK, len(pairs))
-        first = int(np.searchsorted(way_m, way_m[start] - window_m))
-        last = int(np.searchsorted(way_m, way_m[end - 1] + window_m, side="right"))
-        options = {"mounting": mounting, "drift": drift, "config": config.consistency}
-        agreeing = agree(loops[start:end], path, loops[first:last], **options)
-        weights = neighbour_weights(way_m[first:last], np.arange(start, end) - first, config=config.sequence)
+        first = int(np.searchsorted(way_m, way_m[start] - WINDOW_M))
+        last = int(np.searchsorted(way_m, way_m[end - 1] + WINDOW_M, side="right"))
+        agreeing = agree(loops[start:end], path, loops[first:last], mounting=mounting, drift=drift)
+        weights = neighbour_weights(way_m[first:last], np.arange(start, end) - first)
         support[start:end] = (np.where(agreeing, 1.0, -1.0) * weights) @ strength[first:last]
     return model.tested_log_odds(evidence, support)
 
 
-def neighbour_weights(
-    way_m: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"], *, config: SequenceConfig = SequenceConfig()
-) -> Float[np.ndarray, "k n"]:
+def neighbour_weights(way_m: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k n"]:
     """Weight of each pair as neighbour of some pairs: the share of it that is new on the way to them.
 
     Arguments:
       way_m: Travelled distance at each query, in metres, in increasing order.
       rows: The pairs whose neighbours are weighed.
-      config: Selection of neighbours.
     """
-    fresh = 1 - np.exp(-np.concatenate([[0.0], np.diff(way_m), [0.0]]) / config.independent_m)
+    fresh = 1 - np.exp(-np.concatenate([[0.0], np.diff(way_m), [0.0]]) / INDEPENDENT_M)
     before = rows[:, None] > np.arange(len(way_m))[None]
     weight = np.where(before, fresh[None, 1:], fresh[None, :-1]) * (rows[:, None] != np.arange(len(way_m))[None])
-    return weight * (np.abs(way_m[rows][:, None] - way_m[None]) <= config.window_m)
+    return weight * (np.abs(way_m[rows][:, None] - way_m[None]) <= WINDOW_M)
 
 
 def verdict(pair: Pair, model: LoopModel, min_probability: float) -> Reason:

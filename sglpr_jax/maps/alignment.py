@@ -7,7 +7,6 @@ import numpy as np
 
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.config import ConsistencyConfig
 from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.frame_alignment import FrameAlignment, aligned_frames
 from sglpr_jax.maps.place_map import PlaceMap
@@ -62,7 +61,7 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
         return None
     upright, offset = [_upright_loop(loop, before, new) for loop in loops], len(before)
     motion = Motion.joined([Motion.of(one.upright_poses()) for one in (before, new)], [np.eye(3)] * 2)
-    sets, _ = accepted_between(upright, motion, mounting=None, drift=DriftModel(), config=ConsistencyConfig())
+    sets, _ = accepted_between(upright, motion, mounting=None, drift=DriftModel())
     if not sets:
         return None
     accepted = {loop.query - offset for loop in sets[0]}
@@ -92,7 +91,7 @@ def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
         raise ValueError(
             f"expected poses in the world frame of the existing map, found {found.places} places that are "
             f"{found.apart_m:.1f} m away from where the existing map has them (median); with --frame align the poses "
-            "are moved to the existing map, with --frame same they are taken as they are"
+            "are moved to the existing map"
         )
 
 

@@ -22,7 +22,7 @@ from sglpr_jax.loops.arguments import given_poses, given_record
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import Loop, in_metres, planar_loop
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
-from sglpr_jax.loops.config import CANDIDATES, CandidateConfig, PlaceCount
+from sglpr_jax.loops.config import CANDIDATES, MIN_CELLS, CandidateConfig, PlaceCount
 from sglpr_jax.loops.keyframes import Seen, image_spectrum
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.maps.place_names import Content, free_names
@@ -211,7 +211,7 @@ class PlaceMap:
         image = seen.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
-        if not len(self) or np.count_nonzero(image) < CandidateConfig().min_cells:
+        if not len(self) or np.count_nonzero(image) < MIN_CELLS:
             return []
         model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))

@@ -39,7 +39,7 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 INPUT_FILE = "input.json"
 NEEDS = "pip install 'sglpr-jax[export]'"
 NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
-"""jax2onnx is installed without its dependencies. They include an Orbax that is older than this package's and that the
+"""jax2onnx is installed without its dependencies. They include an Orbax that is older than Flax's and that the
 conversion does not use."""
 
 

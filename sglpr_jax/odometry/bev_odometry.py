@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.odometry.config import MotionConfig
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.se3 import inverse, transform, travelled, yaw_of
@@ -33,6 +32,32 @@ GAP_M = 1000.0
 """Travelled distance that counts for an unknown motion, as after a restart, in metres."""
 UNKNOWN_M = 1e6
 """Length of measured path with the same drift as an unknown motion, in metres: the sensor may be anywhere."""
+MIN_CORRELATION = 0.15
+"""Minimum correlation of the two images of an accepted registration."""
+MAX_ALONG_M = 0.25
+"""Maximum standard deviation of the pose along its least certain direction, in metres. Above it, the images do not
+show how far the sensor moved, as between walls."""
+MIN_EXPECTED = 0.8
+"""Minimum correlation near the expected pose, divided by that at the best pose, if the best pose is less certain than
+`MAX_ALONG_M`. Above it, the sensor is assumed to move on as before."""
+MAX_SECOND, MAX_SECOND_OF_JUMP, MAX_SECOND_EXPECTED = 0.8, 0.6, 0.95
+"""Maximum second-peak ratio, that of a pose far from the expected one, and that of the expected pose."""
+EXPECTED_M, EXPECTED_DEG = 1.0, 5.0
+"""Maximum distance of a pose from the expected one, in metres and degrees."""
+MAX_JUMP = 2.0
+"""Distance from the expected pose, as a multiple of the last step, beyond which a pose is far from it."""
+MAX_COASTING = 3
+"""Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
+KEYFRAME_M, KEYFRAME_DEG = 3.0, 20.0
+"""Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
+GUESS_FACTOR = 300.0
+"""Length of measured path with the same drift as one metre of guessed motion, in metres."""
+AMBIGUOUS_SHARE = 0.25
+"""Share of a step that counts as guessed if its link is ambiguous."""
+M_PER_UNCERTAIN_M = 100.0
+"""Length of measured path with the same drift as one metre of uncertainty along a wall, in metres."""
+LEAST_STEP_M, UNKNOWN_STEP_M = 0.5, 12.0
+"""Minimum length of a guessed step, and its length if the speed was never known, in metres."""
 NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8")]
 """Numbers of a frame beside its pose."""
 
@@ -64,8 +89,7 @@ class Link(NamedTuple):
 class Motion:
     """Planar poses of all added frames, in order."""
 
-    def __init__(self, config: MotionConfig = MotionConfig()):
-        self.config = config
+    def __init__(self):
         self.keyframe = 0
         self.path = DrivenPath()
         """Planar poses of all added frames or, with odometry, its gravity-aligned poses."""
@@ -154,7 +178,7 @@ class Motion:
             ambiguous = surprises or not self.is_trusted(link, prior)
             along_m = float(link.along_m) if self.is_ridge(link) else along_m
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
-        elif pose is None and self._coasted < self.config.max_coasting:
+        elif pose is None and self._coasted < MAX_COASTING:
             pose, coasts = self._expected(time), True
         self._coasted = self._coasted + 1 if coasts else 0
         if not len(self):
@@ -166,15 +190,15 @@ class Motion:
             travelled = self.travelled[key] + moved
             guessed_m = self.guessed_m[key]
             if coasts or ambiguous:
-                drifted_m = self._drifted_m(time, share=1.0 if coasts else self.config.ambiguous_share)
-                guessed_m = min(drifted_m, self.guessed_m[-1] + self.config.m_per_uncertain_m * along_m)
+                drifted_m = self._drifted_m(time, share=1.0 if coasts else AMBIGUOUS_SHARE)
+                guessed_m = min(drifted_m, self.guessed_m[-1] + M_PER_UNCERTAIN_M * along_m)
             self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
             if not (self._is_far(moved, rotation) or coasts or ambiguous):
                 return
         self.keyframe = len(self) - 1
 
     def _is_far(self, metres: float, radians: float) -> bool:
-        return bool(metres > self.config.keyframe_m or radians > np.radians(self.config.keyframe_deg))
+        return bool(metres > KEYFRAME_M or radians > np.radians(KEYFRAME_DEG))
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
         """Expected x, y and yaw in the frame of an earlier frame, at constant velocity. NaN if unknown."""
@@ -238,8 +262,8 @@ class Motion:
 
     def _drifted_m(self, time: float, *, share: float = 1.0) -> float:
         """Next value of `guessed_m`, if the motion since the last frame is a guess, or if this share of it is."""
-        step_m = max(self._guessed_step_m(time), self.config.least_step_m)
-        return self.guessed_m[-1] + share * self.config.guess_factor * step_m
+        step_m = max(self._guessed_step_m(time), LEAST_STEP_M)
+        return self.guessed_m[-1] + share * GUESS_FACTOR * step_m
 
     def _guessed_step_m(self, time: float) -> float:
         """Length of the next step, if it is a guess."""
@@ -247,7 +271,7 @@ class Motion:
             return self._last_step_m * max(self._steps(time), 1.0)
         if self._m_per_s is not None:
             return abs(self._m_per_s) * (time - self._times[-1])
-        return self.config.unknown_step_m
+        return UNKNOWN_STEP_M
 
     @property
     def _last_step_m(self) -> float:
@@ -280,18 +304,18 @@ class Motion:
 
         A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
         """
-        config, most = self.config, self.config.max_second
+        most = MAX_SECOND
         apart = float(np.hypot(link.x - prior[0], link.y - prior[1]))
-        if apart > config.max_jump * self._last_step_m + 1.0:
-            most = config.max_second_of_jump
-        elif apart <= config.expected_m and link.angle_to(prior[2]) <= np.radians(config.expected_deg):
-            most = config.max_second_expected
-        fits = bool(link.correlation >= config.min_correlation and link.second <= most)
+        if apart > MAX_JUMP * self._last_step_m + 1.0:
+            most = MAX_SECOND_OF_JUMP
+        elif apart <= EXPECTED_M and link.angle_to(prior[2]) <= np.radians(EXPECTED_DEG):
+            most = MAX_SECOND_EXPECTED
+        fits = bool(link.correlation >= MIN_CORRELATION and link.second <= most)
         return fits and not self.is_ridge(link)
 
     def is_ridge(self, link: Link) -> bool:
         """Whether the images show the position across a direction only, as between walls."""
-        return bool(link.along_m > self.config.max_along_m and link.correlation < EQUAL)
+        return bool(link.along_m > MAX_ALONG_M and link.correlation < EQUAL)
 
     def moved(self, frame: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
         """Distance (metres) and rotation (radians) from a frame to a pose."""

@@ -57,43 +57,6 @@ MOTION_DRIFT = DriftModel(metres_per_metre=0.01, degrees_per_metre=0.03, yaw_deg
 
 
 @dataclasses.dataclass(frozen=True)
-class MotionConfig:
-    """Thresholds for accepting a registration with the keyframe and for choosing the next keyframe."""
-
-    min_correlation: float = 0.15
-    """Minimum correlation of the two images."""
-    max_along_m: float = 0.25
-    """Maximum standard deviation of the pose along its least certain direction, in metres. Above it, the images do not
-    show how far the sensor moved, as between walls."""
-    min_expected: float = 0.8
-    """Minimum correlation near the expected pose, divided by that at the best pose, if the best pose is less certain
-    than `max_along_m`. Above it, the sensor is assumed to move on as before."""
-    max_second: float = 0.8
-    max_second_of_jump: float = 0.6
-    max_second_expected: float = 0.95
-    """Maximum second-peak ratio, that of a pose far from the expected one, and that of the expected pose."""
-    expected_m: float = 1.0
-    expected_deg: float = 5.0
-    """Maximum distance of a pose from the expected one, in metres and degrees."""
-    max_jump: float = 2.0
-    """Distance from the expected pose, as a multiple of the last step, beyond which a pose is far from it."""
-    max_coasting: int = 3
-    """Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
-    keyframe_m: float = 3.0
-    keyframe_deg: float = 20.0
-    """Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
-    guess_factor: float = 300.0
-    """Length of measured path with the same drift as one metre of guessed motion, in metres."""
-    ambiguous_share: float = 0.25
-    """Share of a step that counts as guessed if its link is ambiguous."""
-    m_per_uncertain_m: float = 100.0
-    """Length of measured path with the same drift as one metre of uncertainty along a wall, in metres."""
-    least_step_m: float = 0.5
-    unknown_step_m: float = 12.0
-    """Minimum length of a guessed step, and its length if the speed was never known, in metres."""
-
-
-@dataclasses.dataclass(frozen=True)
 class OdometryConfig:
     """Settings of odometry from the scans (kiss-icp). Lengths are divided by the scale of a recording."""
 

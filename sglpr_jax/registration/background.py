@@ -9,13 +9,16 @@ import functools
 import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
+FRAMES = 16
+"""Number of keyframes in the average."""
+MIN_FRAMES = 4
+"""Minimum number of keyframes before the average is subtracted."""
+
 
 class Background:
     """Exponential moving average of the square roots of images, for subtraction."""
 
-    def __init__(self, *, frames: int, least: int):
-        """`frames` is the length of the average. Nothing is subtracted before `least` images."""
-        self.frames, self.least = frames, least
+    def __init__(self):
         self.added = 0
         """Number of added images."""
         self._root: Float32[np.ndarray, "n n"] | None = None
@@ -24,14 +27,14 @@ class Background:
         """Adds an image to the average. It should show another place than the last one."""
         root = np.sqrt(image, dtype=np.float32)
         self.added += 1
-        self._root = root if self._root is None else self._root + (root - self._root) / min(self.added, self.frames)
+        self._root = root if self._root is None else self._root + (root - self._root) / min(self.added, FRAMES)
 
     def without(self, image: UInt8[np.ndarray, "n n"]) -> UInt8[np.ndarray, "n n"]:
         """Returns an image without the background. Square roots are subtracted, as in the comparison."""
         if not image.size:
             return image
         root = np.sqrt(image, dtype=np.float32)
-        if self._root is None or self.added < self.least:
+        if self._root is None or self.added < MIN_FRAMES:
             more = np.maximum(root - ring_medians(root), 0)
         else:
             more = np.maximum(root - np.maximum(self._root, ring_medians(root)), 0)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Num
 
+from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.registration.bev_search import Peak, search
 from sglpr_jax.registration.bev_spectra import DEFAULT, prepared, rotations, spectrum, twice
 from sglpr_jax.registration.config import VerificationConfig
@@ -162,6 +163,8 @@ class Alignment(NamedTuple):
         return float(np.sqrt(np.linalg.eigvalsh(np.asarray(self.covariance)[:2, :2])[1]))
 
 
+REFINE_DEG = 3.0
+"""Range of the refinement to each side, in degrees, in `TURN_STEPS` steps."""
 TURN_STEPS = 4
 """Number of rotation steps of the refinement to each side."""
 RIDGE_TURNS = (0, 2, 6, 8)
@@ -227,7 +230,7 @@ def _refined(
     query: Float[Array, "m m"], match: Float[Array, "m m"], start: Float[Array, " 3"], config: VerificationConfig
 ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, "3 3"]]:
     """Peak near the pose `start`: (x, y, yaw), its correlation, and the covariance of the pose."""
-    cell_m, step_rad = config.resolution_m, np.float32(np.radians(config.refine_deg) / TURN_STEPS)
+    cell_m, step_rad = DENSITY_RESOLUTION_M, np.float32(np.radians(REFINE_DEG) / TURN_STEPS)
     yaws = start[2] + jnp.arange(-TURN_STEPS, TURN_STEPS + 1) * step_rad
     product = spectrum(match[None], cell_m, config) * jnp.conj(spectrum(rotations(query, yaws), cell_m, config))
     size = product.shape[1]

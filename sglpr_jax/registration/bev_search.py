@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, Num
 
+from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.registration.bev_spectra import (
     DEFAULT,
     AnyArray,
@@ -24,6 +25,11 @@ from sglpr_jax.registration.bev_spectra import (
     query_spectra,
 )
 from sglpr_jax.registration.config import VerificationConfig
+
+SECOND_M, SECOND_DEG = 3.0, 15.0
+"""Minimum distance of the second peak from the best one, in metres or in degrees."""
+PRIOR_M, PRIOR_DEG = 2.0, 10.0
+"""Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -44,7 +50,7 @@ def coarse_correlations(
     """
     turned = quarters(lower_half(jnp.asarray(query)[:, :, ::2].swapaxes(1, 2), config).swapaxes(1, 2))
     matches = lower_half(jnp.asarray(matches), config)
-    reach = cells(config.max_shift_m, 2 * config.resolution_m * config.coarse)
+    reach = cells(config.max_shift_m, 2 * DENSITY_RESOLUTION_M * config.coarse)
 
     def compare(k: Int[Array, ""], found: Float[Array, " k"]) -> Float[Array, " k"]:
         return found.at[k].set(correlations(turned, matches[k], reach).max((0, 2)).max())
@@ -145,15 +151,15 @@ def search_near(
 
 def _reach(config: VerificationConfig) -> int:
     """Maximum shift, in merged cells."""
-    return cells(config.max_shift_m, config.resolution_m * config.coarse)
+    return cells(config.max_shift_m, DENSITY_RESOLUTION_M * config.coarse)
 
 
 def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], config: VerificationConfig) -> Peak:
     reach, step = len(found) // 2, np.float32(2 * np.pi / config.turns)
-    cell_m = config.resolution_m * config.coarse
+    cell_m = DENSITY_RESOLUTION_M * config.coarse
     x, y, yaw = prior  # NaN allows all poses
     expected = reach - y / cell_m, yaw / step, reach + x / cell_m
-    near_prior = _near(found.shape, expected, config.prior_m / cell_m, config.prior_deg)
+    near_prior = _near(found.shape, expected, PRIOR_M / cell_m, PRIOR_DEG)
     highest = found.max(0)  # a maximum along the slowest axis is fast
     allowed = jnp.where(jnp.isnan(x), highest, jnp.where(near_prior, found, -1.0).max(0))
     turn, right = jnp.unravel_index(jnp.argmax(allowed), allowed.shape)
@@ -175,10 +181,10 @@ def _second(
 ) -> Float[Array, ""]:
     """Highest correlation away from a peak. `highest` is the maximum over all shifts down."""
     down, turn, right = at
-    most_turns = int(config.second_deg * config.turns / 360 + 1e-6)
+    most_turns = int(SECOND_DEG * config.turns / 360 + 1e-6)
     turns = jnp.mod(turn + np.arange(-most_turns, most_turns + 1), config.turns)
     about = found[:, turns]
-    near = _near(about.shape, (down, most_turns, right), config.second_m / cell_m, 360.0)
+    near = _near(about.shape, (down, most_turns, right), SECOND_M / cell_m, 360.0)
     other_turns = jnp.ones(config.turns, bool).at[turns].set(False)
     return jnp.maximum(jnp.max(jnp.where(other_turns[:, None], highest, 0.0)), jnp.max(jnp.where(~near, about, 0.0)))
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Num
 from scipy.fft import next_fast_len
 
 from sglpr_jax.bev import centre_crop, rotate_image
+from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.registration.config import VerificationConfig
 
 DEFAULT = VerificationConfig()
@@ -24,7 +25,7 @@ def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAU
     """
     if image.shape[0] != image.shape[1] or image.shape[0] % 2:
         raise ValueError(f"expected a square image of an even number of cells, found {image.shape}")
-    size = min(2 * cells(config.reach_m, config.resolution_m), image.shape[0])
+    size = min(2 * cells(config.reach_m, DENSITY_RESOLUTION_M), image.shape[0])
     size = max(size - size % (2 * config.coarse), 2 * config.coarse)
     return centre_crop(image, height=size, width=size)
 
@@ -33,8 +34,8 @@ def prepared(image: Num[AnyArray, "h w"], config: VerificationConfig) -> Float[A
     """Square root of the counts within reach. Other cells are zero. Raises the error of `within_reach`."""
     middle = within_reach(image, config)
     size = middle.shape[0]
-    axis = (np.arange(size) - (size - 1) / 2) * config.resolution_m
-    inside = np.hypot(axis[:, None], axis[None]) < min(config.reach_m, size / 2 * config.resolution_m)
+    axis = (np.arange(size) - (size - 1) / 2) * DENSITY_RESOLUTION_M
+    inside = np.hypot(axis[:, None], axis[None]) < min(config.reach_m, size / 2 * DENSITY_RESOLUTION_M)
     return jnp.where(inside, jnp.sqrt(jnp.maximum(jnp.asarray(middle, jnp.float32), 0)), 0)
 
 
@@ -46,7 +47,7 @@ def merged(image: Float[Array, "m m"], side: int) -> Float[Array, "k k"]:
 
 def occupied(image: Num[np.ndarray, "h w"], config: VerificationConfig = DEFAULT) -> float:
     """Number of occupied cells within reach."""
-    return float(np.count_nonzero(image[_within(image.shape, config.reach_m / config.resolution_m)]))
+    return float(np.count_nonzero(image[_within(image.shape, config.reach_m / DENSITY_RESOLUTION_M)]))
 
 
 @functools.cache
@@ -74,7 +75,7 @@ def query_spectra(query: Num[AnyArray, "h w"], *, config: VerificationConfig = D
     """
     angles = np.arange(config.turns // 4, dtype=np.float32) * np.float32(2 * np.pi / config.turns)
     rotated = rotations(merged(prepared(query, config), config.coarse), jnp.asarray(angles))
-    first = spectrum(rotated, config.resolution_m * config.coarse, config)
+    first = spectrum(rotated, DENSITY_RESOLUTION_M * config.coarse, config)
     return jnp.stack([first, _quarter_turned(first)]).transpose(0, 2, 1, 3)
 
 
@@ -84,7 +85,7 @@ def match_spectra(matches: Num[AnyArray, "k h w"], *, config: VerificationConfig
 
     def one(image: Num[Array, "h w"]) -> Complex[Array, "s f"]:
         small = merged(prepared(image, config), config.coarse)
-        return spectrum(small[None], config.resolution_m * config.coarse, config)[0]
+        return spectrum(small[None], DENSITY_RESOLUTION_M * config.coarse, config)[0]
 
     return jax.lax.map(one, jnp.asarray(matches))
 
@@ -104,7 +105,7 @@ def spectrum(images: Float[Array, "t m m"], cell_m: float, config: VerificationC
 
 def lower_half(spectra: Complex[Array, "*k s f"], config: VerificationConfig) -> Complex[Array, "*k r g"]:
     """Spectra on cells twice as large, with blurs twice as wide, from the lower frequencies of other spectra."""
-    size, cell_m = spectra.shape[-2] // 2, config.resolution_m * config.coarse
+    size, cell_m = spectra.shape[-2] // 2, DENSITY_RESOLUTION_M * config.coarse
     rows, columns = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
     before, after = _band(rows / 2, columns / 2, cell_m, config), _band(rows, columns, cell_m, config)
     kept = (np.abs(rows) < 0.5) & (columns < 0.5) & (before > 0)

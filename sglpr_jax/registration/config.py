@@ -2,15 +2,11 @@
 
 import dataclasses
 
-from sglpr_jax.grid import DENSITY_RESOLUTION_M
-
 
 @dataclasses.dataclass(frozen=True)
 class VerificationConfig:
     """Settings of the comparison of the bird's-eye-view images of two scans."""
 
-    resolution_m: float = DENSITY_RESOLUTION_M
-    """Edge of an image's cell, in metres."""
     reach_m: float = 25.0
     """Radius of the compared cells around the sensor, in metres. A circle has the same content at every rotation."""
     max_shift_m: float = 12.0
@@ -22,14 +18,6 @@ class VerificationConfig:
     blur_m: float = 0.4
     wide_blur_m: float = 1.0
     """Standard deviations of the two blurs, in metres. The wider blur is subtracted."""
-    refine_deg: float = 3.0
-    """Range of the refinement to each side, in degrees, in 4 steps."""
-    second_m: float = 3.0
-    second_deg: float = 15.0
-    """Minimum distance of the second peak from the best one, in metres or in degrees."""
-    prior_m: float = 2.0
-    prior_deg: float = 10.0
-    """Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""
 
     def __post_init__(self):
         """Raises ValueError if the number of rotations is not a multiple of four."""

@@ -1,8 +1,8 @@
 """Batches of a run in order, read by a thread while the device works, but only up to the next refresh of mining."""
 
 import abc
-import queue
-import threading
+import collections
+import concurrent.futures
 from collections.abc import Callable, Generator
 from typing import Any, TypeVar
 
@@ -72,35 +72,13 @@ def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 
 
     An exception of `make` is raised when its value is due. Closing the iterator stops the thread.
     """
-    ready: queue.Queue = queue.Queue(maxsize=depth)
-    ended = threading.Event()
-
-    def put(item) -> bool:
-        while not ended.is_set():
-            try:
-                ready.put(item, timeout=0.1)
-                return True
-            except queue.Full:
-                continue
-        return False
-
-    def work():
-        for step in range(start, stop):
-            try:
-                item = (make(step), None)
-            except BaseException as error:  # The consumer raises it.
-                item = (None, error)
-            if not put(item) or item[1] is not None:
-                return
-
-    thread = threading.Thread(target=work, name="read-ahead", daemon=True)
-    thread.start()
-    try:
-        for _ in range(start, stop):
-            value, error = ready.get()
-            if error is not None:
-                raise error
-            yield value
-    finally:
-        ended.set()
-        thread.join()
+    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as pool:
+        ahead = collections.deque(pool.submit(make, step) for step in range(start, min(start + depth, stop)))
+        try:
+            for step in range(start, stop):
+                made = ahead.popleft().result()
+                if step + depth < stop:
+                    ahead.append(pool.submit(make, step + depth))
+                yield made
+        finally:
+            pool.shutdown(cancel_futures=True)

@@ -1,6 +1,7 @@
 """Hooks that run during training: the progress on stderr, and event files for TensorBoard."""
 
 import contextlib
+import functools
 import sys
 import time
 from collections.abc import Mapping
@@ -38,8 +39,7 @@ class Callback:
         """Called every `log_every` steps with means since the last call: the loss, its terms, norms and speed."""
 
     def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        """Called every `score_every` steps with the scores of the weights. The entry "score" selects the best
-        checkpoint."""
+        """Called every `score_every` steps with the scores of the weights."""
 
     def on_checkpoint(self, step: int) -> None:
         """Called when a checkpoint of the weights after this step is being written."""
@@ -56,36 +56,18 @@ class Callbacks(Callback):
 
     def __init__(self, *callbacks: Callback):
         self._callbacks = callbacks
-
-    def on_pack(self, recording: str, done: int, scans: int) -> None:
-        for callback in self._callbacks:
-            callback.on_pack(recording, done, scans)
-
-    def on_start(self, step: int, steps: int) -> None:
-        for callback in self._callbacks:
-            callback.on_start(step, steps)
-
-    def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        for callback in self._callbacks:
-            callback.on_step(step, values)
-
-    def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        for callback in self._callbacks:
-            callback.on_score(step, scores)
-
-    def on_checkpoint(self, step: int) -> None:
-        for callback in self._callbacks:
-            callback.on_checkpoint(step)
-
-    def on_end(self, step: int) -> None:
-        for callback in self._callbacks:
-            callback.on_end(step)
+        for name in ("on_pack", "on_start", "on_step", "on_score", "on_checkpoint", "on_end"):
+            setattr(self, name, functools.partial(self._call_each, name))
 
     def close(self) -> None:
         """Close all callbacks in order, even if one of them raises an error."""
         with contextlib.ExitStack() as closing:
             for callback in reversed(self._callbacks):
                 closing.callback(callback.close)
+
+    def _call_each(self, name: str, *arguments: Any) -> None:
+        for callback in self._callbacks:
+            getattr(callback, name)(*arguments)
 
 
 class ProgressBar(Callback):
@@ -138,10 +120,9 @@ def _progress() -> Progress:
 
 
 class EventFiles(Callback):
-    """Writes all measurements into event files in a folder, without delay.
+    """Writes all measurements into event files in a folder. Their first record hides later ones of interrupted runs.
 
-    The first record hides what an interrupted run wrote for this step and later ones. Raises ImportError if the extra
-    is not installed. Writing raises OSError if the files cannot be written.
+    Raises ImportError if the extra is not installed. Writing raises OSError if the files cannot be written.
     """
 
     def __init__(self, folder: Path):
@@ -152,14 +133,6 @@ class EventFiles(Callback):
         self._folder = folder
         self._writer: Any = None
 
-    def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Write the measurements of a step."""
-        self._write(step, values)
-
-    def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        """Write the scores after a step."""
-        self._write(step, scores)
-
     def close(self) -> None:
         """Close the file."""
         if self._writer is not None:
@@ -167,7 +140,8 @@ class EventFiles(Callback):
                 self._writer.close()
             self._writer = None
 
-    def _write(self, step: int, values: Mapping[str, float]) -> None:
+    def on_step(self, step: int, values: Mapping[str, float]) -> None:
+        """Write the measurements of a step."""
         from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - generated
         from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -177,6 +151,10 @@ class EventFiles(Callback):
                 self._writer = _new_writer(self._folder, step)
             self._writer.write_event(Event(wall_time=time.time(), step=step, summary=Summary(value=scalars)))
             self._writer.flush()
+
+    def on_score(self, step: int, scores: Mapping[str, float]) -> None:
+        """Write the scores after a step."""
+        self.on_step(step, scores)
 
 
 def _new_writer(folder: Path, step: int) -> Any:

@@ -114,8 +114,6 @@ class TrainConfig:
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     validation: ValidationConfig = ValidationConfig()
-    select: Literal["last", "best"] = "last"
-    """Weights that a finished run returns: the last ones, or those with the best score on the held-out places."""
     steps: Count = 40_000
     """Number of training steps."""
     tuples: Count = 1
@@ -158,10 +156,6 @@ class TrainConfig:
             raise ValueError(
                 "loss.segmentation_alone freezes all other weights: expected optimizer.weight_decay 0, "
                 f"found {self.optimizer.weight_decay}"
-            )
-        if self.select == "best" and not self.validation.share:
-            raise ValueError(
-                "select best compares scores on held-out places: expected validation.share above 0, found 0"
             )
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")

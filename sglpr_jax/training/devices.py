@@ -1,14 +1,11 @@
 """Data-parallel training: the tuples of a step are split over the devices, and all devices hold the same weights.
 
-The step is written for one device. XLA derives the communication from the placement of the arrays (GSPMD): descriptors
-for the triplet loss, sums for the other losses, and the gradient. The results are those of one device, to float32
-rounding.
-
-Several hosts have one process each, which runs the same command with its own index. Only the first host (index 0)
-writes metrics, weights and pictures. Each host reads its own part of a batch.
+XLA derives the communication from the placement of the arrays (GSPMD). The results are those of one device, to float32
+rounding. Several hosts have one process each, which reads its own part of a batch. Only the first host writes files.
 """
 
 import contextlib
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -39,9 +36,12 @@ def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh
         by_host.setdefault(device.process_index, []).append(device)
     there = min(map(len, by_host.values()))
     shared = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
-    divisors = [n for n in range(1, there + 1) if _divides(n * len(by_host), config)]
+    hosts, common = len(by_host), math.gcd(config.tuples, config.images_at_once)
+    divisors = [n for n in range(1, there + 1) if common % (n * hosts) == 0]
+    if config.also_tuples:  # mixed batches of two datasets are never split
+        divisors = [1] if hosts == 1 else []
     if not divisors:
-        raise ValueError(f"expected {shared} to be divisible by the number of hosts, found {len(by_host)} hosts")
+        raise ValueError(f"expected {shared} to be divisible by the number of hosts, found {hosts} hosts")
     used = divisors[-1]
     if used < there and is_first_host():
         print(f"using {used} of {there} devices of each host: their number must divide {shared}", file=sys.stderr)
@@ -74,18 +74,9 @@ def on_own_rows(function: Function) -> Function:
     return jax.shard_map(function, in_specs=PartitionSpec(AXIS), out_specs=PartitionSpec(AXIS))
 
 
-def keep_split(tree: Tree, *, axis: int) -> Tree:
-    """Under jit: keep `axis` of the arrays split over the devices of the current mesh, if it has several."""
-    return _constrain(tree, PartitionSpec(*[None] * axis, AXIS))
-
-
-def keep_replicated(tree: Tree) -> Tree:
-    """Under jit: keep the arrays replicated on every device of the current mesh, if it has several."""
-    return _constrain(tree, PartitionSpec())
-
-
-def _constrain(tree: Tree, spec: PartitionSpec) -> Tree:
-    """Constrain the sharding on several devices. On one device the program stays the one without a mesh."""
+def keep_placed(tree: Tree, *, axis: int | None = None) -> Tree:
+    """Under jit on several devices: keep `axis` of the arrays split over them, or the arrays replicated on each."""
+    spec = PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, AXIS)
     return jax.lax.with_sharding_constraint(tree, spec) if _several_devices() else tree
 
 
@@ -98,27 +89,12 @@ def _place(tree: Tree, sharding: NamedSharding) -> Tree:
     return jax.make_array_from_process_local_data(sharding, jax.tree.map(np.asarray, tree))
 
 
-def _divides(devices: int, config: TrainConfig) -> bool:
-    """Whether a step can be split over this many devices. Mixed batches of two datasets are never split."""
-    if config.also_tuples:
-        return devices == 1
-    return config.tuples % devices == 0 and config.images_at_once % devices == 0
-
-
 @contextlib.contextmanager
 def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterator[None]:
-    """Connect the processes of `hosts` hosts to one JAX cluster. With one host, do nothing.
+    """Connect the processes of `hosts` hosts to one JAX cluster, before any other use of JAX. All hosts must leave it.
 
-    Enter the context before any other use of JAX. All hosts must leave it.
-
-    Arguments:
-      hosts: Number of hosts.
-      host_index: Index of this host, from 0.
-      coordinator: Address of the first host, as HOST:PORT.
-
-    Raises:
-      ValueError: The index or the address is invalid.
-      ConnectionError: The hosts do not find each other, or another host ends.
+    Raises ValueError if the index or the address (HOST:PORT) is invalid, and ConnectionError if the hosts do not find
+    each other, or if another host ends.
     """
     if not 0 <= host_index < hosts:
         raise ValueError(f"expected a host index from 0 to {hosts - 1}, found {host_index}")
@@ -174,8 +150,3 @@ def on_all_hosts(work: Callable[[], T]) -> T:
     if on_any_host(error is not None):
         raise error or ConnectionError("another host ended with an error; see the message that it printed")
     return done
-
-
-def of_first_host(value: float) -> float:
-    """Return the first host's value on every host. All hosts must call this function."""
-    return value if jax.process_count() == 1 else float(multihost_utils.broadcast_one_to_all(np.float32(value)))

@@ -23,7 +23,7 @@ from sglpr_jax.models.sglpr import forward, init
 from sglpr_jax.models.weights import learning_segmentation_alone
 from sglpr_jax.training.batches import Batch, in_network_order, views
 from sglpr_jax.training.config import LossConfig, OcclusionConfig, OptimizerConfig, TrainConfig
-from sglpr_jax.training.devices import keep_split, on_own_rows
+from sglpr_jax.training.devices import keep_placed, on_own_rows
 from sglpr_jax.training.loss import Summary, joint_loss, segmentation_sums
 from sglpr_jax.training.step import Gradient, Metrics, TrainState
 
@@ -145,7 +145,7 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     whole = (images, maps, jnp.asarray(batch.labelled))
     whole = jax.tree.map(lambda x: in_network_order(x, batch, every=config.loss.segment_every), whole)
     cut = jax.tree.map(lambda x: x.reshape(-1, config.images_at_once, *x.shape[1:]), whole)
-    return Chunk(*keep_split(cut, axis=1), key=keys)  # otherwise each chunk would be on one device
+    return Chunk(*keep_placed(cut, axis=1), key=keys)  # otherwise each chunk would be on one device
 
 
 def _angles(key: Array, config: TrainConfig) -> Array:

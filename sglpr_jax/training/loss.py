@@ -66,24 +66,20 @@ def _cross_entropy_sum(logits: Array, classes: Array, counted: Array, config: Lo
     return losses.cross_entropy(logits, classes, where=counted, balance=config.class_balance).sum()
 
 
-def _cross_entropy(total: Float[Array, ""], images: Int[Array, ""]) -> Float[Array, ""]:
-    """Equation 6, averaged over the labelled images."""
-    return total / jnp.maximum(images, 1)
-
-
 def _dice_sums(logits: Array, classes: Array, counted: Array, config: LossConfig) -> Float[Array, "3 k"]:
     return losses.dice_sums(logits, classes, counted)
 
 
-def _dice(sums: Float[Array, "3 k"], images: Int[Array, ""]) -> Float[Array, ""]:
-    """Equation 7 over the pixels of all labelled images; 0 without labelled images."""
-    return jnp.where(images > 0, losses.dice_from_sums(sums), 0.0)
-
-
 DESCRIPTOR_TERMS = {"triplet": DescriptorTerm(lambda config: 0.0 if config.segmentation_alone else 1.0, triplet)}
 SEGMENTATION_TERMS = {
-    "cross_entropy": SegmentationTerm(lambda config: config.ce_weight, _cross_entropy_sum, _cross_entropy),
-    "dice": SegmentationTerm(lambda config: config.dice_weight, _dice_sums, _dice),
+    "cross_entropy": SegmentationTerm(  # equation 6, averaged over the labelled images
+        lambda config: config.ce_weight, _cross_entropy_sum, lambda total, images: total / jnp.maximum(images, 1)
+    ),
+    "dice": SegmentationTerm(  # equation 7 over the pixels of all labelled images; 0 without labelled images
+        lambda config: config.dice_weight,
+        _dice_sums,
+        lambda sums, images: jnp.where(images > 0, losses.dice_from_sums(sums), 0.0),
+    ),
 }
 """Equation 8 is the weighted sum of all terms. Metrics and learning curves use their names."""
 TERM_NAMES = (*DESCRIPTOR_TERMS, *SEGMENTATION_TERMS)

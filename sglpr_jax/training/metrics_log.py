@@ -1,16 +1,13 @@
 """Measurements of a run as JSON lines, and its speed. Lines are appended, so an interrupted run loses none."""
 
 import contextlib
-import dataclasses
 import itertools
 import json
 import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from sglpr_jax.files import parse_json, write_text, writing
 
@@ -77,29 +74,23 @@ def _plain(value: Any) -> float | None:
     return value if math.isfinite(value) else None
 
 
-@dataclasses.dataclass(frozen=True)
-class Throughput:
-    """Speed of a run without scores and compilation: steps per second, and fraction of the time spent waiting for
-    data."""
+class Throughput(NamedTuple):
+    """Speed of a run without scores and compilation."""
 
     steps_per_second: float
     data_wait: float
+    """Fraction of the time spent waiting for data."""
 
 
 def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
     """Return the mean throughput over all lines of the log that state a speed, or None if no line states one.
 
-    The first line after a start or a resume has no speed, because the step is compiled then. Logs of earlier versions
-    have a speed on these lines: the very first line is skipped, but the first line after each resume is counted.
+    The first line after a start or a resume has no speed, because the step is compiled then.
     """
-    timed = [
-        (line["step"] - before["step"], line)
-        for before, line in itertools.pairwise(lines)
-        if "steps_per_second" in line
-    ]
+    timed = [(line, line["step"] - before["step"]) for before, line in itertools.pairwise(lines)]
+    timed = [(line, steps) for line, steps in timed if "steps_per_second" in line]
     if not timed:
         return None
-    steps = np.array([made for made, _ in timed])
-    seconds = steps / [line["steps_per_second"] for _, line in timed]
-    waited = seconds * [line["data_wait"] for _, line in timed]
-    return Throughput(float(steps.sum() / seconds.sum()), float(waited.sum() / seconds.sum()))
+    seconds = [steps / line["steps_per_second"] for line, steps in timed]
+    waited = [line["data_wait"] * spent for (line, _), spent in zip(timed, seconds, strict=True)]
+    return Throughput(sum(steps for _, steps in timed) / sum(seconds), sum(waited) / sum(seconds))

@@ -60,10 +60,9 @@ class DescriptorCache:
 
 
 class Mining:
-    """Descriptor cache of a run, with the files on disk that a resumed run may need.
+    """Descriptor cache of a run. A refresh at step r runs before that step and writes `folder`/r.npz.
 
-    A refresh at step r runs before that step and writes `folder`/r.npz. Steps r to r + refresh_steps - 1 use it. A run
-    resumed in between reads the same file, so its batches are those of an uninterrupted run.
+    A run that is resumed between two refreshes reads that file, so its batches are those of an uninterrupted run.
     """
 
     def __init__(
@@ -76,15 +75,10 @@ class Mining:
         seed: int,
         checkpoints: Callable[[], Collection[int]],
     ):
-        """Create a miner without a cache.
+        """Create a miner for a pool with this number of places, in a folder for the caches.
 
-        Arguments:
-          describe: Describes places of the pool.
-          places: Number of places of the pool.
-          config: Settings of the tuples.
-          folder: Folder of the caches.
-          seed: Seed of the described places, if `config.mined_places` are fewer than all.
-          checkpoints: Returns the steps of the complete checkpoints of the run.
+        `seed` draws the described places, if `config.mined_places` are fewer than all. `checkpoints` returns the steps
+        of the complete checkpoints of the run.
         """
         self._describe, self._places, self._config, self._folder = describe, places, config, folder
         self._seed, self._checkpoints = seed, checkpoints
@@ -113,10 +107,7 @@ class Mining:
         return np.sort(rng.choice(self._places, wanted, replace=False))
 
     def _drop_unneeded(self) -> None:
-        """Delete the caches that no kept checkpoint needs. An old best checkpoint may still need one.
-
-        A run resumed from a checkpoint reads the cache of its next step and recomputes the later ones.
-        """
+        """Delete the caches that no kept checkpoint needs. A resumed run reads the cache of its next step."""
         every = self._config.refresh_steps
         asked = {step - step % every for step in self._checkpoints()}
         for path in self._folder.glob("*.npz"):

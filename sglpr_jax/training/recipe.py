@@ -19,9 +19,9 @@ from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.batch_queue import BatchSource
 from sglpr_jax.training.batches import batches_of, positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.checkpoint import Checkpoints, checkpoint_steps
+from sglpr_jax.training.checkpoint import checkpoint_steps
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
-from sglpr_jax.training.devices import data_mesh, is_first_host, of_first_host, on_all_hosts, own_copy
+from sglpr_jax.training.devices import data_mesh, is_first_host, on_all_hosts, own_copy
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
 from sglpr_jax.training.mining import FOLDER as MINING
@@ -37,15 +37,15 @@ LIMITS = ("config.steps",)
 """Settings that may differ in a resumed run."""
 
 ScoreFn = Callable[[Params], dict[str, float]]
-"""Scores weights. The entry "score" selects the best checkpoint."""
+"""Scores weights."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class TrainResult:
     """Result of a training run. Printing it shows the finished steps, the folder of the weights and the speed.
 
-    `params` are the weights that are also stored in `folder`/weights: the last ones, or the best ones, as set by
-    `config.select`. A run that was too short has no `throughput`.
+    `params` are the last weights, which are also stored in `folder`/weights. A run that was too short has no
+    `throughput`.
     """
 
     params: Params
@@ -175,10 +175,9 @@ def run_network(
     """
 
     def score_once(run: Trained, snapshots: list[int]) -> dict[str, float]:
-        """Compute the scores on the first host. The other hosts receive the entry "score"."""
+        """Compute the scores on the first host. The other hosts have none."""
         params = run.state.params
-        own = on_all_hosts(lambda: score(own_copy(params)) if is_first_host() else {"score": 0.0})
-        return own | {"score": of_first_host(own["score"])}
+        return on_all_hosts(lambda: score(own_copy(params)) if is_first_host() else {})
 
     network = ImageNetwork(config)
     schedule = Schedule(config.log_every, config.score_every, steps=config.steps)
@@ -203,17 +202,10 @@ def _source_and_score(
 def _finish(last: TrainState, folder: Path, config: TrainConfig) -> TrainResult:
     """Save and return the final weights."""
     steps, params, measured = int(last.step), own_copy(last.params), None
-    if steps == config.steps and config.select == "best":
-        params = best_params(folder, config)
     if is_first_host():
         save(params, folder / WEIGHTS)
         measured = throughput(read_metrics(folder / METRICS_FILE))
     return TrainResult(params, folder, steps, config, measured)
-
-
-def best_params(folder: Path, config: TrainConfig) -> Params:
-    """Return the weights with the best score of the run in `folder`."""
-    return Checkpoints(folder / CHECKPOINTS).best(jax.eval_shape(ImageNetwork(config).new_state)).params
 
 
 def _require_usable(

@@ -20,6 +20,8 @@ from sglpr_jax.files import alone_in, read_json, remove_half_written, write_json
 CONFIG_FILE = "config.json"
 ENVIRONMENT_FILE = "environment.json"
 PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy")
+REMOVED = {"config.select": "last"}
+"""Settings of earlier versions with the only value that runs have today."""
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
@@ -27,10 +29,7 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 def claimed(
     folder: Path, settings: Mapping[str, Any], *, seed: int, resume: bool, limits: Collection[str] = ()
 ) -> Iterator[None]:
-    """Lock a run's folder for this process while the block runs.
-
-    The block starts with the settings and the environment written to the folder, and without incomplete files of
-    killed processes.
+    """Lock a run's folder while the block runs. Writes settings and environment, removes unfinished files.
 
     Arguments:
       folder: Folder of the run.
@@ -80,7 +79,11 @@ def _as_json(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
     if not (isinstance(a, dict) and isinstance(b, dict)):
         return set() if a == b else {prefix.removesuffix(".")}
-    return {name for key in a.keys() | b.keys() for name in _differences(a.get(key), b.get(key), f"{prefix}{key}.")}
+    return {
+        name
+        for key in a.keys() | b.keys()
+        for name in _differences(a.get(key), b.get(key, REMOVED.get(prefix + key)), f"{prefix}{key}.")
+    }
 
 
 def note_environment(folder: Path, *, seed: int) -> None:
@@ -89,20 +92,7 @@ def note_environment(folder: Path, *, seed: int) -> None:
     Raises ValueError if the existing file is damaged.
     """
     path = folder / ENVIRONMENT_FILE
-    now = environment() | {"seed": seed}
-    if not path.exists():
-        write_json(path, now | {"resumes": []})
-        return
-    first = read_json(path)
-    resumes = first.get("resumes") if isinstance(first, dict) else None
-    if not isinstance(resumes, list):
-        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {first!r:.60}")
-    write_json(path, first | {"resumes": [*resumes, now]})
-
-
-def environment() -> dict[str, Any]:
-    """Return the versions, the machine, the commit and the command line of this process."""
-    return {
+    now = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": shlex.join(sys.argv),
         "git": git_commit(_CHECKOUT),
@@ -113,7 +103,16 @@ def environment() -> dict[str, Any]:
         "backend": jax.default_backend(),
         "devices": [device.device_kind for device in jax.devices()],
         "variables": {name: value for name, value in sorted(os.environ.items()) if name.startswith(("JAX_", "XLA_"))},
+        "seed": seed,
     }
+    if not path.exists():
+        write_json(path, now | {"resumes": []})
+        return
+    first = read_json(path)
+    resumes = first.get("resumes") if isinstance(first, dict) else None
+    if not isinstance(resumes, list):
+        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {first!r:.60}")
+    write_json(path, first | {"resumes": [*resumes, now]})
 
 
 def _version(package: str) -> str | None:
@@ -124,19 +123,15 @@ def _version(package: str) -> str | None:
 
 
 def git_commit(checkout: Path) -> dict[str, Any] | None:
-    """Return the commit of a checkout and whether its files differ from it.
-
-    Returns None without a checkout or without git.
-    """
+    """Return the commit of a checkout and whether its files differ from it, or None without a checkout or git."""
     if not (checkout / ".git").exists():
         return None
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(checkout), *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout.strip()
+
     try:
-        commit, changes = _git(checkout, "rev-parse", "HEAD"), _git(checkout, "status", "--porcelain")
+        return {"commit": git("rev-parse", "HEAD"), "dirty": bool(git("status", "--porcelain"))}
     except (OSError, subprocess.SubprocessError):
         return None
-    return {"commit": commit, "dirty": bool(changes)}
-
-
-def _git(checkout: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(checkout), *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout.strip()

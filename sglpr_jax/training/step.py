@@ -8,7 +8,7 @@ import jax
 import optax
 from jaxtyping import Array, Float
 
-from sglpr_jax.training.devices import keep_replicated
+from sglpr_jax.training.devices import keep_placed
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -75,4 +75,4 @@ def train_step(state: TrainState, batch: Any, *, network: PlaceNetwork) -> tuple
     params = optax.apply_updates(state.params, updates)
     norms = {"gradient_norm": gradient, "update_norm": updates, "weight_norm": params}
     metrics = metrics | {name: optax.tree.norm(tree) for name, tree in norms.items()}
-    return keep_replicated(TrainState(state.step + 1, params, optimizer, statistics)), metrics
+    return keep_placed(TrainState(state.step + 1, params, optimizer, statistics)), metrics

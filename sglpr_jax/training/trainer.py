@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -72,13 +72,9 @@ class Schedule:
                 yield due
             due *= 2
 
-    def with_costs(self, run: Trained, values: Mapping[str, float]) -> dict[str, float]:
-        """Add images and seconds to measurements, if they are wanted."""
-        return {"images": float(run.images), "seconds": round(run.seconds, 3), **values} if self.costs else dict(values)
-
 
 KeepFn = Callable[[Trained, list[int]], Mapping[str, float]]
-"""Scores the weights, and keeps those of the snapshots that are due. "score" selects the best checkpoint."""
+"""Scores the weights, and keeps those of the snapshots that are due."""
 
 
 def run_steps(
@@ -87,12 +83,8 @@ def run_steps(
     folder: Path,
     schedule: Schedule,
     *,
-    mesh: Mesh,
-    keep: KeepFn,
-    begin: Callable[[], TrainState] | None = None,
-    resume: bool = False,
-    callback: Callback | None = None,
     stopped: Callable[[], bool] = lambda: False,
+    **options: Any,
 ) -> Trained:
     """Train until a limit of the schedule is reached or `stopped()` returns true, and return the state.
 
@@ -101,33 +93,19 @@ def run_steps(
         source: Source of this host's part of each batch. All devices share a step.
         folder: Folder for metrics and checkpoints.
         schedule: Limits, and moments of measurements, scores and checkpoints.
-        mesh: Devices of the run.
-        keep: Called when a score or a snapshot is due, and at the end.
-        begin: Returns the state of a new run. None: random weights.
-        resume: Continue from the newest checkpoint, if there is one.
-        callback: Receives the measurements.
         stopped: Called after every step.
+        options: Those of `_Run`.
 
     Raises:
         FloatingPointError: The loss is not finite. The message names the step and the places of its batch.
         OSError: Metrics or a checkpoint cannot be written.
     """
-    callback = callback if callback is not None and is_first_host() else Callback()
-    checkpoints = Checkpoints(folder / CHECKPOINTS)
-    if resume and checkpoints.latest_step is not None:
-        state, about = checkpoints.restore(jax.eval_shape(network.new_state))
-    else:
-        state, about = (begin or network.new_state)(), {}
-    run = Trained(replicate(state, mesh), about.get("images", 0), about.get("seconds", 0.0))
-    running = _Running(
-        network, source, folder, schedule, mesh, keep, callback, checkpoints, run, about.get("unlogged", [])
-    )
-    with contextlib.closing(running):
-        running.continue_until(stopped)
-    return running.run
+    with contextlib.closing(_Run(network, source, folder, schedule, **options)) as run:
+        run.continue_until(stopped)
+    return run.run
 
 
-class _Running:
+class _Run:
     """A run in progress: its state, its open files, and the measurements since the last line of the metrics.
 
     A stop between two lines saves the measurements since then, so the lines are those of an uninterrupted run.
@@ -139,22 +117,37 @@ class _Running:
         source: BatchSource,
         folder: Path,
         schedule: Schedule,
+        *,
         mesh: Mesh,
         keep: KeepFn,
-        callback: Callback,
-        checkpoints: Checkpoints,
-        run: Trained,
-        unlogged: list[dict[str, float]],
+        begin: Callable[[], TrainState],
+        resume: bool = False,
+        callback: Callback | None = None,
     ):
-        self._network, self._source, self._schedule, self._mesh = network, source, schedule, mesh
-        self._keep, self._callback, self._checkpoints = keep, callback, checkpoints
-        self.run, self._unlogged = run, unlogged
-        self._saved_s, self._compiled = run.seconds, False
-        start, place = int(run.state.step), lambda batch: split(batch, mesh)
-        names = (METRICS_FILE, schedule.scores_file) if is_first_host() else ()
+        """Open a run.
+
+        Args:
+            network, source, folder, schedule: As in `run_steps`.
+            mesh: Devices of the run.
+            keep: Called when a score or a snapshot is due, and at the end.
+            begin: Returns the state of a new run.
+            resume: Continue from the newest checkpoint, if there is one.
+            callback: Receives the measurements.
+        """
+        self._network, self._source, self._schedule, self._mesh, self._keep = network, source, schedule, mesh, keep
+        self._callback = callback if callback is not None and is_first_host() else Callback()
+        self._checkpoints = Checkpoints(folder / CHECKPOINTS)
+        if resume and self._checkpoints.latest_step is not None:
+            state, about = self._checkpoints.restore(jax.eval_shape(network.new_state))
+        else:
+            state, about = begin(), {}
+        self.run = Trained(replicate(state, mesh), about.get("images", 0), about.get("seconds", 0.0))
+        self._unlogged: list[dict[str, float]] = about.get("unlogged", [])
+        self._saved_s, self._compiled = self.run.seconds, False
+        start, names = int(state.step), (METRICS_FILE, schedule.scores_file) if is_first_host() else ()
         self._logs = {name: MetricsLog(folder / name, start_step=start) for name in dict.fromkeys(names)}
-        self._queue = BatchQueue(source, start=start, stop=schedule.steps, place=place)
-        callback.on_start(start, schedule.steps)
+        self._queue = BatchQueue(source, start=start, stop=schedule.steps, place=lambda batch: split(batch, mesh))
+        self._callback.on_start(start, schedule.steps)
 
     def continue_until(self, stopped: Callable[[], bool]) -> None:
         """Train, and write what is due after each step. At the end, save the state."""
@@ -213,20 +206,21 @@ class _Running:
         scores, step = self._keep(self.run, snapshots), int(self.run.state.step)
         if scores:
             self._callback.on_score(step, self._log(self._schedule.scores_file, scores))
-        self._save(scores.get("score"))
+        self._save()
         self._callback.on_checkpoint(step)
 
     def _log(self, name: str, values: Mapping[str, float]) -> dict[str, float]:
-        measured = self._schedule.with_costs(self.run, values)
+        costs = {"images": float(self.run.images), "seconds": round(self.run.seconds, 3)}
+        measured = {**(costs if self._schedule.costs else {}), **values}
         if name in self._logs:
             self._logs[name].append(int(self.run.state.step), measured)
         return measured
 
-    def _save(self, score: float | None = None) -> None:
+    def _save(self) -> None:
         for log in self._logs.values():
             log.sync()
         about = {"unlogged": self._unlogged, "images": self.run.images, "seconds": self.run.seconds}
-        self._checkpoints.save(own_copy(self.run.state), score=score, about=about)
+        self._checkpoints.save(own_copy(self.run.state), about)
         self._saved_s = self.run.seconds
 
     def _require_finite(self) -> None:

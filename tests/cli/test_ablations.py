@@ -22,7 +22,6 @@ SETTINGS = {  # flags, the parts that have weights, the loss terms beside the tr
         {"dice"},
     ),
     "triplet alone": ("--loss.ce-weight 0 --loss.dice-weight 0", BACKBONE, set()),
-    "RS, 6": ("--model.head.input labels --model.categories 6", {"place_head"}, set()),
     "RB+RS, 15": ("--model.head.input counts+labels --model.categories 15", {"place_head"}, set()),
 }
 
@@ -97,29 +96,7 @@ def test_a_head_that_reads_labels_resumes_and_embeds_a_drive_with_labels_only(ru
     shutil.rmtree(bare / "sequences" / "08" / "labels")
     ended = command("embed", *options[:2], "--data", bare, *options[4:], "--skip-bad")
     assert_one_line_error(ended, "model.head.input", "labels", "found none in sequence 08")
-    flags = ("--data", bare, "--preset", preset, "--out", tmp_path / "other", *flags_of("RS, 6"))
+    flags = ("--data", bare, "--preset", preset, "--out", tmp_path / "other", *flags_of("RB+RS, 15"))
     ended = command("train", "--seq", "08", *flags)
     assert_one_line_error(ended, "model.head.input", "sequence 08", "found 0 of 40")
     assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.slow
-def test_maps_scores_and_pages_are_of_the_weights_categories(runs, command, town, tmp_path):
-    weights = runs("nor NetVLAD, 25, Dice, not turned")
-    options = ("--data", town, "--seq", "08")
-    ended = command("segment", "--weights", weights, *options, "--out", tmp_path / "maps")
-    assert ended.status == 0, ended.error
-    scores = json.loads((tmp_path / "maps" / "segmentation.json").read_text())
-    names = sglpr_jax.taxonomy(25).names
-    assert tuple(scores["iou"]) == names and scores["shares"]["moving"] > 0 and scores["majority"] in names
-
-
-@pytest.mark.slow
-def test_a_page_shows_what_there_is_of_weights_that_read_labels(runs, command, town, tmp_path):
-    folder, out = runs("RS, 6"), tmp_path / "08.npz"
-    options = ("--weights", folder, "--data", town, "--seq", "08")
-    assert command("embed", *options, "--out", out).status == 0
-    ended = command("evaluate", out, *options)
-    assert ended.status == 0, ended.error
-    page = (tmp_path / "08" / "report.html").read_text()
-    assert "these have none" in page and "feature heat maps of frame" in page

@@ -27,11 +27,3 @@ def test_descriptors_are_written_and_scores_ask_for_poses(command, pictures, tmp
     assert_one_line_error(
         command("evaluate", out), "06.npz: expected positions to score against, found", "without poses"
     )
-
-
-@pytest.mark.slow
-def test_loops_are_searched(command, pictures, tmp_path):
-    ended = command("loops", pictures, "--out", tmp_path / "found")
-    assert ended.status == 0, ended.error
-    assert ended.out.startswith("0 loops in 3 of 3 frames of 06")
-    assert (tmp_path / "found" / "loops.csv").is_file()

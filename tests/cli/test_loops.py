@@ -5,7 +5,6 @@ import sys
 import numpy as np
 import pytest
 
-from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
@@ -100,13 +99,13 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
 
 def test_every_setting_of_the_detector_is_a_flag():
     command = parse_command(LoopsCommand, "loops", ["scans", "--out", "found"])
-    assert detector_config(command) == DetectorConfig()
-    flags = ["--candidates.candidates", "10", "--sequence.window-m", "60", "--candidates.motion.keyframe-m", "4"]
-    changed = detector_config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
-    found = changed.candidates.candidates, changed.sequence.window_m, changed.candidates.motion.keyframe_m
-    assert found == (10, 60, 4)
+    assert command.detector == DetectorConfig()
+    flags = ["--candidates.candidates", "10", "--verification.reach-m", "20"]
+    changed = parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]).detector
+    found = changed.candidates.candidates, changed.verification.reach_m
+    assert found == (10, 20)
     flags = ["--keyframe-m", "1.5", "--max-places", "100"]
-    limited = detector_config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
+    limited = parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]).detector
     assert (limited.keyframe_m, limited.max_places) == (1.5, 100)
 
 

@@ -81,19 +81,3 @@ def test_poses_of_all_scans_can_be_named_after_bad_ones_were_skipped(command, sc
     assert report["results"][0]["poses"].endswith("poses.tum (TUM)")
     file = load(tmp_path / "mine.npz")
     assert file.config["skipped"] == [0, 7, 39] and file.positions is None and len(file) == SCANS - 3
-
-
-@pytest.mark.slow
-def test_a_matrix_is_compared_on_the_positions_and_times_of_the_file(command, town, tmp_path):
-    assert command("embed", "--data", town, "--seq", "08", *METHOD, "--out", tmp_path / "08.npz").status == 0
-    np.save(tmp_path / "own.npy", load(tmp_path / "08.npz").descriptors)
-    ended = command("evaluate", tmp_path / "08.npz", "--compare", tmp_path / "own.npy", *PROTOCOL)
-    assert ended.status == 0, ended.error
-    report = json.loads((tmp_path / "08" / "results.json").read_text())
-    ours = [{key: one[key] for key in ("protocol", "counts")} for one in report["results"]]
-    assert [{key: one[key] for key in ("protocol", "counts")} for one in report["compared"]["own"]] == ours
-    np.save(tmp_path / "own.npy", np.ones((39, 3)))
-    ended = command("evaluate", tmp_path / "08.npz", "--compare", tmp_path / "own.npy", *PROTOCOL)
-    assert_one_line_error(
-        ended, "own.npy: expected 40 descriptors, one for each pose of sequences/08/poses.txt, found 39"
-    )

@@ -37,16 +37,6 @@ def steps_of(folder) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_images_with_label_maps_are_trained_on_alone(command, labelled_images, preset, tmp_path, labelled_places):
-    out = tmp_path / "run"
-    options = ("--seq", "06", "--data", labelled_images, "--preset", preset, "--out", out)
-    ended = command("train", *options, "--steps", 2)
-    assert ended.status == 0, ended.error
-    assert all(line["cross_entropy"] > 0 and line["dice"] > 0 for line in steps_of(out))
-    assert len(labelled_places) == 2 and np.all(labelled_places)
-
-
-@pytest.mark.slow
 def test_maps_that_a_model_made_teach_beside_those_of_a_second_dataset(
     command, images, labelled_images, trained, preset, tmp_path, labelled_places
 ):

@@ -53,11 +53,6 @@ def test_paths_and_other_names_stay(installed, path):
     assert own_names(f"error: {path}: expected a descriptor file") == f"error: {path}: expected a descriptor file"
 
 
-def test_a_command_of_the_checkout_keeps_its_name(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["/home/me/sglpr-jax/bin/evaluate"])
-    assert own_names("bin/embed, then bin/evaluate") == "bin/embed, then bin/evaluate"
-
-
 @pytest.mark.parametrize(
     ("flags", "error"),
     [
@@ -97,29 +92,9 @@ def test_a_reader_that_ends_early_ends_the_command_without_a_message():
     assert ended.stdout == "0\n" and ended.stderr == "status 141\n"
 
 
-def test_a_reader_that_ends_before_the_last_flush_is_no_error():
-    ended = python(PRINTS.replace("100_000", "1"), shell="| true")
-    assert ended.stderr == "status 0\n"
-
-
 def test_output_that_is_not_utf_8_is_escaped():
     program = "from sglpr_jax.cli.runtime import run; run(lambda: None, lambda command: print('n\\udcff'))"
     assert python(program, PATH=os.environ["PATH"], LANG="C.UTF-8", HOME="/tmp").stdout == "n\\udcff\n"
-
-
-def test_a_user_without_a_home_has_a_cache_until_the_process_ends(monkeypatch, tmp_path):
-    def no_home():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(Path, "home", no_home)
-    monkeypatch.setattr(runtime.tempfile, "tempdir", str(tmp_path))
-    runtime._temporary_folder.cache_clear()
-    folder = runtime.cache_folder()
-    assert folder == runtime.cache_folder() and folder.is_dir() and folder.stat().st_mode & 0o077 == 0
-    assert folder.parent == tmp_path
-    runtime._temporary_folder().cleanup()
-    runtime._temporary_folder.cache_clear()
 
 
 @pytest.mark.slow

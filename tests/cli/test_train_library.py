@@ -3,17 +3,13 @@
 import dataclasses
 import json
 
-import chex
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import sglpr_jax
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.models.weights import weights_hash, whitened
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.config import OptimizerConfig
 from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.recipe import train
 
@@ -50,16 +46,6 @@ def test_a_training_is_one_call(images, preset, tmp_path):
     assert weights_hash(whole.params) == weights_hash(result.params)
 
 
-@pytest.mark.slow
-def test_a_run_begins_without_the_whitening_layer_of_the_weights_it_is_given(images, preset, random_params, tmp_path):
-    slow = OptimizerConfig(learning_rate=1e-9)
-    config = dataclasses.replace(load_preset(str(preset)), steps=1, optimizer=slow)
-    plain = random_params(config.model)
-    samples = np.random.default_rng(0).normal(size=(600, 256)).astype(np.float32)
-    begun = train(config, [open_recording(images, "00")], out=tmp_path / "run", weights=whitened(plain, samples))
-    chex.assert_trees_all_close(begun.params.weights["place_head"], plain.weights["place_head"], atol=1e-6)
-
-
 def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
     images, labelled_images, random_params, preset, tmp_path
 ):
@@ -84,21 +70,10 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_a_semantic_map_learnt_alone_leaves_descriptors_to_the_bit(labelled_images, random_params, preset, tmp_path):
-    config = load_preset(str(preset))
-    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, segmentation_alone=True))
-    begun = random_params(config.model)
-    learnt = train(config, [open_recording(labelled_images, "00")], out=tmp_path / "run", weights=begun).params
-    grid = config.model.grid
-    image = jnp.asarray(np.random.default_rng(0).poisson(0.7, (grid.height, grid.width)), jnp.float32)
-    np.testing.assert_array_equal(sglpr_jax.describe(learnt, image), sglpr_jax.describe(begun, image))
-    assert np.abs(sglpr_jax.segment(learnt, image) - sglpr_jax.segment(begun, image)).max() > 1e-4
-
-
 def test_a_run_is_not_resumed_with_fewer_steps_than_it_has_made(images, preset, tmp_path):
     config, recordings, out = load_preset(str(preset)), [open_recording(images, "00")], tmp_path / "run"
-    (out / "checkpoints" / "3").mkdir(parents=True)
+    (out / "checkpoints").mkdir(parents=True)
+    (out / "checkpoints" / "3.safetensors").touch()
     names = {"recordings": ["00"], "also": [], "test": None}
     before = json.dumps({**names, "config": dataclasses.asdict(config)}, default=str)
     (out / "config.json").write_text(before)

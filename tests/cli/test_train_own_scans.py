@@ -8,8 +8,6 @@ import pytest
 
 from sglpr_jax.cli.train import SETTINGS, parse, settings
 
-from .conftest import assert_one_line_error
-
 
 def test_flags_that_older_runs_do_not_know_are_noted_only_where_they_are_set():
     assert tuple(settings(parse([]))) == SETTINGS
@@ -41,9 +39,3 @@ def test_bad_scans_are_left_out_before_the_training(damaged, preset, command, tm
     assert json.loads((tmp_path / "run/config.json").read_text())["skip_bad"] is True
     with np.load(tmp_path / "run/test/polar-fft-raw.npz") as file:
         assert len(file["ids"]) == 39 and "000005" not in file["ids"]
-
-
-@pytest.mark.slow
-def test_without_that_a_bad_scan_is_one_line(damaged, preset, command, tmp_path):
-    options = ("--seq", "00", "--data", damaged, "--preset", preset, "--out", tmp_path / "run")
-    assert_one_line_error(command("train", *options, "--train-seq", "08"), "expected")

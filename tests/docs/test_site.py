@@ -44,21 +44,13 @@ def site() -> dict[Path, Page]:
 
 
 @pytest.mark.slow
-def test_every_link_leads_somewhere(site):
+def test_every_page_is_in_the_site_and_its_links_lead_somewhere_and_nothing_is_fetched(site):
     lost = [
         (path.relative_to(SITE), link) for path, page in site.items() for link in page.links if _lost(link, path, site)
     ]
     assert not lost
-
-
-@pytest.mark.slow
-def test_every_page_is_in_the_site(site):
     pages = {path.relative_to(ROOT / "docs").with_suffix(".html") for path in (ROOT / "docs").rglob("*.md")}
     assert pages <= {path.relative_to(SITE) for path in site}
-
-
-@pytest.mark.slow
-def test_nothing_is_fetched(site):
     loads = {address for page in site.values() for address in page.loads}
     assert not [address for address in loads if urlsplit(address).netloc]
     assert not [path for path in SITE.rglob("*.css") if re.search(r"url\([\"']?https?:|@import", path.read_text())]

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from session_pairs import loops_between, two_drives
 
 from sglpr_jax.loops.closure import Loop, planar_loop
-from sglpr_jax.loops.config import ConsistencyConfig
 from sglpr_jax.loops.consistency import MIN_LOOPS, accepted_between, agree, largest_consistent_set
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
@@ -120,7 +119,7 @@ def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
     np.testing.assert_allclose(np.cov(moved.T), covariance[:2, :2], atol=0.3)
 
 
-RULES = {"mounting": None, "drift": DriftModel(), "config": ConsistencyConfig()}
+RULES = {"mounting": None, "drift": DriftModel()}
 FIRST, SECOND, TRUE = two_drives()
 MOTION = Motion.joined([Motion.of(FIRST), Motion.of(SECOND)], [np.eye(3)] * 2)
 

@@ -5,9 +5,8 @@ import pytest
 
 from sglpr_jax.loops import sequence
 from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.config import SequenceConfig
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.sequence import Pair, neighbour_weights, verdict
+from sglpr_jax.loops.sequence import INDEPENDENT_M, WINDOW_M, Pair, neighbour_weights, verdict
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import inverse, transform
@@ -17,13 +16,13 @@ SURPRISE = Curve((0.0, 9.0), (0.0, 9.0))
 MODEL = LoopModel(AdditiveModel({"ambiguity_ratio": REPEATS, "surprise": SURPRISE}, -6.0), "by hand")
 
 
-def by_hand(way_m: np.ndarray, row: int, config: SequenceConfig) -> list[float]:
+def by_hand(way_m: np.ndarray, row: int) -> list[float]:
     """`neighbour_weights` of one pair, neighbour by neighbour."""
     found = []
     for other in range(len(way_m)):
         towards = way_m[other + 1] if other < row else way_m[other - 1]
-        near = other != row and abs(way_m[other] - way_m[row]) <= config.window_m
-        found.append(near * (1 - np.exp(-abs(way_m[other] - towards) / config.independent_m)))
+        near = other != row and abs(way_m[other] - way_m[row]) <= WINDOW_M
+        found.append(near * (1 - np.exp(-abs(way_m[other] - towards) / INDEPENDENT_M)))
     return found
 
 
@@ -31,9 +30,9 @@ WAY_M = np.sort(np.random.default_rng(0).uniform(0, 120, 30))
 
 
 def test_a_neighbour_weighs_as_much_as_the_sensor_moved_on_the_way_to_it():
-    rows, config = np.arange(5, 25), SequenceConfig(window_m=40.0, independent_m=10.0)
-    expected = [by_hand(WAY_M, row, config) for row in rows]
-    np.testing.assert_allclose(neighbour_weights(WAY_M, rows, config=config), expected, atol=1e-12)
+    rows = np.arange(5, 25)
+    expected = [by_hand(WAY_M, row) for row in rows]
+    np.testing.assert_allclose(neighbour_weights(WAY_M, rows), expected, atol=1e-12)
 
 
 def test_scans_that_are_added_again_change_nothing():

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.odometry.bev_odometry import GAP_M, UNKNOWN_M, Link, Motion
-from sglpr_jax.odometry.config import MotionConfig
+from sglpr_jax.odometry.bev_odometry import AMBIGUOUS_SHARE, GAP_M, GUESS_FACTOR, MAX_COASTING, UNKNOWN_M, Link, Motion
 from sglpr_jax.se3 import transform
 
 
@@ -32,12 +31,12 @@ def test_links_to_keyframes_add_up():
 
 
 def test_across_a_gap_the_pose_is_a_guess_that_drifts():
-    most = MotionConfig().max_coasting
+    most = MAX_COASTING
     motion = moved([None, link(1.0), *[None] * (most + 1), link(1.0)])
     assert motion.segments.tolist() == [0] * (most + 2) + [1] * 2
     np.testing.assert_allclose([pose[0, 3] for pose in motion.poses], np.arange(most + 4.0))
     guessed = [0, 0, *range(1, most + 2), most + 1]
-    np.testing.assert_allclose(motion.guessed_m, np.array(guessed) * motion.config.guess_factor)
+    np.testing.assert_allclose(motion.guessed_m, np.array(guessed) * GUESS_FACTOR)
     np.testing.assert_allclose(motion.travelled[: most + 4], np.arange(most + 4.0))
 
 
@@ -62,7 +61,7 @@ def test_another_peak_is_no_matter_where_the_pose_is_expected():
 @pytest.mark.parametrize("turned_deg,drifts", [(80.0, False), (100.0, True), (-179.0, True)])
 def test_a_sensor_that_seems_to_turn_round_at_once_may_be_in_another_row(turned_deg, drifts):
     motion = moved([None, link(1.0), link(1.5, turned_deg=turned_deg)])
-    share = motion.config.ambiguous_share * motion.config.guess_factor
+    share = AMBIGUOUS_SHARE * GUESS_FACTOR
     np.testing.assert_allclose(motion.guessed_m, [0, 0, share * drifts])
 
 
@@ -70,7 +69,7 @@ def test_a_link_after_a_gap_drifts_by_what_the_sensor_may_have_moved_meanwhile()
     motion = Motion()
     for time, one in ((0.0, None), (0.1, link(1.0)), (0.2, link(2.0)), (1.2, link(2.5)), (1.3, link(3.5))):
         motion.add(time, link=one)
-    share = motion.config.ambiguous_share * motion.config.guess_factor
+    share = AMBIGUOUS_SHARE * GUESS_FACTOR
     np.testing.assert_allclose(motion.guessed_m[:4], [0, 0, 0, 10 * share])
     assert set(motion.segments) == {0}
 

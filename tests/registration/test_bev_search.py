@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scenes import place, relative, seen_from
 
-from sglpr_jax.registration.bev_search import search, search_near, search_spectra
+from sglpr_jax.grid import DENSITY_RESOLUTION_M
+from sglpr_jax.registration.bev_search import SECOND_DEG, SECOND_M, search, search_near, search_spectra
 from sglpr_jax.registration.bev_spectra import (
     cells,
     lower_half,
@@ -25,7 +26,7 @@ SMALL = VerificationConfig(reach_m=12.8, max_shift_m=4.0)
 def correlations(query: np.ndarray, match: np.ndarray) -> np.ndarray:
     """Of all rotations and shifts (rotation, down, right), by inverse transforms of the whole spectra."""
     angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
-    cell_m = SMALL.resolution_m * SMALL.coarse
+    cell_m = DENSITY_RESOLUTION_M * SMALL.coarse
     small = [merged(prepared(image, SMALL), SMALL.coarse) for image in (query, match)]
     queries = np.asarray(spectrum(rotations(small[0], jnp.asarray(angles)), cell_m, SMALL))
     there = np.asarray(spectrum(small[1][None], cell_m, SMALL))
@@ -42,15 +43,15 @@ def test_peaks_are_those_of_whole_transforms(seed):
     for k, match in enumerate(matches):
         volume = correlations(query, match)
         turn, down, right = np.unravel_index(volume.argmax(), volume.shape)
-        cell_m, step_deg = SMALL.resolution_m * SMALL.coarse, 360 / SMALL.turns
+        cell_m, step_deg = DENSITY_RESOLUTION_M * SMALL.coarse, 360 / SMALL.turns
         reach = cells(SMALL.max_shift_m, cell_m)
         assert found.correlation[k] == pytest.approx(volume.max(), abs=1e-5)
         assert abs(found.x[k] - (right - reach) * cell_m) <= cell_m / 2 + 1e-5
         assert abs(found.y[k] - (reach - down) * cell_m) <= cell_m / 2 + 1e-5
         assert abs((np.degrees(found.yaw[k]) - turn * step_deg + 180) % 360 - 180) <= step_deg / 2 + 1e-3
         apart = np.abs(np.arange(SMALL.turns) - turn)
-        near_turn = np.minimum(apart, SMALL.turns - apart) * step_deg <= SMALL.second_deg
-        near = [np.abs(np.arange(2 * reach + 1) - at) * cell_m <= SMALL.second_m for at in (down, right)]
+        near_turn = np.minimum(apart, SMALL.turns - apart) * step_deg <= SECOND_DEG
+        near = [np.abs(np.arange(2 * reach + 1) - at) * cell_m <= SECOND_M for at in (down, right)]
         elsewhere = ~(near_turn[:, None, None] & near[0][None, :, None] & near[1][None, None])
         assert found.second[k] == pytest.approx(volume[elsewhere].max(), abs=1e-5)
 
@@ -68,7 +69,7 @@ def test_rotations_by_quarter_turns_follow_from_the_first_quarter():
     query = seen_from(place(3), (0.4, -0.2, 1.0))
     angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
     rotated = rotations(merged(prepared(query, SMALL), SMALL.coarse), jnp.asarray(angles))
-    whole = np.asarray(spectrum(rotated, SMALL.resolution_m * SMALL.coarse, SMALL))
+    whole = np.asarray(spectrum(rotated, DENSITY_RESOLUTION_M * SMALL.coarse, SMALL))
     whole, (size, width) = whole.reshape(4, -1, *whole.shape[1:]), whole.shape[1:]
     found = np.asarray(query_spectra(query, config=SMALL)).swapaxes(1, 2)
     inside = np.s_[..., np.arange(size) != size // 2, : width - 1]  # the highest frequency stands for its opposite, too
@@ -79,7 +80,7 @@ def test_rotations_by_quarter_turns_follow_from_the_first_quarter():
 
 def test_the_lower_half_of_a_spectrum_is_that_of_larger_cells():
     """Of an image without high frequencies, up to a factor: the power is 1 for both."""
-    size, cell_m = 40, SMALL.resolution_m * SMALL.coarse
+    size, cell_m = 40, DENSITY_RESOLUTION_M * SMALL.coarse
     down, right = (np.arange(size) - (size - 1) / 2) * cell_m, (np.arange(size // 2) - (size // 2 - 1) / 2) * 2 * cell_m
 
     def waves(at: np.ndarray) -> jnp.ndarray:

@@ -34,23 +34,6 @@ def test_all_callbacks_are_called_in_their_order():
     assert len(told) == 2 * len(TOLD) > 10
 
 
-def test_all_are_closed_in_their_order_where_one_cannot_be():
-    closed = []
-
-    class Closing(Callback):
-        def __init__(self, own: str):
-            self._own = own
-
-        def close(self):
-            closed.append(self._own)
-            if self._own == "second":
-                raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        Callbacks(*map(Closing, ("first", "second", "third"))).close()
-    assert closed == ["first", "second", "third"]
-
-
 @pytest.fixture
 def terminal(monkeypatch):
     """Stderr counts as a terminal, so that there is a bar."""
@@ -99,11 +82,6 @@ def test_events_are_what_was_measured(tmp_path):
     assert measured.step == 3 and measured.wall_time > 1e9
     assert {value.tag: value.simple_value for value in measured.summary.value} == {"loss": 0.25, "triplet": 0.5}
     assert [event.step for event in read_events(path)] == [0, 3, 3, 6]
-
-
-def test_a_run_that_measured_nothing_leaves_nothing(tmp_path):
-    EventFiles(tmp_path / "tensorboard").close()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_the_extra_the_error_says_how_to_install_it(tmp_path, monkeypatch):

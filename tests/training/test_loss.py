@@ -8,22 +8,9 @@ import pytest
 
 from sglpr_jax.training import loss
 from sglpr_jax.training.config import LossConfig
-from sglpr_jax.training.loss import DescriptorTerm, SegmentationTerm, Summary, joint_loss, segmentation_sums
+from sglpr_jax.training.loss import SegmentationTerm, Summary, joint_loss, segmentation_sums
 
 UNIT = np.eye(8, dtype=np.float32)
-
-
-def mean_length(descriptors, batch, config):
-    return jnp.square(descriptors).sum(-1).mean()
-
-
-def test_an_entry_of_descriptors_joins_the_loss_and_the_metrics(make_batch, monkeypatch):
-    summary, batch = Summary(jnp.asarray(3 * UNIT), {}), make_batch(0, images=True)
-    without, metrics = joint_loss(summary, batch, LossConfig())
-    monkeypatch.setitem(loss.DESCRIPTOR_TERMS, "length", DescriptorTerm(lambda config: 0.5, mean_length))
-    total, measured = joint_loss(summary, batch, LossConfig())
-    assert measured == metrics | {"length": 9.0, "loss": total}
-    assert float(total) == pytest.approx(float(without) + 0.5 * 9)
 
 
 def test_an_entry_of_classes_is_summed_over_chunks_and_left_out_without_weight(make_batch, monkeypatch):

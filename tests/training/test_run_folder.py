@@ -1,5 +1,6 @@
 """A run's folder says with what, where and by which command it was made, each time it was started."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from sglpr_jax.training.run_folder import git_commit, note_environment
+from sglpr_jax.training.run_folder import git_commit, note_environment, require_same_settings
 
 
 def git(folder, *arguments):
@@ -53,9 +54,8 @@ def test_a_checkout_has_a_commit_and_may_differ_from_it(tmp_path):
     assert git_commit(tmp_path) == {"commit": commit, "dirty": True}
 
 
-@pytest.mark.parametrize(("text", "found"), [("{", "expected JSON"), ('{"resumes": 3}', "a list `resumes`")])
-def test_a_damaged_one_is_named(tmp_path, text, found):
-    (tmp_path / "environment.json").write_text(text)
-    with pytest.raises(ValueError, match=rf"environment\.json: .*{found}"):
-        note_environment(tmp_path, seed=0)
-    assert [path.name for path in tmp_path.iterdir()] == ["environment.json"]
+def test_a_setting_that_every_run_has_today_may_be_stored(tmp_path):
+    for stored, fits in (("last", True), ("best", False)):
+        (tmp_path / "config.json").write_text(json.dumps({"config": {"select": stored, "steps": 3}}))
+        with contextlib.nullcontext() if fits else pytest.raises(ValueError, match=r"others: config\.select"):
+            require_same_settings(tmp_path, {"config": {"steps": 3}}, limits=())

@@ -16,7 +16,6 @@ FLAGS = (
     "odometry_frame",
     "drift_percent",
     "drift_deg_per_100m",
-    "drift_height_percent",
     "min_probability",
     "keyframe_m",
     "max_places",
