@@ -7,6 +7,7 @@ import gc
 import inspect
 import io
 import json
+import logging
 import os
 import re
 import signal
@@ -118,8 +119,15 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     """Parse a command line and run the command. Invalid input gives one line on stderr and exit status 1, Ctrl-C gives
     130. If the reader of the output ends early, as `head` does, the command ends without a message."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
+    for chatty in ("absl", "asyncio"):  # they log pages about a failed checkpoint, which orbax also raises
+        logging.getLogger(chatty).setLevel(logging.CRITICAL)
+    warnings.filterwarnings(
+        "ignore", "coroutine .* was never awaited", RuntimeWarning
+    )  # a failed checkpoint again, at exit
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", DataWarning)
+    if sys.unraisablehook is sys.__unraisablehook__:
+        sys.unraisablehook = _show_unraisable
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
     try:
@@ -180,6 +188,12 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
         print(f"warning: {message}", file=sys.stderr)
     else:
         sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
+
+
+def _show_unraisable(unraisable) -> None:
+    """Report errors as Python does, except those of the pending writes of a failed checkpoint."""
+    if str(unraisable.exc_value) != "Event loop is closed":
+        sys.__unraisablehook__(unraisable)
 
 
 def print_error(text: str) -> None:

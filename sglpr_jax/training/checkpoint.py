@@ -1,26 +1,33 @@
-"""Checkpoints of a training run: one safetensors file each, complete or absent, with the SHA-256 of its content.
+"""Checkpoints of a training run: folders that are complete or absent, with the SHA-256 of every file.
 
-17.safetensors            state after step 17, and as JSON what the run had measured
-damaged-17.safetensors    renamed checkpoint whose content does not match its checksum
+17/               state after step 17, written by Orbax, and about.json: what the run had measured, and checksums
+damaged-17/       renamed checkpoint whose files do not match their checksums
+
+The newest two checkpoints are kept.
 """
 
+import contextlib
+import hashlib
 import json
+import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import orbax.checkpoint as ocp
 
-from sglpr_jax.files import replacing
-from sglpr_jax.methods.learned.weights_file import check_leaves, checked_tensors, read_tensors
+from sglpr_jax.files import in_short, read_json, replacing, write_json
+from sglpr_jax.methods.learned.weights_file import check_leaves
 from sglpr_jax.training.devices import is_first_host, on_all_hosts
 from sglpr_jax.training.step import TrainState
 
 _KEPT = 2
-"""Number of checkpoints that are kept, the newest ones."""
-_SUFFIX, _ABOUT = ".safetensors", "about"
+_STATE, _ABOUT = "state", "about.json"
+_MOST_OF_AN_ERROR = 500
+"""Maximum number of characters of an error of Orbax, whose reason comes last."""
 
 
 class Checkpoints:
@@ -36,7 +43,7 @@ class Checkpoints:
     def save(self, state: TrainState, about: Mapping[str, Any]) -> None:
         """Write the state under its step, with JSON values. An existing checkpoint of that step stays unchanged.
 
-        Raises WriteError if the checkpoint cannot be written. The earlier ones are then intact.
+        Raises OSError if the checkpoint cannot be written. The earlier ones are then intact.
         """
         step = int(state.step)
         if step != self.latest_step:
@@ -51,50 +58,103 @@ class Checkpoints:
         if self.latest_step is None:
             raise ValueError(f"{self._folder}: expected a checkpoint to resume from, found none")
         path = self._path(self.latest_step)
-        values, expected = read_tensors(path), _by_path(like)
-        about = json.loads(values.pop(_ABOUT).tobytes())
-        check_leaves(values, expected, source=path)
-        return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in expected]), about
+        return _read(path, like), read_json(path / _ABOUT)["about"]
 
     def _write(self, state: TrainState, about: Mapping[str, Any]) -> None:
-        values = {name: np.asarray(leaf, order="C") for name, leaf in _by_path(state).items()}
-        content = checked_tensors({**values, _ABOUT: np.frombuffer(json.dumps(about).encode(), np.uint8)})
-        with replacing(self._path(int(state.step))) as temporary:
-            temporary.write_bytes(content)
-        for step in checkpoint_steps(self._folder)[:-_KEPT]:
-            self._path(step).unlink()
+        values = {name: np.array(leaf) for name, leaf in _by_path(state).items()}
+        with replacing(self._path(int(state.step))) as temporary, _reported(temporary), _orbax() as orbax:
+            orbax.save(temporary / _STATE, args=ocp.args.StandardSave(values))
+            write_json(temporary / _ABOUT, {"about": about, "sha256": _checksums(temporary, about)})
+        for step in checkpoint_steps(self._folder)[:-_KEPT]:  # a partly deleted checkpoint would seem damaged
+            shutil.rmtree(self._path(step).rename(self._folder / f".{step}.old"))
 
     def _path(self, step: int) -> Path:
-        return self._folder / f"{step}{_SUFFIX}"
+        return self._folder / f"{step}"
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
     """Return the steps of all checkpoints in `folder`, in order."""
-    return sorted(int(path.stem) for path in folder.glob(f"*{_SUFFIX}") if path.stem.isdecimal())
+    return sorted(int(path.name) for path in folder.glob("*") if path.name.isdecimal())
 
 
 def set_damaged_aside(folder: Path) -> None:
-    """Rename the damaged checkpoints in `folder`, and report them on stderr.
+    """Rename the checkpoints in `folder` whose files do not match their checksums, and report them on stderr.
 
-    Raises ValueError, without renaming, if all are damaged, or if they are those of an earlier version.
+    If all checkpoints are damaged, the function renames none and raises ValueError.
     """
-    earlier = next((path for path in folder.glob("*") if path.is_dir() and path.name.isdecimal()), None)
-    if earlier is not None:
-        raise ValueError(f"{earlier}: expected a file, found a checkpoint of version 0.1; finish the run with it")
-    steps, damaged = checkpoint_steps(folder), dict[int, Exception]()
-    for step in steps:
-        try:
-            read_tensors(folder / f"{step}{_SUFFIX}")
-        except ValueError as error:
-            damaged[step] = error
-    if damaged and len(damaged) == len(steps):
-        raise ValueError(f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[steps[-1]]}")
-    for step, error in damaged.items():
-        aside = (folder / f"{step}{_SUFFIX}").replace(folder / f"damaged-{step}{_SUFFIX}")
-        print(f"damaged checkpoint set aside as {aside.name}: {error}", file=sys.stderr)
+    for left in folder.glob(".*.old"):
+        shutil.rmtree(left)
+    paths = [folder / f"{step}" for step in checkpoint_steps(folder)]
+    damaged = {path: found for path in paths if (found := _damage(path)) is not None}
+    if damaged and len(damaged) == len(paths):
+        newest = max(damaged, key=lambda path: int(path.name))
+        raise ValueError(f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[newest]}")
+    for path, found in damaged.items():
+        names = (path.with_name(f"damaged-{path.name}{suffix}") for suffix in ("", *map("-{}".format, range(2, 100))))
+        aside = next(name for name in names if not name.exists())
+        path.rename(aside)
+        print(f"damaged checkpoint set aside as {aside.name}: {found}", file=sys.stderr)
+
+
+def _damage(path: Path) -> str | None:
+    """Describe the first damaged file of a checkpoint, or return None if all files match their checksums."""
+    file = path / _ABOUT
+    try:
+        content = read_json(file)
+        expected, found = content["sha256"], _checksums(path, content["about"])
+    except (ValueError, OSError) as error:
+        return str(error)
+    except (KeyError, TypeError):
+        return f"{file}: expected a description with checksums, found another"
+    if not isinstance(expected, dict):
+        return f"{file}: expected a checksum for each file, found {expected!r:.60}"
+    for name in sorted(expected.keys() | found.keys()):
+        if expected.get(name) != found.get(name):
+            return f"{path / name}: expected SHA-256 {expected.get(name)}, found {found.get(name, 'no such file')}"
+    return None
+
+
+def _checksums(path: Path, about: Mapping[str, Any]) -> dict[str, str]:
+    """SHA-256 of every file of the state, and of the JSON values about it."""
+    files = sorted(one for one in (path / _STATE).rglob("*") if one.is_file())
+    found = {one.relative_to(path).as_posix(): hashlib.sha256(one.read_bytes()).hexdigest() for one in files}
+    return {**found, _ABOUT: hashlib.sha256(json.dumps(about).encode()).hexdigest()}
+
+
+def _read(path: Path, like: TrainState) -> TrainState:
+    expected = _by_path(like)
+    with _orbax() as orbax:
+        there: Any = orbax.metadata(path / _STATE).item_metadata
+        check_leaves(there.tree, expected, source=path)
+        empty = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
+        values = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
+    check_leaves(values, expected, source=path)
+    return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in expected])
 
 
 def _by_path(state: TrainState) -> dict[str, Any]:
     """Return every array by its place in the state."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _orbax() -> ocp.Checkpointer:
+    """Orbax for this host alone: the first host writes, and all hosts read."""
+    host = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(
+        primary_host=host, active_processes={host}, barrier_sync_key_prefix=f"host{host}"
+    )
+    return ocp.Checkpointer(
+        ocp.StandardCheckpointHandler(multiprocessing_options=options), multiprocessing_options=options
+    )
+
+
+@contextlib.contextmanager
+def _reported(folder: Path) -> Iterator[None]:
+    """Turn the long errors of Orbax, which repeat the folder, into one line."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        text = str(error).replace(f"{folder}", folder.name)
+        reason = getattr(error, "strerror", None) or in_short(text, most=_MOST_OF_AN_ERROR)
+        raise OSError(reason) from error

@@ -72,8 +72,7 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
 
 def test_a_run_is_not_resumed_with_fewer_steps_than_it_has_made(images, preset, tmp_path):
     config, recordings, out = load_preset(str(preset)), [open_recording(images, "00")], tmp_path / "run"
-    (out / "checkpoints").mkdir(parents=True)
-    (out / "checkpoints" / "3.safetensors").touch()
+    (out / "checkpoints" / "3").mkdir(parents=True)
     names = {"recordings": ["00"], "also": [], "test": None}
     before = json.dumps({**names, "config": dataclasses.asdict(config)}, default=str)
     (out / "config.json").write_text(before)

@@ -47,11 +47,13 @@ def test_the_two_newest_are_kept_after_a_resume_too_and_a_step_is_saved_once(sta
     chex.assert_trees_all_equal(resumed.restore(state)[0], at(state, 5))
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # writes of Orbax that were pending
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
 def test_a_full_disk_leaves_the_earlier_checkpoint(state, tmp_path, small_files):
     checkpoints = saved(tmp_path, state, 2)
-    with small_files(1000), pytest.raises(OSError, match=rf"{tmp_path}/4.safetensors: cannot be written: "):
+    with small_files(1000), pytest.raises(OSError, match=rf"{tmp_path}/4: cannot be written: "):
         checkpoints.save(at(state, 4), {})
-    assert [path.name for path in tmp_path.iterdir()] == ["2.safetensors"]
+    assert [path.name for path in tmp_path.iterdir()] == ["2"]
 
 
 def test_missing_or_foreign_checkpoints_are_errors(state, tmp_path):
@@ -62,30 +64,30 @@ def test_missing_or_foreign_checkpoints_are_errors(state, tmp_path):
     name = min(weights)
     weights[name] = jax.tree.map(lambda leaf: leaf[None], weights[name])
     like = state.replace(params=state.params.replace(weights=weights))
-    with pytest.raises(ValueError, match=rf"{tmp_path}/4.safetensors: expected params/weights/{name}.* as .*, found"):
+    with pytest.raises(ValueError, match=rf"{tmp_path}/4: expected params/weights/{name}.* as .*, found"):
         Checkpoints(tmp_path).restore(like)
-    (tmp_path / "17").mkdir()
-    with pytest.raises(ValueError, match=rf"{tmp_path}/17: expected a file, found a checkpoint of version 0.1"):
-        Checkpoints(tmp_path)
 
 
 def damage(path, how: str) -> None:
-    content = path.read_bytes()
-    middle = len(content) // 2
-    changed = bytes([content[middle] ^ 1]) + content[middle + 1 :] if how == "values" else b""
-    path.write_bytes(content[:middle] + changed)
+    file = path / "about.json" if how == "about" else max(path.rglob("*/d/*"), key=lambda one: one.stat().st_size)
+    content = bytearray(file.read_bytes())
+    if how == "cut off":
+        del content[len(content) // 2 :]
+    else:
+        content[content.index(b"loss") if how == "about" else len(content) // 2] ^= 1
+    file.write_bytes(content)
 
 
-@pytest.mark.parametrize("how", ["cut off", "values"])
+@pytest.mark.parametrize("how", ["cut off", "about", "values"])
 def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(state, tmp_path, capfd, how):
     saved(tmp_path, state, 2, 4)
-    damage(tmp_path / "4.safetensors", how)
+    damage(tmp_path / "4", how)
     found, about = Checkpoints(tmp_path).restore(state)
     chex.assert_trees_all_equal(found, at(state, 2))
     assert about["unlogged"] == [{"loss": 2.0}]
     said = capfd.readouterr().err
-    assert f"damaged checkpoint set aside as damaged-4.safetensors: {tmp_path}/4.safetensors: expected " in said
-    damage(tmp_path / "2.safetensors", how)
+    assert f"damaged checkpoint set aside as damaged-4: {tmp_path}/4/" in said and "expected SHA-256" in said
+    damage(tmp_path / "2", how)
     with pytest.raises(ValueError, match=rf"{tmp_path}: expected a whole checkpoint, found 1 damaged: {tmp_path}/2"):
         Checkpoints(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["2.safetensors", "damaged-4.safetensors"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["2", "damaged-4"]
