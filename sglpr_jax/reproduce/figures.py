@@ -9,7 +9,7 @@ import numpy as np
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.scan_pictures import semantic_figure
+from sglpr_jax.evaluation.evaluation_page import semantic_figure
 from sglpr_jax.files import file_name
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL, NO_SEGMENTATION
 from sglpr_jax.reproduce.tables import Reproduction, scored

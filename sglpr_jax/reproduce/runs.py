@@ -9,7 +9,7 @@ from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.data.corruption import CLEAN, ROTATION
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.evaluation.learning_curves import LearningCurves
+from sglpr_jax.evaluation.final_test import LearningCurves
 from sglpr_jax.files import file_name, read_json, write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED

@@ -10,7 +10,7 @@ from typing import Any
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.evaluation.protocols.protocol import Result
-from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL
 from sglpr_jax.evaluation.published import TABLES
 from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.files import write_json, write_text

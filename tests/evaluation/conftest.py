@@ -33,6 +33,23 @@ def two_laps() -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
+def noisy_laps(make_file, two_laps) -> DescriptorFile:
+    """Two laps, described by their positions with noise."""
+    noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
+    return make_file(two_laps, two_laps / 200 + noise)
+
+
+@pytest.fixture(scope="session")
+def mistaken(make_file, two_laps) -> DescriptorFile:
+    """Two laps of which frames 500 and 501 look like 10 and 11, and 600 almost like 20; 700 meets its own place."""
+    descriptors = two_laps / 200
+    descriptors[[500, 501]] = descriptors[[10, 11]]
+    descriptors[600] = descriptors[20] + [0.001, 0, 0]
+    descriptors[700] += [0.01, 0, 0]
+    return make_file(two_laps, descriptors, sequence="monday")
+
+
+@pytest.fixture(scope="session")
 def straight() -> np.ndarray:
     """Return positions (800, 3) of a recording that never comes back."""
     return np.arange(800.0)[:, None] * [1.0, 0.0, 0.0]

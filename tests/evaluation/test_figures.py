@@ -3,11 +3,13 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
+from scenes import place, relative, seen_from
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.labels import CATEGORIES, taxonomy
 from sglpr_jax.metrics import classification_curve
+from sglpr_jax.se3 import transform
 
 
 def pixels(figure, path):
@@ -94,3 +96,24 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[viz\]'"):
         figures.learning_curves({"loss": {"raw": [(0, 0.1)]}})
+
+
+def test_a_right_pose_makes_the_picture_white_and_a_wrong_one_coloured():
+    match, query = (0.3, -0.2, 0.5), (1.4, 0.8, 2.5)
+    images = [seen_from(place(0), pose) for pose in (query, match)]
+    right = figures.overlaid(*images, transform(*relative(match, query)))
+    wrong = figures.overlaid(*images, transform(*relative(query, match)))
+    assert right.shape == (64, 64, 3) and right.min() >= 0 and right.max() <= 1 + 1e-9
+
+    def agreement(picture: np.ndarray) -> float:
+        return float(np.minimum(picture[..., 0], picture[..., 1]).sum() / picture[..., 0].sum())
+
+    assert agreement(right) > 0.5 > 0.3 > agreement(wrong)
+    np.testing.assert_array_equal(right[..., 1], right[..., 2])
+
+
+def test_without_a_motion_the_query_stays_and_an_empty_one_is_black():
+    image = seen_from(place(1), (0.0, 0.0, 0.0))
+    same = figures.overlaid(image, image, np.eye(4))
+    np.testing.assert_allclose(same[..., 0], same[..., 1], atol=1e-6)
+    assert figures.overlaid(np.zeros_like(image), image, np.eye(4))[..., 1].max() == 0
