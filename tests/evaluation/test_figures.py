@@ -8,7 +8,7 @@ from scenes import place, relative, seen_from
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.labels import CATEGORIES, taxonomy
-from sglpr_jax.metrics import classification_curve
+from sglpr_jax.metrics import PrecisionRecallCurve
 from sglpr_jax.se3 import transform
 
 
@@ -31,9 +31,10 @@ def legend(figure):
 
 
 def test_precision_recall_names_each_curve_with_its_f1max(tmp_path):
-    scores = np.arange(6.0)
-    good = classification_curve(scores, scores > 2)
-    poor = classification_curve(scores, scores % 2 == 0)
+    thresholds, recall = np.arange(3.0), np.array([1.0, 0.7, 0.3])
+    good, poor = (
+        PrecisionRecallCurve(thresholds, np.array(values), recall) for values in ([1.0, 1, 1], [0.5, 0.6, 0.4])
+    )
     figure = figures.precision_recall({"good": good, "poor": poor}, title="Sequence 06")
     assert legend(figure) == ["good 1.000", f"poor {poor.f1_max:.3f}"]
     (axes,) = figure.axes

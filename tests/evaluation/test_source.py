@@ -55,9 +55,8 @@ def test_a_frame_that_is_not_listed_is_missed(listed):
     found = np.flatnonzero(whole.decisions == Decision.TRUE_POSITIVE)
     rows = np.setdiff1d(np.arange(800), found[::2])
     half = TOP1_F1MAX(replace(listed, queries=rows, nearest=listed.nearest[rows], scores=listed.scores[rows]))
-    assert half.counts == whole.counts
+    assert half.counts == whole.counts and half.score < whole.score
     assert np.all(half.decisions[found[::2]] == Decision.FALSE_NEGATIVE)
-    assert half.score < whole.score
 
 
 def test_a_list_without_answers_scores_nothing(listed):
@@ -89,7 +88,6 @@ def test_pairs_without_labels_are_labelled_by_position(noisy_laps):
     ("change", "error"),
     [
         ({"pairs": np.zeros((0, 2), dtype=np.int64)}, "at least one pair, found none"),
-        ({"scores": np.zeros(3)}, "expected 2 pairs"),
         ({"labels": np.array([True])}, "expected 2 pairs"),
         ({"labels": None}, "expected labels, or positions"),
         ({"pairs": np.array([[5, 0], [-1, 3]])}, "expected pairs of frames from 0 .* found -1 in row 1"),
@@ -105,8 +103,6 @@ def test_scored_pairs_must_fit(change, error):
     ("change", "error"),
     [
         ({"queries": np.zeros(0, dtype=np.int64)}, "at least one query, found none"),
-        ({"nearest": np.zeros((800, 0), dtype=np.int64)}, r"expected 800 rows of retrieved frames, found \(800, 0\)"),
-        ({"times": np.zeros(3)}, "expected 800 times"),
         ({"queries": np.arange(800) // 2}, "found one listed twice"),
         ({"queries": np.arange(1, 801)}, "expected query frames from 0 to 799, found 800 in row 799"),
         ({"nearest": np.full((800, 800), 800)}, "expected retrieved frames from -1 to 799, found 800 in row 0"),
