@@ -49,6 +49,7 @@ PARSED = (
     "poses search --scans 60",
     "realism semantics --weights sglpr --out out --prior towns",
     "repeating fit drives --out model.json",
+    "robustness mutations --tree elsewhere",
     "robustness platforms --extras slam",
     "sensors deskew --places 2",
     "sessions render --seeds 1",
