@@ -12,7 +12,7 @@ from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, mi
 from sglpr_jax.evaluation.report import TextTable
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
-from sglpr_jax.loops.frame_alignment import AlignedParts, Part
+from sglpr_jax.loops.frame_alignment import AlignedParts
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import FoundLoops, why_none
 from sglpr_jax.pose_graph.folder import unique_names
@@ -83,7 +83,10 @@ def _trajectory(found: FoundLoops) -> list[Picture | Text]:
     drawn, wrong = [], _frames(wrong_loops(found))
     if positions is not None:
         what = "from the odometry" if found.odometry is not None else f"from {found.recording.pose_source}"
-        judged = _judged(found) or "Long lines are drift, or wrong loops."
+        judged = "Long lines are drift, or wrong loops."
+        if found.recording.positions is not None and found.loops:
+            said = f"{len(wrong)} of {len(found.loops)} loops are wrong{' (red)' if wrong else ''}"
+            judged = f"{said}: more than {NEGATIVE_M:g} m apart by {found.recording.pose_source}."
         caption = f"The trajectory {what}. A line connects the two frames of each loop. {judged}"
         right = [pair for pair in _frames(found.loops) if pair not in set(wrong)]
         plot = figures.loops(positions[: found.frames], right, wrong=wrong)
@@ -104,15 +107,6 @@ def _apart_m(found: FoundLoops, loop: Loop) -> float | None:
     """Return the true distance between the two frames of a loop in metres, or None if it is not known."""
     true = found.recording.positions
     return None if true is None else float(np.linalg.norm(true[loop.query] - true[loop.match]))
-
-
-def _judged(found: FoundLoops) -> str:
-    """Return a sentence with the number of wrong loops. Empty if true positions are not known."""
-    if found.recording.positions is None or not found.loops:
-        return ""
-    wrong = len(wrong_loops(found))
-    said = f"{wrong} of {len(found.loops)} loops are wrong{' (red)' if wrong else ''}"
-    return f"{said}: more than {NEGATIVE_M:g} m apart by {found.recording.pose_source}."
 
 
 def _frames(loops: Iterable[Loop]) -> list[tuple[int, int]]:
@@ -226,19 +220,19 @@ def _transforms(found: FoundLoops, names: list[str]) -> Section:
     rows = []
     for match, query in found.pairs:
         pair, transforms = (names[match], names[query]), found.between(match, query).transforms
-        rows += [
-            (*map(_framed, pair, (aligned.match, aligned.query)), *_numbers(aligned)) for aligned in transforms
-        ] or [(*pair, "no common place found", *[""] * 6)]
+        for aligned in transforms:
+            parts = zip(pair, (aligned.match, aligned.query), strict=True)
+            framed = (
+                name if part.is_odometry else f"{name}, from the LiDAR at scan {part.first} to scan {part.last}"
+                for name, part in parts
+            )
+            rows.append((*framed, *_numbers(aligned)))
+        rows += [] if transforms else [(*pair, "no common place found", *[""] * 6)]
     meaning = (
         "Pose of the query recording's frame in the match recording's frame, with standard deviations of position in "
         "the plane and yaw. All numbers are in frames.json."
     )
     return Section("Transforms", [Text(meaning), TextTable(header, rows, header[2:])])
-
-
-def _framed(name: str, part: Part) -> str:
-    """Name of a recording, with the part if it has no odometry."""
-    return name if part.is_odometry else f"{name}, from the LiDAR at scan {part.first} to scan {part.last}"
 
 
 def _numbers(aligned: AlignedParts) -> tuple[str, ...]:
