@@ -37,7 +37,6 @@ PROGRAMS = {
     "maps submaps": Program("quality.submaps", "recall", "recall of single scans and of submaps"),
     "sensors imu": Program("quality.sensors", "imu", "gravity of a sensor in a hand by IMU and ground"),
     "sensors deskew": Program("quality.sensors", "deskew", "scans on a fast turn before and after deskewing"),
-    "sensors ranges": Program("quality.sensors", "ranges", "how far sensors see in each scenery"),
     "sensors rotation": Program("quality.sensors", "rotation", "movement of a descriptor when the scan rotates"),
     "methods baselines": Program("quality.methods", "baselines", "methods beside each other: scores and times"),
     "realism compare": Program("quality.realism", "compare", "histograms of real and simulated scans"),
@@ -63,9 +62,6 @@ PROGRAMS = {
     "fleet loops": Program("fleet.ray", "loops", "recipe for Ray: loops between recordings that may overlap"),
     "fleet places": Program("fleet.index", "places", "places for a large index"),
     "fleet index": Program("fleet.index", "index", "time, bytes and recall of a large index"),
-    "robustness kills": Program("robustness.disturbed", "kills", "commands that are killed again and again"),
-    "robustness together": Program("robustness.disturbed", "together", "commands started twice at once on one folder"),
-    "robustness disk": Program("robustness.disturbed", "disk", "full disk, read-only folder, missing files"),
     "robustness mutations": Program("robustness.mutations", "mutations", "wrong lines, and whether tests notice them"),
     "robustness platforms": Program("robustness.platforms", "platforms", "wheels of every dependency, by platform"),
 }

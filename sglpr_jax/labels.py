@@ -12,7 +12,7 @@ UNLABELLED = 0
 
 # Red, green and blue of each raw id, as in SemanticKITTI. Only outlier, on-rails and moving objects have other colours,
 # because SemanticKITTI draws them in the colours of other ids.
-_COLORS = {
+_COLORS: dict[int, tuple[int, ...]] = {
     0: (0, 0, 0),
     1: (110, 110, 110),
     10: (100, 150, 245),
@@ -43,11 +43,8 @@ _COLORS = {
 _STANDING_TWIN = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
 
 
-def _color(raw: int) -> tuple[int, ...]:
-    """Colour of a raw id. A moving object has the colour of its standing variant, mixed half with white."""
-    if raw in _COLORS:
-        return _COLORS[raw]
-    return tuple((channel + 255) // 2 for channel in _COLORS[_STANDING_TWIN[raw]])
+# A moving object has the colour of its standing variant, mixed half with white.
+_COLORS |= {moving: tuple((channel + 255) // 2 for channel in _COLORS[raw]) for moving, raw in _STANDING_TWIN.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +64,7 @@ def _label_map(raw_ids: dict[str, tuple[int, ...]]) -> Taxonomy:
     class_of = np.full(max(RAW_NAMES) + 1, -1, dtype=np.int32)
     for class_id, members in enumerate(raw_ids.values()):
         class_of[list(members)] = class_id
-    colors = np.array([_color(members[0]) for members in raw_ids.values()], dtype=np.uint8)
+    colors = np.array([_COLORS[members[0]] for members in raw_ids.values()], dtype=np.uint8)
     raw_of = np.array([members[0] for members in raw_ids.values()], dtype=np.int32)
     return Taxonomy(tuple(raw_ids), colors, class_of, raw_of)
 

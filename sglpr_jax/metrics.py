@@ -87,22 +87,6 @@ def decision_curve(
     return PrecisionRecallCurve(thresholds, precision, recall if np.any(missed_if_rejected) else np.ones_like(recall))
 
 
-def classification_curve(
-    scores: Float[np.ndarray, " n"],
-    positive: Bool[np.ndarray, " n"],
-    *,
-    thresholds: Float[np.ndarray, " k"] | None = None,
-) -> PrecisionRecallCurve:
-    """Return the curve of n >= 1 items that are positive or negative. Only positive items are correct to accept."""
-    return decision_curve(
-        scores,
-        true_if_accepted=positive,
-        false_if_accepted=~positive,
-        missed_if_rejected=positive,
-        thresholds=thresholds,
-    )
-
-
 def _ratio(part: Float[np.ndarray, " k"], whole: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
     """part / whole, or 0 where whole is 0."""
     return np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)

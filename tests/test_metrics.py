@@ -6,10 +6,16 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import average_precision_score, precision_recall_curve
 
-from sglpr_jax.metrics import classification_curve, decision_curve
+from sglpr_jax.metrics import decision_curve
 
 TIED_SCORES = st.integers(-3, 3).map(float)
 SCORES = st.floats(-1e3, 1e3)
+
+
+def classification_curve(scores, positive, **options):
+    """The curve of items that are positive or negative."""
+    flags = {"true_if_accepted": positive, "false_if_accepted": ~positive, "missed_if_rejected": positive}
+    return decision_curve(scores, **flags, **options)
 
 
 def assert_is_sklearns(scores, positive):

@@ -23,8 +23,7 @@ from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation.protocols.pairs import PAIRS_F1MAX
-from sglpr_jax.evaluation.protocols.recall import BEVPLACE_RECALL_AT_1
-from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL, BEVPLACE_RECALL_AT_1
 from sglpr_jax.evaluation.protocols.source import Source, TopK, nearest_frames
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.files import write_json

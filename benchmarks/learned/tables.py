@@ -27,7 +27,7 @@ AHEAD = 0.005
 NEARLY = 1.5
 """Largest ratio of two numbers of images that are compared."""
 FAR = 0.1
-"""Difference by which a trained network is far above a baseline."""
+"""Difference by which a trained network is far above its untrained self."""
 REVERSED = 0.02
 """Difference from which two means are in an order."""
 PUBLISHED_NAMES = {
@@ -276,19 +276,19 @@ def _beside_ours(scores: Mapping[str, Scores], pairs: Sequence[tuple[str, str]])
 
 
 def _baselines(scores: Mapping[str, Scores]) -> tuple[str, str]:
-    """Each network beside its untrained self and the thumbnail, and those that are not far above both."""
+    """Each network beside its untrained self, and those that are not far above it."""
     rows, near = [], []
     for name in finals(scores):
         untrained, recall = scores.get(f"{method_of(name)}@random:0", {}), mean(scores[name], TOWN)
         if not images_of(scores[name]) or recall is None:
             continue
-        against = [mean(one, TOWN) for one in (untrained, scores.get("thumbnail", {}))]
-        near += [f"`{name}`"] if any(one is not None and recall < one + FAR for one in against) else []
+        against = mean(untrained, TOWN)
+        near += [f"`{name}`"] if against is not None and recall < against + FAR else []
         directions = [Column("", (test,)) for test in (*TOWN.tests, *TRAINED_TOWN)]
         cells = (both(*(mean(one, column) for one in (scores[name], untrained))) for column in directions)
-        rows.append([f"`{name}`", text(recall), *map(text, against), *cells])
+        rows.append([f"`{name}`", text(recall), text(against), *cells])
     towns = ("same direction", "opposite direction", "training town, same", "training town, opposite")
-    return markdown(["", "trained", "untrained", "thumbnail", *towns], rows), ", ".join(near) or "none"
+    return markdown(["", "trained", "untrained", *towns], rows), ", ".join(near) or "none"
 
 
 def _labels(scores: Mapping[str, Scores]) -> str:

@@ -17,7 +17,7 @@ import sglpr_jax
 from benchmarks.quality.repeating import RenderedDrive, chosen, compared, read
 from benchmarks.quality.scoring import WAY_M, pose_errors
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.loop_figures import overlaid
+from sglpr_jax.evaluation.figures import overlaid
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.registration.bev_alignment import refined
 from sglpr_jax.registration.bev_spectra import within_reach

@@ -12,20 +12,18 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation, RotationSpline
 
 import sglpr_jax
-from benchmarks.drives import Case, in_memory, lidar, recording_of
+from benchmarks.drives import in_memory, lidar, recording_of
 from benchmarks.quality.poses import WALKS, simulated
 from sglpr_jax.data.deskew import deskew as deskew_points
 from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
 from sglpr_jax.data.recording import Record, Recording
-from sglpr_jax.data.scaled import chosen_scale, typical_range_m
 from sglpr_jax.data.views import view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.se3 import distances, inverse, transformed
 from sglpr_jax.sim.drive import TimedPoses, plan_path, poses_on
 from sglpr_jax.sim.recording import SimulatedRecording
-from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import Sensor, scan
 from sglpr_jax.sim.world import World, build_world
 
@@ -231,22 +229,6 @@ def _row_of_motion(name: str, motion: str, towns: list[list[_Place]], params: Pa
 def _descriptors(params: Params, clouds: list[np.ndarray]) -> Float[np.ndarray, "n d"]:
     records = [Record(points=np.ascontiguousarray(cloud, np.float32)) for cloud in clouds]
     return sglpr_jax.embed(params, recording_of("scans", records)).descriptors
-
-
-def ranges(*, sensors: tuple[str, ...] = ("vlp16", "hdl64e"), seeds: tuple[int, ...] = (11, 12)) -> None:
-    """Measure how far sensors see in each scenery, and the scale that `--scale auto` chooses.
-
-    Args:
-        sensors: names of simulated sensors.
-        seeds: one drive of 40 scans for each.
-    """
-    for name in sensors:
-        for world in (*REPEATING, "town"):
-            route = "00" if world == "town" else "none"
-            cases = [Case(world, route, seed, name) for seed in seeds]
-            drives = [case.simulate(scans=40, azimuth_steps=300) for case in cases]
-            said = ", ".join(f"{typical_range_m(drive):.1f} m, scale {chosen_scale(drive)}" for drive in drives)
-            print(f"{name} {world}: {said}", flush=True)
 
 
 def rotation(

@@ -86,9 +86,8 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     """Score the methods, print the table and write the results. Returns the paths written."""
     from sglpr_jax.data.formats.pose_files import read_trajectory
     from sglpr_jax.evaluation import figures
-    from sglpr_jax.evaluation.evaluation_page import write_evaluation
+    from sglpr_jax.evaluation.evaluation_page import poses_of, recording_rows, take_pictures, write_evaluation
     from sglpr_jax.evaluation.inputs import read_methods
-    from sglpr_jax.evaluation.scan_pictures import poses_of, recording_rows, take_pictures
     from sglpr_jax.evaluation.scoring import evaluate_methods
     from sglpr_jax.models.weights_file import load
 

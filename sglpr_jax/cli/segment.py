@@ -42,7 +42,7 @@ def segment_recording(command: SegmentCommand) -> Path:
     """Run the command. Returns the output folder."""
     import numpy as np  # slow imports, not needed for --help
 
-    from sglpr_jax.evaluation.segmentation import draw_segmentation, map_confusion, score_confusion, title_of
+    from sglpr_jax.evaluation.segmentation import confusion_matrix, draw_segmentation, score_confusion, title_of
     from sglpr_jax.files import check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.image_maps import save_map, semantic_maps
@@ -59,7 +59,7 @@ def segment_recording(command: SegmentCommand) -> Path:
         for row, record, found in semantic_maps(params, recording, min_confidence=least, on_progress=show):
             path = command.out / f"{file_name(recording.ids[row])}.png"
             save_map(path, found, record, categories=categories)
-            confusion += map_confusion(found, categories=categories)
+            confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
             labelled, cells = labelled + found.seen.sum(), cells + (found.counts > 0).sum()
     print(f"{command.out}: {len(recording)} semantic maps of {labelled / max(cells, 1):.0%} of the cells with points")
     if recording.has_labels:

@@ -1,13 +1,19 @@
 """Folder of an evaluation: its numbers as JSON, its plots, and a page with all of them."""
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Num
 
+from sglpr_jax.data.formats.pose_files import Trajectory
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.views import view
 from sglpr_jax.evaluation import figures, report
+from sglpr_jax.evaluation.inputs import Input
 from sglpr_jax.evaluation.page import (
     PicturePairs,
     Section,
@@ -18,10 +24,13 @@ from sglpr_jax.evaluation.page import (
     render,
 )
 from sglpr_jax.evaluation.protocols.protocol import Result
-from sglpr_jax.evaluation.scan_pictures import Pictures
-from sglpr_jax.evaluation.scoring import Evaluation
+from sglpr_jax.evaluation.scoring import Evaluation, FalsePositive
 from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, AcrossSessions
 from sglpr_jax.files import file_name, json_text, read_json, text_bytes, write_all
+from sglpr_jax.models.config import model_preset
+from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.image_maps import heat_maps, semantic_map
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -37,12 +46,89 @@ INTERVALS = (
     "95 %: bootstrap interval over the queries. Published on: poses of the published numbers of the protocol;"
     " scores on other poses differ."
 )
+SHOWN = (1 / 3, 2 / 3)
+"""Positions of the scans whose maps are shown, as fractions of the recording."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Pictures of a page, by frame. A string instead of figures says what adds them."""
+
+    images: Mapping[int, Num[np.ndarray, "_ _"]] = field(default_factory=dict)
+    """Point counts of the queries and answers of false positives, by frame number."""
+    semantic: "Mapping[str, matplotlib.figure.Figure] | str" = "Semantic maps: add --weights and --data."
+    heat: "Mapping[str, matplotlib.figure.Figure] | str" = "Feature heat maps: add --weights and --data."
+
+
+def take_pictures(
+    recording: Recording, params: Params | None, source: Input, worst: Sequence[FalsePositive]
+) -> Pictures:
+    """Return images of the false positives and, with `params`, maps of two scans of the recording.
+
+    Raises ValueError if `source` and the recording have different frames.
+    """
+    rows = recording_rows(recording, source)
+    grid = None if recording.has_images else model_preset("sglpr").grid  # ready-made images are not cropped
+    images = {
+        frame: np.asarray(view(recording.record(rows[frame], labels=False), grid).image)
+        for frame in sorted({frame for found in worst for frame in (found.query, found.answer)})
+    }
+    if params is None:
+        needs = "maps: add --weights beside --data."
+        return Pictures(images, f"Semantic {needs}", f"Feature heat {needs}")
+    if not figures.can_draw():
+        return Pictures(images)
+    shown = sorted({int(part * len(recording)) for part in SHOWN})
+    config, heat = params.config, {}
+    for row in shown:
+        record = recording.record(row, labels=bool(config.categories_read))
+        seen = view(record, config.grid, categories=config.categories_read, image=config.image)
+        heat[recording.ids[row]] = figures.heat_maps(np.asarray(seen.image), heat_maps(params, *seen))
+    if not params.config.segments:
+        return Pictures(images, "Semantic maps: add --weights that have a segmentation head; these have none.", heat)
+    return Pictures(images, {recording.ids[row]: semantic_figure(recording, params, row) for row in shown}, heat)
+
+
+def poses_of(recording: Recording) -> Trajectory | None:
+    """Return the positions and times of a recording, or None if it has no positions."""
+    if recording.positions is None:
+        return None
+    return Trajectory(recording.positions, recording.times, recording.pose_source or recording.name)
+
+
+def recording_rows(recording: Recording, source: Input) -> Mapping[int, int]:
+    """Return the row in the recording of each frame of `source`.
+
+    Frames are matched by id or, if ids do not match, by number. Raises ValueError if the numbers of frames differ, too.
+    """
+    n = len(recording) if source.positions is None else len(source.positions)
+    row_of = {name: row for row, name in enumerate(recording.ids)}
+    if isinstance(source, DescriptorFile) and set(source.ids) <= set(row_of):
+        return {frame: row_of[name] for frame, name in enumerate(source.ids)}
+    if n != len(recording):
+        raise ValueError(
+            f"--data: expected {n} frames in sequence {recording.name}, as in the input, found {len(recording)}"
+        )
+    return {frame: frame for frame in range(n)}
+
+
+def semantic_figure(recording: Recording, params: Params, row: int, *, title: str = "") -> "matplotlib.figure.Figure":
+    """Draw point counts and predicted semantic map of a scan, and the true map if the scan has labels (figure 7)."""
+    config, found = params.config, semantic_map(params, recording.record(row))
+    return figures.segmentation_panel(
+        found.counts,
+        found.truth if recording.labelled[row] else None,
+        found.predicted,
+        resolution_m=config.grid.resolution_m,
+        categories=config.categories,
+        title=title,
+    )
 
 
 def write_evaluation(found: Evaluation, folder: Path, pictures: Pictures | None = None) -> list[Path]:
-    """Write numbers, plots and page to `folder`. Without matplotlib no plots are written.
+    """Write numbers, plots and page to `folder`, and remove the plots of an earlier evaluation there.
 
-    Plots of an earlier evaluation in the folder are removed.
+    Without matplotlib no plots are written.
 
     Arguments:
       found: Results to write.
@@ -66,7 +152,11 @@ def write_sessions(found: AcrossSessions, folder: Path) -> list[Path]:
 
 def _write(folder: Path, numbers: Mapping[str, Any], plots: Plots, html: str) -> list[Path]:
     """Replace an earlier evaluation in the folder, completely or not at all. Returns the paths written."""
-    earlier = _earlier_plots(folder)
+    try:
+        results = [result["protocol"] for result in read_json(folder / NUMBERS)["results"]]
+        earlier = {CURVES, TRAJECTORY, *map(_curves_name, results)}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # missing, damaged, or from another command
+        earlier = set()
     drawn = {name: functools.partial(figures.write, figure) for name, figure in plots.items()}
     texts = {NUMBERS: json_text(numbers), PAGE: html}
     said = {name: functools.partial(Path.write_bytes, data=text_bytes(text)) for name, text in texts.items()}
@@ -74,15 +164,6 @@ def _write(folder: Path, numbers: Mapping[str, Any], plots: Plots, html: str) ->
     for name in earlier - set(plots):
         (folder / name).unlink(missing_ok=True)
     return written
-
-
-def _earlier_plots(folder: Path) -> set[str]:
-    """Return the possible file names of plots in an evaluation folder. Empty if it has no evaluation results."""
-    try:
-        results = [result["protocol"] for result in read_json(folder / NUMBERS)["results"]]
-        return {CURVES, TRAJECTORY, *map(_curves_name, results)}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # missing, damaged, or from another command
-        return set()
 
 
 def draw_curves(found: Evaluation) -> Plots:
@@ -118,32 +199,25 @@ def _curves_name(result: str) -> str:
 
 def evaluation_page(found: Evaluation, *, curves: Plots, trajectory: Plots, pictures: Pictures) -> str:
     """Return the page as HTML. If a section cannot be filled, one line names the option that adds it."""
-    drawn = figures.can_draw()
     sections = [_results(found.results)]
     if len(found.methods) > 1:
         sections.append(Section("Methods side by side", [report.comparison(found.methods)]))
     if found.published:  # apart from our results: these are of real KITTI and by several protocols
         table = report.published_table(found.published)
         sections.append(Section("Published numbers", [table, Text(report.PUBLISHED_NOTE, "about")]))
-    no_curve = "No protocol of this evaluation has a curve." if drawn else NO_MATPLOTLIB
+    no_curve = "No protocol of this evaluation has a curve."
     no_decisions = (
         "Decisions along the recording: add --poses, and a protocol that answers queries (--protocol top1-f1max)."
-        if drawn
-        else NO_MATPLOTLIB
     )
     activation = Text("Activation strength of each layer: root mean square over the channels.")
-    return render(
-        found.title,
-        found.about,
-        [
-            *sections,
-            _figures("Precision and recall", curves.values(), "precision over recall", nothing=no_curve),
-            _figures("Trajectory", trajectory.values(), "every frame, coloured by its decision", nothing=no_decisions),
-            _false_positives(found, pictures.images),
-            _maps("Semantic maps", pictures.semantic if drawn else NO_MATPLOTLIB, "semantic map of"),
-            _maps("Feature heat maps", pictures.heat if drawn else NO_MATPLOTLIB, "feature heat maps of", activation),
-        ],
-    )
+    sections += [
+        _drawn("Precision and recall", curves or no_curve, lambda _: ("precision over recall", "")),
+        _drawn("Trajectory", trajectory or no_decisions, lambda _: ("every frame, coloured by its decision", "")),
+        _false_positives(found, pictures.images),
+        _drawn("Semantic maps", pictures.semantic, lambda frame: (f"semantic map of {frame}", frame)),
+        _drawn("Feature heat maps", pictures.heat, lambda frame: (f"feature heat maps of {frame}", frame), activation),
+    ]
+    return render(found.title, found.about, sections)
 
 
 def _results(results: Sequence[Result]) -> Section:
@@ -152,15 +226,18 @@ def _results(results: Sequence[Result]) -> Section:
     return Section("Results", [table, Text(INTERVALS, "about"), report.threshold_table(results)])
 
 
-def _figures(title: str, plots: "Iterable[matplotlib.figure.Figure]", name: str, *, nothing: str) -> Section:
-    return Section(title, [figure_picture(plot, name) for plot in plots] or [missing(nothing)])
-
-
-def _maps(title: str, found: "Mapping[str, matplotlib.figure.Figure] | str", name: str, *before: Text) -> Section:
+def _drawn(
+    title: str,
+    found: "Mapping[str, matplotlib.figure.Figure] | str",
+    words: Callable[[str], tuple[str, str]],
+    *before: Text,
+) -> Section:
+    """Section of figures, or of the reason for their absence. `words` returns the name and caption of a figure."""
+    found = found if figures.can_draw() else NO_MATPLOTLIB
     if isinstance(found, str):
         return Section(title, [missing(found)])
-    drawn = [figure_picture(one, f"{name} frame {frame}", caption=f"frame {frame}") for frame, one in found.items()]
-    return Section(title, [*before, *drawn])
+    drawn = [(words(f"frame {key}"), figure) for key, figure in found.items()]
+    return Section(title, [*before, *(figure_picture(one, name, caption=said) for (name, said), one in drawn)])
 
 
 def _false_positives(found: Evaluation, images: Mapping[int, np.ndarray]) -> Section:

@@ -1,4 +1,4 @@
-"""Test of a trained network on a held-out recording, raw and with every scan rotated, compared with other methods."""
+"""Results of a training run: its learning curves, and the test on a held-out recording beside other methods."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,14 +13,24 @@ from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.scoring import score
 from sglpr_jax.evaluation.segmentation import SegmentationScore, score_segmentation
 from sglpr_jax.files import write_json
-from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.names import BESIDE, NETWORK
 from sglpr_jax.methods.registry import method_beside, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.embed import embed
+from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.loss import TERM_NAMES
+from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.trainer import METRICS_FILE
 
 ROTATION_SEED = 0
+LEARNING_CURVES = "learning-curves.png"
+_PANELS = {
+    "loss": ("loss", *TERM_NAMES),
+    "score: recall@1 of held-out or training places": ("score",),
+    "gradient norm": ("gradient_norm",),
+}
+"""Title of each panel, and the names of its curves in the metrics file."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -81,9 +91,14 @@ def final_test(
     """
     folder.mkdir(parents=True, exist_ok=True)
     beside = {name: method_beside(params, name, recording, seed=seed) for name in methods}
-    results = {}
+    results: dict[str, dict[str, list[Result]]] = {}
     for title, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
-        results[title] = _score({NETWORK: network(params), **beside}, recording, folder, title, rotation_seed, progress)
+        results[title] = {}
+        for name, method in {NETWORK: network(params), **beside}.items():
+            with progress(f"embed {title} {name}", len(recording)) as show:
+                file = embed(method, recording, rotation_seed=rotation_seed, on_progress=show)
+            file.save(folder / f"{name}-{title}.npz")
+            results[title][name] = score(file)
         if figures.can_draw():
             _draw(results[title], recording, folder, title)
     semantics = None
@@ -92,23 +107,6 @@ def final_test(
     found = FinalTest(recording.name, results, semantics)
     write_json(folder / "results.json", found.to_json())
     return found
-
-
-def _score(
-    methods: Mapping[str, Method],
-    recording: Recording,
-    folder: Path,
-    title: str,
-    rotation_seed: int | None,
-    progress: Progress,
-) -> dict[str, list[Result]]:
-    results = {}
-    for name, method in methods.items():
-        with progress(f"embed {title} {name}", len(recording)) as show:
-            file = embed(method, recording, rotation_seed=rotation_seed, on_progress=show)
-        file.save(folder / f"{name}-{title}.npz")
-        results[name] = score(file)
-    return results
 
 
 def _draw(results: Mapping[str, Sequence[Result]], recording: Recording, folder: Path, title: str) -> None:
@@ -120,3 +118,25 @@ def _draw(results: Mapping[str, Sequence[Result]], recording: Recording, folder:
     decisions = top1[NETWORK].decisions
     if decisions is not None and recording.positions is not None:
         figures.save(figures.trajectory(recording.positions, decisions), folder / f"trajectory-{title}.png")
+
+
+class LearningCurves(Callback):
+    """Draws the learning curves of the run in `folder` when training ends, if matplotlib (extra `viz`) is installed."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+
+    def on_end(self, step: int) -> None:
+        """Draw loss terms, score and gradient norm of the whole run, including those of earlier processes."""
+        lines = read_metrics(self._folder / METRICS_FILE)
+        if not lines or not figures.can_draw():
+            return
+        panels = {
+            title: {
+                name: [(line["step"], line[name]) for line in lines if line.get(name) is not None]
+                for name in names
+                if any(line.get(name) is not None for line in lines)
+            }
+            for title, names in _PANELS.items()
+        }
+        figures.save(figures.learning_curves(panels), self._folder / LEARNING_CURVES)

@@ -10,7 +10,8 @@ Frames are numbered from 0, in the order of the poses. Higher scores mean closer
 start with # are ignored.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,30 +86,22 @@ def read_methods(
       ValueError: As `read_input`.
     """
     methods: dict[str, Input] = {}
+    of_first = None
     for path in paths:
-        trajectory = poses if path.suffix == ".npz" else _of_first(methods) or poses or dataset
+        trajectory = poses if path.suffix == ".npz" else of_first or poses or dataset
         compared_by = distance if path == paths[0] or path.suffix == ".npy" else None
         name = path.stem if sum(other.stem == path.stem for other in paths) == 1 else str(path)
-        methods[name] = read_input(path, trajectory, sequence=sequence or path.stem, distance=compared_by)
-    return methods if poses is None else _timed(methods)
-
-
-def _of_first(methods: Mapping[str, Input]) -> Trajectory | None:
-    """Return the positions and times in the file of the first method, or None if it has no positions."""
-    first = next(iter(methods.values()), None)
-    if not isinstance(first, DescriptorFile) or first.positions is None:
-        return None
-    return Trajectory(first.positions, first.times, first.pose_source or first.sequence, by_row=True)
-
-
-def _timed(methods: Mapping[str, Input]) -> dict[str, Input]:
-    """Give methods without times the times of the first method with times. All have the same poses."""
-    retrieved = [method for method in methods.values() if not isinstance(method, ScoredPairs)]
-    times = next((method.times for method in retrieved if method.times is not None), None)
-    return {
-        name: method if isinstance(method, ScoredPairs) or method.times is not None else replace(method, times=times)
-        for name, method in methods.items()
-    }
+        method = read_input(path, trajectory, sequence=sequence or path.stem, distance=compared_by)
+        if not methods and isinstance(method, DescriptorFile) and method.positions is not None:
+            source = method.pose_source or method.sequence
+            of_first = Trajectory(method.positions, method.times, source, by_row=True)
+        methods[name] = method
+    if poses is not None:
+        untimed = {name: one for name, one in methods.items() if not isinstance(one, ScoredPairs) and one.times is None}
+        all_times = (one.times for one in methods.values() if not isinstance(one, ScoredPairs))
+        times = next((one for one in all_times if one is not None), None)
+        methods |= {name: replace(one, times=times) for name, one in untimed.items()}
+    return methods
 
 
 def as_descriptors(
@@ -239,7 +232,10 @@ def _read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
             )
     pairs = np.array([[_frame(word, where) for word in words[:2]] for where, words in rows])
     scores = np.array([_score(words[2], where) for where, words in rows])
-    labels = np.array([_label(words[3], where) for where, words in rows]) if columns == 4 else None
+    for where, words in rows if columns == 4 else ():
+        if words[3] not in LABELS:
+            raise ValueError(f"{where}: expected a label 0 or 1, found {words[3]!r}")
+    labels = np.array([LABELS[words[3]] for _, words in rows]) if columns == 4 else None
     if trajectory is None and labels is not None:
         return ScoredPairs(pairs, scores, labels)
     trajectory = _needed(path, trajectory)
@@ -270,18 +266,10 @@ def _score(word: str, where: str) -> float:
     return score
 
 
-def _label(word: str, where: str) -> bool:
-    if word not in LABELS:
-        raise ValueError(f"{where}: expected a label 0 or 1, found {word!r}")
-    return LABELS[word]
-
-
 def _check_rows(where: Sequence[str], frames: Int[np.ndarray, "rows _"], trajectory: Trajectory) -> None:
     """Raise ValueError if a frame has no pose. The message names the first such line."""
     n = len(trajectory.positions)
-    outside = np.argwhere(frames >= n)
-    if outside.size:
-        row, column = outside[0]
+    for row, column in np.argwhere(frames >= n)[:1]:
         expected = f"expected frames from 0 to {n - 1} ({trajectory.source})"
         raise ValueError(f"{where[row]}: {expected}, found {frames[row, column]}")
 
@@ -304,7 +292,10 @@ def check_agreement(first: Input, other: Input) -> None:
     Scores on different recordings cannot be compared.
     """
     if isinstance(first, DescriptorFile) and isinstance(other, DescriptorFile) and first.ids != other.ids:
-        raise ValueError(f"expected the frames of the first file, {_ids(first, other)}, found {_ids(other, first)}")
+        pairs = itertools.zip_longest(first.ids, other.ids)
+        here, there = next((a, b) for a, b in pairs if a != b)
+        said = [f"{len(file)} with {name or 'none more'!r}" for file, name in ((first, here), (other, there))]
+        raise ValueError(f"expected the frames of the first file, {said[0]}, found {said[1]}")
     _check_equal("positions", first.positions, other.positions, NEAR_M)
     if not isinstance(first, ScoredPairs) and not isinstance(other, ScoredPairs):
         if (first.times is None) != (other.times is None):
@@ -326,10 +317,3 @@ def _check_equal(what: str, first: np.ndarray | None, other: np.ndarray | None, 
         raise ValueError(
             f"expected the {what} of the first file, {first[row].tolist()} in row {row}, found {other[row].tolist()}"
         )
-
-
-def _ids(file: DescriptorFile, beside: DescriptorFile) -> str:
-    """Return the number of frames and the first id that differs."""
-    pairs = zip(file.ids, [*beside.ids, *[None] * len(file)], strict=False)
-    strange = next((name for name, other in pairs if name != other), "none more")
-    return f"{len(file)} with {strange!r}"

@@ -7,12 +7,12 @@ from jaxtyping import Float
 
 from sglpr_jax.data.levelling import mountings_of, upright_from_lidar, upright_odometry
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.evaluation import figures, loop_figures
+from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, missing, render
 from sglpr_jax.evaluation.report import TextTable
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
-from sglpr_jax.loops.frame_alignment import AlignedParts, Part
+from sglpr_jax.loops.frame_alignment import AlignedParts
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import FoundLoops, why_none
 from sglpr_jax.pose_graph.folder import unique_names
@@ -83,14 +83,17 @@ def _trajectory(found: FoundLoops) -> list[Picture | Text]:
     drawn, wrong = [], _frames(wrong_loops(found))
     if positions is not None:
         what = "from the odometry" if found.odometry is not None else f"from {found.recording.pose_source}"
-        judged = _judged(found) or "Long lines are drift, or wrong loops."
+        judged = "Long lines are drift, or wrong loops."
+        if found.recording.positions is not None and found.loops:
+            said = f"{len(wrong)} of {len(found.loops)} loops are wrong{' (red)' if wrong else ''}"
+            judged = f"{said}: more than {NEGATIVE_M:g} m apart by {found.recording.pose_source}."
         caption = f"The trajectory {what}. A line connects the two frames of each loop. {judged}"
         right = [pair for pair in _frames(found.loops) if pair not in set(wrong)]
-        plot = loop_figures.loops(positions[: found.frames], right, wrong=wrong)
+        plot = figures.loops(positions[: found.frames], right, wrong=wrong)
         drawn.append(figure_picture(plot, "The loops on the trajectory", caption=caption))
     shown = [(one.query, one.match, one.probability) for one in found.loops]
     rejected = _frames(one.loop for one in found.rejected)
-    order = loop_figures.loops_in_time(shown, found.frames, wrong=wrong, rejected=rejected)
+    order = figures.loops_in_time(shown, found.frames, wrong=wrong, rejected=rejected)
     caption = "The match of each query. Rejected pairs are grey." if rejected else "The match of each query."
     return [*drawn, figure_picture(order, "The loops in time", caption=caption)]
 
@@ -104,15 +107,6 @@ def _apart_m(found: FoundLoops, loop: Loop) -> float | None:
     """Return the true distance between the two frames of a loop in metres, or None if it is not known."""
     true = found.recording.positions
     return None if true is None else float(np.linalg.norm(true[loop.query] - true[loop.match]))
-
-
-def _judged(found: FoundLoops) -> str:
-    """Return a sentence with the number of wrong loops. Empty if true positions are not known."""
-    if found.recording.positions is None or not found.loops:
-        return ""
-    wrong = len(wrong_loops(found))
-    said = f"{wrong} of {len(found.loops)} loops are wrong{' (red)' if wrong else ''}"
-    return f"{said}: more than {NEGATIVE_M:g} m apart by {found.recording.pose_source}."
 
 
 def _frames(loops: Iterable[Loop]) -> list[tuple[int, int]]:
@@ -131,7 +125,7 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> Section:
     if not figures.can_draw():
         return Section("Corrected", [missing(about)])
     level = {name: upright_odometry(poses, mountings_of(found.recording))[:, :3, 3] for name, poses in both.items()}
-    drawn = figure_picture(loop_figures.trajectories(level), "The trajectory before and after", caption=about)
+    drawn = figure_picture(figures.trajectories(level), "The trajectory before and after", caption=about)
     return Section("Corrected", [drawn])
 
 
@@ -155,7 +149,7 @@ def _reliability(found: FoundLoops) -> list[Picture | Text | TextTable]:
         f"Share of loops among all candidates, before neighbours and odometry are considered. A loop is a pair up to "
         f"10 m apart by {found.recording.pose_source}; pairs 10 to 20 m apart are ignored. Labels: number of pairs."
     )
-    drawn = loop_figures.reliability([(one.said, one.share, one.pairs) for one in bins])
+    drawn = figures.reliability([(one.said, one.share, one.pairs) for one in bins])
     return [figure_picture(drawn, "Share of loops over probability", caption=caption), table]
 
 
@@ -171,18 +165,18 @@ def _pairs(query: Recording, match: Recording, loops: Sequence[Loop], *, nothing
         for loop in (loops[row] for row in rows)
     }
     caption = "Match in red, query in cyan; cells with points of both are white. Pairs are spread over the recording."
-    return figure_picture(loop_figures.overlays(pictures), "Pairs of images", caption=caption)
+    return figure_picture(figures.overlays(pictures), "Pairs of images", caption=caption)
 
 
 def overlay_of(query: Recording, match: Recording, loop: Loop) -> Float[np.ndarray, "h w 3"]:
-    """Overlay the images of the two scans of a loop, as RGB colours from 0 to 1 (`loop_figures.overlaid`)."""
+    """Overlay the images of the two scans of a loop, as RGB colours from 0 to 1 (`figures.overlaid`)."""
     images = (
         square_image(query.record(loop.query, labels=False)),
         square_image(match.record(loop.match, labels=False)),
     )
     to_upright = upright_from_lidar(match.mounting_of(loop.match))
     from_upright = inverse(upright_from_lidar(query.mounting_of(loop.query)))
-    return loop_figures.overlaid(*images, to_upright @ loop.match_from_query @ from_upright)
+    return figures.overlaid(*images, to_upright @ loop.match_from_query @ from_upright)
 
 
 def _reasons(rejected: Sequence[Rejected]) -> list[Text | TextTable]:
@@ -226,19 +220,19 @@ def _transforms(found: FoundLoops, names: list[str]) -> Section:
     rows = []
     for match, query in found.pairs:
         pair, transforms = (names[match], names[query]), found.between(match, query).transforms
-        rows += [
-            (*map(_framed, pair, (aligned.match, aligned.query)), *_numbers(aligned)) for aligned in transforms
-        ] or [(*pair, "no common place found", *[""] * 6)]
+        for aligned in transforms:
+            parts = zip(pair, (aligned.match, aligned.query), strict=True)
+            framed = (
+                name if part.is_odometry else f"{name}, from the LiDAR at scan {part.first} to scan {part.last}"
+                for name, part in parts
+            )
+            rows.append((*framed, *_numbers(aligned)))
+        rows += [] if transforms else [(*pair, "no common place found", *[""] * 6)]
     meaning = (
         "Pose of the query recording's frame in the match recording's frame, with standard deviations of position in "
         "the plane and yaw. All numbers are in frames.json."
     )
     return Section("Transforms", [Text(meaning), TextTable(header, rows, header[2:])])
-
-
-def _framed(name: str, part: Part) -> str:
-    """Name of a recording, with the part if it has no odometry."""
-    return name if part.is_odometry else f"{name}, from the LiDAR at scan {part.first} to scan {part.last}"
 
 
 def _numbers(aligned: AlignedParts) -> tuple[str, ...]:
@@ -272,6 +266,6 @@ def _together(found: FoundLoops, names: list[str], optimized: OptimizedTrajector
             for loop in found.loops
             if loop.match_session != loop.query_session and {loop.match_session, loop.query_session} <= set(positions)
         ]
-        plot = loop_figures.loops_between({names[number]: some for number, some in positions.items()}, pairs)
+        plot = figures.loops_between({names[number]: some for number, some in positions.items()}, pairs)
         drawn.append(figure_picture(plot, "Trajectories in one frame", caption=caption))
     return [Section("Together", drawn)] if drawn else []

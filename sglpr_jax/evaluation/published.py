@@ -16,7 +16,6 @@ Our numbers are comparable with these only under the same protocol, on the same 
 """
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any, Literal
@@ -25,8 +24,6 @@ Kind = Literal["handcrafted", "learned"]
 LEARNED = "learned"
 RINET, OWN_RUN = "RINet's paper", "run by SG-LPR's authors"
 
-KITTI = ("00", "02", "05", "06", "07", "08")
-NCLT = ("2012-02-04", "2012-03-17", "2012-06-15", "2012-09-28", "2012-11-16", "2013-02-23")
 NCLT_DATABASE = "2012-01-15"
 """Database session of table 3."""
 
@@ -58,13 +55,6 @@ class Table:
     dataset: str
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
-
-    def column(self, sequence: str, *, kind: Kind | None = None) -> Mapping[str, float]:
-        """Return the scores on one sequence by method, optionally of one kind. Empty for an unknown sequence."""
-        if sequence not in self.columns:
-            return {}
-        i = self.columns.index(sequence)
-        return {row.method: row.scores[i] for row in self.rows if kind in (None, row.kind)}
 
 
 def _read(table: dict[str, Any]) -> Table:

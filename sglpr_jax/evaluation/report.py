@@ -75,17 +75,21 @@ def results_table(results: Sequence[Result], *, title: str = "", published_on: b
 
     With `published_on`, it has a column with the poses of the published numbers.
     """
-    rows = [(*_cells(result), *([result.published_on] if published_on else [])) for result in results]
+    rows = [
+        (
+            result.name,
+            result.rule,
+            format_score(result.score),
+            "" if result.interval is None else "{:.3f} to {:.3f}".format(*result.interval),
+            "\n".join(f"{count} {name}" for name, count in result.counts.items()),
+            "as given" if result.dimensions is None else f"{result.dimensions}-D",
+            result.pose_source or "",
+            *([result.published_on] if published_on else []),
+        )
+        for result in results
+    ]
     header = (*COLUMNS, "published on") if published_on else COLUMNS
     return TextTable(header, rows, ("score", "95 %", "rests on"), title)
-
-
-def _cells(result: Result) -> tuple[str, ...]:
-    """Return the cells of one result, in the order of `COLUMNS`."""
-    counts = "\n".join(f"{count} {name}" for name, count in result.counts.items())
-    distance = "as given" if result.dimensions is None else f"{result.dimensions}-D"
-    interval = "" if result.interval is None else "{:.3f} to {:.3f}".format(*result.interval)
-    return result.name, result.rule, format_score(result), interval, counts, distance, result.pose_source or ""
 
 
 def threshold_table(results: Sequence[Result]) -> TextTable:
@@ -93,12 +97,9 @@ def threshold_table(results: Sequence[Result]) -> TextTable:
 
     Each result with a curve has a row for the highest F1 and for each of `PRECISIONS`.
     """
+    names = ("distance", "precision", "recall")
     rows = [
-        (
-            result.name,
-            goal,
-            *("" if point is None else f"{point[name]:.3f}" for name in ("distance", "precision", "recall")),
-        )
+        (result.name, goal, *("" if point is None else f"{point[name]:.3f}" for name in names))
         for result in results
         if result.curve is not None
         for goal, point in {"highest F1": _at_f1max(result), **_at_precisions(result, "precision {:g}")}.items()
@@ -114,7 +115,7 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> T
     sequence.
     """
     names = [result.name for result in next(iter(methods.values()))]
-    scores = [[format_score(result) for result in results] for results in methods.values()]
+    scores = [[format_score(result.score) for result in results] for results in methods.values()]
     if len(names) <= MOST_COLUMNS:
         rows = [(name, *line) for name, line in zip(methods, scores, strict=True)]
         return TextTable(("method", *names), rows, names, title)
@@ -129,9 +130,8 @@ def published_rows(sequence: str) -> list[tuple[str, ...]]:
     """
     if sequence not in TABLE_1.columns:
         raise ValueError(f"expected a sequence with published numbers, {', '.join(TABLE_1.columns)}, found {sequence}")
-    sources = {row.method: row.source for row in TABLE_1.rows}
-    scores = TABLE_1.column(sequence, kind=LEARNED)
-    return [(method, f"{score:.3f}", sources[method]) for method, score in scores.items()]
+    i = TABLE_1.columns.index(sequence)
+    return [(row.method, f"{row.scores[i]:.3f}", row.source) for row in TABLE_1.rows if row.kind == LEARNED]
 
 
 def published_table(rows: Sequence[tuple[str, ...]]) -> TextTable:
@@ -140,9 +140,9 @@ def published_table(rows: Sequence[tuple[str, ...]]) -> TextTable:
     return TextTable(header, rows, header[1:2])
 
 
-def format_score(result: Result) -> str:
+def format_score(score: float) -> str:
     """Return the score with three decimals, or "no revisit" if it is NaN."""
-    return "no revisit" if math.isnan(result.score) else f"{result.score:.3f}"
+    return "no revisit" if math.isnan(score) else f"{score:.3f}"
 
 
 def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
@@ -172,13 +172,9 @@ def _at_f1max(result: Result) -> dict[str, float] | None:
 
 
 def _at_precisions(result: Result, name: str) -> dict[str, dict[str, float] | None]:
-    """Return precision, recall and distance for each of `PRECISIONS`, or None if no threshold reaches this
-    precision.
-    """
+    """Return the same for each of `PRECISIONS`, or None if no threshold reaches this precision."""
     curve = result.curve
-    if curve is None:
-        return {}
-    return {name.format(goal): _point(curve, curve.at_precision(goal)) for goal in PRECISIONS}
+    return {} if curve is None else {name.format(goal): _point(curve, curve.at_precision(goal)) for goal in PRECISIONS}
 
 
 def _point(curve: PrecisionRecallCurve, index: int | None) -> dict[str, float] | None:

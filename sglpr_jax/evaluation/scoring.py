@@ -134,8 +134,15 @@ def evaluate(
     if isinstance(source, Input):
         poses = {} if given is None else {"positions": given.positions, "pose_source": given.source}
         source = _with_options(source, **poses, times=clock, distance=distance)
-    else:
-        source = _of_array(source, given, distance or "l2")
+        return evaluate_methods({"descriptors": source}, protocols, published=published)
+    rows = np.asarray(source)
+    if rows.ndim != 2:
+        raise ValueError(
+            f"expected a file, an opened input, or descriptors (n, d), found an array of shape {rows.shape}"
+        )
+    if given is None:
+        raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
+    source = as_descriptors(rows, given, sequence="", method="", distance=distance or "l2")
     return evaluate_methods({"descriptors": source}, protocols, published=published)
 
 
@@ -144,23 +151,11 @@ def _with_options(source: Input, *, where: str = "", **options: Any) -> Input:
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if not hasattr(source, name):
-            raise ValueError(f"{where}expected no {name} beside {_about(source, None)}, found {name}")
+            raise ValueError(f"{where}expected no {name} beside {_about(source)}, found {name}")
     try:
         return dataclasses.replace(source, **given)
     except ValueError as error:
         raise ValueError(f"{where}{error}") from error
-
-
-def _of_array(rows: ArrayLike, trajectory: Trajectory | None, distance: str) -> DescriptorFile:
-    """Return an array as unnamed descriptors. Raises ValueError without a matrix or without positions."""
-    rows = np.asarray(rows)
-    if rows.ndim != 2:
-        raise ValueError(
-            f"expected a file, an opened input, or descriptors (n, d), found an array of shape {rows.shape}"
-        )
-    if trajectory is None:
-        raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
-    return as_descriptors(rows, trajectory, sequence="", method="", distance=distance)
 
 
 def evaluate_methods(
@@ -184,13 +179,20 @@ def evaluate_methods(
         with naming(name):
             check_agreement(source, of_one)
             results[name] = score(of_one, chosen_protocols(of_one, chosen))
+    if isinstance(source, ScoredPairs):
+        sequence, title = "scored pairs", f"{'pairs' if file is None else file.name}, {len(source.pairs)} pairs"
+    else:
+        sequence, title = source.sequence, f"sequence {printable(source.sequence)}, {len(source)} scans"
+    made_with: dict[str, Any] = {} if file is None else {"file": str(file)}
+    if isinstance(source, DescriptorFile):
+        made_with |= {"config": source.config, "weights_hash": source.weights_hash, "distance": source.distance}
     return Evaluation(
-        title=_title(source, file),
-        about=_about(source, file),
+        title=title,
+        about=_about(source) if file is None else f"{file}: {_about(source)}",
         methods=results,
         positions=source.positions,
-        published=report.published_rows(_sequence_of(source)) if published else (),
-        made_with=_made_with(source, file),
+        published=report.published_rows(sequence) if published else (),
+        made_with=made_with,
     )
 
 
@@ -204,12 +206,8 @@ def score(source: Input, protocols: Sequence[str] = ()) -> list[Result]:
 
 
 def worst_false_positives(result: Result, positions: Float[np.ndarray, "n 3"], *, most: int = 6) -> list[FalsePositive]:
-    """Return up to `most` false positives, in order of descriptor distance.
-
-    The list is empty if the protocol applies no threshold to answers.
-    """
-    if result.answers is None or result.answer_distances is None or result.decisions is None:
-        return []
+    """Return up to `most` false positives of a protocol that applies a threshold, in order of descriptor distance."""
+    assert result.answers is not None and result.answer_distances is not None and result.decisions is not None
     positions = positions[:, : result.dimensions or 3]
     wrong = np.flatnonzero(result.decisions == Decision.FALSE_POSITIVE)
     worst: list[FalsePositive] = []
@@ -221,28 +219,10 @@ def worst_false_positives(result: Result, positions: Float[np.ndarray, "n 3"], *
     return worst
 
 
-def _title(source: Input, file: Path | None) -> str:
-    if isinstance(source, ScoredPairs):
-        return f"{'pairs' if file is None else file.name}, {len(source.pairs)} pairs"
-    return f"sequence {printable(source.sequence)}, {len(source)} scans"
-
-
-def _sequence_of(source: Input) -> str:
-    return "scored pairs" if isinstance(source, ScoredPairs) else source.sequence
-
-
-def _about(source: Input, file: Path | None) -> str:
+def _about(source: Input) -> str:
     """Describe the source and its distance."""
-    where = "" if file is None else f"{file}: "
     if isinstance(source, ScoredPairs):
-        return f"{where}scored pairs" + (" with labels" if source.labels is not None else "")
+        return "scored pairs" + (" with labels" if source.labels is not None else "")
     if isinstance(source, TopK):
-        return f"{where}up to {source.nearest.shape[1]} retrieved frames for each of {len(source.queries)} queries"
-    return f"{where}descriptors of {source.descriptors.shape[1]} numbers, compared by {source.distance}"
-
-
-def _made_with(source: Input, file: Path | None) -> dict[str, Any]:
-    about: dict[str, Any] = {} if file is None else {"file": str(file)}
-    if isinstance(source, DescriptorFile):
-        about |= {"config": source.config, "weights_hash": source.weights_hash, "distance": source.distance}
-    return about
+        return f"up to {source.nearest.shape[1]} retrieved frames for each of {len(source.queries)} queries"
+    return f"descriptors of {source.descriptors.shape[1]} numbers, compared by {source.distance}"

@@ -13,7 +13,7 @@ from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
 from sglpr_jax.models.params import Params
 from sglpr_jax.progress import Progress, no_progress
-from sglpr_jax.retrieval.image_maps import SemanticMap, semantic_map, semantic_maps
+from sglpr_jax.retrieval.image_maps import semantic_map, semantic_maps
 
 PICTURE = "segmentation.png"
 
@@ -97,7 +97,7 @@ def score_segmentation(
     confusion = np.zeros((config.classes, config.classes), np.int64)
     with progress(f"segment {recording.name}", len(rows)) as show:
         for _, _, found in semantic_maps(params, recording, rows, on_progress=show):
-            confusion += map_confusion(found, categories=config.categories)
+            confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=config.classes)
     score = score_confusion(confusion, categories=config.categories, title=title_of(recording))
     draw_segmentation(params, recording, folder)
     return score
@@ -123,15 +123,6 @@ def _labelled_rows(recording: Recording) -> list[int]:
     return [row for row, labelled in enumerate(recording.labelled) if labelled]
 
 
-def map_confusion(found: SemanticMap, *, categories: int) -> Int[np.ndarray, "k k"]:
-    """Return the confusion matrix of one semantic map, over the cells that have a prediction and a label.
-
-    It is all zeros for a scan without labels.
-    """
-    classes = len(taxonomy(categories).names)
-    return confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
-
-
 def confusion_matrix(
     truth: Int[np.ndarray, "*b h w"],
     prediction: Int[np.ndarray, "*b h w"],
@@ -141,7 +132,8 @@ def confusion_matrix(
 ) -> Int[np.ndarray, "k k"]:
     """Return the number of counted cells of true class i that are predicted as class j.
 
-    As in SemanticKITTI, cells of class 0 (unlabelled) are ignored. Matrices of several scans may be added.
+    As in SemanticKITTI, cells of class 0 (unlabelled) are ignored: a scan without labels has only zeros. Matrices of
+    several scans may be added.
     """
     counted = counted & (truth != UNLABELLED)
     pairs = truth[counted].astype(np.int64) * classes + prediction[counted]

@@ -20,6 +20,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_metho
 
 APART_M = 25.0
 """Largest distance, in metres, at which a protocol across sessions considers two frames the same place."""
+PUBLISHED_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset}, by bevplace-nclt-recall's rule."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,20 +50,17 @@ class AcrossSessions(PrintsItself):
         """Results of all protocols and sessions, in order of protocol."""
         return [result for of_one in self.protocols.values() for result in of_one]
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Header of `rows`."""
-        return ("", *map(printable, self.sessions), "mean")
-
-    def rows(self) -> list[tuple[str, ...]]:
-        """Return one row for each protocol: name, score of each session, and mean over the sessions with a score."""
-        return [
-            (name, *map(format_score, results), _text(mean_score(results))) for name, results in self.protocols.items()
-        ]
-
     def table(self) -> TextTable:
-        """Return `rows` and the published rows as a table."""
-        return TextTable(self.columns, [*self.rows(), *self.published], self.columns[1:], self.title)
+        """Return a table with the score of each session and their mean, in a row for each protocol.
+
+        The published rows follow.
+        """
+        header = ("", *map(printable, self.sessions), "mean")
+        rows = [
+            (name, *(format_score(result.score) for result in results), format_score(mean_score(results)))
+            for name, results in self.protocols.items()
+        ]
+        return TextTable(header, [*rows, *self.published], header[1:], self.title)
 
     def to_json(self) -> dict[str, Any]:
         """Return values for `json.dump`."""
@@ -73,7 +71,7 @@ class AcrossSessions(PrintsItself):
             }
             for name, of_one in self.protocols.items()
         }
-        published = {"about": PUBLISHED_NOTE, "columns": self.columns, "rows": self.published}
+        published = {"about": PUBLISHED_NOTE, "columns": self.table().header, "rows": self.published}
         beside = {"published": published} if self.published else {}
         return {**self.made_with, "database_session": self.database, "results": results, **beside}
 
@@ -84,7 +82,27 @@ class AcrossSessions(PrintsItself):
             yield PUBLISHED_NOTE
 
 
-PUBLISHED_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset}, by bevplace-nclt-recall's rule."
+def mean_score(results: Sequence[Result]) -> float:
+    """Return the mean score over the sessions with a revisit, or NaN if no session has one."""
+    scores = [result.score for result in results if not math.isnan(result.score)]
+    return float(np.mean(scores)) if scores else math.nan
+
+
+def evaluate_session_files(
+    database: Path, queries: Sequence[Path], names: Sequence[str] = (), *, published: bool = False
+) -> AcrossSessions:
+    """Run `evaluate_sessions` on paths of descriptor files. Raises ValueError for other kinds of files, too."""
+    files = []
+    for path in (database, *queries):
+        if path.suffix != ".npz":
+            raise ValueError(f"{path}: expected descriptor files of bin/embed (.npz) for an evaluation across sessions")
+        files.append(read_descriptor_file(path))
+    for path, file in zip(queries, files[1:], strict=True):
+        with naming(path):
+            check_same_method(files[0], file)
+    found = evaluate_sessions(files[0], files[1:], names, published=published)
+    made_with = {"files": [str(path) for path in queries], "database": str(database)}
+    return replace(found, about=f"{database}: {found.about}", made_with=made_with)
 
 
 def evaluate_sessions(
@@ -120,25 +138,6 @@ def evaluate_sessions(
     )
 
 
-def evaluate_session_files(
-    database: Path, queries: Sequence[Path], names: Sequence[str] = (), *, published: bool = False
-) -> AcrossSessions:
-    """Run `evaluate_sessions` on paths of descriptor files. Raises ValueError for other kinds of files, too."""
-    files = [_read(path) for path in (database, *queries)]
-    for path, file in zip(queries, files[1:], strict=True):
-        with naming(path):
-            check_same_method(files[0], file)
-    found = evaluate_sessions(files[0], files[1:], names, published=published)
-    made_with = {"files": [str(path) for path in queries], "database": str(database)}
-    return replace(found, about=f"{database}: {found.about}", made_with=made_with)
-
-
-def _read(path: Path) -> DescriptorFile:
-    if path.suffix != ".npz":
-        raise ValueError(f"{path}: expected descriptor files of bin/embed (.npz) for an evaluation across sessions")
-    return read_descriptor_file(path)
-
-
 def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the rows of table 3 for these sessions, marked as published.
 
@@ -151,39 +150,24 @@ def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ..
             f"expected database {NCLT_DATABASE} and queries among {', '.join(TABLE_3.columns)}, for which numbers "
             f"are published; found database {database} and queries {', '.join(sessions)}"
         )
-    columns = [TABLE_3.column(session) for session in sessions]
-    complete = len(shown) == len(TABLE_3.columns)
     rows = []
     for row in TABLE_3.rows:
-        scores = [column.get(row.method) for column in columns]
-        mean = row.mean if complete else float(np.mean([score for score in scores if score is not None]))
-        rows.append((f"published: {row.method}", *map(_text, scores), _text(mean)))
+        scores = dict(zip(TABLE_3.columns, row.scores, strict=True))
+        mean = row.mean if len(shown) == len(scores) else float(np.mean([scores[session] for session in shown]))
+        cells = (format_score(scores[session]) if session in scores else "" for session in sessions)
+        rows.append((f"published: {row.method}", *cells, format_score(mean)))
     return rows
 
 
 def _check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
     """Raise ValueError if the areas of the two sessions do not overlap. Their positions then have different frames."""
-    corners = [(places.min(axis=0), places.max(axis=0)) for places in map(_plane, (database, queries))]
-    (low, high), (low_q, high_q) = corners
+    planes = [positions_of(file, 2) for file in (database, queries)]
+    (low, high), (low_q, high_q) = ((places.min(axis=0), places.max(axis=0)) for places in planes)
     if np.any(low_q > high + APART_M) or np.any(high_q < low - APART_M):
-        there, here = (f"x {a[0]:.0f} to {b[0]:.0f}, y {a[1]:.0f} to {b[1]:.0f} m" for a, b in corners)
+        there, here = (
+            f"x {a[0]:.0f} to {b[0]:.0f}, y {a[1]:.0f} to {b[1]:.0f} m" for a, b in ((low, high), (low_q, high_q))
+        )
         raise ValueError(
             f"expected {queries.sequence} in the world frame of the database {database.sequence} ({there}), found it "
             f"elsewhere ({here}): no place is in both"
         )
-
-
-def mean_score(results: Sequence[Result]) -> float:
-    """Return the mean score over the sessions with a revisit, or NaN if no session has one."""
-    scores = [result.score for result in results if not math.isnan(result.score)]
-    return float(np.mean(scores)) if scores else math.nan
-
-
-def _plane(file: DescriptorFile) -> np.ndarray:
-    return positions_of(file, 2)
-
-
-def _text(score: float | None) -> str:
-    if score is None:
-        return ""
-    return "no revisit" if math.isnan(score) else f"{score:.3f}"

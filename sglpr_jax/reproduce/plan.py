@@ -2,8 +2,8 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 
@@ -41,53 +41,38 @@ def check(
     """
     if not names:
         raise ValueError(f"expected tables or figures, found none; choose from all, {', '.join(EXPERIMENTS)}")
+    recordings, chosen = recording_names(runs.data), {name: EXPERIMENTS[name] for name in names}
     if not seqs:
-        found = ", ".join(recording_names(runs.data))
+        found = ", ".join(recordings)
         raise ValueError(
             f"{runs.data}: expected recordings named as in the paper, found {found}; choose yours with --seq"
         )
-    if any(EXPERIMENTS[name].kind == "figure" for name in names) and not figures.can_draw():
+    if any(one.kind == "figure" for one in chosen.values()) and not figures.can_draw():
         raise ImportError("figures need matplotlib: pip install 'sglpr-jax[viz]'")
-    alone = [name for name in names if not EXPERIMENTS[name].beside_handcrafted]
+    alone = [name for name, one in chosen.items() if not one.beside_handcrafted]
     if not trained and (alone or not (methods or weights)):
         what = f"{', '.join(alone)}, which compares trained variants" if alone else "no --weights and no --method"
         raise ValueError(f"with --no-train, expected tables 1 to 3 or figure 5 of other methods, found {what}")
-    _check_recordings(runs, seqs, trained=trained)
-    if nclt is not None and any(EXPERIMENTS[name].across_sessions for name in names):
-        _check_sessions(nclt)
-    for name in weights:
-        method_with_weights(name)  # raises an error if the weights are missing or damaged
-    for name in names:
-        _check_labels(runs, name)
-        if EXPERIMENTS[name].beside_handcrafted:
-            _check_methods(runs, seqs, methods, weights)
-
-
-def _check_recordings(runs: Runs, seqs: Sequence[str], *, trained: bool) -> None:
-    recordings = recording_names(runs.data) if trained else []
     if trained and len(recordings) < 2:
         raise ValueError(
             f"{runs.data}: expected two recordings or more, to train and test on, found {', '.join(recordings)}"
         )
-    for seq in (*seqs, *recordings):
+    for seq in (*seqs, *(recordings if trained else [])):
         if runs.recording(seq).positions is None:
             raise ValueError(f"{runs.data}: sequence {seq} has no poses; training and scoring need them")
-
-
-def _check_sessions(root: Path) -> None:
-    """The first session is the database, the others are queries."""
-    sessions = recording_names(root)
-    if len(sessions) < 2:
-        raise ValueError(f"{root}: expected two sessions or more, found {', '.join(sessions)}")
-
-
-def _check_labels(runs: Runs, name: str) -> None:
-    """Tables that compare the segmentation branch need labels, because without labels it learns nothing."""
-    if not EXPERIMENTS[name].needs_labels:
-        return
-    for seq in recording_names(runs.data):
-        if not runs.recording(seq).has_labels:
-            raise ValueError(f"{name} is about semantics: expected labels in sequence {seq} of {runs.data}, found none")
+    if nclt is not None and any(one.across_sessions for one in chosen.values()):
+        sessions = recording_names(nclt)  # the first is the database, the others are queries
+        if len(sessions) < 2:
+            raise ValueError(f"{nclt}: expected two sessions or more, found {', '.join(sessions)}")
+    for name in weights:
+        method_with_weights(name)  # raises an error if the weights are missing or damaged
+    for name, one in chosen.items():
+        unlabelled = [seq for seq in recordings if one.needs_labels and not runs.recording(seq).has_labels]
+        if unlabelled:
+            expected = f"expected labels in sequence {unlabelled[0]} of {runs.data}, found none"
+            raise ValueError(f"{name} is about semantics: {expected}")
+    if len(alone) < len(chosen):
+        _check_methods(runs, seqs, methods, weights)
 
 
 def _check_methods(runs: Runs, seqs: Sequence[str], methods: Sequence[str], weights: Sequence[str]) -> None:
@@ -104,15 +89,14 @@ def _check_methods(runs: Runs, seqs: Sequence[str], methods: Sequence[str], weig
                 raise ValueError(f"{name} needs labels, found none in sequence {seq}; leave it out")
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """The runs that the experiments need, and those that are not trained yet, as (variant, recording)."""
 
     runs: tuple[tuple[str, str], ...]
     missing: tuple[tuple[str, str], ...]
     steps: int
     without_revisits: tuple[str, ...] = ()
-    """Test recordings without revisits. They have no scores."""
+    """Test recordings without revisits, by the rule of top-1 F1max. They have no scores."""
 
     def text(self, seconds_per_step: float | None) -> str:
         """Describe the plan."""
@@ -134,32 +118,26 @@ def make_plan(runs: Runs, names: Sequence[str], seqs: Sequence[str]) -> Plan:
 
     Experiments across sessions need only one run of each variant. Raises ValueError if a run has other settings.
     """
-    needed = {}
-    for name in names:
-        of_one = seqs[:1] if EXPERIMENTS[name].across_sessions else seqs
-        needed |= {(variant, seq): None for variant in EXPERIMENTS[name].variants for seq in of_one}
+    needed = {
+        (variant, seq): None
+        for name in names
+        for variant in EXPERIMENTS[name].variants
+        for seq in (seqs[:1] if EXPERIMENTS[name].across_sessions else seqs)
+    }
     missing = tuple(run for run in needed if not runs.is_trained(*run))
     scored = () if all(EXPERIMENTS[name].across_sessions for name in names) else seqs
-    return Plan(tuple(needed), missing, runs.config.steps, tuple(seq for seq in scored if not _comes_back(runs, seq)))
-
-
-def _comes_back(runs: Runs, seq: str) -> bool:
-    """Whether a recording has a revisit, by the rule of top-1 F1max."""
-    recording = runs.recording(seq)
-    return recording.positions is None or bool(revisits(recording.positions, times=recording.times).any())
+    places = {seq: (runs.recording(seq).positions, runs.recording(seq).times) for seq in scored}
+    straight = [seq for seq, (xyz, times) in places.items() if xyz is not None and not revisits(xyz, times=times).any()]
+    return Plan(tuple(needed), missing, runs.config.steps, tuple(straight))
 
 
 def time_a_step(runs: Runs, variant: str, seq: str) -> float:
-    """Measure the duration of a training step in seconds, on the first batches of the run. The program is compiled
-    first."""
-    config = runs.config_of(variant)
-    recordings = runs.recordings_but(seq)
+    """Measure the duration of a training step in seconds, on the first batches of the run, without compilation."""
+    config, recordings = runs.config_of(variant), runs.recordings_but(seq)
     network, batches = ImageNetwork(config), batches_of(recordings, tuple_pool(recordings, config), config)
-    state = network.new_state()
-    seconds = []
+    state, start = network.new_state(), 0.0
     for step in range(1 + TIMED_STEPS):
-        since = time.perf_counter()
+        start = time.perf_counter() if step == 1 else start
         state, metrics = train_step(state, batches.batch(step), network=network)
         jax.block_until_ready(metrics)
-        seconds.append(time.perf_counter() - since)
-    return sum(seconds[1:]) / TIMED_STEPS
+    return (time.perf_counter() - start) / TIMED_STEPS

@@ -9,7 +9,7 @@ from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.data.corruption import CLEAN, ROTATION
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.evaluation.learning_curves import LearningCurves
+from sglpr_jax.evaluation.final_test import LearningCurves
 from sglpr_jax.files import file_name, read_json, write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
@@ -35,15 +35,8 @@ WITHOUT_TRAINING = "without-training"
 
 @functools.cache
 def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
-    """Open a recording once. If a scan disappears later, reading it fails. A second opening would silently omit the
-    scan.
-    """
+    """Open a recording once. A second opening would silently omit scans that disappear."""
     return open_recording(data, seq, pose_source=pose_source)
-
-
-def _begun(folder: Path) -> bool:
-    """Whether the folder has a run to resume. A process that was killed early may leave a folder without a run."""
-    return (folder / CONFIG_FILE).is_file()
 
 
 @dataclass(frozen=True)
@@ -65,7 +58,7 @@ class Runs:
     def is_trained(self, variant: str, seq: str) -> bool:
         """Whether a run is finished. Raises ValueError if it has other settings."""
         folder = self._folder(variant, seq)
-        if not _begun(folder):
+        if not (folder / CONFIG_FILE).is_file():  # a process that was killed early leaves a folder without a run
             return False
         settings = run_settings(self.config_of(variant), self._settings(seq))
         require_same_settings(folder, settings, limits=LIMITS)
@@ -85,7 +78,7 @@ class Runs:
             self.recordings_but(seq),
             out=folder,
             test=self.recording(seq),
-            resume=_begun(folder),
+            resume=(folder / CONFIG_FILE).is_file(),
             callback=Callbacks(ProgressBar(), LearningCurves(folder)),
             stopped=stopped,
             settings=self._settings(seq),

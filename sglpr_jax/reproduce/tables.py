@@ -10,7 +10,7 @@ from typing import Any
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.evaluation.protocols.protocol import Result
-from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL
+from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL
 from sglpr_jax.evaluation.published import TABLES
 from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.files import write_json, write_text
@@ -33,8 +33,7 @@ class Row:
     """Change of the mean when the scans are rotated (table 2's Cmp)."""
 
     def mean(self, columns: Sequence[str]) -> float | None:
-        """Return the mean over the columns. If a column is missing, return None, because the mean would not be
-        comparable."""
+        """Return the mean over the columns, or None if a column is missing: such means are not comparable."""
         values = [self.scores.get(name) for name in columns]
         return None if None in values or not values else sum(values) / len(values)  # type: ignore[arg-type]
 
@@ -49,14 +48,13 @@ class PaperTable(PrintsItself):
     caption: str
 
     def __rich__(self) -> TextTable:
-        head = self._head()
-        return TextTable(head, list(map(self._cells, self.rows)), head[2:], self.title, self.caption)
+        head, *rows = self._lines()
+        return TextTable(head, rows, head[2:], self.title, self.caption)
 
     def markdown(self) -> str:
         """Return the table as Markdown."""
-        head = self._head()
-        lines = [head, ["---"] * len(head), *map(self._cells, self.rows)]
-        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        head, *rows = self._lines()
+        table = "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
         return f"**{self.title}**\n\n{table}\n\n{self.caption}\n"
 
     def to_json(self) -> list[dict[str, Any]]:
@@ -72,18 +70,17 @@ class PaperTable(PrintsItself):
             for row in self.rows
         ]
 
-    @property
-    def _has_change(self) -> bool:
-        return any(row.change is not None for row in self.rows)
-
-    def _head(self) -> list[str]:
-        return ["method", "source", *self.columns, "mean", *(["change"] if self._has_change else [])]
-
-    def _cells(self, row: Row) -> list[str]:
-        missing = NO_REVISITS if row.source == OURS else NONE
-        scores = (_text(row.scores.get(name), missing) for name in self.columns)
-        change = NONE if row.change is None else f"{row.change:+.3f}"
-        return [row.label, row.source, *scores, _text(row.mean(self.columns)), *([change] if self._has_change else [])]
+    def _lines(self) -> list[list[str]]:
+        """Return the cells of the header and of each row."""
+        has_change = any(row.change is not None for row in self.rows)
+        lines = [["method", "source", *self.columns, "mean", *(["change"] if has_change else [])]]
+        for row in self.rows:
+            missing = NO_REVISITS if row.source == OURS else NONE
+            scores = (_text(row.scores.get(name), missing) for name in self.columns)
+            change = NONE if row.change is None else f"{row.change:+.3f}"
+            cells = [row.label, row.source, *scores, _text(row.mean(self.columns)), change]
+            lines.append(cells[: len(lines[0])])
+        return lines
 
 
 @dataclass(frozen=True)
@@ -116,25 +113,26 @@ class Reproduction:
         return variants | ({other: other for other in self.methods} if experiment.beside_handcrafted else {})
 
     def _of_protocol(self, name: str, protocol: str) -> PaperTable:
-        """Return table 1, 2, 4, 5, 6 or 7 by one protocol, the reproduced rows first."""
-        experiment = EXPERIMENTS[name]
-        rows = [self._row(method, label, protocol, experiment.rotated) for method, label in self.labels(name).items()]
+        """Return table 1, 2, 4, 5, 6 or 7 by one protocol, the reproduced rows first.
+
+        With rotated scans, rows have the change of their mean.
+        """
+        experiment, rows = EXPERIMENTS[name], []
+        for method, label in self.labels(name).items():
+            row = self._row(method, label, protocol, rotated=experiment.rotated)
+            if experiment.rotated:
+                after = row.mean(self.seqs)
+                before = self._row(method, label, protocol, rotated=False).mean(self.seqs)
+                row = replace(row, change=None if after is None or before is None else after - before)
+            rows.append(row)
         published = protocol if len(experiment.protocols) > 1 else None
         poses = dict.fromkeys(self.runs.recording(seq).pose_source for seq in self.seqs)
         caption = [f"{protocol} ({PROTOCOLS[protocol].rule})", f"poses: {', '.join(map(str, poses))}"]
         return self._table(name, self.seqs, rows, "leave-one-out", caption, protocol=published)
 
-    def _row(self, method: str, label: str, protocol: str, rotated: bool) -> Row:
-        """Return the scores of a method, and with rotated scans their change."""
-
-        def row(rotated: bool) -> Row:
-            results = {seq: scored(self.runs, method, seq, protocol=protocol, rotated=rotated) for seq in self.seqs}
-            return Row(label, OURS, {seq: _score_or_none(result) for seq, result in results.items()})
-
-        if not rotated:
-            return row(False)
-        turned, after, before = row(True), row(True).mean(self.seqs), row(False).mean(self.seqs)
-        return turned if after is None or before is None else replace(turned, change=after - before)
+    def _row(self, method: str, label: str, protocol: str, *, rotated: bool) -> Row:
+        results = {seq: scored(self.runs, method, seq, protocol=protocol, rotated=rotated) for seq in self.seqs}
+        return Row(label, OURS, {seq: _score_or_none(result) for seq, result in results.items()})
 
     def _across_sessions(self, name: str) -> PaperTable:
         """Return Recall@1 of each later session in the first one.
@@ -167,9 +165,8 @@ class Reproduction:
         """Return the reproduced rows and then the published ones, of one protocol if it is given."""
         published = published_rows(name, columns, protocol=protocol)
         steps = f"here: preset {Path(self.runs.preset).stem}, {self.runs.config.steps} steps, {split}"
-        caption = [*([steps] if self.trained else []), *caption]
-        if published:
-            caption.append("published: the paper's numbers, on the real dataset")
+        source = ["published: the paper's numbers, on the real dataset"] if published else []
+        caption = [*([steps] if self.trained else []), *caption, *source]
         title = f"{name}: {EXPERIMENTS[name].title}"
         return PaperTable(title, [*ours, *published], list(columns), "; ".join(caption))
 
@@ -177,8 +174,7 @@ class Reproduction:
 def published_rows(name: str, columns: Sequence[str], *, protocol: str | None = None) -> list[Row]:
     """Return the paper's rows of a table, if it has any of these columns.
 
-    With a protocol, only the rows that were scored by it are returned. The source that the paper names then stands
-    beside each method.
+    With a protocol, these are the rows that were scored by it, with the source that the paper names beside each method.
     """
     return [
         Row(
@@ -195,8 +191,7 @@ def published_rows(name: str, columns: Sequence[str], *, protocol: str | None = 
 
 @functools.cache
 def scored(runs: Runs, method: str, seq: str, *, protocol: str = TOP1, rotated: bool = False) -> Result:
-    """Return the result of a variant, a handcrafted method or weights. The default protocol is that of the paper: F1max
-    of top-1 retrieval, 3 m / 20 m."""
+    """Return the result of a variant, a handcrafted method or weights, by default by the paper's protocol."""
     return PROTOCOLS[protocol](runs.descriptors(method, seq, rotated=rotated))
 
 

@@ -23,7 +23,6 @@ from sglpr_jax.files import in_short, naming, parse_json, replacing
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function, smallest
-from sglpr_jax.revisits import are_recent
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 from sglpr_jax.schema import check_about, check_columns
 
@@ -229,8 +228,13 @@ class Index:
     def recent(
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
-        """Return which places are too recent to be a revisit at the time `now` (`revisits.are_recent`)."""
-        return are_recent(len(self), self.times, now, seconds=seconds, frames=frames)
+        """Return which places are too recent to be a revisit: those less than `seconds` old at the time `now`.
+
+        Without times or without `now`, these are the last `frames` places.
+        """
+        if now is not None and self.times is not None:
+            return self.times > now - seconds
+        return np.arange(len(self)) >= len(self) - frames
 
     def save(self, path: Path | str) -> None:
         """Write the index to one safetensors file, atomically. Its header contains the ids and metadata as JSON."""

@@ -8,7 +8,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.cli.train import parse
-from sglpr_jax.evaluation import final_test, learning_curves
+from sglpr_jax.evaluation import final_test
 from sglpr_jax.training import recipe
 from sglpr_jax.training.metrics_log import read_metrics
 
@@ -41,7 +41,7 @@ def runs(town, preset, tmp_path_factory):
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(final_test, "final_test", lambda *_, **__: None)
                 patch.setattr(recipe, "training_recall", lambda *_: lambda _: {"score": 0.0})
-                patch.setattr(learning_curves, "draw_learning_curves", lambda _: None)
+                patch.setattr(final_test.LearningCurves, "on_end", lambda *_: None)
                 flags = ("--data", town, "--preset", preset, "--out", folder, "--steps", 2, *flags_of(name))
                 ended = run_command("train", "--seq", "08", *flags)
             assert ended.status == 0, ended.error

@@ -1,5 +1,4 @@
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -37,16 +36,6 @@ def test_every_scan_gets_a_map_and_the_scores_are_those_of_the_training(segment,
     assert (maps / "segmentation.png").stat().st_size > 1000
 
 
-def test_scans_without_labels_get_maps_but_no_scores(segment, trained, town, tmp_path):
-    scans = tmp_path / "my_scans"
-    shutil.copytree(town / "sequences" / "08" / "velodyne", scans)
-    ended, maps = segment("--weights", trained.folder, "--data", scans)
-    assert ended.status == 0, ended.error
-    assert len(list(maps.glob("*.png"))) == 40
-    assert json.loads((maps / "command.json").read_text())["data"] == str(scans)
-    assert not (maps / "segmentation.json").exists()
-
-
 def pixels(path) -> np.ndarray:
     with Image.open(path) as image:
         return np.asarray(image)
@@ -74,6 +63,7 @@ def test_what_the_network_is_not_sure_of_is_left_out(segment, trained, images):
     some = np.stack([pixels(path) for path in sorted(maps.glob("*.png"))])
     assert 0 < (some > 0).sum() < (every > 0).sum()
     np.testing.assert_array_equal(some, np.where(some > 0, every, 0))
+    assert json.loads((maps / "command.json").read_text())["data"] == str(images)
     assert f"30 semantic maps of {(some > 0).sum() / (every > 0).sum():.0%} of the cells with points" in ended.out
     assert not (maps / "segmentation.json").exists()
     assert_one_line_error(segment(*options, "--min-confidence", 80)[0], "--min-confidence: expected", "0 up to 1", "80")

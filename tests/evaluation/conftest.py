@@ -2,8 +2,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from recordings import of_images
 
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.se3 import transform
 
 
 @pytest.fixture(scope="session")
@@ -33,6 +37,33 @@ def two_laps() -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
+def noisy_laps(make_file, two_laps) -> DescriptorFile:
+    """Two laps, described by their positions with noise."""
+    noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
+    return make_file(two_laps, two_laps / 200 + noise)
+
+
+@pytest.fixture(scope="session")
+def mistaken(make_file, two_laps) -> DescriptorFile:
+    """Two laps of which frames 500 and 501 look like 10 and 11, and 600 almost like 20; 700 meets its own place."""
+    descriptors = two_laps / 200
+    descriptors[[500, 501]] = descriptors[[10, 11]]
+    descriptors[600] = descriptors[20] + [0.001, 0, 0]
+    descriptors[700] += [0.01, 0, 0]
+    return make_file(two_laps, descriptors, sequence="monday")
+
+
+@pytest.fixture(scope="session")
 def straight() -> np.ndarray:
     """Return positions (800, 3) of a recording that never comes back."""
     return np.arange(800.0)[:, None] * [1.0, 0.0, 0.0]
+
+
+@pytest.fixture
+def found_loops(tmp_path) -> FoundLoops:
+    """Three loops of eight images, with odometry."""
+    rng = np.random.default_rng(0)
+    images = {tmp_path / f"{i:06d}.png": rng.uniform(0, 10, (20, 20)).astype(np.float32) for i in range(8)}
+    odometry = np.stack([transform(float(x), 0.0, 0.0) for x in range(8)])
+    loops = tuple(Loop(q, q - 4, transform(1.0, 2.0, 0.3), np.eye(6), 0.99 + q / 1000) for q in (5, 6, 7))
+    return FoundLoops((Session(of_images(images, times=np.arange(8.0)), 8, odometry),), loops)

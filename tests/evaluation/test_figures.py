@@ -3,11 +3,13 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
+from scenes import place, relative, seen_from
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.labels import CATEGORIES, taxonomy
-from sglpr_jax.metrics import classification_curve
+from sglpr_jax.metrics import PrecisionRecallCurve
+from sglpr_jax.se3 import transform
 
 
 def pixels(figure, path):
@@ -29,9 +31,10 @@ def legend(figure):
 
 
 def test_precision_recall_names_each_curve_with_its_f1max(tmp_path):
-    scores = np.arange(6.0)
-    good = classification_curve(scores, scores > 2)
-    poor = classification_curve(scores, scores % 2 == 0)
+    thresholds, recall = np.arange(3.0), np.array([1.0, 0.7, 0.3])
+    good, poor = (
+        PrecisionRecallCurve(thresholds, np.array(values), recall) for values in ([1.0, 1, 1], [0.5, 0.6, 0.4])
+    )
     figure = figures.precision_recall({"good": good, "poor": poor}, title="Sequence 06")
     assert legend(figure) == ["good 1.000", f"poor {poor.f1_max:.3f}"]
     (axes,) = figure.axes
@@ -64,11 +67,13 @@ def test_learning_curves_have_a_panel_each_over_the_same_steps(tmp_path):
     assert pixels(figure, tmp_path / "curves.png").std() > 10
 
 
-def test_a_segmentation_panel_is_in_metres_and_in_the_classes_colours(tmp_path):
+def test_a_segmentation_panel_is_in_metres_and_in_the_names_and_colours_of_its_classes(tmp_path):
     bev = np.zeros((20, 40), np.int32)
     bev[:, :20] = 3
     truth = np.where(bev > 0, CATEGORIES.index("road"), 0)
     prediction = np.where(bev > 0, CATEGORIES.index("building"), 0)
+    moving = np.full((8, 8), taxonomy(25).names.index("moving"))
+    assert legend(figures.segmentation_panel(moving, None, moving, resolution_m=1.0, categories=25)) == ["moving"]
     figure = figures.segmentation_panel(bev, truth, prediction, resolution_m=0.5, title="Sequence 08")
     counts, true_map, predicted = figure.axes
     assert legend(figure) == ["unlabeled", "road", "building"]
@@ -82,15 +87,28 @@ def test_a_segmentation_panel_is_in_metres_and_in_the_classes_colours(tmp_path):
     assert shows(middle[:, 2 * third :], building) and not shows(middle[:, 2 * third :], road)
 
 
-def test_a_segmentation_panel_has_the_names_and_colours_of_its_categories(tmp_path):
-    moving = taxonomy(25).names.index("moving")
-    found = np.full((8, 8), moving)
-    figure = figures.segmentation_panel(found, None, found, resolution_m=1.0, categories=25)
-    assert legend(figure) == ["moving"]
-    assert shows(pixels(figure, tmp_path / "moving.png"), taxonomy(25).colors[moving])
-
-
 def test_without_matplotlib_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[viz\]'"):
         figures.learning_curves({"loss": {"raw": [(0, 0.1)]}})
+
+
+def test_a_right_pose_makes_the_picture_white_and_a_wrong_one_coloured():
+    match, query = (0.3, -0.2, 0.5), (1.4, 0.8, 2.5)
+    images = [seen_from(place(0), pose) for pose in (query, match)]
+    right = figures.overlaid(*images, transform(*relative(match, query)))
+    wrong = figures.overlaid(*images, transform(*relative(query, match)))
+    assert right.shape == (64, 64, 3) and right.min() >= 0 and right.max() <= 1 + 1e-9
+
+    def agreement(picture: np.ndarray) -> float:
+        return float(np.minimum(picture[..., 0], picture[..., 1]).sum() / picture[..., 0].sum())
+
+    assert agreement(right) > 0.5 > 0.3 > agreement(wrong)
+    np.testing.assert_array_equal(right[..., 1], right[..., 2])
+
+
+def test_without_a_motion_the_query_stays_and_an_empty_one_is_black():
+    image = seen_from(place(1), (0.0, 0.0, 0.0))
+    same = figures.overlaid(image, image, np.eye(4))
+    np.testing.assert_allclose(same[..., 0], same[..., 1], atol=1e-6)
+    assert figures.overlaid(np.zeros_like(image), image, np.eye(4))[..., 1].max() == 0

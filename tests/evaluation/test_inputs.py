@@ -33,9 +33,8 @@ def read(tmp_path, poses):
     return read
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.uint8])
-def test_a_matrix_is_scored_as_the_file_it_would_make(read, make_file, two_laps, dtype):
-    rows = np.abs(two_laps).astype(dtype)
+def test_a_matrix_is_scored_as_the_file_it_would_make(read, make_file, two_laps):
+    rows = np.abs(two_laps).astype(np.uint8)
     found = read("mine.npy", rows)
     assert (found.sequence, found.distance, found.pose_source) == ("town", "l2", "laps.csv (csv)")
     assert found.config == {"method": "mine"} and found.ids[:2] == ("000000", "000001")
@@ -71,10 +70,8 @@ def test_poses_of_other_times_are_interpolated_at_those_of_an_own_file(tmp_path,
         read_input(tmp_path / "own.npz", late, sequence="x")
 
 
-@pytest.mark.parametrize("timed", [True, False])
-def test_poses_of_all_scans_serve_a_file_from_which_some_were_left_out(tmp_path, make_file, two_laps, poses, timed):
-    times = poses.times if timed else None
-    whole = dataclasses.replace(make_file(two_laps, two_laps, times=times), positions=None)
+def test_poses_of_all_scans_serve_a_file_from_which_some_were_left_out(tmp_path, make_file, two_laps, poses):
+    whole = dataclasses.replace(make_file(two_laps, two_laps), positions=None)
     kept = ~np.isin(np.arange(800), (3, 700))
     whole.only(kept).save(tmp_path / "own.npz")
     found = read_input(tmp_path / "own.npz", poses, sequence="x")
@@ -95,15 +92,10 @@ def test_methods_beside_an_own_file_take_its_positions_and_times(tmp_path, make_
         check_agreement(found["own"], found[name])
         np.testing.assert_array_equal(found[name].times, found["own"].times)
         assert found[name].pose_source == "made up"
-    np.save(tmp_path / "mine.npy", two_laps[:700])
-    with pytest.raises(
-        ValueError, match=r"mine\.npy: expected 800 descriptors, one for each pose of made up.*, found 700"
-    ):
-        read_methods([tmp_path / name for name in ("own.npz", "mine.npy")])
 
 
-@pytest.mark.parametrize("names", [("own.npz", "mine.npy", "pairs.txt"), ("mine.npy", "pairs.txt", "own.npz")])
-def test_methods_on_poses_without_times_share_those_of_an_own_file(tmp_path, make_file, two_laps, poses, names):
+def test_methods_on_poses_without_times_share_those_of_an_own_file(tmp_path, make_file, two_laps, poses):
+    names = ("mine.npy", "pairs.txt", "own.npz")
     make_file(two_laps, two_laps, times=np.arange(800) * 0.1).save(tmp_path / "own.npz")
     np.save(tmp_path / "mine.npy", two_laps)
     (tmp_path / "pairs.txt").write_text("400 0 0.5\n")
@@ -130,25 +122,16 @@ def test_top_k_lists_and_scored_pairs(read):
     assert read("pairs.txt", "9999 0 0.5 1\n", trajectory=None).positions is None
 
 
-NAN = np.ones((800, 4))
-NAN[17, 2] = np.nan
-
-
 @pytest.mark.parametrize(
     ("name", "content", "error"),
     [
         ("few.npy", np.ones((700, 4)), "expected 800 descriptors, one for each pose of laps.csv .csv., found 700"),
-        ("nan.npy", NAN, "expected finite descriptors, found NaN or infinity in 1 rows, first in row 17"),
         ("flat.npy", np.ones(800), r"expected descriptors \(n, d\) as numbers, found float64 \(800,\)"),
         ("pickle.npy", np.full((800, 2), None), "found no valid .npy file .*allow_pickle=False"),
         ("empty.txt", "", "expected lines `i j score .label.` or `query: frame frame ...`, found none"),
         ("pairs.txt", "5 0 .5\n5 800 .5\n", r"line 2: expected frames from 0 to 799 \(laps.csv .csv.\), found 800"),
-        ("pairs.txt", "5 -1 .5\n", "line 1: expected a frame number, found '-1'"),
         ("pairs.txt", "5 0 nan\n", "line 1: expected a finite score, found 'nan'"),
-        ("pairs.txt", "5 0 .5 2\n", "line 1: expected a label 0 or 1, found '2'"),
         ("pairs.txt", "5 0 .5 1\n6 0 .5\n", "line 2: expected 4 numbers `i j score .label.`, found '6 0 .5'"),
-        ("binary.txt", b"\x00\xff\xfe\x93", "line 1: expected 3 or 4 numbers"),
-        ("list.txt", "5: 0\n800: 3\n", "line 2: expected frames from 0 to 799 .*found 800"),
         ("list.txt", "5: 0\n6 3\n", "line 2: expected `query: frame frame ...`, found '6 3'"),
         ("list.txt", "5: 0=.5 3\n", "expected a score for every retrieved frame or for none, found 1 without"),
         ("list.txt", "5: 0\n5: 1\n", "expected every query once"),
@@ -178,33 +161,18 @@ def test_a_distance_is_for_descriptors(read, tmp_path):
 
 def test_protocols_fit_the_input(read):
     matrix, pairs = read("a.npy", np.ones((800, 2))), read("p.txt", "5 0 .5\n")
-    bare, scored = read("b.txt", "5: 0\n"), read("s.txt", "5: 0=.5\n")
+    bare = read("b.txt", "5: 0\n")
     assert chosen_protocols(matrix, ()) == ["top1-f1max", "pairs-f1max", "bevplace-recall-at-1"]
     assert chosen_protocols(matrix, ["all"]) == list(protocols_taking("descriptors"))
-    assert chosen_protocols(scored, ()) == ["top1-f1max", "bevplace-recall-at-1"]
     assert chosen_protocols(bare, ()) == ["bevplace-recall-at-1"]
     assert chosen_protocols(bare, ["all"]) == ["bevplace-recall-at-1", "ssc-recall", "bevplace-v1-recall"]
     assert chosen_protocols(pairs, ()) == chosen_protocols(pairs, ["all"]) == ["listed-pairs-f1max"]
     assert chosen_protocols(matrix, ["ssc-recall", "ssc-recall"]) == ["ssc-recall"]
     with pytest.raises(ValueError, match=r"for a top-k list without scores, which are .*; found top1-f1max"):
         chosen_protocols(bare, ["top1-f1max"])
-    with pytest.raises(ValueError, match=r"for descriptors, which are .*; found listed-pairs-f1max"):
-        chosen_protocols(matrix, ["listed-pairs-f1max"])
     check_names(["all", "ssc-recall", "listed-pairs-f1max"])
     with pytest.raises(ValueError, match="expected a protocol, found 'top1'; did you mean 'top1-f1max'"):
         check_names(["top1"])
-
-
-@pytest.fixture
-def few(make_file):
-    return make_file(np.arange(9.0).reshape(3, 3), np.eye(3), times=np.arange(3.0))
-
-
-def test_the_same_frames_agree_whatever_describes_them(few):
-    check_agreement(few, dataclasses.replace(few, descriptors=np.ones((3, 7), np.float32), weights_hash="other"))
-    check_agreement(few, dataclasses.replace(few, positions=few.positions + 1e-4))
-    check_agreement(few, TopK("town", few.positions, few.times, None, np.arange(1), np.zeros((1, 1), int)))
-    check_agreement(few, ScoredPairs(np.array([[7, 8]]), np.ones(1), np.ones(1, bool)))
 
 
 @pytest.mark.parametrize(
@@ -219,20 +187,8 @@ def test_the_same_frames_agree_whatever_describes_them(few):
         ({"times": np.array([0.0, 1.0, 2.5])}, "times of the first file, 2.0 in row 2, found 2.5"),
     ],
 )
-def test_other_frames_positions_or_times_are_refused(few, change, message):
+def test_other_frames_positions_or_times_are_refused(make_file, change, message):
+    few = make_file(np.arange(9.0).reshape(3, 3), np.eye(3), times=np.arange(3.0))
     other = dataclasses.replace(few, **change)
-    with pytest.raises(ValueError, match=message):
-        check_agreement(few, other)
     with pytest.raises(ValueError, match=f"theirs: .*{message}"):
         evaluate_methods({"ours": few, "theirs": other}, ["top1-f1max"])
-
-
-def test_a_scan_that_one_method_skipped_is_named(make_file, few):
-    fewer = dataclasses.replace(
-        few, ids=few.ids[1:], positions=few.positions[1:], times=few.times[1:], descriptors=few.descriptors[1:]
-    )
-    with pytest.raises(ValueError, match="3 with '000000', found 2 with '000001'"):
-        check_agreement(few, fewer)
-    shorter = TopK("town", few.positions[:2], None, None, np.arange(1), np.zeros((1, 1), int))
-    with pytest.raises(ValueError, match="expected 3 positions, as in the first file, found 2"):
-        check_agreement(few, shorter)

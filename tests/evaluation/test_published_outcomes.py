@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from recordings import kitti_trajectory
 
-from sglpr_jax.evaluation.protocols.pairs import LISTED_PAIRS_F1MAX, frame_pairs, is_revisit, score_listed_pairs
+from sglpr_jax.evaluation.protocols.pairs import LISTED_PAIRS_F1MAX, frame_pairs, is_revisit, pair_distances
 from sglpr_jax.evaluation.protocols.recall import SSC_RECALL
-from sglpr_jax.evaluation.protocols.source import TopK
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
 from sglpr_jax.evaluation.protocols.top1 import CONTOUR_CONTEXT_F1MAX, TOP1_F1MAX
 
 
@@ -88,8 +88,9 @@ def test_rinets_list_scores_descriptors(shared, make_file, neg_100):
     positions, _, _ = kitti_trajectory(shared / "data/kitti_odometry", "07", pose_source="kitti")
     noise = np.random.default_rng(0).normal(scale=10, size=positions.shape)
     file = make_file(positions, positions + noise, sequence="07")
-    by_label = LISTED_PAIRS_F1MAX(score_listed_pairs(file, pairs, positive))
-    by_position = LISTED_PAIRS_F1MAX(score_listed_pairs(file, pairs))
+    scores = -pair_distances(file, pairs.T)
+    by_label = LISTED_PAIRS_F1MAX(ScoredPairs(pairs, scores, positive))
+    by_position = LISTED_PAIRS_F1MAX(ScoredPairs(pairs, scores, positions=file.positions))
     assert by_label.counts == by_position.counts == {"positive pairs": 1833, "negative pairs": 183_300}
     assert by_label.score == by_position.score
     assert 0 < by_label.interval[0] < by_label.score < by_label.interval[1] < 1

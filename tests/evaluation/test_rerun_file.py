@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import of_images
 
 from sglpr_jax.evaluation import rerun_file
 from sglpr_jax.evaluation.rerun_file import write_rerun
-from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transform
 from sglpr_jax.sim.recording import simulate_recording
+from sglpr_jax.sim.sensor import Sensor
+
+SMALL = Sensor(elevations_deg=(2.0, -2.0, -6.0, -12.0), azimuth_steps=90)
 
 
 def entities(path: Path) -> set[str]:
@@ -27,42 +27,33 @@ def entities(path: Path) -> set[str]:
     return {word for line in run.stdout.splitlines() for word in line.replace("`", " ").split() if word.startswith("/")}
 
 
-@pytest.fixture
-def found(tmp_path) -> FoundLoops:
-    rng = np.random.default_rng(0)
-    images = {tmp_path / f"{i:06d}.png": rng.uniform(0, 10, (20, 20)).astype(np.float32) for i in range(8)}
-    odometry = np.stack([transform(float(x), 0.0, 0.0) for x in range(8)])
-    loops = tuple(Loop(q, q - 4, transform(1.0, 2.0, 0.3), np.eye(6), 0.99 + q / 1000) for q in (5, 6))
-    return FoundLoops((Session(of_images(images, times=np.arange(8.0)), 8, odometry),), loops)
-
-
-def test_both_trajectories_and_each_loop_are_there(found, tmp_path):
-    corrected = OptimizedTrajectory(found.odometry @ transform(0.1, 0.0, 0.0), np.ones(2, bool))
-    write_rerun(found, tmp_path / "a.rrd", optimized=corrected)
+def test_both_trajectories_and_each_loop_are_there(found_loops, tmp_path):
+    corrected = OptimizedTrajectory(found_loops.odometry @ transform(0.1, 0.0, 0.0), np.ones(3, bool))
+    write_rerun(found_loops, tmp_path / "a.rrd", optimized=corrected)
     there = entities(tmp_path / "a.rrd")
     expected = {"/map/trajectory/given", "/map/trajectory/corrected", "/map/sensor", "/map/loops/5", "/map/loops/6"}
     assert expected | {"/pair", "/evidence/loop"} <= there
 
 
-def test_without_poses_the_images_remain(found, tmp_path):
-    bare = dataclasses.replace(found.sessions[0], odometry=None)
-    write_rerun(dataclasses.replace(found, sessions=(bare,)), tmp_path / "a.rrd")
+def test_without_poses_the_images_remain(found_loops, tmp_path):
+    bare = dataclasses.replace(found_loops.sessions[0], odometry=None)
+    write_rerun(dataclasses.replace(found_loops, sessions=(bare,)), tmp_path / "a.rrd")
     there = entities(tmp_path / "a.rrd")
     assert "/pair" in there and not any(name.startswith("/map") for name in there)
 
 
 def test_scans_of_keyframes_and_the_evidence(tmp_path):
-    drive = simulate_recording("08", scans=12, seed=3)
+    drive = simulate_recording("08", scans=12, seed=3, sensor=SMALL)
     found = find_loops(drive, load("circular"), odometry=drive.poses.world_from_lidar, registered=False)
     write_rerun(found, tmp_path / "a.rrd")
     scans = {name for name in entities(tmp_path / "a.rrd") if name.startswith("/map/scans/")}
     assert "/map/scans/0" in scans and len(scans) >= 3
 
 
-def test_an_existing_file_is_replaced_whole_or_not_at_all(found, tmp_path, monkeypatch):
+def test_an_existing_file_is_replaced_whole_or_not_at_all(found_loops, tmp_path, monkeypatch):
     path = tmp_path / "a.rrd"
     path.write_text("before")
     monkeypatch.setattr(rerun_file, "_log_loops", lambda *args: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        write_rerun(found, path)
+        write_rerun(found_loops, path)
     assert path.read_text() == "before" and list(tmp_path.glob("*.tmp")) == []

@@ -40,21 +40,6 @@ def test_scores_are_those_of_one_class_at_a_time(truth, prediction, counted):
     assert others[result.majority - 1] == max(others)
 
 
-def test_the_truth_scores_one():
-    truth = np.arange(16, dtype=np.int32).reshape(1, 4, 4) % CLASSES
-    result = score(truth, truth, np.ones_like(truth, bool))
-    assert result.mean_iou == 1
-    assert np.isnan(result.iou[0]) and result.cells == 12
-
-
-def test_a_class_predicted_where_nothing_counts_costs_nothing():
-    truth = np.array([[[1, 2], [0, 1]]], np.int32)
-    prediction = np.array([[[1, 2], [4, 3]]], np.int32)
-    counted = np.array([[[True, True], [True, False]]])
-    result = score(truth, prediction, counted)
-    np.testing.assert_array_equal(result.iou, [np.nan, 1, 1, np.nan, np.nan])
-
-
 @pytest.mark.parametrize("label", [0, 1])
 def test_without_a_cell_to_count_there_is_no_score(label):
     truth = np.full((1, 2, 2), label, np.int32)

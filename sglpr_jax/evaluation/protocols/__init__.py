@@ -1,7 +1,7 @@
 """Protocols: published rules that compute one score from the output of a method on a recording.
 
 The same descriptors score very differently under different protocols. Every result therefore has its rule and counts.
-To add a protocol, add it to the file of its kind (`top1`, `pairs`, `recall`, `sessions`) and to `PROTOCOLS`.
+To add a protocol, add it to the file of its kind (`top1`, `pairs`, `recall`) and to `PROTOCOLS`.
 """
 
 import difflib
@@ -16,8 +16,13 @@ from sglpr_jax.evaluation.protocols.pairs import (
     SGPR_PAIRS_F1MAX,
 )
 from sglpr_jax.evaluation.protocols.protocol import Protocol
-from sglpr_jax.evaluation.protocols.recall import BEVPLACE_RECALL_AT_1, BEVPLACE_V1_RECALL, SSC_RECALL
-from sglpr_jax.evaluation.protocols.sessions import BEVPLACE_NCLT_RECALL, POINTNETVLAD_RECALL
+from sglpr_jax.evaluation.protocols.recall import (
+    BEVPLACE_NCLT_RECALL,
+    BEVPLACE_RECALL_AT_1,
+    BEVPLACE_V1_RECALL,
+    POINTNETVLAD_RECALL,
+    SSC_RECALL,
+)
 from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, Source, kind_of
 from sglpr_jax.evaluation.protocols.top1 import (
     CONTOUR_CONTEXT_F1MAX,

@@ -7,10 +7,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax import metrics
-from sglpr_jax.evaluation.protocols.bootstrap import f1_max_interval
-from sglpr_jax.evaluation.protocols.protocol import Protocol, Result
-from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, check_frames, positions_of
+from sglpr_jax.evaluation.protocols.protocol import Protocol, Result, with_f1_max
+from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.se3 import distances
@@ -61,13 +59,13 @@ class DrawnPairs(Protocol):
     def __call__(self, source: DescriptorFile, *, seed: int = 0) -> Result:
         """Score a descriptor file. `seed` draws the negatives and the resamples."""
         positions, rng = positions_of(source, self.dimensions), np.random.default_rng(seed)
-        positive = frame_pairs(positions, self.positive)
-        if self.negatives_per_positive is not None:
+        positive, drawn = frame_pairs(positions, self.positive), "all negatives"
+        if self.negatives_per_positive is None:
+            negative = frame_pairs(positions, are_apart)
+        else:
             most = self.negatives_per_positive * len(positive)
             negative = drawn_frame_pairs(positions, are_apart, most=most, rng=rng)
             drawn = f"{self.negatives_per_positive} negatives per positive, seed {seed}"
-        else:
-            negative, drawn = frame_pairs(positions, are_apart), "all negatives"
         if self.negatives_share is not None:
             negative = negative[rng.random(len(negative)) < self.negatives_share]
             drawn = f"no gap, {self.negatives_share:.1%} of the negatives, seed {seed}"
@@ -145,14 +143,6 @@ LISTED_PAIRS_F1MAX = ListedPairs(
 )
 
 
-def score_listed_pairs(
-    file: DescriptorFile, pairs: Int[np.ndarray, "p 2"], labels: Bool[np.ndarray, " p"] | None = None
-) -> ScoredPairs:
-    """Score pairs of rows of a descriptor file by the negated distances of their descriptors."""
-    check_frames("pairs of", pairs, 0, len(file))
-    return ScoredPairs(pairs, -pair_distances(file, pairs.T), labels, file.positions, file.pose_source)
-
-
 def frame_pairs(positions: Float[np.ndarray, "n d"], keep: Keep) -> Int[np.ndarray, " pairs"]:
     """Return every ordered pair (i, j) that `keep` selects as i * n + j, in increasing order."""
     return np.concatenate([first + np.flatnonzero(kept) for first, kept in _kept_in_blocks(positions, keep)])
@@ -184,22 +174,16 @@ def _kept_in_blocks(
 
 def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
     """Return the distance between the descriptors of each pair, by the kind of distance that the file states."""
-    if file.distance != "l2":
-        return _distances_by_row(file, pairs)
     apart = np.empty(pairs.shape[1])
-    for start in range(0, pairs.shape[1], PAIR_BLOCK):
-        i, j = pairs[:, start : start + PAIR_BLOCK]
-        apart[start : start + PAIR_BLOCK] = np.linalg.norm(file.descriptors[i] - file.descriptors[j], axis=1)
-    return apart
-
-
-def _distances_by_row(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
-    """Same as `pair_distances` for distances between sets: each first frame is compared with all its partners."""
-    compare, apart = distance_function(file.distance), np.empty(pairs.shape[1])
-    order = np.argsort(pairs[0], kind="stable")
-    starts = np.flatnonzero(np.diff(pairs[0][order], prepend=-1))
-    for of_one in np.split(order, starts[1:]):
-        # Partners are repeated up to a multiple of `PARTNERS`, so that a jitted distance compiles for few shapes.
+    if file.distance == "l2":
+        for start in range(0, pairs.shape[1], PAIR_BLOCK):
+            i, j = pairs[:, start : start + PAIR_BLOCK]
+            apart[start : start + PAIR_BLOCK] = np.linalg.norm(file.descriptors[i] - file.descriptors[j], axis=1)
+        return apart
+    # Other distances are between sets: each first frame is compared with all its partners. These are repeated up to a
+    # multiple of `PARTNERS`, so that a jitted distance compiles for few shapes.
+    compare, order = distance_function(file.distance), np.argsort(pairs[0], kind="stable")
+    for of_one in np.split(order, np.flatnonzero(np.diff(pairs[0][order])) + 1):
         partners = np.resize(pairs[1, of_one], -(-len(of_one) // PARTNERS) * PARTNERS)
         found = compare(file.descriptors[pairs[0, of_one[:1]]], file.descriptors[partners])
         apart[of_one] = found[0, : len(of_one)]
@@ -214,22 +198,11 @@ def _score(
     *,
     seed: int,
 ) -> Result:
-    """Complete `result` with counts and, if a pair is positive, with F1max, its curve and interval.
-
-    The interval resamples the first frames. The pairs of a first frame are drawn or omitted together.
-    """
-    counts = {"positive pairs": int(positive.sum()), "negative pairs": int((~positive).sum())}
-    result = replace(result, counts=counts)
+    """Add counts and, if a pair is positive, F1max. The interval resamples the first frames with all their pairs."""
+    result = replace(result, counts={"positive pairs": int(positive.sum()), "negative pairs": int((~positive).sum())})
     if not positive.any():
         return result
     # Between the scores of two positive pairs only precision falls, so the millions of negative scores are not needed.
-    curve = metrics.classification_curve(scores, positive, thresholds=np.unique(scores[positive]))
-    interval = f1_max_interval(
-        scores,
-        true_if_accepted=positive,
-        false_if_accepted=~positive,
-        missed_if_rejected=positive,
-        query=pairs[0],
-        seed=seed,
-    )
-    return replace(result, score=curve.f1_max, curve=curve, interval=interval)
+    thresholds = np.unique(scores[positive])
+    flags = {"true_if_accepted": positive, "false_if_accepted": ~positive, "missed_if_rejected": positive}
+    return with_f1_max(result, scores, query=pairs[0], seed=seed, thresholds=thresholds, **flags)

@@ -1,20 +1,26 @@
-"""Types of a protocol, a published rule that computes one score from the output of a method, and of its result."""
+"""Types of a protocol and of its result, and F1max with its bootstrap interval."""
 
 import abc
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, Int8, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int64
 
 from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, Source
-from sglpr_jax.metrics import PrecisionRecallCurve
+from sglpr_jax.metrics import PrecisionRecallCurve, decision_curve
 
 RETRIEVAL: tuple[Kind, ...] = ("descriptors", "top-k list", "scored top-k list")
 """Kinds of input that a recall needs."""
 SCORED_RETRIEVAL: tuple[Kind, ...] = ("descriptors", "scored top-k list")
 """Kinds of input with scored answers, which a threshold can accept or reject."""
+RESAMPLES = 500
+"""Number of bootstrap resamples."""
+CONFIDENCE = 0.95
+"""Confidence level of the intervals."""
+THRESHOLDS = 256
+"""Maximum number of thresholds tried in each resample."""
 
 
 class Decision(IntEnum):
@@ -92,3 +98,70 @@ class Protocol(abc.ABC):
         """Return a result of these sources without a score. `rule` has the distances in words."""
         poses = ", ".join(dict.fromkeys(source.pose_source for source in sources if source.pose_source)) or None
         return Result(self.title, rule, self.dimensions, poses, self.published_on)
+
+
+def with_f1_max(
+    result: Result,
+    scores: Float[np.ndarray, " n"],
+    *,
+    query: Int[np.ndarray, " n"],
+    seed: int,
+    thresholds: Float[np.ndarray, " k"] | None = None,
+    **flags: Bool[np.ndarray, " n"],
+) -> Result:
+    """Add F1max, its curve and its interval. Scores, `flags` and `thresholds` are those of `metrics.decision_curve`."""
+    curve = decision_curve(scores, thresholds=thresholds, **flags)
+    interval = percentile_interval(resampled_f1_max(scores, query=query, seed=seed, **flags))
+    return replace(result, score=curve.f1_max, curve=curve, interval=interval)
+
+
+def percentile_interval(scores: Float[np.ndarray, " resamples"]) -> tuple[float, float]:
+    """Return the interval of resampled scores.
+
+    Neighbouring frames of a recording are correlated, so the true uncertainty is larger.
+    """
+    low, high = np.quantile(scores, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def resampled_means(found: Bool[np.ndarray, " q"], rng: np.random.Generator) -> Float[np.ndarray, " resamples"]:
+    """Return the share of found queries in each resample of q >= 1 queries."""
+    # The number of found queries among q draws with replacement is binomial, so single draws are not needed.
+    return rng.binomial(len(found), np.mean(found), RESAMPLES) / len(found)
+
+
+def resampled_f1_max(
+    scores: Float[np.ndarray, " n"],
+    *,
+    true_if_accepted: Bool[np.ndarray, " n"],
+    false_if_accepted: Bool[np.ndarray, " n"],
+    missed_if_rejected: Bool[np.ndarray, " n"],
+    query: Int[np.ndarray, " n"],
+    seed: int,
+) -> Float[np.ndarray, " resamples"]:
+    """Return F1max of each resample. Scores and flags are those of `metrics.decision_curve`.
+
+    The items of a query are drawn or omitted together. With the same seed, methods that answer the same queries get the
+    same resamples. Each resample has its own best threshold. Candidates are at most 256 scores of items that are right
+    or could be missed, because accepting other items cannot increase F1.
+    """
+    if not np.any(true_if_accepted & np.isfinite(scores)):
+        return np.zeros(RESAMPLES)
+    edges = np.unique(scores[(true_if_accepted | missed_if_rejected) & np.isfinite(scores)])
+    edges = edges[np.unique(np.linspace(0, len(edges) - 1, THRESHOLDS).round().astype(np.int64))]
+    bins = np.searchsorted(edges, scores, side="right")  # an item is accepted at the thresholds edges[:bins]
+    queries, row = np.unique(query, return_inverse=True)
+    n, shape = len(queries), (len(queries), len(edges) + 1)
+
+    def accepted(flags: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "queries edges"]:
+        cells = np.bincount(row[flags] * shape[1] + bins[flags], minlength=shape[0] * shape[1]).reshape(shape)
+        return np.cumsum(cells[:, ::-1], axis=1)[:, ::-1].astype(np.float32)
+
+    right, wrong, caught = accepted(true_if_accepted), accepted(false_if_accepted), accepted(missed_if_rejected)
+    twice_right = 2 * right[:, 1:]
+    # F1 = 2 TP / (2 TP + FP + FN). Each count is a sum over queries, weighted by the number of times a query is drawn.
+    draws = np.random.default_rng(seed).integers(n, size=(RESAMPLES, n)) + n * np.arange(RESAMPLES)[:, None]
+    drawn = np.bincount(draws.ravel(), minlength=RESAMPLES * n).reshape(RESAMPLES, n).astype(np.float32)
+    whole = drawn @ (twice_right + wrong[:, 1:] + caught[:, :1] - caught[:, 1:])
+    f1 = np.divide(drawn @ twice_right, whole, out=np.zeros_like(whole), where=whole > 0)
+    return f1.max(axis=1).astype(np.float64)

@@ -1,15 +1,33 @@
-"""Protocols of recall on one recording: the share of queries with a right answer among their first N answers."""
+"""Protocols of recall: the share of queries with a right answer among their first N answers."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from sglpr_jax.evaluation.protocols.bootstrap import interval, resampled_means
-from sglpr_jax.evaluation.protocols.protocol import RETRIEVAL, Decision, Protocol, Result
-from sglpr_jax.evaluation.protocols.source import Kind, Source, TopK, first_hits, nearest_frames, positions_of
-from sglpr_jax.revisits import has_near
+from sglpr_jax.evaluation.protocols.protocol import (
+    RETRIEVAL,
+    Decision,
+    Protocol,
+    Result,
+    percentile_interval,
+    resampled_means,
+)
+from sglpr_jax.evaluation.protocols.source import (
+    Kind,
+    Source,
+    TopK,
+    first_true,
+    nearest_descriptors,
+    nearest_frames,
+    positions_of,
+    recall_at,
+)
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
+from sglpr_jax.revisits import Near, has_near
 
 FRAMES = {"00": 4541, "02": 4661, "05": 2761, "06": 1101, "08": 4071}
 """Number of frames of each KITTI sequence. The published splits apply only to recordings of this length."""
@@ -23,8 +41,6 @@ SPLITS = {
 """BEVPlace++: end of the database, start of the queries and end of the queries, by sequence."""
 V1_SPLITS = {"00": SPLITS["00"], "02": SPLITS["02"], "05": (1000, 1200, 2751), "06": SPLITS["06"]}
 """BEVPlace: the same without 08 and with ten queries fewer in 05."""
-POSITIVE_M = 5.0
-"""Distance up to which two frames show the same place, in metres."""
 DATABASE_SHARE = 0.6
 """Fraction of the frames that is the database, for recordings without a published split."""
 SEAM_M = 20.0
@@ -33,163 +49,217 @@ SEAM_M = 20.0
 Closer frames are neighbours, not revisits. The published splits skip 200 frames, which are too many for a short
 recording.
 """
+GAP = 50
+"""The database of frame i is frames 0 to i - 51 in SSC's recall."""
+
+
+class Split(NamedTuple):
+    """Queries of a recording, and their databases."""
+
+    queries: Int[np.ndarray, " q"]
+    ends: Int[np.ndarray, " q"]
+    """Number of first frames that are the database of each query."""
+    words: str
+    every_counts: bool = False
+    """Whether queries without a revisit count, as missed."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplitRecall(Protocol):
-    """Recall@N of BEVPlace: the first part of a recording is the database, a later part the queries.
+class Recall(Protocol):
+    """Recall@N on one recording. The score and its interval, which resamples queries, are of the first N.
 
-    A query counts if the database has a frame less than 5 m away. It is found if such a frame is among the first N
-    answers. The published split is used if name and number of frames are those of a KITTI sequence with a published
-    split. For other recordings the database is the first 60 % of the frames, and the queries begin at the first frame
-    20 m from the last frame of the database. The interval of the first recall resamples the queries that count.
+    A query counts if its database has a near frame. It is found if such a frame is among the first N answers.
     """
 
-    published_on: str = "the poses of BEVPlace's images"
     takes: tuple[Kind, ...] = RETRIEVAL
-    paper: str
-    """Name of the method that published the splits."""
-    splits: Mapping[str, tuple[int, int, int]]
-    """End of the database, start of the queries and end of the queries, by sequence."""
-    numbers: tuple[int, ...]
+    near: Near = lambda apart: apart < 5
+    split: Callable[[Source, Float[np.ndarray, "n _"]], Split]
+    """Returns the queries, given a source and its positions in metres."""
+    numbers: tuple[int, ...] = (1,)
     """The numbers N, increasing."""
 
     def __call__(self, source: Source, *, seed: int = 0) -> Result:
         """Score descriptors or a top-k list. Raises ValueError if positions are missing."""
         positions = positions_of(source, self.dimensions)
-        end, first, last, split = self._split(source, positions)
-        queries, ends = np.arange(first, last), np.full(last - first, end)
-        revisited = has_near(positions[queries], positions, ends, closer_than_5_m)
-        ranks = np.full(len(queries), self.numbers[-1])
-        if revisited.any():
-            nearest, _ = nearest_frames(source, queries, ends, k=self.numbers[-1])
-            ranks = first_hits(positions[queries], positions, nearest, closer_than_5_m)
-        result = self.result(f"{POSITIVE_M:g} m, {split}", source)
-        result = score_recall(result, ranks, revisited, numbers=self.numbers, seed=seed)
-        return replace(result, decisions=_decisions(len(source), queries, ranks, revisited))
-
-    def _split(self, source: Source, positions: Float[np.ndarray, "n _"]) -> tuple[int, int, int, str]:
-        """Return the end of the database, the start and the end of the queries, and the split in words."""
-        n = len(source)
-        if source.sequence in self.splits and FRAMES[source.sequence] == n:
-            end, first, last = self.splits[source.sequence]
-            return end, first, last, f"{self.paper} split: database 0 to {end - 1}, queries {first} to {last - 1}"
-        end = max(int(DATABASE_SHARE * n), 1)
-        apart = np.linalg.norm(positions[end:] - positions[end - 1], axis=1)
-        first = end + int(next(iter(np.flatnonzero(apart >= SEAM_M)), n - end))
-        database = f"database is the first {DATABASE_SHARE:.0%} of the frames"
-        return end, first, n, f"no published split: {database}, queries begin {SEAM_M:g} m from its end"
+        queries, ends, words, every_counts = self.split(source, positions)
+        revisited = has_near(positions[queries], positions, ends, self.near)
+        nearest, _ = nearest_frames(source, queries, ends, k=self.numbers[-1])
+        ranks = first_true(_are_near(positions[queries], positions, nearest, self.near))
+        counted = np.ones_like(revisited) if every_counts else revisited
+        decisions = np.full(len(source), Decision.NOT_A_QUERY, dtype=np.int8)
+        first = np.where(ranks == 0, Decision.TRUE_POSITIVE, Decision.FALSE_NEGATIVE)
+        decisions[queries] = np.where(counted, first, Decision.UNCOUNTED)
+        counts = {"queries": len(queries), "revisits": int(revisited.sum())}
+        result = replace(self.result(f"5 m, {words}", source), counts=counts, decisions=decisions)
+        if not counted.any():
+            return result
+        recalls, found = recall_at(ranks[counted], self.numbers), ranks[counted] < self.numbers[0]
+        interval = percentile_interval(resampled_means(found, np.random.default_rng(seed)))
+        return replace(result, score=recalls[self.numbers[0]], recalls=recalls, interval=interval)
 
 
-BEVPLACE_RECALL_AT_1 = SplitRecall(
+def published_split(paper: str, splits: Mapping[str, tuple[int, int, int]]) -> Callable[..., Split]:
+    """Return the split of BEVPlace: the first part of a recording is the database, a later part has the queries.
+
+    The published split is used if name and number of frames are those of a KITTI sequence with a published split. For
+    other recordings the database is the first 60 % of the frames, and the queries begin at the first frame 20 m from
+    the last frame of the database.
+
+    Arguments:
+      paper: Name of the method that published the splits.
+      splits: End of the database, start of the queries and end of the queries, by sequence.
+    """
+
+    def split(source: Source, positions: Float[np.ndarray, "n _"]) -> Split:
+        n, words = len(source), f"{paper} split: database 0 to {{}}, queries {{}} to {{}}"
+        if source.sequence in splits and FRAMES[source.sequence] == n:
+            end, first, last = splits[source.sequence]
+            words = words.format(end - 1, first, last - 1)
+        else:
+            end, last = max(int(DATABASE_SHARE * n), 1), n
+            apart = np.linalg.norm(positions[end:] - positions[end - 1], axis=1)
+            first = end + int(next(iter(np.flatnonzero(apart >= SEAM_M)), n - end))
+            database = f"database is the first {DATABASE_SHARE:.0%} of the frames"
+            words = f"no published split: {database}, queries begin {SEAM_M:g} m from its end"
+        return Split(np.arange(first, last), np.full(last - first, end), words)
+
+    return split
+
+
+BEVPLACE_RECALL_AT_1 = Recall(
     name="bevplace-recall-at-1",
     title="Recall@1",
     rule="Recall@1 of a later part of the recording in its first part: less than 5 m in 3-D",
     source="BEVPlace++, kitti_dataset.py",
+    published_on="the poses of BEVPlace's images",
     dimensions=3,
-    paper="BEVPlace++",
-    splits=SPLITS,
-    numbers=(1,),
+    split=published_split("BEVPlace++", SPLITS),
     headline=True,
 )
 """The published code (zjuluolun/BEVPlace2) uses every fifth frame of sequence 08; here all frames are used."""
-BEVPLACE_V1_RECALL = SplitRecall(
+BEVPLACE_V1_RECALL = Recall(
     name="bevplace-v1-recall",
     title="BEVPlace v1 Recall@1",
     rule="Recall@1, 5, 10 and 20 of a later part of the recording in its first part: less than 5 m in x and y",
     source="BEVPlace",
+    published_on="the poses of BEVPlace's images",
     dimensions=2,
-    paper="BEVPlace",
-    splits=V1_SPLITS,
+    split=published_split("BEVPlace", V1_SPLITS),
     numbers=(1, 5, 10, 20),
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SscRecall(Protocol):
-    """Recall@1 to 25 of SSC and RINet: 5 m in x and y, a gap of 50 frames.
+def _up_to_5_m(apart: Float[np.ndarray, "..."]) -> np.ndarray:
+    return apart <= 5
 
-    The database of frame i is frames 0 to i - 51. A frame is a query if its database has a frame at most 5 m away. It
-    is found at N if such a frame is among the first N answers. Every row of a top-k list is a query and counts. With
-    this rule SSC's own lists give the published numbers, although one or two rows of some sequences have no revisit on
-    these poses. The interval of Recall@1 resamples queries.
+
+def _ssc_split(source: Source, positions: Float[np.ndarray, "n _"]) -> Split:
+    """Return the frames with a revisit, or every row of a top-k list.
+
+    With this rule SSC's own lists give the published numbers, although one or two rows of some sequences have no
+    revisit on these poses.
     """
-
-    gap: int = 50
-    numbers: tuple[int, ...] = tuple(range(1, 26))
-
-    def __call__(self, source: Source, *, seed: int = 0) -> Result:
-        """Score descriptors or a top-k list. Raises ValueError if positions are missing."""
-        positions, n = positions_of(source, self.dimensions), len(source)
-        ends = np.maximum(np.arange(n) - self.gap, 0)
-        frames = np.flatnonzero(ends)
-        revisited = np.zeros(n, dtype=bool)
-        revisited[frames] = has_near(positions[frames], positions, ends[frames], up_to_5_m)
-        queries = source.queries if isinstance(source, TopK) else np.flatnonzero(revisited)
-        ranks = np.zeros(0, dtype=np.int64)
-        if len(queries):
-            nearest, _ = nearest_frames(source, queries, ends[queries], k=self.numbers[-1])
-            ranks = first_hits(positions[queries], positions, nearest, up_to_5_m)
-        every_row = ", every row" if isinstance(source, TopK) else ""
-        result = self.result(f"{POSITIVE_M:g} m, gap {self.gap} frames{every_row}", source)
-        every = np.ones(len(queries), dtype=bool)  # all queries count, even without a revisit
-        scored = score_recall(result, ranks, every, numbers=self.numbers, seed=seed)
-        counts = {"queries": len(queries), "revisits": int(revisited[queries].sum())}
-        return replace(scored, counts=counts, decisions=_decisions(n, queries, ranks, every))
+    ends = np.maximum(np.arange(len(source)) - GAP, 0)
+    if isinstance(source, TopK):
+        return Split(source.queries, ends[source.queries], f"gap {GAP} frames, every row", True)
+    frames = np.flatnonzero(ends)
+    queries = frames[has_near(positions[frames], positions, ends[frames], _up_to_5_m)]
+    return Split(queries, ends[queries], f"gap {GAP} frames", True)
 
 
-SSC_RECALL = SscRecall(
+SSC_RECALL = Recall(
     name="ssc-recall",
     title="SSC Recall@1",
     rule="Recall@1 to 25: a frame more than 50 older, no farther than 5 m in x and y",
     source="SSC, script/recall.py; RINet",
     published_on="SemanticKITTI's poses",
     dimensions=2,
-    takes=RETRIEVAL,
+    near=_up_to_5_m,
+    split=_ssc_split,
+    numbers=tuple(range(1, 26)),
 )
 
 
-def closer_than_5_m(apart: Float[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
-    """Return whether frames at these distances, in metres, show the same place according to BEVPlace."""
-    return apart < POSITIVE_M
+@dataclass(frozen=True, kw_only=True)
+class SessionRecall(Protocol):
+    """Recall of sessions in each other: all frames of one are the database, all frames of another are the queries.
 
-
-def up_to_5_m(apart: Float[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
-    """Return whether frames at these distances, in metres, show the same place according to SSC."""
-    return apart <= POSITIVE_M
-
-
-def recall_at(ranks: Int[np.ndarray, " q"], numbers: Sequence[int]) -> dict[int, float]:
-    """Return Recall@N for each N, given the rank (from 0) of the first right answer of each query."""
-    return {n: float(np.mean(ranks < n)) for n in numbers}
-
-
-def score_recall(
-    result: Result,
-    ranks: Int[np.ndarray, " q"],
-    revisited: Bool[np.ndarray, " q"],
-    *,
-    numbers: Sequence[int] = (1,),
-    seed: int,
-) -> Result:
-    """Complete `result` with counts and, if there is a revisit, with recalls. The score is the first recall.
-
-    Only queries that are `revisited` count.
+    Queries count as in `Recall`. With `every_pair`, score and recalls are means over every ordered pair of sessions
+    that has a query that counts. Otherwise the first of two sessions is the database. The interval resamples the
+    queries that count, in each pair.
     """
-    result = replace(result, counts={"queries": len(ranks), "revisits": int(revisited.sum())})
-    if not revisited.any():
-        return result
-    found = ranks[revisited] < numbers[0]
-    recalls = recall_at(ranks[revisited], numbers)
-    bounds = interval(resampled_means(found, np.random.default_rng(seed)))
-    return replace(result, score=recalls[numbers[0]], recalls=recalls, interval=bounds)
+
+    takes: tuple[Kind, ...] = ("sessions",)
+    dimensions: Literal[2, 3] = 2
+    metres: float
+    near: Near
+    neighbours: int = 1
+    """Number of retrieved frames."""
+    every_pair: bool = False
+    """Whether every ordered pair is scored, by Recall@1 %: the first max(round(n / 100), 1) answers, at most
+    `neighbours`, for a database of n frames. Otherwise one pair is scored by Recall@1."""
+
+    def __call__(self, *sessions: DescriptorFile, seed: int = 0) -> Result:
+        """Score two or more sessions. Raises ValueError for fewer, or for descriptors of different methods."""
+        if len(sessions) < 2:
+            raise ValueError(f"expected at least two sessions, found {len(sessions)}")
+        rng = np.random.default_rng(seed)
+        queries, revisits, recalls, found = 0, 0, [], []
+        for database, other in itertools.permutations(sessions, 2) if self.every_pair else [sessions]:
+            check_same_method(database, other)
+            there, here = positions_of(database, 2), positions_of(other, 2)
+            ends = np.full(len(here), len(there))
+            nearest, _ = nearest_descriptors(
+                other.descriptors, database.descriptors, ends, k=self.neighbours, distance=database.distance
+            )
+            revisited = has_near(here, there, ends, self.near)
+            ranks = first_true(_are_near(here, there, nearest, self.near))[revisited]
+            queries, revisits = queries + len(here), revisits + len(ranks)
+            if len(ranks):
+                recalls.append(recall_at(ranks, range(1, self.neighbours + 1)))
+                found.append(ranks < min(max(round(len(there) / 100), 1), self.neighbours))
+        pairs = f"every ordered pair of {len(sessions)} sessions"
+        if not self.every_pair:
+            pairs = f"database {sessions[0].sequence}, queries {sessions[1].sequence}"
+        counts = {"session pairs": len(found)} if self.every_pair else {}
+        counts |= {"queries": queries, "revisits": revisits}
+        result = replace(self.result(f"{self.metres:g} m, {pairs}", *sessions), counts=counts)
+        if not found:
+            return result
+        return replace(
+            result,
+            score=float(np.mean([np.mean(pair) for pair in found])),
+            recalls={n: float(np.mean([recall[n] for recall in recalls])) for n in recalls[0]},
+            interval=percentile_interval(np.mean([resampled_means(pair, rng) for pair in found], axis=0)),
+        )
 
 
-def _decisions(
-    n: int, queries: Int[np.ndarray, " q"], ranks: Int[np.ndarray, " q"], revisited: Bool[np.ndarray, " q"]
+BEVPLACE_NCLT_RECALL = SessionRecall(
+    name="bevplace-nclt-recall",
+    title="NCLT Recall@1",
+    rule="Recall@1 of one session in another: less than 5 m in x and y",
+    source="BEVPlace++, nclt_dataset.py",
+    published_on="NCLT's ground truth",
+    metres=5.0,
+    near=lambda apart: apart < 5,
+)
+"""Published with 2012-01-15 as the database and 2012-02-04, 03-17, 06-15, 09-28, 11-16 and 2013-02-23 as queries. The
+frames used there are not published."""
+POINTNETVLAD_RECALL = SessionRecall(
+    name="pointnetvlad-recall",
+    title="PointNetVLAD Recall@1 %",
+    rule="Recall@1 % over every ordered pair of sessions: no farther than 25 m in x and y",
+    source="PointNetVLAD, evaluate.py; MinkLoc3D",
+    published_on="Oxford RobotCar's positions",
+    metres=25.0,
+    near=lambda apart: apart <= 25,
+    neighbours=25,
+    every_pair=True,
+)
+
+
+def _are_near(
+    queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], nearest: Int[np.ndarray, "q k"], near: Near
 ) -> np.ndarray:
-    """Return the `Decision` of each frame by its first answer, (n,) int8. Queries without a revisit are not counted."""
-    decisions = np.full(n, Decision.NOT_A_QUERY, dtype=np.int8)
-    found = np.where(ranks == 0, Decision.TRUE_POSITIVE, Decision.FALSE_NEGATIVE)
-    decisions[queries] = np.where(revisited, found, Decision.UNCOUNTED)
-    return decisions
+    """Return whether each retrieved frame is near its query. False for padding."""
+    return near(np.linalg.norm(queries[:, None] - database[nearest], axis=2)) & (nearest >= 0)

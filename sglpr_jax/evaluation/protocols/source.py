@@ -1,6 +1,6 @@
 """Inputs of protocols (descriptors, retrieved frames or scored pairs), and the nearest frames of their queries."""
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function, smallest
-from sglpr_jax.revisits import Near
 
 BLOCK = 512
 """Number of queries compared with the whole database at a time."""
@@ -166,11 +165,16 @@ def nearest_descriptors(
 
     `distance` is a name in `distances.DISTANCES`. Rows with fewer than k descriptors are padded with -1.
     """
-    compare = _ranking(database, distance)
     nearest, best = np.full((len(queries), k), -1, dtype=np.int64), np.zeros(len(queries))
+    exact = database.astype(np.float64)
+    norms, compare = np.sum(exact**2, axis=1), distance_function(distance)
     for start in range(0, len(queries), BLOCK):
         rows = slice(start, start + BLOCK)
-        ranking = compare(queries[rows])
+        if distance == "l2":
+            # |q - d|^2 without |q|^2, which is constant in a row. In float64: the terms cancel far from zero.
+            ranking = norms[None, :] - 2 * queries[rows].astype(np.float64) @ exact.T
+        else:
+            ranking = compare(queries[rows], database)
         ranking[np.arange(len(database)) >= ends[rows, None]] = np.inf
         nearest[rows, : min(k, len(database))] = smallest(ranking, min(k, len(database)))
         best[rows] = np.take_along_axis(ranking, nearest[rows, :1], axis=1)[:, 0]
@@ -179,25 +183,11 @@ def nearest_descriptors(
     return np.where(nearest < ends[:, None], nearest, -1), best
 
 
-def _ranking(database: Float[np.ndarray, "n d"], distance: str) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of queries whose values order the database as the named distance does."""
-    if distance != "l2":
-        compare = distance_function(distance)
-        return lambda queries: compare(queries, database)
-    # |q - d|^2 without |q|^2, which is constant in a row. In float64, because the terms cancel far from zero.
-    exact = database.astype(np.float64)
-    norms = np.sum(exact**2, axis=1)
-    return lambda queries: norms[None, :] - 2 * queries.astype(np.float64) @ exact.T
-
-
-def first_hits(
-    queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], nearest: Int[np.ndarray, "q k"], near: Near
-) -> Int[np.ndarray, " q"]:
-    """Return for each query the rank, from 0, of the first retrieved frame that is near the query, or k if none is."""
-    apart = np.linalg.norm(queries[:, None] - database[nearest], axis=2)
-    return first_true(near(apart) & (nearest >= 0))
-
-
 def first_true(flags: Bool[np.ndarray, "q k"]) -> Int[np.ndarray, " q"]:
     """Return the first true column of each row, or k if no column is true."""
     return np.where(flags.any(axis=1), np.argmax(flags, axis=1), flags.shape[1])
+
+
+def recall_at(ranks: Int[np.ndarray, " q"], numbers: Iterable[int]) -> dict[int, float]:
+    """Return Recall@N for each N, given the rank (from 0) of the first right answer of each query."""
+    return {n: float(np.mean(ranks < n)) for n in numbers}
