@@ -62,6 +62,9 @@ PROGRAMS = {
     "fleet loops": Program("fleet.ray", "loops", "recipe for Ray: loops between recordings that may overlap"),
     "fleet places": Program("fleet.index", "places", "places for a large index"),
     "fleet index": Program("fleet.index", "index", "time, bytes and recall of a large index"),
+    "robustness kills": Program("robustness.disturbed", "kills", "commands that are killed again and again"),
+    "robustness together": Program("robustness.disturbed", "together", "commands started twice at once on one folder"),
+    "robustness disk": Program("robustness.disturbed", "disk", "full disk, read-only folder, missing files"),
     "robustness mutations": Program("robustness.mutations", "mutations", "wrong lines, and whether tests notice them"),
     "robustness platforms": Program("robustness.platforms", "platforms", "wheels of every dependency, by platform"),
 }
