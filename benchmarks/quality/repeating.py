@@ -239,7 +239,8 @@ def _counts(path: Path, drive: RenderedDrive, params: Params, odometry: Odometry
         pose = None if given is None else given[i]
         detector.add_seen(seen, time=float(drive.times[i]), odometry=pose, compared=frame)
     drift = detector.finder.present_drift
-    loops = detector.loops if given is None else accepted(detector.loops, given, drift=drift)[0]
+    path = detector.finder.motion.path
+    loops = detector.loops if given is None else accepted(detector.loops, path, drift=drift)[0]
     fits = np.array([one.match_from_query for one in loops])
     errors = pose_errors([(one.query, one.match) for one in loops], fits, drive.world_from_lidar)
     right = {loop.query for loop, ok in zip(loops, errors.right, strict=True) if ok}

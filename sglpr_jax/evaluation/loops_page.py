@@ -5,20 +5,21 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.levelling import mountings_of, upright_from_lidar, upright_odometry
+from sglpr_jax.data.levelling import uprights
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures, loop_figures
 from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, missing, render
 from sglpr_jax.evaluation.report import TextTable
 from sglpr_jax.loops.calibration import reliability_of
-from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
+from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, to_upright
 from sglpr_jax.loops.frame_alignment import AlignedParts, Part
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import FoundLoops, why_none
+from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.pose_graph.folder import unique_names
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements, trajectory_error
 from sglpr_jax.same_place import NEGATIVE_M
-from sglpr_jax.se3 import inverse, yaw_of
+from sglpr_jax.se3 import yaw_of
 
 PAGE = "index.html"
 SHOWN_PAIRS = 9
@@ -79,7 +80,7 @@ def _trajectory(found: FoundLoops) -> list[Picture | Text]:
         return [missing("No scan was processed.")]
     positions = found.recording.positions
     if found.odometry is not None:
-        positions = upright_odometry(found.odometry, mountings_of(found.recording))[:, :3, 3]
+        positions = level_odometry(found.odometry, uprights(found.recording))[:, :3, 3]
     drawn, wrong = [], _frames(wrong_loops(found))
     if positions is not None:
         what = "from the odometry" if found.odometry is not None else f"from {found.recording.pose_source}"
@@ -130,7 +131,8 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> Section:
         about += f" Position error (RMSE after alignment with {found.recording.pose_source}): {', '.join(errors)}."
     if not figures.can_draw():
         return Section("Corrected", [missing(about)])
-    level = {name: upright_odometry(poses, mountings_of(found.recording))[:, :3, 3] for name, poses in both.items()}
+    upright = uprights(found.recording)[: found.frames]
+    level = {name: level_odometry(poses, upright)[:, :3, 3] for name, poses in both.items()}
     drawn = figure_picture(loop_figures.trajectories(level), "The trajectory before and after", caption=about)
     return Section("Corrected", [drawn])
 
@@ -180,9 +182,8 @@ def overlay_of(query: Recording, match: Recording, loop: Loop) -> Float[np.ndarr
         square_image(query.record(loop.query, labels=False)),
         square_image(match.record(loop.match, labels=False)),
     )
-    to_upright = upright_from_lidar(match.mounting_of(loop.match))
-    from_upright = inverse(upright_from_lidar(query.mounting_of(loop.query)))
-    return loop_figures.overlaid(*images, to_upright @ loop.match_from_query @ from_upright)
+    level = to_upright(loop, query=query.mounting_of(loop.query), match=match.mounting_of(loop.match))
+    return loop_figures.overlaid(*images, level.match_from_query)
 
 
 def _reasons(rejected: Sequence[Rejected]) -> list[Text | TextTable]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.bev import even_cells, rotate_image
-from sglpr_jax.data.levelling import mountings_of, upright_odometry
+from sglpr_jax.data.levelling import uprights
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
@@ -21,6 +21,7 @@ from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, reca
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.same_place import NEGATIVE_M
@@ -171,14 +172,13 @@ class _Drive:
         self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], config: CandidateConfig
     ):
         self.finder, self.recording = CandidateFinder(params, config=config), recording
-        self.motion = Motion.of(upright_odometry(odometry, mountings_of(recording)))
+        self.motion = Motion.of(level_odometry(odometry, uprights(recording)))
         self.motion.add(0.0, continues=False)
         self.stored = StoredScans(self.finder.index, verification=VerificationConfig())
         for row, seen in scan_stream(recording, lambda row, record: self.finder.seen(record)):
             assert seen is not None  # the stream raises the error of a bad scan
             self.stored.add(row, seen.descriptor, np.asarray(within_reach(seen.image)))
-        nothing = np.zeros((0, 2), np.int64)
-        self.comparer = Comparer(self.motion, DriftModel(), np.eye(3), config, VerificationConfig(), nothing)
+        self.comparer = Comparer(self.motion, DriftModel(), config)
 
     def pair(self, frame: int, angle: float, *, positive: bool) -> Candidate | None:
         """Pair of a frame that is rotated by `angle` (radians) and a near or far one, or None."""

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from sglpr_jax.data.levelling import Mountings, upright_from_lidar
+from sglpr_jax.data.levelling import is_tilted, upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record
 from sglpr_jax.growing import GrowingArray
@@ -81,11 +81,12 @@ class CandidateFinder:
         """Comparisons of the last frame."""
         self.has_odometry = False
         """Whether the frames have poses from odometry. If so, `motion` holds them."""
-        self.mountings = Mountings()
+        self.mountings: list[Mounting | None] = []
         """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
         self.motion = Motion(config.motion)
-        self._joined = GrowingArray(np.empty((0, 2), np.int64))
+        self.joined = GrowingArray(np.empty((0, 2), np.int64))
+        """Frames of the query and the match of each accepted loop."""
         self.background = Background(frames=config.background_frames, least=config.min_background_frames)
         self.missing: list[int] = []
         """Frames whose scans cannot be read."""
@@ -112,10 +113,6 @@ class CandidateFinder:
         return self._times.rows if len(self._times) else None
 
     @property
-    def _last_mounting(self) -> Mounting | None:
-        return self.mountings[len(self) - 1] if len(self) else None
-
-    @property
     def empty(self) -> Bool[np.ndarray, " n"]:
         """Whether each frame is almost empty (`is_empty`)."""
         return self._empty.rows
@@ -123,8 +120,7 @@ class CandidateFinder:
     @property
     def nbytes(self) -> int:
         """Number of bytes of all frames: descriptors, compressed images, poses and times."""
-        arrays = self.stored, self.motion, self._times, self._empty, self.mountings
-        return sum(one.nbytes for one in arrays)
+        return sum(one.nbytes for one in (self.stored, self.motion, self._times, self._empty))
 
     def add(
         self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
@@ -163,10 +159,11 @@ class CandidateFinder:
         frame = len(self)
         if seen is None:
             self.missing.append(frame)
-            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self._last_mounting)
-        pose = None if odometry is None else np.asarray(odometry, np.float64)
+            mounting = self.mountings[-1] if self.mountings else None
+            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), mounting)
+        to_upright = upright_from_lidar(seen.mounting)
+        pose = None if odometry is None else np.asarray(odometry, np.float64) @ inverse(to_upright)
         clock = float(frame) if time is None else time
-        upright = None if pose is None else pose @ inverse(upright_from_lidar(seen.mounting))
         middle = np.asarray(within_reach(seen.image, self.verification)) if seen.image.size else seen.image
         empty = self.is_empty(seen.image)
         if not empty:
@@ -178,12 +175,13 @@ class CandidateFinder:
         link = None if compared is None else compared.link
         if not continues:
             self.odometry_check.restart()
-        if upright is not None:
-            link = self._check_odometry(query, upright, link, known=compared is not None)
+        if pose is not None:
+            link = self._check_odometry(query, pose, link, known=compared is not None)
         elif compared is None and continues:
             link = self._link(query, clock)
-        self.motion.add(clock, pose=upright, link=link, continues=continues)
+        self.motion.add(clock, pose=pose, link=link, continues=continues)
         self.mountings.append(seen.mounting)
+        self.motion.path.tilted |= is_tilted(to_upright)
         comparer = self.comparer
         if compared is None:
             compared = Compared(NO_FITS if query is None else comparer.compare(query, self.stored), link)
@@ -204,13 +202,7 @@ class CandidateFinder:
     @property
     def comparer(self) -> Comparer:
         """Comparison with the stored scans, after the motion so far."""
-        level = self.motion.path.level(self.mountings)
-        return Comparer(self.motion, self.present_drift, level, self.config, self.verification, self.joined)
-
-    @property
-    def joined(self) -> Int[np.ndarray, "l 2"]:
-        """Frames of the query and the match of each accepted loop."""
-        return self._joined.rows
+        return Comparer(self.motion, self.present_drift, self.config, self.verification, self.joined.rows)
 
     @property
     def present_drift(self) -> DriftModel:
@@ -224,7 +216,7 @@ class CandidateFinder:
 
     def close_loop(self, query: int, match: int) -> None:
         """Note an accepted loop between two frames."""
-        self._joined.append((query, match))
+        self.joined.append((query, match))
         self.stored.close_loop(query, match)
 
     def seen(self, record: Record) -> Seen:

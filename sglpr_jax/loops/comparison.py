@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int, UInt
 
 from sglpr_jax.loops.closure import Planar, compose, inverted
 from sglpr_jax.loops.config import CandidateConfig
-from sglpr_jax.loops.drift import floor_deviations, planar_deviations, planar_spread
+from sglpr_jax.loops.drift import planar_deviations, planar_spread
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
@@ -101,11 +101,9 @@ class Comparer:
     """Motion of all frames. It may grow."""
     drift: DriftModel
     """Drift of this motion."""
-    level: Float[np.ndarray, "3 3"]
-    """Rotation that makes the z axis of the motion's world point up."""
-    config: CandidateConfig
-    verification: VerificationConfig
-    joined: Int[np.ndarray, "l 2"]
+    config: CandidateConfig = CandidateConfig()
+    verification: VerificationConfig = VerificationConfig()
+    joined: Int[np.ndarray, "l 2"] = dataclasses.field(default_factory=lambda: np.zeros((0, 2), np.int64))
     """Frames of the queries and matches of accepted loops, which join passes of one place."""
 
     def compare(
@@ -193,8 +191,7 @@ class Comparer:
         A lookalike stands anywhere in the surroundings. Its rotation is one of `SYMMETRIES`, because walls stand at
         right angles. The result is negative if the motion allows more positions than the surroundings have.
         """
-        rules = {"drift": self.drift, "level": self.level}
-        spread = planar_spread(self.motion.path, np.array([query]), np.array([match]), **rules)[0]
+        spread = planar_spread(self.motion.path, np.array([query]), np.array([match]), drift=self.drift)[0]
         area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
         rotation = max(2 * self.drift.max_deviation * np.sqrt(spread[2, 2]), 2 * np.pi / SYMMETRIES)
         return float(np.log(SURROUNDINGS_M**2 / area) + max(np.log(2 * np.pi / rotation), 0))
@@ -252,9 +249,8 @@ class Comparer:
         self, query: int, matches: Int[np.ndarray, " k"], match_from_query: Planar
     ) -> Float[np.ndarray, " k"]:
         """Deviation of poses of a frame in the frames of others from the motion, in standard deviations."""
-        args = self.motion.path, np.full(len(matches), query), matches, match_from_query
-        rules = {"drift": self.drift, "level": self.level}
-        return np.maximum(planar_deviations(*args, **rules), floor_deviations(*args, **rules))
+        queries = np.full(len(matches), query)
+        return planar_deviations(self.motion.path, queries, matches, match_from_query, drift=self.drift)
 
     def are_joined(self, match: int, frames: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
         """Whether an accepted loop joins the surroundings of each frame with those of a match."""

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.levelling import AnyMounting
 from sglpr_jax.loops.closure import Loop, Reason, Rejected, compose, frames_of, inverted, planar, planar_loops, relative
 from sglpr_jax.loops.config import ConsistencyConfig
 from sglpr_jax.odometry.bev_odometry import Motion
@@ -27,18 +26,16 @@ def agree(
     others: Sequence[Loop] | None = None,
     *,
     way: Float[np.ndarray, " n"] | None = None,
-    mounting: AnyMounting = None,
     drift: DriftModel = DriftModel(),
     config: ConsistencyConfig = ConsistencyConfig(),
 ) -> Bool[np.ndarray, "a b"]:
     """Pairs of loops that are consistent, given the path of all frames. The length of the path does not cost time.
 
     Arguments:
-      loops: Loops between LiDAR frames.
+      loops: Loops between gravity-aligned frames.
       path: Path of all frames.
       others: Loops to compare with, by default `loops`.
       way: Travelled distance at each frame in metres, by default that of the path.
-      mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
       drift: Drift model of the path.
       config: Thresholds.
 
@@ -46,7 +43,7 @@ def agree(
       Whether loop i of `loops` is consistent with loop j of `others`.
     """
     way = path.travelled if way is None else way
-    a, b = (_columns(each, path, way, mounting) for each in (loops, loops if others is None else others))
+    a, b = (_columns(each, path, way) for each in (loops, loops if others is None else others))
     pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)
     for start in range(0, len(pairs), BLOCK):
         rows = slice(start, start + BLOCK)
@@ -87,13 +84,10 @@ def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[
         chosen = np.argmax(np.where(left, degrees, -1))
 
 
-def _columns(
-    loops: Sequence[Loop], path: DrivenPath, way: Float[np.ndarray, " n"], mounting: AnyMounting
-) -> dict[str, np.ndarray]:
+def _columns(loops: Sequence[Loop], path: DrivenPath, way: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
     query, match = frames_of(loops)
-    level = path.level(mounting)
-    query_pose, match_pose = (planar(path.leveled(frames, level)) for frames in (query, match))
-    poses, covariances = planar_loops(loops, mounting)
+    query_pose, match_pose = (planar(path.leveled(frames)) for frames in (query, match))
+    poses, covariances = planar_loops(loops)
     return {
         "pose": poses,
         "query_pose": query_pose,
@@ -133,14 +127,13 @@ MAX_RIVAL = 0.5
 
 
 def accepted_between(
-    loops: Sequence[Loop], motion: Motion, *, mounting: AnyMounting, drift: DriftModel, config: ConsistencyConfig
+    loops: Sequence[Loop], motion: Motion, *, drift: DriftModel, config: ConsistencyConfig
 ) -> tuple[list[list[Loop]], list[Rejected]]:
     """Accept sets of consistent loops between two sessions, at most one for each segment of each session.
 
     Arguments:
-      loops: Loops in the order of their queries. Their frames are rows of the motion.
+      loops: Loops between gravity-aligned frames, in the order of their queries. Their frames are rows of the motion.
       motion: Motion of both sessions (`Motion.joined`). Poses of different segments are not comparable.
-      mounting: Mounting of the LiDAR at each row.
       drift: Drift model of the motion.
       config: Thresholds of the consistency of two loops.
 
@@ -152,8 +145,7 @@ def accepted_between(
     found, rejected = [], []
     for pair in np.unique(segments, axis=0):
         some = [loops[row] for row in np.flatnonzero((segments == pair).all(axis=1)).tolist()]
-        rules = {"way": motion.travelled, "mounting": mounting, "drift": drift, "config": config}
-        pairs = agree(some, motion.path, **rules)
+        pairs = agree(some, motion.path, way=motion.travelled, drift=drift, config=config)
         members = largest_consistent_set(pairs).tolist()
         others = np.setdiff1d(np.arange(len(some)), members)
         rival = largest_consistent_set(pairs[np.ix_(others, others)])

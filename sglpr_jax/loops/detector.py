@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from sglpr_jax.data.recording import Record
 from sglpr_jax.loops.arguments import given_pose, given_record, given_time
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.closure import Loop, Reason, Rejected
+from sglpr_jax.loops.closure import Loop, Reason, Rejected, to_lidar
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
@@ -160,9 +160,8 @@ class LoopDetector:
     def _probable(self, pairs: Sequence[Pair], done: set[int]) -> list[Loop]:
         """Pairs that are probable enough given their neighbours. Queries that are `done` are left out, and noted."""
         finder = self.finder
-        rules = {"mounting": finder.mountings, "drift": finder.present_drift, "config": self.config}
-        found = probable_loops(pairs, self.model, finder.motion.path, **rules)
-        new = [loop for loop in found if loop is not None and loop.query not in done]
+        found = probable_loops(pairs, self.model, finder.motion.path, drift=finder.present_drift, config=self.config)
+        new = [self._handed_out(loop) for loop in found if loop is not None and loop.query not in done]
         done |= {loop.query for loop in new}
         return new
 
@@ -173,4 +172,9 @@ class LoopDetector:
     def _verdicts(self, pairs: Sequence[Pair]) -> list[Rejected]:
         """Reasons why pairs that were not returned are no loops."""
         left = [one for one in pairs if one.loop.query not in self._returned and self._is_allowed(one)]
-        return [Rejected(one.loop, verdict(one, self.model, self.config.min_probability)) for one in left]
+        least = self.config.min_probability
+        return [Rejected(self._handed_out(one.loop), verdict(one, self.model, least)) for one in left]
+
+    def _handed_out(self, loop: Loop) -> Loop:
+        """The loop between LiDAR frames."""
+        return to_lidar(loop, query=self.finder.mountings[loop.query], match=self.finder.mountings[loop.match])

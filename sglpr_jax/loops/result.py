@@ -119,7 +119,7 @@ class FoundLoops:
         """
         kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
         others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
-        return dataclasses.replace(self, loops=kept, rejected=ordered_rejections([*self.rejected, *others]))
+        return dataclasses.replace(self, loops=kept, rejected=tuple(ordered_rejections([*self.rejected, *others])))
 
     def __str__(self) -> str:
         within = (self.within(number)._session_in_words() for number in range(len(self.sessions)))
@@ -151,14 +151,14 @@ def _ends(loop: Loop) -> tuple[int, int]:
     return loop.match_session, loop.query_session
 
 
-def ordered_rejections(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
+def ordered_rejections(rejected: Iterable[Rejected]) -> list[Rejected]:
     """Pairs within the sessions, then those between them, in the order of their frames."""
 
     def order(one: Rejected) -> tuple[bool, tuple[int, int], int, int]:
         match, query = _ends(one.loop)
         return match != query, (match, query), one.loop.query, one.loop.match
 
-    return tuple(sorted(rejected, key=order))
+    return sorted(rejected, key=order)
 
 
 def why_none(found: FoundLoops) -> list[str]:

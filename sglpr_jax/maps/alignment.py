@@ -5,15 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sglpr_jax.data.levelling import upright_from_lidar
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import Loop, to_upright
 from sglpr_jax.loops.config import ConsistencyConfig
 from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.frame_alignment import FrameAlignment, aligned_frames
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.se3 import inverse, moved_covariance, travelled
+from sglpr_jax.se3 import travelled
 
 SAMPLE = 300
 """Maximum number of places of the new map that are located in the existing map. They are evenly spaced."""
@@ -60,9 +59,12 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     loops = _located(before, new)
     if not loops:
         return None
-    upright, offset = [_upright_loop(loop, before, new) for loop in loops], len(before)
-    motion = Motion.joined([Motion.of(one.upright_poses()) for one in (before, new)], [np.eye(3)] * 2)
-    sets, _ = accepted_between(upright, motion, mounting=None, drift=DriftModel(), config=ConsistencyConfig())
+    offset, upright = len(before), []
+    for loop in loops:
+        level = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
+        upright.append(dataclasses.replace(level, query=offset + loop.query))
+    motion = Motion.joined([Motion.of(one.upright_poses()) for one in (before, new)])
+    sets, _ = accepted_between(upright, motion, drift=DriftModel(), config=ConsistencyConfig())
     if not sets:
         return None
     accepted = {loop.query - offset for loop in sets[0]}
@@ -110,11 +112,3 @@ def _located(before: PlaceMap, new: PlaceMap) -> list[Loop]:
         if answers and answers[0].probability >= MIN_PROBABILITY:
             loops.append(dataclasses.replace(answers[0].loop, query=row))
     return loops
-
-
-def _upright_loop(loop: Loop, before: PlaceMap, new: PlaceMap) -> Loop:
-    """The loop in gravity-aligned frames. The rows of the new map follow those of the existing map."""
-    ours = upright_from_lidar(new.mounting(loop.query))
-    pose = upright_from_lidar(before.mounting(loop.match)) @ loop.match_from_query @ inverse(ours)
-    covariance = moved_covariance(loop.covariance, ours)
-    return dataclasses.replace(loop, query=len(before) + loop.query, match_from_query=pose, covariance=covariance)

@@ -20,7 +20,7 @@ from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, replacing
 from sglpr_jax.loops.arguments import given_poses, given_record
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.closure import Loop, in_metres, planar_loop
+from sglpr_jax.loops.closure import Loop, in_metres, planar_loop, to_lidar
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
 from sglpr_jax.loops.config import CANDIDATES, CandidateConfig, PlaceCount
 from sglpr_jax.loops.keyframes import Seen, image_spectrum
@@ -76,7 +76,6 @@ def _most_probable_first(answers: Sequence[Relocated]) -> list[Relocated]:
 
 NO_DRIFT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=1e-3)
 """Drift of the poses of a map. It is small, but large over the unknown motion of a query (`motion.UNKNOWN_M`)."""
-NO_LOOPS = np.zeros((0, 2), np.int64)
 ARRAYS = {
     "images": Column("uint8", ("n", "h", "h")),
     "world_from_place": Column("float64", ("n", 4, 4)),
@@ -216,7 +215,7 @@ class PlaceMap:
         model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
         query = Query(len(self), seen.descriptor, image, query_spectra(image))
-        comparer = Comparer(self._motion, NO_DRIFT, np.eye(3), config, VerificationConfig(), NO_LOOPS)
+        comparer = Comparer(self._motion, NO_DRIFT, config)
         fits = comparer.compare(query, self)
         order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
@@ -308,10 +307,9 @@ class PlaceMap:
 
     def _answer(self, one: Candidate, seen: Seen, probability: float) -> Relocated:
         """Pose of a query by a place."""
-        match_mounting = self.mounting(one.match).scaled(self.scale)
-        mountings = {"query_mounting": seen.mounting, "match_mounting": match_mounting}
-        loop = planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
-        loop = in_metres(loop, self.scale)
+        sensors = seen.mounting, self.mounting(one.match).scaled(self.scale)
+        loop = planar_loop(*one[:3], probability=probability, sensors=sensors)
+        loop = in_metres(to_lidar(loop, query=sensors[0], match=sensors[1]), self.scale)
         return Relocated(self.index.ids[one.match], self.world_from_place[one.match] @ loop.match_from_query, loop)
 
 

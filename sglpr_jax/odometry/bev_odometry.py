@@ -87,24 +87,17 @@ class Motion:
         return found
 
     @classmethod
-    def joined(cls, motions: "Sequence[Motion]", levels: Sequence[Float[np.ndarray, "3 3"]]) -> "Motion":
-        """Motion of several recordings, one after the other, in worlds whose z axes point up.
-
-        Poses between two recordings are unknown.
-
-        Arguments:
-          motions: Motions of the recordings.
-          levels: Rotations that make the z axes of their worlds point up (`DrivenPath.level`).
-        """
+    def joined(cls, motions: "Sequence[Motion]") -> "Motion":
+        """Motion of several recordings, one after the other, in level worlds. Poses between two of them are unknown."""
         found = cls()
-        for one, level in zip(motions, levels, strict=True):
+        for one in motions:
             numbers, last = one._numbers.rows.copy(), found._numbers.rows[-1:]
             numbers["guessed_m"] += UNKNOWN_M * len(last)
             numbers["travelled"] += GAP_M * len(last)
             for name in ("segment", "travelled", "guessed_m") if len(last) else ():
                 numbers[name] += last[name] + (name == "segment")
             found._numbers.extend(numbers)
-            found.path.extend(one.path.leveled(np.arange(len(one)), level), numbers["guessed_m"])
+            found.path.extend(one.path.leveled(np.arange(len(one))), numbers["guessed_m"])
         return found
 
     @property
@@ -264,7 +257,7 @@ class Motion:
         travelled: float,
         guessed_m: float,
     ) -> None:
-        self.path.add(pose, guessed_m=guessed_m)
+        self.path.extend(pose[None], np.array([guessed_m]))
         self._numbers.append((time, segment, travelled, guessed_m))
 
     @property

@@ -14,14 +14,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.levelling import mountings_of, upright_from_lidar, upright_odometry, uprights
+from sglpr_jax.data.levelling import is_tilted, uprights
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.closure import FrameId, Loop, frames_of
+from sglpr_jax.loops.closure import FrameId, Loop, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
 from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.se3 import inverse, moved_covariance
+from sglpr_jax.se3 import inverse
 
 FIRST_POSE = 1e-6
 """Standard deviation of the first pose, which stays fixed, in metres and radians."""
@@ -80,19 +80,25 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     without = next((one.recording.name for one in found.sessions if one.odometry is None), None)
     if without is not None:
         raise ValueError(f"{without}: expected loops found with odometry, found loops without it")
-    placed = placements(found)
+    placed, sessions = placements(found), found.sessions
     poses, inliers = dict[int, np.ndarray](), np.zeros(len(found.loops), bool)
     solved = []
     for group in dict.fromkeys(group for group, _ in placed):
         members = {number: to_first for number, (other, to_first) in enumerate(placed) if other == group}
         rows = [row for row, loop in enumerate(found.loops) if loop.query_session in members]
-        graph, to_level = _upright_graph(found, members, [found.loops[row] for row in rows])
+        turned = {number: uprights(sessions[number].recording)[: sessions[number].frames] for number in members}
+        given = {number: np.asarray(sessions[number].odometry)[: sessions[number].frames] for number in members}
+        upright = {number: members[number] @ given[number] @ inverse(turned[number]) for number in members}
+        level = np.eye(4)
+        level[:3, :3] = DrivenPath(upright[group], tilted=is_tilted(turned[group])).level
+        loops = [_upright(found.loops[row], sessions) for row in rows]
+        graph = PoseGraph({number: level @ one for number, one in upright.items()}, loops, sessions[group].drift)
         solved.append(graph.solve())
         inliers[rows] = solved[-1].inliers
-        for number, upright in zip(members, _split(solved[-1].poses, graph), strict=True):
-            sensors = uprights(mountings_of(found.sessions[number].recording), np.arange(len(upright)))
-            poses[number] = inverse(to_level) @ upright @ sensors
-            _check_heights(found.sessions[number], members[number], poses[number])
+        ends = np.cumsum([len(one) for one in upright.values()])[:-1]
+        for number, one in zip(members, np.split(solved[-1].poses, ends), strict=True):
+            poses[number] = inverse(level) @ one @ turned[number]
+            _check_heights(sessions[number], members[number], poses[number])
     moved = [one.moved_rms_m**2 * len(one.poses) for one in solved]
     return OptimizedTrajectory(
         np.concatenate([poses[number] for number in range(len(found.sessions))]),
@@ -104,34 +110,10 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     )
 
 
-def _upright_graph(
-    found: FoundLoops, members: Mapping[int, Float[np.ndarray, "4 4"]], loops: Sequence[Loop]
-) -> tuple["PoseGraph", Float[np.ndarray, "4 4"]]:
-    """Graph of connected sessions in gravity-aligned frames, because their mountings may differ.
-
-    Also returns the transform from the frame of the first session to that of the graph.
-    """
-    sessions = {number: found.sessions[number] for number in members}
-    level, odometry = np.eye(4), {}
-    for number, one in sessions.items():
-        assert one.odometry is not None
-        given, mounting = one.odometry[: one.frames], mountings_of(one.recording)
-        upright = members[number] @ given @ inverse(uprights(mounting, np.arange(len(given))))
-        if not odometry and len(given):
-            level = upright_odometry(given, mounting)[0] @ inverse(upright[0])
-        odometry[number] = level @ upright
-    edges = []
-    for loop in loops:
-        ours = upright_from_lidar(sessions[loop.query_session].recording.mounting_of(loop.query))
-        theirs = upright_from_lidar(sessions[loop.match_session].recording.mounting_of(loop.match))
-        pose, covariance = theirs @ loop.match_from_query @ inverse(ours), moved_covariance(loop.covariance, ours)
-        edges.append(dataclasses.replace(loop, match_from_query=pose, covariance=covariance))
-    return PoseGraph(odometry, edges, next(iter(sessions.values())).drift), level
-
-
-def _split(poses: Float[np.ndarray, "n 4 4"], graph: "PoseGraph") -> list[Float[np.ndarray, "_ 4 4"]]:
-    """Divide the poses of all nodes by session."""
-    return np.split(poses, np.cumsum([len(one) for one in graph.odometry.values()])[:-1])
+def _upright(loop: Loop, sessions: Sequence[Session]) -> Loop:
+    """The loop between the gravity-aligned frames of its sessions, whose mountings may differ."""
+    query = sessions[loop.query_session].recording.mounting_of(loop.query)
+    return to_upright(loop, query=query, match=sessions[loop.match_session].recording.mounting_of(loop.match))
 
 
 def _check_heights(session: Session, to_first: Float[np.ndarray, "4 4"], corrected: Float[np.ndarray, "n 4 4"]) -> None:
@@ -253,7 +235,7 @@ def _contradictions(
 ) -> Float[np.ndarray, " k"]:
     """Deviation of each loop from the odometry (`deviations`). It is 0 for loops between two sessions."""
     query, match = frames_of(loops)
-    return np.where(sessions[query] == sessions[match], deviations(loops, DrivenPath.of(odometry), drift=drift), 0.0)
+    return np.where(sessions[query] == sessions[match], deviations(loops, DrivenPath(odometry), drift=drift), 0.0)
 
 
 def _bend(

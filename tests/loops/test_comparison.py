@@ -7,12 +7,10 @@ import pytest
 from scenes import place, seen_from
 
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
-from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 
@@ -52,7 +50,7 @@ def compared(
 def comparer_along(poses: Sequence[np.ndarray], *, drift: DriftModel = EXACT, joined=()) -> Comparer:
     joined = np.array(joined, np.int64).reshape(-1, 2)
     motion = Motion.of(np.stack(poses))
-    return Comparer(motion, drift, np.eye(3), CandidateConfig(), VerificationConfig(), joined)
+    return Comparer(motion, drift, joined=joined)
 
 
 def test_the_place_is_found_and_no_other_place_fits_as_well():

@@ -66,8 +66,8 @@ def test_odometry_drifts_as_much_at_any_scale(there_and_back):
     large = [in_metres(loop, 1) for loop in loops]
     for loop in large:
         loop.match_from_query[:3, 3] *= SCALE
-    expected = deviations(loops, DrivenPath.of(there_and_back), drift=drift)
-    path = DrivenPath.of(scaled_poses(there_and_back, float(SCALE)))
+    expected = deviations(loops, DrivenPath(there_and_back), drift=drift)
+    path = DrivenPath(scaled_poses(there_and_back, float(SCALE)))
     found = deviations(large, path, drift=scaled_drift(drift, float(SCALE)))
     np.testing.assert_allclose(found, expected, rtol=0.02)
 
