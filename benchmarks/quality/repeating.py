@@ -35,7 +35,6 @@ from sglpr_jax.files import replacing
 from sglpr_jax.loops.acceptance import accepted
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.checkpoint import columns, compared_of
-from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.models.params import Params
@@ -114,7 +113,10 @@ def _render(case: Case, params: Params, *, scans: int, azimuth_steps: int, scale
             sensor=case.sensor,
             seed=case.seed,
         )
-    seconds, empty = time.perf_counter() - begin, np.mean([finder.is_empty(one.image) for one in seen])
+    seconds, empty = (
+        time.perf_counter() - begin,
+        np.mean([np.count_nonzero(one.image) < finder.config.min_cells for one in seen]),
+    )
     return f"{_name(case)}: {len(seen)} scans in {seconds:.1f} s, {empty:.0%} nearly empty"
 
 
@@ -160,7 +162,7 @@ def chosen(folder: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> It
 
 def finder_of(params: Params) -> CandidateFinder:
     """An empty finder with the settings of the loop detector. It needs no model of the probability."""
-    return CandidateFinder(params, keyframe_m=DetectorConfig.keyframe_m)
+    return CandidateFinder(params)
 
 
 def compared(

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.levelling import upright_from_lidar
@@ -16,6 +15,7 @@ from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, Loop, Reason, Rejected, fr
 from sglpr_jax.loops.config import ConsistencyConfig, DetectorConfig
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.drift import deviations
+from sglpr_jax.loops.frame_alignment import logarithm
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.gicp import register
@@ -43,10 +43,8 @@ def accepted(
     """Accept the loops of a whole drive, between gravity-aligned frames, jointly against the path by odometry.
 
     Loops that contradict the odometry are rejected, even if many agree with each other, because loops of repeating
-    places agree with each other. Of the remaining loops the largest consistent set is accepted.
-
-    Returns:
-      The accepted and the rejected loops, each in the given order.
+    places agree with each other. Of the others the largest consistent set is accepted. Returns accepted and rejected
+    loops.
     """
     fits = deviations(loops, path, drift=drift) <= drift.max_deviation
     left = np.flatnonzero(fits).tolist()
@@ -70,7 +68,7 @@ def check_odometry(
 ) -> None:
     """Warn if the odometry contradicts most of the frames that have a loop.
 
-    Both drift and repeating places can be the cause. The message names both, and the options that state a larger drift.
+    Drift or repeating places can be the cause. The message names both, and the options that state a larger drift.
 
     Arguments:
       name: Name of the recording.
@@ -109,14 +107,10 @@ def registered_loops(
     knows_height: bool = True,
     should_stop: Callable[[], bool],
 ) -> tuple[list[Loop], list[Rejected]]:
-    """Registered loops, and loops whose scans contradict the images. After a stop, the others are unchanged.
+    """Registered loops, and those whose scans contradict the images. After `should_stop`, the others are unchanged.
 
-    Arguments:
-      queries: Recording of the queries.
-      matches: Recording of the matches, which may be the same.
-      loops: Loops, with the rows of these recordings.
-      knows_height: Whether the odometry measures height. If not, the storey is unknown.
-      should_stop: If it returns True, no further loop is registered.
+    The frames of the loops are rows of the two recordings, which may be the same. If the odometry does not measure
+    height (`knows_height`), the storey is unknown.
     """
     kept, rejected = [], []
     for i, loop in enumerate(loops):
@@ -142,8 +136,7 @@ def registered_loops(
 
 def agrees(fine: Loop, loop: Loop) -> bool:
     """Whether the pose by the scans agrees with that by the images, within the covariances of both."""
-    apart = inverse(loop.match_from_query) @ fine.match_from_query
-    error = np.concatenate([apart[:3, 3], Rotation.from_matrix(apart[:3, :3]).as_rotvec()])
+    error = logarithm((inverse(loop.match_from_query) @ fine.match_from_query)[None])[0]
     least = np.repeat([AGREE_M, np.radians(AGREE_DEG)], 3) ** 2
     spread = loop.covariance + fine.covariance + np.diag(least)
     return bool(error @ np.linalg.solve(spread, error) <= AGREE**2)

@@ -12,27 +12,24 @@ from sglpr_jax.data.recording import Record
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query
-from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen, StoredScans, described, image_spectrum
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.odometry.bev_odometry import Link, Motion
-from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel
+from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.registration.background import Background
 from sglpr_jax.registration.bev_alignment import refined
 from sglpr_jax.registration.bev_search import Peak, search_near
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
-
-
 AGREE_M, AGREE_DEG = 0.8, 6.0
-"""Maximum distance and angle between two poses that agree, in metres and degrees."""
+"""Maximum distance and angle between two poses of a scan in one frame that agree, in metres and degrees."""
 
 
 class Compared(NamedTuple):
@@ -44,38 +41,22 @@ class Compared(NamedTuple):
     """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
-def agree(first: Link, second: Link) -> bool:
-    """Whether two poses of a scan in one frame agree."""
-    apart, turned = np.hypot(first.x - second.x, first.y - second.y), first.angle_to(float(second.yaw))
-    return bool(apart <= AGREE_M and turned <= np.radians(AGREE_DEG))
-
-
 class CandidateFinder:
     """Finds candidates in a stream of scans. Stores descriptor and compressed image of each scan that is not empty.
 
-    The number of image comparisons for a frame is constant. The search for the nearest descriptor (a matrix product) is
-    proportional to the number of stored scans. Times, motion and drift are compared with those of all frames.
+    Each frame takes a constant number of image comparisons, and a matrix product for the nearest descriptors.
     """
 
-    def __init__(
-        self,
-        params: Params,
-        *,
-        config: CandidateConfig = CandidateConfig(),
-        verification: VerificationConfig = VerificationConfig(),
-        drift: DriftModel = DriftModel(),
-        motion_drift: DriftModel = MOTION_DRIFT,
-        keyframe_m: float = 0.0,
-        max_places: int | None = None,
-    ):
-        """Create a finder without frames. The arguments are those of `DetectorConfig`."""
+    def __init__(self, params: Params, config: DetectorConfig = DetectorConfig()):
+        """Create a finder without frames."""
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
-        self.params, self.config, self.verification = params, config, verification
-        self.drift, self.motion_drift = drift, motion_drift
+        self.params, self.config, self.verification = params, config.candidates, config.verification
+        self.drift, self.motion_drift = config.drift, config.motion_drift
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
-        self.stored = StoredScans(index, verification=verification, keyframe_m=keyframe_m, max_places=max_places)
+        limits = {"keyframe_m": config.keyframe_m, "max_places": config.max_places}
+        self.stored = StoredScans(index, verification=config.verification, **limits)
         """Descriptors, and centres of the images without the background, for comparison."""
         self.compared = Compared(NO_FITS, None)
         """Comparisons of the last frame."""
@@ -84,10 +65,10 @@ class CandidateFinder:
         self.mountings: list[Mounting | None] = []
         """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
-        self.motion = Motion(config.motion)
+        self.motion = Motion(self.config.motion)
         self.joined = GrowingArray(np.empty((0, 2), np.int64))
         """Frames of the query and the match of each accepted loop."""
-        self.background = Background(frames=config.background_frames, least=config.min_background_frames)
+        self.background = Background(frames=self.config.background_frames, least=self.config.min_background_frames)
         self.missing: list[int] = []
         """Frames whose scans cannot be read."""
         self._times = GrowingArray(np.empty(0))
@@ -114,28 +95,13 @@ class CandidateFinder:
 
     @property
     def empty(self) -> Bool[np.ndarray, " n"]:
-        """Whether each frame is almost empty (`is_empty`)."""
+        """Whether each frame is almost empty: it has fewer than `min_cells` occupied cells."""
         return self._empty.rows
 
     @property
     def nbytes(self) -> int:
         """Number of bytes of all frames: descriptors, compressed images, poses and times."""
         return sum(one.nbytes for one in (self.stored, self.motion, self._times, self._empty))
-
-    def add(
-        self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
-    ) -> list[Candidate]:
-        """Describe a scan or image, add it, and return its candidate, or an empty list.
-
-        Arguments:
-          record: The scan or image.
-          time: Time of the scan, in seconds.
-          odometry: Pose of the LiDAR in any fixed frame.
-
-        Raises:
-          ValueError: If only some frames have a time or a pose, or if times decrease.
-        """
-        return self.add_seen(self.seen(record), time=time, odometry=odometry)
 
     def add_seen(
         self,
@@ -146,14 +112,17 @@ class CandidateFinder:
         compared: Compared | None = None,
         continues: bool = True,
     ) -> list[Candidate]:
-        """Add a frame that is already described, and return its candidate. Raises the errors of `add`.
+        """Add a described scan or image, and return its candidate, or an empty list.
 
         Arguments:
           seen: Descriptor and image, or None for a scan that cannot be read.
           time: Time of the scan, in seconds.
           odometry: Pose of the LiDAR in any fixed frame.
-          compared: Comparisons of an earlier run. If they are given, they are not repeated.
+          compared: Comparisons of an earlier run (`loops.checkpoint`), which are then not repeated.
           continues: See `LoopDetector.add`.
+
+        Raises:
+          ValueError: If only some frames have a time or a pose, or if times decrease.
         """
         self._check(seen, time, odometry)
         frame = len(self)
@@ -165,7 +134,7 @@ class CandidateFinder:
         pose = None if odometry is None else np.asarray(odometry, np.float64) @ inverse(to_upright)
         clock = float(frame) if time is None else time
         middle = np.asarray(within_reach(seen.image, self.verification)) if seen.image.size else seen.image
-        empty = self.is_empty(seen.image)
+        empty = np.count_nonzero(seen.image) < self.config.min_cells  # too few cells to recognise a place
         if not empty:
             self.stored.check(frame, middle)
         detail, keyframe = self.background.without(middle), self.motion.keyframe
@@ -182,10 +151,10 @@ class CandidateFinder:
         self.motion.add(clock, pose=pose, link=link, continues=continues)
         self.mountings.append(seen.mounting)
         self.motion.path.tilted |= is_tilted(to_upright)
-        comparer = self.comparer
+        comparer = Comparer(self.motion, self.present_drift, self.config, self.verification, self.joined.rows)
         if compared is None:
             compared = Compared(NO_FITS if query is None else comparer.compare(query, self.stored), link)
-        candidates = [] if query is None else comparer.candidates(query, compared.fits, self.stored.image_of)
+        candidates = [] if query is None else comparer.candidates(query, compared.fits, self.stored)
         if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
         self._last = None if empty else (frame, detail)
@@ -198,11 +167,6 @@ class CandidateFinder:
             self._times.append(time)
         self.compared = compared
         return candidates
-
-    @property
-    def comparer(self) -> Comparer:
-        """Comparison with the stored scans, after the motion so far."""
-        return Comparer(self.motion, self.present_drift, self.config, self.verification, self.joined.rows)
 
     @property
     def present_drift(self) -> DriftModel:
@@ -222,10 +186,6 @@ class CandidateFinder:
     def seen(self, record: Record) -> Seen:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
         return described(self.params, record)
-
-    def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
-        """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""
-        return bool(np.count_nonzero(image) < self.config.min_cells)
 
     def _link(self, query: Query | None, clock: float) -> Link | None:
         """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
@@ -248,8 +208,12 @@ class CandidateFinder:
                 x, y, yaw = prior
                 ridge = self._from_keyframe(best._replace(x=x, y=y, yaw=yaw), frame)
             found.append(self._from_keyframe(near, frame))
-        certain = not any(map(self.motion.is_ridge, found))
-        return found[0] if len(found) > 1 and certain and agree(*found) else ridge
+        if len(found) == 2 and not any(map(self.motion.is_ridge, found)):
+            first, second = found
+            apart_m, turned = np.hypot(first.x - second.x, first.y - second.y), first.angle_to(float(second.yaw))
+            if apart_m <= AGREE_M and turned <= np.radians(AGREE_DEG):
+                return first
+        return ridge
 
     def _check_odometry(
         self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Link | None, *, known: bool

@@ -140,8 +140,7 @@ def _diagonal(height_m: float, tilt_deg: float) -> Float[np.ndarray, "6 6"]:
 def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
     """Largest standard deviation of the position in the plane, over all directions, in metres.
 
-    Arguments:
-      covariance: Covariance of (x, y, yaw), as in `Alignment`, or of all 6 degrees of freedom, as in `Loop`.
+    The covariance is that of (x, y, yaw), as in `Alignment`, or of all 6 degrees of freedom, as in `Loop`.
     """
     return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance, np.float64)[:2, :2])[-1], 0)))
 
@@ -165,13 +164,8 @@ def planar_loop(
 ) -> Loop:
     """Return the loop of two aligned images, between gravity-aligned frames.
 
-    Arguments:
-      query: Frame of the query.
-      match: Frame of the match.
-      alignment: Pose of the query's image in the match's image, and its covariance.
-      probability: Probability that both frames show one place.
-      knows_height: Whether the odometry measures height. If not, the storey is unknown.
-      sensors: Mountings at query and match, whose deviations count (`unseen_covariance`).
+    If the odometry does not measure height (`knows_height`), the storey is unknown. The deviations of the `sensors` at
+    query and match count (`unseen_covariance`).
     """
     pose = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
     covariance = unseen_covariance(pose, *sensors)

@@ -1,8 +1,7 @@
 """Consistency of loops with each other and with the odometry.
 
-Two loops and the odometry between their frames form a cycle. If the cycle does not close within the drift and the
-loops' own errors, one of the two loops is wrong. After Mangelson et al., Pairwise Consistent Measurement Set
-Maximization (ICRA 2018), in the plane.
+Two loops and the odometry between their frames form a cycle. If it does not close within the drift and the loops' own
+errors, one of them is wrong. After Mangelson et al., Pairwise Consistent Measurement Set Maximization (ICRA 2018).
 """
 
 from collections.abc import Sequence
@@ -29,18 +28,15 @@ def agree(
     drift: DriftModel = DriftModel(),
     config: ConsistencyConfig = ConsistencyConfig(),
 ) -> Bool[np.ndarray, "a b"]:
-    """Pairs of loops that are consistent, given the path of all frames. The length of the path does not cost time.
+    """Whether each loop is consistent with each of the `others`, by default with each of `loops`.
 
     Arguments:
       loops: Loops between gravity-aligned frames.
-      path: Path of all frames.
-      others: Loops to compare with, by default `loops`.
+      path: Path of all frames. Its length costs no time.
+      others: Loops to compare with.
       way: Travelled distance at each frame in metres, by default that of the path.
       drift: Drift model of the path.
       config: Thresholds.
-
-    Returns:
-      Whether loop i of `loops` is consistent with loop j of `others`.
     """
     way = path.travelled if way is None else way
     a, b = (_columns(each, path, way) for each in (loops, loops if others is None else others))
@@ -54,8 +50,8 @@ def agree(
 def largest_consistent_set(pairs: Bool[np.ndarray, "n n"], *, starts: int = 20) -> Int[np.ndarray, " k"]:
     """Indices, in order, of a large set in which every pair is consistent.
 
-    Finding the largest set is NP-hard. This search is greedy: it starts from each of the `starts` loops that are
-    consistent with most others, and always adds the loop that leaves most candidates.
+    The search is greedy, as the problem is NP-hard: it starts from each of the `starts` loops that are consistent with
+    most others, and always adds the loop that leaves most candidates.
     """
     pairs = pairs & pairs.T
     degrees = pairs.sum(0)
@@ -132,7 +128,7 @@ def accepted_between(
     """Accept sets of consistent loops between two sessions, at most one for each segment of each session.
 
     Arguments:
-      loops: Loops between gravity-aligned frames, in the order of their queries. Their frames are rows of the motion.
+      loops: Loops between gravity-aligned frames, rows of the motion, in the order of their queries.
       motion: Motion of both sessions (`Motion.joined`). Poses of different segments are not comparable.
       drift: Drift model of the motion.
       config: Thresholds of the consistency of two loops.

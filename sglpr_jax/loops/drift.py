@@ -17,22 +17,15 @@ STEP_M, STEP_DEG = 0.005, 0.005
 
 
 def deviations(loops: Sequence[Loop], path: DrivenPath, *, drift: DriftModel = DriftModel()) -> Float[np.ndarray, " k"]:
-    """Mahalanobis distance of each loop from the odometry between its frames.
+    """Mahalanobis distance of each loop from the odometry between its gravity-aligned frames.
 
     The distance is `sqrt(e' S^-1 e)` with 3 degrees of freedom. e is x, y and yaw of the query by the loop minus those
-    by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model.
-
-    If the loop has no errors, the distance is the smallest RMS drift along the path that explains the loop, as a
-    multiple of the model's drift. If position and heading drift at constant rates, f and g times those of the model,
-    the distance is at most `sqrt(f^2 + g^2)`.
+    by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model. If
+    the loop has no errors, the distance is the smallest RMS drift that explains the loop, as a multiple of the model's
+    drift.
 
     If the deviation in height alone is larger, it is returned instead. Floors of a building look alike, so a difference
-    in height must not be outweighed by a good fit in the plane.
-
-    Arguments:
-      loops: Loops between gravity-aligned frames of the path. The time is independent of the length of the path.
-      path: Path of the sensor by odometry.
-      drift: Drift model.
+    in height must not be outweighed by a good fit in the plane. The length of the path costs no time.
     """
     poses, covariances = planar_loops(loops)
     heights = np.array([loop.match_from_query[2, 3] for loop in loops])
@@ -97,8 +90,8 @@ def step_deviations(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Standard deviations of the steps of a pose graph, in metres and radians.
 
-    Steps of a graph are independent, so their variances add up in proportion to the distance. The variances of the
-    model grow with the square of the distance. Both are equal after `GRAPH_M`.
+    Steps of a graph are independent: their variances add up with the distance, while those of the model grow with its
+    square. Both are equal after `GRAPH_M`.
     """
     root = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
     metres, degrees = (

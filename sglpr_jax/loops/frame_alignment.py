@@ -77,10 +77,9 @@ def aligned_frames(
 ) -> FrameAlignment:
     """Estimate the transform by robust least squares (iteratively reweighted, with Cauchy's cost).
 
-    Each loop predicts the transform. Its weight follows from its covariance and from the drift between the loop and the
-    middle of all loops. Neighbouring loops see the same walls, so the weights of loops closer than `independent_m` are
-    reduced in proportion to their distance. The transform is best where the loops are. Its covariance also contains the
-    drift over the path between the loops, which does not average out.
+    The weight of a loop follows from its covariance and from the drift between it and the middle of all loops. Loops
+    closer than `independent_m` see the same walls, so their weights are reduced in proportion to their distance. The
+    covariance also contains the drift over the path between the loops, which does not average out.
 
     Arguments:
       loops: At least one loop. Its match is a row of `match_poses`, its query a row of `query_poses`.
@@ -97,32 +96,27 @@ def aligned_frames(
     spread = np.stack([loop.covariance for loop in loops]) + drifted
     fresh = _fresh(query_way[query])
     jacobians = np.stack([adjoint(inverse(pose)) for pose in there])
-    found = (measured @ inverse(there))[_middle(measured, there)]
+    # The first estimate is by the loop that moves the queries nearest to where the others see them: least median.
+    moved = (measured @ inverse(there))[:, None] @ there[None]
+    apart_m = np.linalg.norm(moved[..., :3, 3] - measured[None, :, :3, 3], axis=2)
+    found = (measured @ inverse(there))[int(np.median(apart_m, axis=1).argmin())]
     for _ in range(ROUNDS):
-        error = _logarithm(inverse(measured) @ found @ there)
+        error = logarithm(inverse(measured) @ found @ there)
         weighted = np.linalg.solve(spread, np.concatenate([error[..., None], jacobians], axis=2))
         distance = np.einsum("ni,ni->n", error, weighted[..., 0])
         weights = fresh / (1 + distance / 6)
         gradient = np.einsum("n,nij,ni->j", weights, jacobians, weighted[..., 0])
         hessian = np.einsum("n,nij,nik->jk", weights, jacobians, weighted[..., 1:])
         step = -np.linalg.solve(hessian, gradient)
-        found = found @ _exponential(step)
+        small = np.eye(4)
+        small[:3, :3], small[:3, 3] = Rotation.from_rotvec(step[3:]).as_matrix(), step[:3]
+        found = found @ small
         if np.abs(step).max() < SMALL:
             break
-    return FrameAlignment(found, np.linalg.inv(hessian) + _common(drifted, there))
-
-
-def _common(drifted: Float[np.ndarray, "k 6 6"], there: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, "6 6"]:
-    """Mean drift of the loops, as the covariance of a motion of the frame about the middle of the loops."""
     middle = np.eye(4)
     middle[:3, 3] = np.median(there[:, :3, 3], axis=0)
-    return moved_covariance(drifted.mean(axis=0), middle)
-
-
-def _middle(measured: Float[np.ndarray, "n 4 4"], there: Float[np.ndarray, "n 4 4"]) -> int:
-    """The loop whose transform moves the queries nearest to where the other loops see them: least median distance."""
-    moved = (measured @ inverse(there))[:, None] @ there[None]
-    return int(np.median(np.linalg.norm(moved[..., :3, 3] - measured[None, :, :3, 3], axis=2), axis=1).argmin())
+    common = moved_covariance(drifted.mean(axis=0), middle)  # drift does not average out
+    return FrameAlignment(found, np.linalg.inv(hessian) + common)
 
 
 def _drifted(
@@ -146,14 +140,6 @@ def _fresh(way: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
     return weights
 
 
-def _logarithm(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6"]:
+def logarithm(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6"]:
     """Translation and rotation vector of small motions."""
     return np.concatenate([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()], axis=1)
-
-
-def _exponential(step: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "4 4"]:
-    """Small motion with this translation and rotation vector."""
-    found = np.eye(4)
-    found[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
-    found[:3, 3] = step[:3]
-    return found

@@ -353,7 +353,7 @@ def _candidates_between(
         spectra = query_spectra(image, config=matches.verification)
         query = Query(frame, own.index.descriptors[row], image, spectra)
         fits = comparer.compare(query, matches.stored, own)
-        found += comparer.candidates(query, fits, matches.stored.image_of, possible=fits.frames < offset)
+        found += comparer.candidates(query, fits, matches.stored, possible=fits.frames < offset)
         on_progress(row + 1)
     return found
 

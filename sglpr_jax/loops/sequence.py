@@ -1,8 +1,7 @@
 """Sequential test: what neighbouring frames say about a pair.
 
-Neighbouring pairs support a pair if their matches move as their queries do, and speak against it if they match
-elsewhere. Neighbours that see the same walls are not independent, so the weight of a frame depends on the distance
-travelled since the previous one. Only what their images say counts: the motion between the two passes is common to all.
+Neighbouring pairs support a pair if their matches move as their queries do, and oppose it otherwise. Neighbours that
+see the same walls are not independent, so the weight of a frame depends on the distance travelled since the last one.
 """
 
 import dataclasses
@@ -51,12 +50,7 @@ def probable_loops(
 ) -> list[Loop | None]:
     """For each pair, the loop with its probability given the neighbours, or None below `config.min_probability`.
 
-    Arguments:
-      pairs: Pairs in the order of their queries.
-      model: Model of the probabilities.
-      path: Path of all frames.
-      drift: Drift model of the path.
-      config: Thresholds.
+    The pairs are in the order of their queries. `path` and its `drift` are those of all frames.
     """
     found = tested_log_odds(pairs, model, path, drift=drift, config=config)
     least = logit(config.min_probability)
@@ -94,12 +88,9 @@ def tested_log_odds(
 def neighbour_weights(
     way_m: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"], *, config: SequenceConfig = SequenceConfig()
 ) -> Float[np.ndarray, "k n"]:
-    """Weight of each pair as neighbour of some pairs: the share of it that is new on the way to them.
+    """Weight of each pair as neighbour of the pairs in `rows`: the share of it that is new on the way to them.
 
-    Arguments:
-      way_m: Travelled distance at each query, in metres, in increasing order.
-      rows: The pairs whose neighbours are weighed.
-      config: Selection of neighbours.
+    `way_m` is the travelled distance at each query, in metres, in increasing order.
     """
     fresh = 1 - np.exp(-np.concatenate([[0.0], np.diff(way_m), [0.0]]) / config.independent_m)
     before = rows[:, None] > np.arange(len(way_m))[None]

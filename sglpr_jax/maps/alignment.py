@@ -44,17 +44,10 @@ class MapAlignment(NamedTuple):
 
 
 def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
-    """Locate places of a new map in an existing map, and estimate the transform between their world frames.
+    """Locate places of a new map in an existing one, and estimate the transform between their world frames, if any.
 
-    Arguments:
-      before: Existing map.
-      new: Map of one drive, made with the same weights, with its places in order.
-
-    Returns:
-      The transform, or None if the maps have no common place.
-
-    Raises:
-      ValueError: If the maps were made with other weights, or if their images have other sizes.
+    `new` is the map of one drive, with its places in order. Raises ValueError if the maps were made with other weights,
+    or if their images have other sizes.
     """
     loops = _located(before, new)
     if not loops:
@@ -84,11 +77,7 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
 
 
 def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
-    """Check that two maps are in one world frame, as far as they have common places.
-
-    Raises:
-      ValueError: If the common places have other positions in the two maps.
-    """
+    """Raise ValueError if common places of two maps have other positions, so that their world frames differ."""
     found = align_maps(before, new)
     if found is not None and found.apart_m > MAX_APART_M:
         raise ValueError(

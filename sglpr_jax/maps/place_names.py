@@ -25,10 +25,8 @@ def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict
 def free_names(names: Iterable[str], coming: Mapping[str, Content], *, taken: Mapping[str, Content]) -> list[str]:
     """Names for new places, with the first suffix of "", ~2, ~3, ... after the recording that makes them free.
 
-    Arguments:
-      names: Names of the new places. How many there are depends on how much of the drive is mapped.
-      coming: All scans of the drive. The suffix must not depend on how much is mapped, so all of them are checked.
-      taken: Places of the map.
+    `coming` has all scans of the drive, because the suffix must not depend on how much of it is mapped. `taken` has the
+    places of the map.
     """
     names = list(names)
     recordings = {_recording_of(name) for name in names}

@@ -1,10 +1,8 @@
 """Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
 
-The decision about a loop needs to know which scans show other places. The motion is accurate enough for this purpose
-over some hundred metres. It does not replace odometry. Where the surroundings show the position across a direction
-only, as in a tunnel, the sensor is assumed to move on as before, and the drift grows fast. Where they show nothing,
-the motion is unknown and a new segment begins. Only ratios of times count, so a drive at another speed has the same
-motion.
+It is accurate enough over some hundred metres to tell which scans show other places. Where the surroundings show only
+the position across a direction, as in a tunnel, the sensor is assumed to move on as before, and the drift grows fast.
+Where they show nothing, a new segment begins. Only ratios of times count, so a faster drive has the same motion.
 """
 
 import math
@@ -135,8 +133,7 @@ class Motion:
     ) -> None:
         """Add a frame at `time`, by its `pose` from odometry or its `link` with the keyframe.
 
-        An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown, as
-        after a restart.
+        An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown.
         """
         if len(self) and not continues:
             return self._begin(time, self.poses[-1] if pose is None else pose)

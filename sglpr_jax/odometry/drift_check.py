@@ -52,12 +52,7 @@ class OdometryCheck:
         self._frames += 1
 
     def add(self, pose: Float[np.ndarray, "4 4"], link: Link | None) -> None:
-        """Add a compared scan.
-
-        Arguments:
-          pose: Gravity-aligned pose by odometry.
-          link: Pose in the frame of the last compared scan by the images. None if unknown.
-        """
+        """Add a compared scan: its gravity-aligned pose, and by the images that in the last compared one."""
         step = np.eye(4) if self._last is None else inverse(self._last) @ pose
         far = float(np.linalg.norm(step[:3, 3])) > MAX_STEP_M
         if self._last is None or link is None or far or not _is_clear(link):

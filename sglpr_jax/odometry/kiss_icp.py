@@ -58,7 +58,7 @@ def scan_odometry(
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Compute odometry from the scans of a recording.
+    """Compute odometry from the scans of a recording, in the frame of the first scan. Fewer poses if stopped.
 
     If scans and points have times, the motion within scans is removed, and each pose is that at the time of its scan.
     Scans that are unreadable or have few points get an extrapolated pose. A warning names them, and scans that do not
@@ -68,14 +68,10 @@ def scan_odometry(
       recording: The scans, about 10 a second.
       config: Settings of kiss-icp.
       scale: Factor for all lengths, as in `find_loops`. With 4, the default range is 25 m and the voxels .25 m.
-      kept_in: File of a checkpoint (.npz). If the scans and settings are the same, an interrupted run resumes from it
-        with the same result. The file is not removed.
-      on_bad_scan: Called with id and error of an unreadable scan. Without it the error is raised.
-      should_stop: If it returns True, the poses until then are returned.
-      on_progress: Called with the number of scans.
-
-    Returns:
-      world_from_lidar, the pose of the LiDAR at each scan, in the frame of the first scan. Fewer if stopped.
+      kept_in: Checkpoint file (.npz) of this recording and these settings, from which a stopped call resumes. It stays.
+      on_bad_scan: Called with id and error of an unreadable scan.
+      should_stop: If it returns True, the poses of the scans so far are returned.
+      on_progress: Called with the number of processed scans.
 
     Raises:
       ValueError: If the recording has ready-made images, or if no scan is readable or has enough points.

@@ -86,11 +86,9 @@ class DrivenPath:
         return Mounting(0.0, tuple((self._up / np.linalg.norm(self._up)).tolist())).upright_from_lidar
 
     def extend(self, poses: Float[np.ndarray, "n 4 4"], guessed_m: Float[np.ndarray, " n"] | None = None) -> None:
-        """Add the poses of the next frames.
+        """Add the poses of the next frames, of which `guessed_m` is a guess (`Motion.guessed_m`).
 
-        Arguments:
-          poses: Gravity-aligned poses of the sensor.
-          guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
+        Guessed motion drifts like a path of unknown direction.
         """
         guessed_m = np.full(len(poses), self._guessed_m) if guessed_m is None else guessed_m
         if len(self):

@@ -1,6 +1,6 @@
 """Correction of a trajectory while it is driven: an incremental pose graph, solved by gtsam's iSAM2 (extra `gtsam`).
 
-`optimization` solves a graph of all frames and loops at the end, and removes wrong loops. Here a robust cost (Cauchy)
+`optimize` solves a graph of all frames and loops at the end, and removes wrong loops. Here a robust cost (Cauchy)
 limits the influence of a wrong loop.
 """
 
@@ -35,11 +35,8 @@ class IncrementalTrajectory:
     """A trajectory of odometry that loops correct frame by frame.
 
     The loops should come from a `LoopDetector` with the same odometry, which rejects loops that contradict it. A
-    segment is a part of the trajectory whose motion is known. A new segment is part of the graph as soon as a loop
-    connects it with a segment in the graph.
-
-    The graph has a node every few metres. A loop connects the nodes before its query and its match. Loops that agree
-    with the graph are used every `LOOP_EVERY_M` only.
+    segment, a part whose motion is known, enters the graph as soon as a loop connects it with a segment in the graph.
+    The graph has a node every few metres. A loop connects the nodes before its query and its match.
 
     Example:
       trajectory = IncrementalTrajectory()
@@ -49,14 +46,7 @@ class IncrementalTrajectory:
     """
 
     def __init__(self, *, drift: DriftModel = DriftModel()):
-        """Create a trajectory without frames.
-
-        Arguments:
-          drift: Stated drift of the odometry.
-
-        Raises:
-          ImportError: If the extra `gtsam` is not installed.
-        """
+        """Create a trajectory without frames. Raises ImportError if the extra `gtsam` is not installed."""
         self._gtsam, self._drift = gtsam_library(), drift
         settings = self._gtsam.ISAM2Params()
         settings.setRelinearizeThreshold(RELINEARIZE)
@@ -93,12 +83,9 @@ class IncrementalTrajectory:
     def add(
         self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[Loop] = (), *, continues: bool = True
     ) -> None:
-        """Add the next frame, and new loops of this and of earlier frames.
+        """Add the pose of the LiDAR by odometry at the next frame, and new loops of this and of earlier frames.
 
-        Arguments:
-          world_from_lidar: Pose of the LiDAR by odometry.
-          loops: New loops.
-          continues: False if the motion since the last frame is unknown. The odometry may then begin in another frame.
+        With `continues=False`, the motion since the last frame is unknown, and the odometry may begin in another frame.
         """
         frame, before = len(self), self._odometry.rows[-1:]
         self._odometry.append(world_from_lidar)

@@ -1,7 +1,7 @@
 """Correction of a trajectory by its loops: a pose graph, solved with gtsam (extra `gtsam`).
 
-In least squares, every wrong loop bends the graph. Graduated non-convexity (Yang et al., RA-L 2020) starts with a
-convex cost and ends with one that ignores outliers. The result is compared with the stated drift of the odometry.
+In least squares, every wrong loop bends the graph. Graduated non-convexity (Yang et al., RA-L 2020) ignores outliers.
+The result is compared with the stated drift of the odometry.
 """
 
 import dataclasses
@@ -65,9 +65,6 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
 
     Sessions that loops connect get one frame, that of the first one. It takes about a second for a few hundred frames,
     and minutes for a few thousand.
-
-    Arguments:
-      found: Loops found with odometry.
 
     Raises:
       ValueError: If the loops were found without odometry.
@@ -170,15 +167,12 @@ class PoseGraph:
         return [FrameId(session, frame) for session, poses in self.odometry.items() for frame in range(len(poses))]
 
     def solve(self) -> OptimizedTrajectory:
-        """Solve the graph of odometry and loops.
+        """Solve the graph of odometry and loops. Raises ImportError if the extra `gtsam` is not installed.
 
         Loops that contradict the odometry are dropped. If the solution contradicts the odometry between the frames of a
-        loop, that loop is dropped, too, and the graph is solved again. If a contradiction remains after `ROUNDS`
-        solutions, the odometry is returned without inliers. Between two sessions there is no odometry, and loops
-        between them cannot contradict it.
-
-        Raises:
-          ImportError: If the extra `gtsam` is not installed.
+        loop, that loop is dropped, too, and the graph is solved again, up to `ROUNDS` times. If a contradiction
+        remains, the odometry is returned without inliers. Loops between two sessions, where no odometry is, cannot
+        contradict it.
         """
         gtsam, drift, rows = gtsam_library(), self.drift, {node: row for row, node in enumerate(self.nodes)}
         odometry, sessions = np.concatenate(list(self.odometry.values())), np.array([node.session for node in rows])
@@ -247,8 +241,8 @@ def _bend(
 ) -> Float[np.ndarray, " k"]:
     """Deviation of the solved poses from the odometry at each loop, in standard deviations.
 
-    Deviations are measured along the path between the two frames of the loop, and along the paths from each of them to
-    the next earlier and later frame of any loop. The largest one counts.
+    It is the largest one along the path between the two frames of the loop, and along the paths from each of them to
+    the next earlier and later frame of any loop.
     """
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))

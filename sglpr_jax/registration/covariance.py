@@ -1,8 +1,8 @@
 """Covariance of the registration of two scans, for points with correlated errors.
 
-Errors of neighbouring points are correlated: the points lie on one surface, one ring of the sensor or one vehicle that
-has moved. Their contributions are summed in blocks of space, and the scatter of the blocks gives the noise (a sandwich
-estimator). The constants were fitted on simulated drives with 64, 32 and 16 beams (`benchmarks/quality/poses.py`).
+Points on one surface, ring or vehicle have correlated errors. Their contributions are summed in blocks of space, and
+the scatter of the blocks gives the noise (a sandwich estimator). The constants were fitted on simulated drives with 64,
+32 and 16 beams (`benchmarks/quality/poses.py`).
 """
 
 from typing import Any, NamedTuple
@@ -57,11 +57,8 @@ def registration_covariance(
 ) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of a small motion of the query in its own frame: metres, then radians.
 
-    Arguments:
-      information: GICP's information matrix of the same motion.
-      matched: Corresponding points.
-      match_from_query: Estimated pose.
-      initial_covariance: Covariance of the first guess, which is kept along degenerate directions.
+    `information` is GICP's matrix of the same motion. The covariance of the first guess is kept along degenerate
+    directions.
     """
     inverse = np.linalg.pinv(information, hermitian=True)
     grow = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * matched.sparse), 3)
@@ -74,14 +71,9 @@ def registration_covariance(
 def matched_points(
     match: Any, tree: Any, query: Any, match_from_query: Float[np.ndarray, "4 4"], *, max_apart_m: float
 ) -> Matched:
-    """Find the nearest neighbours of a subset of the query's points.
+    """Find the nearest neighbours of a subset of the query's points, at most `max_apart_m` metres away.
 
-    Arguments:
-      match: Cloud of the match, from small_gicp's `preprocess_points`.
-      tree: Search tree of the match, from the same function.
-      query: Cloud of the query, from the same function.
-      match_from_query: Estimated pose.
-      max_apart_m: Maximum distance of corresponding points, in metres.
+    `match`, its search tree `tree`, and `query` are results of small_gicp's `preprocess_points`.
     """
     turn = match_from_query[:3, :3]
     points, theirs = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))

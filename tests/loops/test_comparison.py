@@ -44,7 +44,7 @@ def compared(
         stored.add(frame, np.ones(2, np.float32), one)
     shown = image(TRUE, THERE, noise=1) if shown is None else shown
     query = Query(len(images), np.ones(2, np.float32), shown, query_spectra(shown))
-    return comparer.candidates(query, comparer.compare(query, stored), stored.image_of)
+    return comparer.candidates(query, comparer.compare(query, stored), stored)
 
 
 def comparer_along(poses: Sequence[np.ndarray], *, drift: DriftModel = EXACT, joined=()) -> Comparer:

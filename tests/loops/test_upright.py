@@ -11,7 +11,7 @@ from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import Loop, planar_loop, to_lidar, to_upright
-from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
@@ -55,10 +55,10 @@ def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 @pytest.mark.slow
 def test_the_pose_of_a_revisit_is_that_of_the_raw_points_and_is_registered(drive, revisit, params):
     recording, poses = tilted_drive(drive, TILTS["upside down"])
-    finder = CandidateFinder(params, config=CandidateConfig(recent_m=1e-9))
+    finder = CandidateFinder(params, DetectorConfig(candidates=CandidateConfig(recent_m=1e-9), keyframe_m=0.0))
     query, match = revisit
-    finder.add(recording.record(match))
-    (found,) = finder.add(recording.record(query))
+    finder.add_seen(finder.seen(recording.record(match)))
+    (found,) = finder.add_seen(finder.seen(recording.record(query)))
     upright = planar_loop(1, 0, found.alignment, probability=1.0)
     loop = to_lidar(upright, query=recording.mounting, match=recording.mounting)
     expected = inverse(poses[match]) @ poses[query]
