@@ -180,8 +180,8 @@ def search(
             for gravity, given in (("recording", None), ("auto", None), ("auto", odometry)):
                 opened = mounted(unknown, "auto", gravity=gravity, known=False)
                 found = sglpr_jax.find_loops(opened, params, odometry=given, registered=False)
-                print(*found.recording.found, sep="\n")
-                fine = [_registered(found.recording, loop) for loop in found.loops]
+                print(*found.sessions[0].recording.found, sep="\n")
+                fine = [_registered(found.sessions[0].recording, loop) for loop in found.loops]
                 for how, loops in (("no", found.loops), ("yes", fine)):
                     counts = counted(closures_of(loops), poses[:, :3, 3], rule)
                     about = (gravity, "no" if given is None else "yes", how, str(counts.right), str(counts.wrong))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Gravity, SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value, require
@@ -190,10 +190,13 @@ def tilts(scans: Sequence[Mounting | None], common: Mounting | None) -> bool:
 
 def with_gravity(recording: Recording, common: Mounting) -> Recording:
     """Estimate the mounting of each scan of a recording about a mean mounting. This reads all scans."""
+
+    def ground_of(row: int, record: Record) -> Mounting | None:
+        assert record.points is not None
+        return estimate_mounting(record.points, near=common)
+
     options = {"ahead": os.cpu_count() or 1, "on_bad_scan": lambda scan, error: None}
-    ground = [
-        one for _, one in scan_stream(recording, lambda _, scan: estimate_mounting(scan.points, near=common), **options)
-    ]
+    ground = [found for _, found in scan_stream(recording, ground_of, **options)]
     seen = [scan for scan in ground if scan is not None] or [common]
     apart = np.array([_apart(scan, common) for scan in seen])
     middle = np.median(apart, axis=0)

@@ -60,26 +60,6 @@ class FoundLoops:
     """Whether the search between sessions was stopped before its end."""
 
     @property
-    def recording(self) -> Recording:
-        """Recording of the first session."""
-        return self.sessions[0].recording
-
-    @property
-    def frames(self) -> int:
-        """Number of scans of the first session that were searched."""
-        return self.sessions[0].frames
-
-    @property
-    def odometry(self) -> Float[np.ndarray, "n 4 4"] | None:
-        """Pose of the LiDAR at every scan of the first session."""
-        return self.sessions[0].odometry
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Compared pairs of the first session."""
-        return self.sessions[0].candidates
-
-    @property
     def whole(self) -> bool:
         """Whether the search was completed."""
         ended = (one.frames == len(one.recording) and not one.unregistered for one in self.sessions)

@@ -136,7 +136,15 @@ class Motion:
         An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown.
         """
         if len(self) and not continues:
-            return self._begin(time, self.poses[-1] if pose is None else pose)
+            self._append(
+                time,
+                self.poses[-1] if pose is None else pose,
+                segment=int(self.segments[-1]) + 1,
+                travelled=self.travelled[-1] + GAP_M,
+                guessed_m=self.guessed_m[-1] + UNKNOWN_M,
+            )
+            self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
+            return
         key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
         if pose is None and link is not None:
             prior = self.prior(time, key)
@@ -159,12 +167,10 @@ class Motion:
                 drifted_m = self._drifted_m(time, share=1.0 if coasts else self.config.ambiguous_share)
                 guessed_m = min(drifted_m, self.guessed_m[-1] + self.config.m_per_uncertain_m * along_m)
             self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
-            if not (self._is_far(moved, rotation) or coasts or ambiguous):
+            is_far = moved > self.config.keyframe_m or rotation > np.radians(self.config.keyframe_deg)
+            if not (is_far or coasts or ambiguous):
                 return
         self.keyframe = len(self) - 1
-
-    def _is_far(self, metres: float, radians: float) -> bool:
-        return bool(metres > self.config.keyframe_m or radians > np.radians(self.config.keyframe_deg))
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
         """Expected x, y and yaw in the frame of an earlier frame, at constant velocity. NaN if unknown."""
@@ -220,12 +226,6 @@ class Motion:
             guessed_m=self._drifted_m(time),
         )
 
-    def _begin(self, time: float, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add the first frame after an unknown motion."""
-        segment, guessed_m = int(self.segments[-1]) + 1, self.guessed_m[-1] + UNKNOWN_M
-        self._append(time, pose, segment=segment, travelled=self.travelled[-1] + GAP_M, guessed_m=guessed_m)
-        self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
-
     def _drifted_m(self, time: float, *, share: float = 1.0) -> float:
         """Next value of `guessed_m`, if the motion since the last frame is a guess, or if this share of it is."""
         step_m = max(self._guessed_step_m(time), self.config.least_step_m)
@@ -246,13 +246,7 @@ class Motion:
         return float(np.linalg.norm(np.diff(ends, axis=0), axis=1).max(initial=0.0))
 
     def _append(
-        self,
-        time: float,
-        pose: Float[np.ndarray, "4 4"],
-        *,
-        segment: int,
-        travelled: float,
-        guessed_m: float,
+        self, time: float, pose: Float[np.ndarray, "4 4"], *, segment: int, travelled: float, guessed_m: float
     ) -> None:
         self.path.extend(pose[None], np.array([guessed_m]))
         self._numbers.append((time, segment, travelled, guessed_m))

@@ -118,9 +118,8 @@ class _FrontEnd:
     def __init__(self, config: OdometryConfig):
         library, used = _library(), config.effective
         data = {"max_range": used.max_range_m, "min_range": used.min_range_m, "deskew": True}
-        settings = importlib.import_module("kiss_icp.config").KISSConfig(
-            data=data, mapping={"voxel_size": used.voxel_m}
-        )
+        of_library = importlib.import_module("kiss_icp.config")
+        settings = of_library.KISSConfig(data=data, mapping={"voxel_size": used.voxel_m})
         self._icp, self._voxel_m = library.KissICP(settings), float(used.voxel_m or 0)
         self._before: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
 
@@ -138,21 +137,20 @@ class _FrontEnd:
         if len(source) < MIN_POINTS:
             icp.last_pose = guess
             return _Registered(guess, len(source), 1.0)
-        pose = self._aligned(source, guess) if known is None else known
+        pose = known
+        if pose is None:
+            sigma = icp.adaptive_threshold.get_threshold()
+            pose = icp.registration.align_points_to_map(
+                points=source,
+                voxel_map=icp.local_map,
+                initial_guess=guess,
+                max_correspondance_distance=3 * sigma,
+                kernel=sigma,
+            )
         icp.adaptive_threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         icp.local_map.update(mapped, pose)
         icp.last_delta, icp.last_pose = np.linalg.inv(icp.last_pose) @ pose, pose
         return _Registered(pose, len(source), self._overlap(source, mapped, pose))
-
-    def _aligned(self, source: np.ndarray, guess: np.ndarray) -> Float[np.ndarray, "4 4"]:
-        sigma = self._icp.adaptive_threshold.get_threshold()
-        return self._icp.registration.align_points_to_map(
-            points=source,
-            voxel_map=self._icp.local_map,
-            initial_guess=guess,
-            max_correspondance_distance=3 * sigma,
-            kernel=sigma,
-        )
 
     def _overlap(self, source: np.ndarray, mapped: np.ndarray, pose: np.ndarray) -> float:
         """Share of points with a point of the previous scans within a voxel."""

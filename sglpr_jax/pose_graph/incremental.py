@@ -91,37 +91,24 @@ class IncrementalTrajectory:
         self._odometry.append(world_from_lidar)
         step = float(np.linalg.norm(world_from_lidar[:3, 3] - before[-1, :3, 3])) if frame and continues else 0.0
         self._travelled.append(self._travelled.rows[-1] + step if frame else 0.0)
-        if not frame:
-            self._begin(world_from_lidar)
-        elif not continues:
-            self._add_node(frame, self._segments[-1] + 1)
-        elif self._travelled.rows[-1] - self._travelled.rows[self._nodes[-1]] >= NODE_EVERY_M:
-            self._continue(frame)
+        last = self._nodes[-1] if frame else 0
+        if not frame or not continues or self._travelled.rows[-1] - self._travelled.rows[last] >= NODE_EVERY_M:
+            segment = self._segments[-1] + (not continues) if frame else 0
+            self._nodes.append(frame)
+            self._segments.append(segment)
+            if not frame:  # the first pose is fixed
+                self._placed.add(0)
+                self._values.insert(0, self._gtsam.Pose3(world_from_lidar))
+                first = self._gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
+                self._graph.add(self._gtsam.PriorFactorPose3(0, self._gtsam.Pose3(world_from_lidar), first))
+            elif continues and segment in self._placed:
+                self._values.insert(frame, self._gtsam.Pose3(self._correction(last) @ world_from_lidar))
+                self._chain(last, frame)
         self._waiting += loops
         self._use_loops()
         if self._values.size() or self._graph.size():
             self._solver.update(self._graph, self._values)
             self._graph, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
-
-    def _begin(self, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Insert the first frame, whose pose is fixed."""
-        first = self._gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
-        self._add_node(0, 0)
-        self._placed.add(0)
-        self._values.insert(0, self._gtsam.Pose3(pose))
-        self._graph.add(self._gtsam.PriorFactorPose3(0, self._gtsam.Pose3(pose), first))
-
-    def _continue(self, frame: int) -> None:
-        """Add a node to the segment of the last one."""
-        before, segment = self._nodes[-1], self._segments[-1]
-        self._add_node(frame, segment)
-        if segment in self._placed:
-            self._values.insert(frame, self._gtsam.Pose3(self._correction(before) @ self._odometry.rows[frame]))
-            self._chain(before, frame)
-
-    def _add_node(self, frame: int, segment: int) -> None:
-        self._nodes.append(frame)
-        self._segments.append(segment)
 
     def _chain(self, before: int, frame: int) -> None:
         """Connect two nodes by odometry."""
@@ -147,7 +134,9 @@ class IncrementalTrajectory:
     def _use(self, loop: Loop) -> None:
         """Connect the nodes of a loop. The covariance is that of the loop, because the nodes are near its frames."""
         query, match = self._node(loop.query), self._node(loop.match)
-        pose = self._from_node(match, loop.match) @ loop.match_from_query @ inverse(self._from_node(query, loop.query))
+        ends = (loop.match, match), (loop.query, query)
+        match_moved, query_moved = (inverse(self._odometry.rows[node]) @ self._odometry.rows[one] for one, node in ends)
+        pose = match_moved @ loop.match_from_query @ inverse(query_moved)
         if self._segment(query) not in self._placed:
             self._place(query, self._pose(match) @ pose)
         elif self._segment(match) not in self._placed:
@@ -189,10 +178,6 @@ class IncrementalTrajectory:
 
     def _segment(self, frame: int) -> int:
         return self._segments[bisect.bisect_right(self._nodes, frame) - 1]
-
-    def _from_node(self, node: int, frame: int) -> Float[np.ndarray, "4 4"]:
-        """Pose of a frame in that of a node, by odometry."""
-        return inverse(self._odometry.rows[node]) @ self._odometry.rows[frame]
 
     def _correction(self, node: int) -> Float[np.ndarray, "4 4"]:
         """Correction of the odometry at a node in the graph."""

@@ -81,7 +81,7 @@ def known(found) -> FoundLoops:
     model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((8, 3))
     positions[:, 0] = [0, 1, 2, 3, 4, 5, 6, 97]
-    recording = dataclasses.replace(found.recording, positions=positions, pose_source="poses.txt")
+    recording = dataclasses.replace(found.sessions[0].recording, positions=positions, pose_source="poses.txt")
     pairs = [(5, 1, 6.0), (6, 2, 7.0), (7, 3, -6.0)]
     candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, 0.0, c)) for q, m, c in pairs)
     return with_session(dataclasses.replace(found, model=model), recording=recording, candidates=candidates)

@@ -37,7 +37,7 @@ def found(tmp_path) -> FoundLoops:
 
 
 def test_both_trajectories_and_each_loop_are_there(found, tmp_path):
-    corrected = OptimizedTrajectory(found.odometry @ transform(0.1, 0.0, 0.0), np.ones(2, bool))
+    corrected = OptimizedTrajectory(found.sessions[0].odometry @ transform(0.1, 0.0, 0.0), np.ones(2, bool))
     write_rerun(found, tmp_path / "a.rrd", optimized=corrected)
     there = entities(tmp_path / "a.rrd")
     expected = {"/map/trajectory/given", "/map/trajectory/corrected", "/map/sensor", "/map/loops/5", "/map/loops/6"}

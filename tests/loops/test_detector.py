@@ -69,7 +69,7 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
     poses = drive.poses.world_from_lidar
     done = []
     found = find_loops(drive, params, odometry=poses, registered=True, on_progress=done.append)
-    assert done == list(range(1, len(drive) + 1)) and found.frames == len(drive)
+    assert done == list(range(1, len(drive) + 1)) and found.sessions[0].frames == len(drive)
     assert len(found.loops) + len(found.rejected) == sum(
         map(len, (streamed[0].loops, streamed[0].rejected, streamed[0].undecided()))
     )
@@ -78,7 +78,7 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
         error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
         assert loop.overlap >= LITTLE_OVERLAP and np.linalg.norm(error[:3, 3]) < 0.5
     stopped = find_loops(drive, params, should_stop=lambda: True)
-    assert stopped.frames == 0 and stopped.loops == ()
+    assert stopped.sessions[0].frames == 0 and stopped.loops == ()
 
 
 def test_images_and_scans_are_the_same_to_it(drive, params, revisit):

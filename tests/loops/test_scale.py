@@ -46,8 +46,8 @@ def test_loops_of_scaled_scans_are_in_metres(params, compare_only, there_and_bac
         np.testing.assert_allclose(loop.match_from_query, true, atol=1e-6)
         np.testing.assert_allclose(loop.covariance[:3, :3], one.covariance[:3, :3] / SCALE**2)
         np.testing.assert_allclose(loop.covariance[3:, 3:], one.covariance[3:, 3:])
-    np.testing.assert_array_equal(found.odometry, there_and_back)
-    assert found.recording is recording and found.scale == SCALE
+    np.testing.assert_array_equal(found.sessions[0].odometry, there_and_back)
+    assert found.sessions[0].recording is recording and found.scale == SCALE
     assert found.config == CONFIG
 
 
