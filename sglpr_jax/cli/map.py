@@ -191,7 +191,7 @@ def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict
             "found too few"
         )
     print(f"{command.recording}: {found}")
-    world_from_new = found.frames.match_from_query
+    world_from_new = found.old_from_new
     return before.merged(new.moved(world_from_new), drive={id: world_from_new @ pose for id, pose in drive.items()})
 
 

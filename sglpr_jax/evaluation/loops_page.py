@@ -249,7 +249,7 @@ def _framed(name: str, part: Part) -> str:
 
 
 def _numbers(aligned: AlignedParts) -> tuple[str, ...]:
-    pose, sigma = aligned.alignment.match_from_query, np.sqrt(np.diag(aligned.alignment.covariance))
+    pose, sigma = aligned.match_from_query, np.sqrt(np.diag(aligned.covariance))
     position = (f"{value:.2f}" for value in pose[:3, 3])
     yaw, spread = np.degrees(yaw_of(pose)), (np.hypot(*sigma[:2]), np.degrees(sigma[5]))
     return (f"{aligned.loops}", *position, f"{yaw:.2f}", *(f"{value:.2f}" for value in spread))

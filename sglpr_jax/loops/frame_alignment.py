@@ -20,16 +20,6 @@ SMALL = 1e-9
 """Step in metres and radians at which the estimate is final."""
 
 
-class FrameAlignment(NamedTuple):
-    """Transform between the frames of two sessions."""
-
-    match_from_query: Float[np.ndarray, "4 4"]
-    """Pose of the query recording's frame in the match recording's frame, in metres."""
-    covariance: Float[np.ndarray, "6 6"]
-    """Covariance of a small motion of the query recording's frame in itself: x, y, z in metres, then rotations about x,
-    y, z in radians."""
-
-
 class Part(NamedTuple):
     """Frames of a session whose poses are known in one frame: all of them if there is odometry."""
 
@@ -46,18 +36,21 @@ class AlignedParts(NamedTuple):
 
     match: Part
     query: Part
-    alignment: FrameAlignment
+    match_from_query: Float[np.ndarray, "4 4"]
+    """Pose of the query's frame in the match's frame, in metres."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Covariance of a small motion of the query's frame in itself: x, y, z in metres, then rotations in radians."""
     loops: int
     """Number of loops from which the transform was estimated."""
 
     def in_metres(self, scale: Scale) -> "AlignedParts":
         """The transform before all lengths were multiplied by `scale`."""
-        pose = scaled_poses(self.alignment.match_from_query, 1 / scale)
-        return self._replace(alignment=FrameAlignment(pose, covariance_in_metres(self.alignment.covariance, scale)))
+        pose = scaled_poses(self.match_from_query, 1 / scale)
+        return self._replace(match_from_query=pose, covariance=covariance_in_metres(self.covariance, scale))
 
     def __str__(self) -> str:
-        (x, y, z), sigma = self.alignment.match_from_query[:3, 3], np.sqrt(np.diag(self.alignment.covariance))
-        yaw, parts = np.degrees(yaw_of(self.alignment.match_from_query)), ""
+        (x, y, z), sigma = self.match_from_query[:3, 3], np.sqrt(np.diag(self.covariance))
+        yaw, parts = np.degrees(yaw_of(self.match_from_query)), ""
         if not self.match.is_odometry:
             parts = f" of scans {self.match.first}-{self.match.last} and {self.query.first}-{self.query.last}"
         return (
@@ -74,8 +67,8 @@ def aligned_frames(
     match_way: Float[np.ndarray, " n"],
     query_way: Float[np.ndarray, " m"],
     drift: DriftModel,
-) -> FrameAlignment:
-    """Estimate the transform by robust least squares (iteratively reweighted, with Cauchy's cost).
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
+    """Estimate a transform and its covariance by iteratively reweighted least squares, with Cauchy's cost.
 
     The weight of a loop follows from its covariance and from the drift between it and the middle of all loops. Loops
     closer than `independent_m` see the same walls, so their weights are reduced in proportion to their distance. The
@@ -116,7 +109,7 @@ def aligned_frames(
     middle = np.eye(4)
     middle[:3, 3] = np.median(there[:, :3, 3], axis=0)
     common = moved_covariance(drifted.mean(axis=0), middle)  # drift does not average out
-    return FrameAlignment(found, np.linalg.inv(hessian) + common)
+    return found, np.linalg.inv(hessian) + common
 
 
 def _drifted(

@@ -373,5 +373,5 @@ def _aligned(loops: Sequence[Loop], both: Sequence[Searched], motion: Motion, dr
         else:
             poses.append(odometry[: len(finder)])
     match_way, query_way = np.split(motion.travelled, [len(poses[0])])
-    alignment = aligned_frames(loops, *poses, match_way=match_way, query_way=query_way, drift=drift)
-    return AlignedParts(parts[0], parts[1], alignment, len(loops))
+    found = aligned_frames(loops, *poses, match_way=match_way, query_way=query_way, drift=drift)
+    return AlignedParts(parts[0], parts[1], *found, len(loops))

@@ -4,15 +4,16 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from sglpr_jax.loops.closure import Loop, to_upright
 from sglpr_jax.loops.config import ConsistencyConfig
 from sglpr_jax.loops.consistency import accepted_between
-from sglpr_jax.loops.frame_alignment import FrameAlignment, aligned_frames
+from sglpr_jax.loops.frame_alignment import aligned_frames
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.se3 import travelled
+from sglpr_jax.se3 import travelled, yaw_of
 
 SAMPLE = 300
 """Maximum number of places of the new map that are located in the existing map. They are evenly spaced."""
@@ -25,18 +26,18 @@ MAX_APART_M = 5.0
 class MapAlignment(NamedTuple):
     """Transform from the world frame of a new map to that of an existing map."""
 
-    frames: FrameAlignment
-    """`match_from_query` is the pose of the new world frame in the existing one."""
+    old_from_new: Float[np.ndarray, "4 4"]
+    """Pose of the new world frame in the existing one."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Covariance of a small motion of the new frame in itself: x, y, z in metres, then rotations in radians."""
     places: int
     """Number of common places from which the transform was estimated."""
     apart_m: float
     """Median distance between the positions of these places in both maps, as if the frames were the same."""
 
     def __str__(self) -> str:
-        x, y, z = self.frames.match_from_query[:3, 3]
-        rotation = self.frames.match_from_query[:3, :3]
-        yaw = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
-        along, across, *_, turn = np.sqrt(np.diag(self.frames.covariance))
+        (x, y, z), yaw = self.old_from_new[:3, 3], np.degrees(yaw_of(self.old_from_new))
+        along, across, *_, turn = np.sqrt(np.diag(self.covariance))
         return (
             f"transform x {x:.2f} m, y {y:.2f} m, z {z:.2f} m, yaw {yaw:.2f} degrees from {self.places} common places "
             f"(standard deviations {along:.2f} m, {across:.2f} m, {np.degrees(turn):.2f} degrees)"
@@ -62,7 +63,7 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
         return None
     accepted = {loop.query - offset for loop in sets[0]}
     common = [loop for loop in loops if loop.query in accepted]
-    frames = aligned_frames(
+    found = aligned_frames(
         common,
         before.world_from_place,
         new.world_from_place,
@@ -73,7 +74,7 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     there = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])
     here = new.world_from_place[[loop.query for loop in common]]
     apart = np.linalg.norm(there[:, :3, 3] - here[:, :3, 3], axis=1)
-    return MapAlignment(frames, len(common), float(np.median(apart)))
+    return MapAlignment(*found, len(common), float(np.median(apart)))
 
 
 def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:

@@ -137,8 +137,8 @@ def placements(found: FoundLoops) -> tuple[tuple[int, Float[np.ndarray, "4 4"]],
         (known, new, pose)
         for one in links
         for known, new, pose in (
-            (one.match.session, one.query.session, one.alignment.match_from_query),
-            (one.query.session, one.match.session, inverse(one.alignment.match_from_query)),
+            (one.match.session, one.query.session, one.match_from_query),
+            (one.query.session, one.match.session, inverse(one.match_from_query)),
         )
     ]
     for root in range(len(found.sessions)):

@@ -10,7 +10,7 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.loops_page import loops_page
 from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.frame_alignment import AlignedParts, FrameAlignment, Part
+from sglpr_jax.loops.frame_alignment import AlignedParts, Part
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
@@ -120,8 +120,8 @@ def test_without_matplotlib_there_is_a_table(found, monkeypatch):
 def several(found) -> FoundLoops:
     loop = Loop(2, 3, transform(1.0, 2.0, 0.3), np.eye(6), 0.995, query_session=1)
     second = (dataclasses.replace(one, query_session=1, match_session=1) for one in found.loops)
-    alignment = FrameAlignment(transform(10.0, 0.0, 0.5), 0.01 * np.eye(6))
-    transforms = (AlignedParts(Part(0, 0, 7, True), Part(1, 0, 7, True), alignment, 1),)
+    alignment = transform(10.0, 0.0, 0.5), 0.01 * np.eye(6)
+    transforms = (AlignedParts(Part(0, 0, 7, True), Part(1, 0, 7, True), *alignment, 1),)
     return FoundLoops(2 * found.sessions, (*found.loops, *second, loop), transforms=transforms)
 
 

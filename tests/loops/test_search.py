@@ -191,7 +191,7 @@ def test_one_street_on_two_days_has_a_transform_with_and_without_odometry(drive,
     found = find_loops(both, params, odometry=[first_poses, second_poses], on_progress=steps.append)
     assert found.whole and steps == list(range(1, len(first) + 2 * len(second) + 1))
     assert len(found.between(0, 1).loops) >= 5 and found.transforms[0].match.is_odometry
-    error = inverse(inverse(first_frame) @ second_frame) @ found.transforms[0].alignment.match_from_query
+    error = inverse(inverse(first_frame) @ second_frame) @ found.transforms[0].match_from_query
     assert np.linalg.norm(error[:2, 3]) < 0.3 and abs(np.degrees(yaw_of(error))) < 0.5
     assert "first and second: " in str(found) and "transform x " in str(found)
     bare = find_loops(both, params).between(0, 1)

@@ -142,7 +142,7 @@ def test_rows_name_the_recordings_and_the_transform_is_in_frames_json(pair, tmp_
     assert [one["first_vertex"] for one in frames["recordings"]] == [0, FIRST_VERTEX]
     (written,) = frames["transforms"]
     assert written["match_frame"]["frame"] == "odometry" and written["loops"] == len(loops)
-    np.testing.assert_allclose(written["match_from_query"], pair.transforms[0].alignment.match_from_query)
+    np.testing.assert_allclose(written["match_from_query"], pair.transforms[0].match_from_query)
 
 
 def test_trajectories_of_several_sessions_have_names_and_older_ones_a_warning(pair, tmp_path):
