@@ -107,8 +107,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     from sglpr_jax.files import naming
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.maps.build import map_recording
-    from sglpr_jax.maps.place_map import PlaceMap
-    from sglpr_jax.maps.place_names import poses_by_id
+    from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.retrieval.index import check_scale
 

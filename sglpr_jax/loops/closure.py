@@ -119,22 +119,14 @@ def unseen_covariance(
         height = np.hypot(UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M * apart_m)
         tilt = np.radians(np.hypot(UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M * apart_m))
         return np.diag([0.0, 0.0, height, tilt, tilt, 0.0]) ** 2
-    ground = _diagonal(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)
-    own, other = (_diagonal(*_deviations(mounting)) for mounting in (query, match))
+    deviations = [(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)]
+    for sensor in (query, match):
+        if sensor is None or sensor.height_deviation_m is None or sensor.tilt_deviation_deg is None:
+            deviations.append((UNSEEN_HEIGHT_M / 2**0.5, UNSEEN_TILT_DEG / 2**0.5))
+        else:
+            deviations.append((sensor.height_deviation_m, sensor.tilt_deviation_deg))
+    ground, own, other = (np.diag([0, 0, up, np.radians(tilt), np.radians(tilt), 0]) ** 2 for up, tilt in deviations)
     return own + moved_covariance(other, inverse(match_from_query)) + ground
-
-
-def _deviations(mounting: Mounting | None) -> tuple[float, float]:
-    """Standard deviations of height (metres) and tilt (degrees) of one scan."""
-    if mounting is None or mounting.height_deviation_m is None or mounting.tilt_deviation_deg is None:
-        return UNSEEN_HEIGHT_M / 2**0.5, UNSEEN_TILT_DEG / 2**0.5
-    return mounting.height_deviation_m, mounting.tilt_deviation_deg
-
-
-def _diagonal(height_m: float, tilt_deg: float) -> Float[np.ndarray, "6 6"]:
-    """Covariance of independent height, roll and pitch."""
-    tilt = np.radians(tilt_deg)
-    return np.diag([0.0, 0.0, height_m, tilt, tilt, 0.0]) ** 2
 
 
 def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:

@@ -147,7 +147,8 @@ def accepted_between(
         rival = largest_consistent_set(pairs[np.ix_(others, others)])
         chosen = [some[k] for k in members]
         reason: Reason = "contradicts other loops"
-        if not _is_enough(chosen, motion.travelled):
+        ways = [np.ptp(motion.travelled[frames]) for frames in frames_of(chosen) if len(frames)]
+        if len(chosen) < MIN_LOOPS or min(ways) < MIN_TRAVELLED_M:
             reason, others = "too few neighbours", np.arange(len(some))
         elif len(rival) > MAX_RIVAL * len(members):
             others = np.arange(len(some))
@@ -155,8 +156,3 @@ def accepted_between(
             found.append(chosen)
         rejected += [Rejected(some[k], reason) for k in others]
     return sorted(found, key=len, reverse=True), rejected
-
-
-def _is_enough(loops: Sequence[Loop], way: Float[np.ndarray, " n"]) -> bool:
-    """Whether there are enough loops, over enough travelled distance in both sessions."""
-    return len(loops) >= MIN_LOOPS and all(np.ptp(way[frames]) >= MIN_TRAVELLED_M for frames in frames_of(loops))

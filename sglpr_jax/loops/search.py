@@ -138,9 +138,10 @@ def find_loops(
     loops, rejected, transforms = [], [], []
     for number, one in enumerate(given):
         folder = None if kept_in is None else Path(kept_in) / f"{number}" if len(given) > 1 else Path(kept_in)
+        large = one.scaled(scale)
         found = _search_session(
-            one.scaled(scale),
-            LoopDetector(params, model=model, config=one.scaled(scale).config),
+            large,
+            LoopDetector(params, model=model, config=large.config),
             scale=scale,
             on_bad_scan=on_bad_scan,
             kept_in=folder,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.loops.closure import Loop, to_upright
+from sglpr_jax.loops.closure import to_upright
 from sglpr_jax.loops.config import ConsistencyConfig
 from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.frame_alignment import aligned_frames
@@ -50,7 +50,11 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     `new` is the map of one drive, with its places in order. Raises ValueError if the maps were made with other weights,
     or if their images have other sizes.
     """
-    loops = _located(before, new)
+    loops = []
+    for row in np.unique(np.linspace(0, len(new) - 1, min(len(new), SAMPLE)).astype(int)).tolist():
+        answers = before.relocate_seen(new.seen(row), weights_hash=new.index.weights_hash)
+        if answers and answers[0].probability >= MIN_PROBABILITY:
+            loops.append(dataclasses.replace(answers[0].loop, query=row))
     if not loops:
         return None
     offset, upright = len(before), []
@@ -92,13 +96,3 @@ def without_known_places(before: PlaceMap, new: PlaceMap) -> PlaceMap:
     """The new map without the places whose descriptors the existing map has, so that no scan is added twice."""
     known = {descriptor.tobytes() for descriptor in before.index.descriptors}
     return new.some([row for row, found in enumerate(new.index.descriptors) if found.tobytes() not in known])
-
-
-def _located(before: PlaceMap, new: PlaceMap) -> list[Loop]:
-    """Loops from places of the new map (query) to the existing map (match)."""
-    loops = []
-    for row in np.unique(np.linspace(0, len(new) - 1, min(len(new), SAMPLE)).astype(int)).tolist():
-        answers = before.relocate_seen(new.seen(row), weights_hash=new.index.weights_hash)
-        if answers and answers[0].probability >= MIN_PROBABILITY:
-            loops.append(dataclasses.replace(answers[0].loop, query=row))
-    return loops

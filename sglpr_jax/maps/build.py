@@ -21,8 +21,7 @@ from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.loops.keyframes import Seen
-from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.maps.place_names import place_names
+from sglpr_jax.maps.place_map import PlaceMap, place_names
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
 

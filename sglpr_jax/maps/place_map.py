@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scaled import scaled_poses, scaled_record
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, replacing
@@ -25,7 +26,6 @@ from sglpr_jax.loops.comparison import Comparer, Query
 from sglpr_jax.loops.config import CANDIDATES, CandidateConfig, PlaceCount
 from sglpr_jax.loops.keyframes import Keyframes, Seen
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.maps.place_names import Content, free_names
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
@@ -142,7 +142,7 @@ class PlaceMap(Keyframes):
         coming: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in (drive or {}).items()}
         coming |= zip(other.index.ids, other._contents(), strict=True)
         taken = dict(zip(self.index.ids, self._contents(), strict=True))
-        new_ids = free_names([other.index.ids[row] for row in new], coming, taken=taken)
+        new_ids = _free_names([other.index.ids[row] for row in new], coming, taken=taken)
         index = self.index.without_places()
         for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
             places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
@@ -283,3 +283,43 @@ def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
         Mounting(height, tuple(up))
         if abs(np.linalg.norm(up) - 1) > ROTATION_TOLERANCE:
             raise ValueError(f"expected up directions of length 1 in mountings, found {up}")
+
+
+Content = tuple[bytes | None, bytes]
+"""Identity of a place: its descriptor (None if not known yet) and its pose, as bytes."""
+
+
+def place_names(recording: Recording) -> list[str]:
+    """Name of the place of each scan, whether or not the scan is in a map."""
+    return [f"{recording.name}/{scan}" for scan in recording.ids]
+
+
+def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Pose of each scan by the id of its place, whether or not the scan is in the map."""
+    return dict(zip(place_names(recording), np.asarray(poses, np.float64), strict=True))
+
+
+def _free_names(names: Sequence[str], coming: Mapping[str, Content], *, taken: Mapping[str, Content]) -> list[str]:
+    """Names for new places, with the first suffix of "", ~2, ~3, ... after the recording that makes them free.
+
+    `coming` has all scans of the drive, because the suffix must not depend on how much of it is mapped. `taken` has the
+    places of the map.
+    """
+    recordings = {name.rpartition("/")[0] for name in names}
+    drive = {name: content for name, content in coming.items() if name.rpartition("/")[0] in recordings}
+
+    def is_free(suffix: str) -> bool:
+        """Whether no scan of the drive has, with the suffix, the name of another place."""
+        for name, (descriptor, pose) in drive.items():
+            there = taken.get(_with_suffix(name, suffix))
+            if there is not None and (there[1] != pose or descriptor not in (None, there[0])):
+                return False
+        return True
+
+    suffix = next(filter(is_free, itertools.chain([""], (f"~{number}" for number in itertools.count(2)))))
+    return [_with_suffix(name, suffix) for name in names]
+
+
+def _with_suffix(name: str, suffix: str) -> str:
+    recording, slash, scan = name.rpartition("/")
+    return f"{recording}{suffix}{slash}{scan}"

@@ -248,15 +248,11 @@ def _bend(
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
     solved = [Loop(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
     found = _contradictions(solved, odometry, sessions, drift)
-    return np.array(
-        [max(found[k], *(found[len(loops) :][_touching(frames, loop)]), 0.0) for k, loop in enumerate(loops)]
-    )
-
-
-def _touching(frames: np.ndarray, loop: Loop) -> Bool[np.ndarray, " m"]:
-    """Whether each path between consecutive `frames` starts or ends at a frame of the loop."""
-    ends = np.isin(frames, [loop.match, loop.query])
-    return ends[:-1] | ends[1:]
+    bends = []
+    for k, loop in enumerate(loops):
+        own = np.isin(frames, [loop.match, loop.query])  # a path that starts or ends at one of these counts
+        bends.append(max(found[k], *found[len(loops) :][own[:-1] | own[1:]], 0.0))
+    return np.array(bends)
 
 
 def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndarray, "n 3"]) -> float:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Num
+from jaxtyping import Array, Complex, Float, Float32, Int, Num
 from scipy.fft import next_fast_len
 
 from sglpr_jax.bev import centre_crop, rotate_image
@@ -41,18 +41,6 @@ def merged(image: Float[Array, "m m"], side: int) -> Float[Array, "k k"]:
     """Average pooling over squares of `side` cells."""
     size = image.shape[0] // side
     return image.reshape(size, side, size, side).mean((1, 3))
-
-
-def occupied(image: Num[np.ndarray, "h w"], config: VerificationConfig = DEFAULT) -> float:
-    """Number of occupied cells within reach."""
-    return float(np.count_nonzero(image[_within(image.shape, config.reach_m / config.resolution_m)]))
-
-
-@functools.cache
-def _within(shape: tuple[int, int], radius: float) -> Bool[np.ndarray, "h w"]:
-    """Whether each cell lies within a radius (in cells) of the centre."""
-    down, right = (np.arange(n) - (n - 1) / 2 for n in shape)
-    return np.hypot(down[:, None], right[None]) < radius
 
 
 def cells(metres: float, cell_m: float) -> int:
