@@ -86,7 +86,7 @@ class DrivenPath:
         return Mounting(0.0, tuple((self._up / np.linalg.norm(self._up)).tolist())).upright_from_lidar
 
     def extend(self, poses: Float[np.ndarray, "n 4 4"], guessed_m: Float[np.ndarray, " n"] | None = None) -> None:
-        """Add the poses of the next frames, of which `guessed_m` is a guess (`Motion.guessed_m`).
+        """Add the poses of the next frames, and the guessed motion up to each of them (`Motion.guessed_m`).
 
         Guessed motion drifts like a path of unknown direction.
         """

@@ -99,8 +99,8 @@ def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known
 
 
 def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, monkeypatch):
-    optimized = OptimizedTrajectory(known.odometry + 0.0, np.array([True, True, False]))
-    optimized.poses[:, :3, 3] = known.recording.positions
+    optimized = OptimizedTrajectory(known.sessions[0].odometry + 0.0, np.array([True, True, False]))
+    optimized.poses[:, :3, 3] = known.sessions[0].recording.positions
     page = Parsed(loops_page(known, optimized=optimized))
     assert [headline for headline, _ in page.images].count("Corrected") == 1
     said = page.texts["Corrected"]
