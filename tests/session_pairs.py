@@ -51,7 +51,7 @@ def found_pair(*, odometry: tuple[np.ndarray, np.ndarray] | None = None) -> Foun
         for name, poses in zip(("monday", "tuesday"), given, strict=True)
     )
     between = tuple(dataclasses.replace(loop, query_session=1) for loop in loops)
-    return FoundLoops(sessions, between, transforms=(AlignedParts(*parts, alignment, len(loops)),))
+    return FoundLoops(sessions, between, transforms=(AlignedParts(*parts, *alignment, len(loops)),))
 
 
 def _recording(scans: int, name: str) -> Recording:

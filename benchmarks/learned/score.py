@@ -34,7 +34,7 @@ from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.registration.bev_alignment import align_all
+from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.reproduce.runs import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
@@ -255,5 +255,5 @@ def _verified(file: DescriptorFile, images: Float32[np.ndarray, "n h w"]) -> Top
 
 def _correlations(images: np.ndarray, query: int, nearest: np.ndarray) -> np.ndarray:
     """Return the correlation of a frame with each of its nearest places; -1 where there is no further place."""
-    found = align_all(images[query], images[nearest])
-    return np.where(nearest >= 0, np.asarray(found.correlation, np.float64), -1.0)
+    found = [float(align(images[query], images[place]).correlation) for place in nearest]
+    return np.where(nearest >= 0, found, -1.0)

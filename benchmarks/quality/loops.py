@@ -233,7 +233,7 @@ def images(
         counts = counted(closures_of(found.loops), poses[:, :3, 3], town_rule(poses[:, :3, 3], recording.times))
         print(f"{name}: {counts.loops} loops, {counts.wrong} wrong, recall {counts.recall}; {told(found.loops, poses)}")
         assert found.model is not None
-        for one in reliability_of(found.candidates, found.model, poses[:, :3, 3]):
+        for one in reliability_of(found.sessions[0].candidates, found.model, poses[:, :3, 3]):
             share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.said:.4f} said"
             print(f"  probability {one.low:g} to {one.high:g}: {share}")
         _report_top1(found, poses, sglpr_jax.embed(params, recording).descriptors)
@@ -245,8 +245,8 @@ def _report_top1(found: FoundLoops, poses: Float[np.ndarray, "n 4 4"], descripto
     Frames without a candidate are answered by the nearest descriptor that is old enough, with the least log odds.
     """
     assert found.model is not None
-    pairs = [(one.query, one.match) for one in found.candidates]
-    log_odds = found.model.log_odds(Evidence.stack([one.evidence for one in found.candidates]))
+    pairs = [(one.query, one.match) for one in found.sessions[0].candidates]
+    log_odds = found.model.log_odds(Evidence.stack([one.evidence for one in found.sessions[0].candidates]))
     for frame in sorted({*range(EXCLUDED_FRAMES, len(poses))} - {query for query, _ in pairs}):
         apart = np.linalg.norm(descriptors[: frame - EXCLUDED_FRAMES + 1] - descriptors[frame], axis=1)
         pairs.append((frame, int(apart.argmin())))
@@ -260,10 +260,10 @@ def _report_top1(found: FoundLoops, poses: Float[np.ndarray, "n 4 4"], descripto
         queries = np.array(sorted(best))
         chosen = np.array([best[query] for query in queries.tolist()])
         source = TopK(
-            sequence=found.recording.name,
+            sequence=found.sessions[0].recording.name,
             positions=poses[:, :3, 3],
-            times=found.recording.times,
-            pose_source=found.recording.pose_source,
+            times=found.sessions[0].recording.times,
+            pose_source=found.sessions[0].recording.pose_source,
             queries=queries,
             nearest=np.array([pairs[i][1] for i in chosen])[:, None],
             scores=scores[chosen][:, None],

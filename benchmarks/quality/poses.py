@@ -25,7 +25,7 @@ from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.loops.closure import Loop, planar_loop
+from sglpr_jax.loops.closure import Loop, planar_loop, to_lidar
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.registration.gicp import register
@@ -140,8 +140,9 @@ def _aligned(recording: Recording, pairs: np.ndarray) -> Iterator[Loop]:
     """The loops of pairs of query and match, by their images."""
     for query, match in pairs.tolist():
         images = [square_image(recording.record(frame, labels=False)) for frame in (query, match)]
-        mountings = {"query_mounting": recording.mounting_of(query), "match_mounting": recording.mounting_of(match)}
-        yield planar_loop(query, match, jax.device_get(align(*images)), probability=1.0, **mountings)
+        sensors = recording.mounting_of(query), recording.mounting_of(match)
+        loop = planar_loop(query, match, jax.device_get(align(*images)), probability=1.0, sensors=sensors)
+        yield to_lidar(loop, query=sensors[0], match=sensors[1])
 
 
 def _registered(recording: Recording, loop: Loop) -> Loop:
@@ -179,8 +180,8 @@ def search(
             for gravity, given in (("recording", None), ("auto", None), ("auto", odometry)):
                 opened = mounted(unknown, "auto", gravity=gravity, known=False)
                 found = sglpr_jax.find_loops(opened, params, odometry=given, registered=False)
-                print(*found.recording.found, sep="\n")
-                fine = [_registered(found.recording, loop) for loop in found.loops]
+                print(*found.sessions[0].recording.found, sep="\n")
+                fine = [_registered(found.sessions[0].recording, loop) for loop in found.loops]
                 for how, loops in (("no", found.loops), ("yes", fine)):
                     counts = counted(closures_of(loops), poses[:, :3, 3], rule)
                     about = (gravity, "no" if given is None else "yes", how, str(counts.right), str(counts.wrong))

@@ -35,7 +35,7 @@ from sglpr_jax.files import replacing
 from sglpr_jax.loops.acceptance import accepted
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.checkpoint import columns, compared_of
-from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.config import MIN_CELLS
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.models.params import Params
@@ -115,7 +115,10 @@ def _render(case: Case, params: Params, *, scans: int, azimuth_steps: int, scale
             sensor=case.sensor,
             seed=case.seed,
         )
-    seconds, empty = time.perf_counter() - begin, np.mean([finder.is_empty(one.image) for one in seen])
+    seconds, empty = (
+        time.perf_counter() - begin,
+        np.mean([np.count_nonzero(one.image) < MIN_CELLS for one in seen]),
+    )
     return f"{_name(case)}: {len(seen)} scans in {seconds:.1f} s, {empty:.0%} nearly empty"
 
 
@@ -161,7 +164,7 @@ def chosen(folder: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> It
 
 def finder_of(params: Params) -> CandidateFinder:
     """An empty finder with the settings of the loop detector. It needs no model of the probability."""
-    return CandidateFinder(params, keyframe_m=DetectorConfig.keyframe_m)
+    return CandidateFinder(params)
 
 
 def compared(
@@ -240,7 +243,8 @@ def _counts(path: Path, drive: RenderedDrive, params: Params, odometry: Odometry
         pose = None if given is None else given[i]
         detector.add_seen(seen, time=float(drive.times[i]), odometry=pose, compared=frame)
     drift = detector.finder.present_drift
-    loops = detector.loops if given is None else accepted(detector.loops, given, drift=drift)[0]
+    path = detector.finder.motion.path
+    loops = detector.loops if given is None else accepted(detector.loops, path, drift=drift)[0]
     fits = np.array([one.match_from_query for one in loops])
     errors = pose_errors([(one.query, one.match) for one in loops], fits, drive.world_from_lidar)
     right = {loop.query for loop, ok in zip(loops, errors.right, strict=True) if ok}

@@ -92,8 +92,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     from sglpr_jax.files import naming
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.maps.build import map_recording
-    from sglpr_jax.maps.place_map import PlaceMap
-    from sglpr_jax.maps.place_names import poses_by_id
+    from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.pose_graph.files import write_tum
     from sglpr_jax.retrieval.index import check_scale
@@ -162,7 +161,7 @@ def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict
             "found too few"
         )
     print(f"{command.recording}: {found}")
-    world_from_new = found.frames.match_from_query
+    world_from_new = found.old_from_new
     return before.merged(new.moved(world_from_new), drive={id: world_from_new @ pose for id, pose in drive.items()})
 
 

@@ -1,7 +1,7 @@
 """Mounting of a recording's sensor: given, or estimated from the ground; for one that tilts, at each scan.
 
-The ground of one scan gives height and up (`estimate_mounting`). `GroundFilter` replaces ground that contradicts the
-scans before. With an IMU, the ground must agree with the IMU. With odometry, up is averaged over some metres of path.
+The ground of a scan gives height and up. `GroundFilter` replaces ground that contradicts the scans before. With an IMU,
+the ground must agree with it. With odometry, up is averaged over some metres of path.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Gravity, SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value, require
@@ -57,8 +57,8 @@ does not show it."""
 def mounted(recording: Recording, height: SensorHeight, *, gravity: Gravity = "auto", known: bool) -> Recording:
     """Return the recording with its sensor mounting, and a description of the mounting in `Recording.found`.
 
-    Recordings of images are returned unchanged. If the ground does not show the mounting, it stays unknown, and
-    models assume a sensor 1.73 m above the ground.
+    If the ground does not show the mounting, it stays unknown, and models assume a sensor 1.73 m above the ground.
+    Recordings of images are returned unchanged.
 
     Arguments:
       recording: Recording of scans or images.
@@ -84,13 +84,18 @@ def mounted(recording: Recording, height: SensorHeight, *, gravity: Gravity = "a
 
 
 def _estimated(recording: Recording, gravity: Gravity) -> Recording:
+    """The recording with the mounting that some of its scans show."""
     each = _of_scans(recording, SCANS)
     mounting = common_mounting(each)
     hanging = [scan.up[2] < 0 for scan in each if scan is not None]
     if mounting is None:
-        found = (
-            f"sensor: {_unclear(hanging, len(each))}, assumed {MODEL_HEIGHT_M} m above the ground; set --sensor-height"
+        unclear = (
+            f"ground found in {len(hanging)} of {len(each)} scans (is z up in these files?)"
+            if 2 * len(hanging) < len(each)
+            else f"the ground is below the sensor in {hanging.count(False)} of {len(each)} scans and above it in"
+            f" {hanging.count(True)}"
         )
+        found = f"sensor: {unclear}, assumed {MODEL_HEIGHT_M} m above the ground; set --sensor-height"
     else:
         agreed = hanging.count(mounting.up[2] < 0)
         found = f"sensor: {mounting}, estimated from the ground in {agreed} of {len(each)} scans"
@@ -98,17 +103,6 @@ def _estimated(recording: Recording, gravity: Gravity) -> Recording:
     if gravity == "scan" or (gravity == "auto" and tilts(each, mounting)):
         return with_gravity(recording, mounting or Mounting(MODEL_HEIGHT_M))
     return recording
-
-
-def _unclear(hanging: list[bool], scans: int) -> str:
-    """Explain why the scans show no mounting. `hanging` states for each scan with ground whether the sensor is upside
-    down."""
-    if 2 * len(hanging) < scans:
-        return f"ground found in {len(hanging)} of {scans} scans (is z up in these files?)"
-    return (
-        f"the ground is below the sensor in {hanging.count(False)} of {scans} scans and above it in"
-        f" {hanging.count(True)}"
-    )
 
 
 def _check_layout(recording: Recording) -> None:
@@ -126,13 +120,12 @@ def _check_layout(recording: Recording) -> None:
 
 def _of_scans(recording: Recording, scans: int) -> list[Mounting | None]:
     """Estimate the mounting from some scans, spread over the recording, or None for unreadable ones."""
-    rows = np.unique(np.linspace(0, len(recording) - 1, scans).astype(int)).tolist()
-
-    def of_scan(row: int) -> Mounting | None:
+    found: list[Mounting | None] = []
+    for row in np.unique(np.linspace(0, len(recording) - 1, scans).astype(int)).tolist():
+        found.append(None)
         with contextlib.suppress(ValueError, OSError):
-            return estimate_mounting(recording.points(row))
-
-    return [of_scan(row) for row in rows]
+            found[-1] = estimate_mounting(recording.points(row))
+    return found
 
 
 class GroundFilter:
@@ -146,12 +139,9 @@ class GroundFilter:
     """
 
     def __init__(self, mean: Mounting, *, spread_deg: float = SPREAD_DEG, spread_m: float = SPREAD_M):
-        """Start a filter.
+        """Start a filter with the mean mounting.
 
-        Arguments:
-          mean: Mean mounting.
-          spread_deg: Standard deviation of up about its mean, about each horizontal axis, in degrees.
-          spread_m: Standard deviation of the height about its mean, in metres.
+        The spreads are standard deviations of up about each horizontal axis, in degrees, and of the height, in metres.
         """
         self.mean = mean
         self.followed = 0
@@ -167,9 +157,8 @@ class GroundFilter:
     def update(self, ground: Mounting | None, *, up: Float[np.ndarray, "3"] | None = None) -> Mounting:
         """Add the mounting by the ground of the next scan, or None for a scan without ground.
 
-        Arguments:
-          ground: Mounting, or None.
-          up: Direction of up in the LiDAR frame by an IMU, which replaces the mean. Use it for all scans or for none.
+        `up` is the direction of up in the LiDAR frame by an IMU, which replaces the mean. Use it for all scans or for
+        none.
         """
         mean, spread, noise = self.mean, self._spread, self._noise
         if up is not None:
@@ -200,13 +189,14 @@ def tilts(scans: Sequence[Mounting | None], common: Mounting | None) -> bool:
 
 
 def with_gravity(recording: Recording, common: Mounting) -> Recording:
-    """Estimate the mounting of each scan of a recording. This reads all scans.
+    """Estimate the mounting of each scan of a recording about a mean mounting. This reads all scans."""
 
-    Arguments:
-      recording: The scans.
-      common: Mean mounting.
-    """
-    ground = _ground(recording, common)
+    def ground_of(row: int, record: Record) -> Mounting | None:
+        assert record.points is not None
+        return estimate_mounting(record.points, near=common)
+
+    options = {"ahead": os.cpu_count() or 1, "on_bad_scan": lambda scan, error: None}
+    ground = [found for _, found in scan_stream(recording, ground_of, **options)]
     seen = [scan for scan in ground if scan is not None] or [common]
     apart = np.array([_apart(scan, common) for scan in seen])
     middle = np.median(apart, axis=0)
@@ -250,13 +240,9 @@ def _ups_by_imu(
 
 
 def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
-    """Average up of each scan over the path by the rotations of odometry, if the recording has `mountings`.
+    """Average up of each scan over the path by the poses of the LiDAR, if the recording has `mountings`.
 
     Odometry that does not show the tilt, as that of wheels, is not used.
-
-    Arguments:
-      recording: The scans.
-      world_from_lidar: Pose of the LiDAR at each scan, in any fixed frame.
     """
     if recording.mountings is None:
         return recording
@@ -276,16 +262,6 @@ def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4
     )
     found = f"gravity: tilt of each scan from the odometry and the ground, {left:.1f} degrees apart"
     return dataclasses.replace(recording, mountings=mountings, found=(*recording.found, found))
-
-
-def _ground(recording: Recording, common: Mounting) -> list[Mounting | None]:
-    """Mounting by the ground of each scan, or None for scans that show no ground or cannot be read."""
-
-    def of_scan(row: int, record) -> Mounting | None:
-        return estimate_mounting(record.points, near=common)
-
-    options = {"ahead": os.cpu_count() or 1, "on_bad_scan": lambda scan, error: None}
-    return [found for _, found in scan_stream(recording, of_scan, **options)]
 
 
 def _apart(one: Mounting, mean: Mounting) -> Float[np.ndarray, "3"]:

@@ -5,7 +5,7 @@ sensors are rotated to be gravity-aligned and shifted to this height.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -105,19 +105,16 @@ class Mounting:
 
 
 def estimate_mounting(points: Float32[np.ndarray, "n 3"], *, near: Mounting | None = None) -> Mounting | None:
-    """Estimate the mounting of a sensor from the ground in one scan.
+    """Estimate the mounting of a sensor from the ground in one scan, or None if no ground is found.
 
-    RANSAC searches for the plane with the most points and almost no points below it. A least-squares fit to the ground
-    points refines the plane. The plane may be tilted by up to 35 degrees against the sensor's z axis, and the sensor
-    may hang upside down. The result is deterministic.
+    RANSAC searches for the plane with the most points and almost no points below it, and least squares refine it. The
+    plane may be tilted by up to 35 degrees against the sensor's z axis, and the sensor may hang upside down. The result
+    is deterministic.
 
     Arguments:
       points: Points in the LiDAR frame, in metres.
       near: Mounting of other scans of the sensor. The ground is searched on the same side of the sensor, with fewer
         trials.
-
-    Returns:
-      The mounting, or None if no ground is found.
 
     Example:
       mounting = estimate_mounting(recording.points(0))
@@ -145,21 +142,16 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"], *, near: Mounting | No
 
 
 def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
-    """Combine the mountings estimated from the scans of a recording into their median.
+    """Median of the mountings that were estimated from the scans of a recording. A tilt below 2 degrees is set to zero.
 
-    If some scans show an upright sensor and others an upside-down one, only the majority counts. A tilt below 2 degrees
-    is set to zero.
-
-    Arguments:
-      found: Mounting of each scan, or None for scans without ground.
-
-    Returns:
-      The median, or None if fewer than half of the scans have a mounting, or if there is no majority.
+    If some scans show an upright sensor and others an upside-down one, only the majority counts. Returns None if fewer
+    than half of the scans have a mounting, or if there is no majority.
     """
     scans = list(found)
-    seen = [mounting for mounting in scans if mounting is not None]
-    agreed = _on_one_side(seen)
-    if 2 * len(seen) < len(scans) or not agreed:
+    hanging = [one for one in scans if one is not None and one.up[2] < 0]
+    upright = [one for one in scans if one is not None and one.up[2] >= 0]
+    agreed = max(hanging, upright, key=len)
+    if 2 * len(hanging + upright) < len(scans) or len(hanging) == len(upright):
         return None
     height = float(np.median([mounting.height_m for mounting in agreed]))
     up = np.median([mounting.up for mounting in agreed], axis=0)
@@ -167,14 +159,6 @@ def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
     if min(mounting.tilt_deg, 180 - mounting.tilt_deg) < LEVEL_DEG:
         return Mounting(height, (0.0, 0.0, float(np.sign(up[2]))))
     return mounting
-
-
-def _on_one_side(seen: Sequence[Mounting]) -> Sequence[Mounting]:
-    """Return the mountings of the upright or of the upside-down sensors, whichever are more. Opposite directions have
-    no median."""
-    hanging = [mounting for mounting in seen if mounting.up[2] < 0]
-    upright = [mounting for mounting in seen if mounting.up[2] >= 0]
-    return [] if len(hanging) == len(upright) else max(hanging, upright, key=len)
 
 
 def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -193,8 +177,7 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 def _planes(
     points: Float[np.ndarray, "n 3"], *, trials: int
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
-    """Sample planes that may be the ground. Returns normals that point up, and heights of the sensor above the
-    planes."""
+    """Sample planes that may be the ground. Returns normals that point up, and heights of the sensor above them."""
     rng = np.random.default_rng(0)
     first = rng.integers(len(points), size=trials)
     near = rng.normal(scale=len(points) / 8, size=(2, trials)).astype(int) + first  # often neighbours in the file
@@ -204,10 +187,7 @@ def _planes(
     kept = np.abs(normals[:, 2]) > np.maximum(np.cos(np.radians(STEEPEST_DEG)) * lengths, 0.5)
     normals = (normals / np.copysign(np.maximum(lengths, 1e-9), normals[:, 2])[:, None])[kept]
     heights = -np.einsum("ti,ti->t", normals, a[kept])
-    normals, heights = (
-        np.concatenate([normals, -normals]),
-        np.concatenate([heights, -heights]),
-    )  # Either side may be up.
+    normals, heights = np.concatenate([normals, -normals]), np.concatenate([heights, -heights])  # either side may be up
     kept = (heights >= np.where(normals[:, 2] > 0, HEIGHTS_M[0], LEAST_HANGING_M)) & (heights <= HEIGHTS_M[1])
     return normals[kept], heights[kept]
 

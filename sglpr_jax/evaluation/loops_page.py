@@ -5,20 +5,21 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.levelling import mountings_of, upright_from_lidar, upright_odometry
+from sglpr_jax.data.levelling import uprights
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, missing, render
 from sglpr_jax.evaluation.report import TextTable
 from sglpr_jax.loops.calibration import reliability_of
-from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
+from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, to_upright
 from sglpr_jax.loops.frame_alignment import AlignedParts
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import FoundLoops, why_none
+from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.pose_graph.folder import unique_names
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements, trajectory_error
 from sglpr_jax.same_place import NEGATIVE_M
-from sglpr_jax.se3 import inverse, yaw_of
+from sglpr_jax.se3 import yaw_of
 
 PAGE = "index.html"
 SHOWN_PAIRS = 9
@@ -32,7 +33,7 @@ def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = Non
     With `optimized` trajectories it shows them before and after the correction.
     """
     if len(found.sessions) == 1:
-        return render(f"Loops of {found.recording.name}", _about(found), _of_recording(found, optimized))
+        return render(f"Loops of {found.sessions[0].recording.name}", _about(found), _of_recording(found, optimized))
     names = unique_names(found)
     sections = [_transforms(found, names), *_together(found, names, optimized)]
     pairs = {pair: found.between(*pair) for pair in found.pairs}
@@ -52,19 +53,20 @@ def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = Non
 
 
 def _about(found: FoundLoops) -> str:
-    return f"{found}; {'with odometry' if found.odometry is not None else 'without odometry'}."
+    return f"{found}; {'with odometry' if found.sessions[0].odometry is not None else 'without odometry'}."
 
 
 def _of_recording(found: FoundLoops, optimized: OptimizedTrajectory | None) -> list[Section]:
     """Sections of a recording. With an `optimized` trajectory there is one about the correction."""
+    session = found.sessions[0]
     reasons = why_none(found)
     why = [Section("Why no loops", [Text(reason) for reason in reasons])] if reasons else []
-    corrected = [_corrected(found, optimized)] if optimized is not None and found.frames else []
+    corrected = [_corrected(found, optimized)] if optimized is not None and session.frames else []
     return [
         *why,
         Section("Trajectory", _trajectory(found)),
         *corrected,
-        Section("Pairs", [_pairs(found.recording, found.recording, found.loops, nothing="No loops.")]),
+        Section("Pairs", [_pairs(session.recording, session.recording, found.loops, nothing="No loops.")]),
         Section("Loops", [_table(found)]),
         Section("Rejected", _reasons(found.rejected)),
         Section("Reliability", _reliability(found)),
@@ -73,27 +75,25 @@ def _of_recording(found: FoundLoops, optimized: OptimizedTrajectory | None) -> l
 
 def _trajectory(found: FoundLoops) -> list[Picture | Text]:
     """Draw the loops on the trajectory, if positions are known, and the match of each query."""
+    session = found.sessions[0]
     if not figures.can_draw():
         return [NO_MATPLOTLIB]
-    if not found.frames:
+    if not session.frames:
         return [missing("No scan was processed.")]
-    positions = found.recording.positions
-    if found.odometry is not None:
-        positions = upright_odometry(found.odometry, mountings_of(found.recording))[:, :3, 3]
+    positions = session.recording.positions
+    if session.odometry is not None:
+        positions = level_odometry(session.odometry, uprights(session.recording))[:, :3, 3]
     drawn, wrong = [], _frames(wrong_loops(found))
     if positions is not None:
-        what = "from the odometry" if found.odometry is not None else f"from {found.recording.pose_source}"
-        judged = "Long lines are drift, or wrong loops."
-        if found.recording.positions is not None and found.loops:
-            said = f"{len(wrong)} of {len(found.loops)} loops are wrong{' (red)' if wrong else ''}"
-            judged = f"{said}: more than {NEGATIVE_M:g} m apart by {found.recording.pose_source}."
+        what = "from the odometry" if session.odometry is not None else f"from {session.recording.pose_source}"
+        judged = _judged(found) or "Long lines are drift, or wrong loops."
         caption = f"The trajectory {what}. A line connects the two frames of each loop. {judged}"
         right = [pair for pair in _frames(found.loops) if pair not in set(wrong)]
-        plot = figures.loops(positions[: found.frames], right, wrong=wrong)
+        plot = figures.loops(positions[: session.frames], right, wrong=wrong)
         drawn.append(figure_picture(plot, "The loops on the trajectory", caption=caption))
     shown = [(one.query, one.match, one.probability) for one in found.loops]
     rejected = _frames(one.loop for one in found.rejected)
-    order = figures.loops_in_time(shown, found.frames, wrong=wrong, rejected=rejected)
+    order = figures.loops_in_time(shown, session.frames, wrong=wrong, rejected=rejected)
     caption = "The match of each query. Rejected pairs are grey." if rejected else "The match of each query."
     return [*drawn, figure_picture(order, "The loops in time", caption=caption)]
 
@@ -105,8 +105,18 @@ def wrong_loops(found: FoundLoops) -> list[Loop]:
 
 def _apart_m(found: FoundLoops, loop: Loop) -> float | None:
     """Return the true distance between the two frames of a loop in metres, or None if it is not known."""
-    true = found.recording.positions
+    true = found.sessions[0].recording.positions
     return None if true is None else float(np.linalg.norm(true[loop.query] - true[loop.match]))
+
+
+def _judged(found: FoundLoops) -> str:
+    """Return a sentence with the number of wrong loops. Empty if true positions are not known."""
+    session = found.sessions[0]
+    if session.recording.positions is None or not found.loops:
+        return ""
+    wrong = len(wrong_loops(found))
+    said = f"{wrong} of {len(found.loops)} loops are wrong{' (red)' if wrong else ''}"
+    return f"{said}: more than {NEGATIVE_M:g} m apart by {session.recording.pose_source}."
 
 
 def _frames(loops: Iterable[Loop]) -> list[tuple[int, int]]:
@@ -115,16 +125,18 @@ def _frames(loops: Iterable[Loop]) -> list[tuple[int, int]]:
 
 def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> Section:
     """Draw the trajectory before and after the correction. If true positions are known, the caption has both errors."""
-    assert found.odometry is not None
-    both = {"odometry": found.odometry[: found.frames], "optimized": optimized.poses}
+    session = found.sessions[0]
+    assert session.odometry is not None
+    both = {"odometry": session.odometry[: session.frames], "optimized": optimized.poses}
     about = _sentence(optimized)
-    true = found.recording.positions
-    if true is not None and found.frames > 2:
-        errors = (f"{name} {trajectory_error(poses, true[: found.frames]):.2f} m" for name, poses in both.items())
-        about += f" Position error (RMSE after alignment with {found.recording.pose_source}): {', '.join(errors)}."
+    true = session.recording.positions
+    if true is not None and session.frames > 2:
+        errors = (f"{name} {trajectory_error(poses, true[: session.frames]):.2f} m" for name, poses in both.items())
+        about += f" Position error (RMSE after alignment with {session.recording.pose_source}): {', '.join(errors)}."
     if not figures.can_draw():
         return Section("Corrected", [missing(about)])
-    level = {name: upright_odometry(poses, mountings_of(found.recording))[:, :3, 3] for name, poses in both.items()}
+    upright = uprights(session.recording)[: session.frames]
+    level = {name: level_odometry(poses, upright)[:, :3, 3] for name, poses in both.items()}
     drawn = figure_picture(figures.trajectories(level), "The trajectory before and after", caption=about)
     return Section("Corrected", [drawn])
 
@@ -135,9 +147,10 @@ def _sentence(said: object) -> str:
 
 def _reliability(found: FoundLoops) -> list[Picture | Text | TextTable]:
     """Plot and table of the share of loops over the predicted probability, if true positions are known."""
-    if found.recording.positions is None or found.model is None:
+    session = found.sessions[0]
+    if session.recording.positions is None or found.model is None:
         return [missing("The share of loops among the pairs is not known: the recording has no poses.")]
-    bins = reliability_of(found.candidates, found.model, found.recording.positions)
+    bins = reliability_of(session.candidates, found.model, session.recording.positions)
     if not bins:
         return [missing("No pair was compared.")]
     header = ("probability", "pairs", "loops", "share", "said")
@@ -147,7 +160,7 @@ def _reliability(found: FoundLoops) -> list[Picture | Text | TextTable]:
         return [table]
     caption = (
         f"Share of loops among all candidates, before neighbours and odometry are considered. A loop is a pair up to "
-        f"10 m apart by {found.recording.pose_source}; pairs 10 to 20 m apart are ignored. Labels: number of pairs."
+        f"10 m apart by {session.recording.pose_source}; pairs 10 to 20 m apart are ignored. Labels: number of pairs."
     )
     drawn = figures.reliability([(one.said, one.share, one.pairs) for one in bins])
     return [figure_picture(drawn, "Share of loops over probability", caption=caption), table]
@@ -174,9 +187,8 @@ def overlay_of(query: Recording, match: Recording, loop: Loop) -> Float[np.ndarr
         square_image(query.record(loop.query, labels=False)),
         square_image(match.record(loop.match, labels=False)),
     )
-    to_upright = upright_from_lidar(match.mounting_of(loop.match))
-    from_upright = inverse(upright_from_lidar(query.mounting_of(loop.query)))
-    return figures.overlaid(*images, to_upright @ loop.match_from_query @ from_upright)
+    level = to_upright(loop, query=query.mounting_of(loop.query), match=match.mounting_of(loop.match))
+    return figures.overlaid(*images, level.match_from_query)
 
 
 def _reasons(rejected: Sequence[Rejected]) -> list[Text | TextTable]:
@@ -190,14 +202,15 @@ def _reasons(rejected: Sequence[Rejected]) -> list[Text | TextTable]:
 
 def _table(found: FoundLoops) -> Text | TextTable:
     """Table of the wrong loops, if known, and of the loops with the lowest probabilities."""
+    session = found.sessions[0]
     if not found.loops:
         return missing("No loops.")
-    known = found.recording.positions is not None
+    known = session.recording.positions is not None
     header = ("query", "match", "x [m]", "y [m]", "yaw [deg]", "probability", "overlap")
     header = (*header, "true distance [m]") if known else header
     wrong = set(_frames(wrong_loops(found)))
     first = sorted(found.loops, key=lambda loop: ((loop.query, loop.match) not in wrong, loop.probability))[:SHOWN_ROWS]
-    ids = found.recording.ids
+    ids = session.recording.ids
     rows = [
         (
             ids[loop.query],
@@ -236,7 +249,7 @@ def _transforms(found: FoundLoops, names: list[str]) -> Section:
 
 
 def _numbers(aligned: AlignedParts) -> tuple[str, ...]:
-    pose, sigma = aligned.alignment.match_from_query, np.sqrt(np.diag(aligned.alignment.covariance))
+    pose, sigma = aligned.match_from_query, np.sqrt(np.diag(aligned.covariance))
     position = (f"{value:.2f}" for value in pose[:3, 3])
     yaw, spread = np.degrees(yaw_of(pose)), (np.hypot(*sigma[:2]), np.degrees(sigma[5]))
     return (f"{aligned.loops}", *position, f"{yaw:.2f}", *(f"{value:.2f}" for value in spread))

@@ -53,7 +53,7 @@ def write_rerun(found: FoundLoops, path: Path | str, *, optimized: OptimizedTraj
     rerun: Any = importlib.import_module("rerun")
     poses = _poses(found, optimized)
     with replacing(Path(path)) as temporary:
-        stream = rerun.RecordingStream("sglpr-jax", recording_id=f"loops {found.recording.name}")
+        stream = rerun.RecordingStream("sglpr-jax", recording_id=f"loops {found.sessions[0].recording.name}")
         stream.save(temporary, default_blueprint=_layout(rerun, with_map=poses is not None))
         if poses is not None:
             _log_map(rerun, stream, found, poses, optimized)
@@ -64,15 +64,16 @@ def write_rerun(found: FoundLoops, path: Path | str, *, optimized: OptimizedTraj
 
 def _poses(found: FoundLoops, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
     """Pose of each searched frame in the map: corrected, by odometry, or a known position without a rotation."""
+    session = found.sessions[0]
     if optimized is not None:
         return optimized.poses
-    if found.odometry is not None:
-        return found.odometry[: found.frames]
-    positions = found.recording.positions
+    if session.odometry is not None:
+        return session.odometry[: session.frames]
+    positions = session.recording.positions
     if positions is None:
         return None
-    poses = np.tile(np.eye(4), (found.frames, 1, 1))
-    poses[:, :3, 3] = positions[: found.frames] - positions[0]
+    poses = np.tile(np.eye(4), (session.frames, 1, 1))
+    poses[:, :3, 3] = positions[: session.frames] - positions[0]
     return poses
 
 
@@ -93,19 +94,20 @@ def _log_map(
     optimized: OptimizedTrajectory | None,
 ) -> None:
     """Both trajectories, the sensor, and the scans of keyframes."""
+    session = found.sessions[0]
     stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     lines = {"given": (poses, BEFORE)}
-    if optimized is not None and found.odometry is not None:
-        lines = {"given": (found.odometry[: found.frames], BEFORE), "corrected": (poses, AFTER)}
+    if optimized is not None and session.odometry is not None:
+        lines = {"given": (session.odometry[: session.frames], BEFORE), "corrected": (poses, AFTER)}
     for name, (path, colour) in lines.items():
         stream.log(f"map/trajectory/{name}", rerun.LineStrips3D([path[:, :3, 3]], colors=[colour]), static=True)
-    turned = found.odometry is not None  # known positions have no rotation
-    keyframes = set(_keyframes(poses).tolist()) if turned and not found.recording.has_images else set()
+    turned = session.odometry is not None  # known positions have no rotation
+    keyframes = set(_keyframes(poses).tolist()) if turned and not session.recording.has_images else set()
     for frame, pose in enumerate(poses):
         stream.set_time(TIMELINE, sequence=frame)
         stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[AFTER]))
-        if frame in keyframes and found.recording.ids[frame] not in found.sessions[0].skipped:
-            points = found.recording.record(frame, labels=False).points
+        if frame in keyframes and session.recording.ids[frame] not in session.skipped:
+            points = session.recording.record(frame, labels=False).points
             if points is not None and len(points):
                 placed = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)
                 stream.log(f"map/scans/{frame}", rerun.Points3D(placed, colors=[SCAN], radii=[0.05]))
@@ -125,6 +127,7 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
 
 def _log_loops(rerun: Any, stream: Any, found: FoundLoops, poses: Float[np.ndarray, "n 4 4"] | None) -> None:
     """A line in the map, the pair of images and a text for each loop, at the frame of the query."""
+    session = found.sessions[0]
     wrong = {(loop.query, loop.match) for loop in wrong_loops(found)}
     for loop in found.loops:
         colour = WRONG if (loop.query, loop.match) in wrong else RIGHT
@@ -135,7 +138,7 @@ def _log_loops(rerun: Any, stream: Any, found: FoundLoops, poses: Float[np.ndarr
                 f"map/loops/{loop.query}",
                 rerun.LineStrips3D([ends], colors=[colour], labels=[_said(loop)], show_labels=False),
             )
-        image = (255 * np.clip(overlay_of(found.recording, found.recording, loop), 0, 1)).astype(np.uint8)
+        image = (255 * np.clip(overlay_of(session.recording, session.recording, loop), 0, 1)).astype(np.uint8)
         stream.log("pair", rerun.Image(image).compress(jpeg_quality=90))
         stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {_said(loop)}"))
 
@@ -147,10 +150,11 @@ def _said(loop: Loop) -> str:
 
 def _log_evidence(rerun: Any, stream: Any, found: FoundLoops) -> None:
     """Correlation of the candidate of each frame, and its probability without the evidence of neighbours."""
-    if found.model is None or not found.candidates:
+    session = found.sessions[0]
+    if found.model is None or not session.candidates:
         return
-    probabilities = found.model.probability(Evidence.stack([one.evidence for one in found.candidates]))
-    for one, probability in zip(found.candidates, probabilities.tolist(), strict=True):
+    probabilities = found.model.probability(Evidence.stack([one.evidence for one in session.candidates]))
+    for one, probability in zip(session.candidates, probabilities.tolist(), strict=True):
         stream.set_time(TIMELINE, sequence=one.query)
         stream.log("evidence/probability", rerun.Scalars(probability))
         stream.log("evidence/correlation", rerun.Scalars(float(one.alignment.correlation)))

@@ -1,7 +1,7 @@
 """Reliability of loop probabilities: pairs in bins of probability, and the share of loops in each bin."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,20 +9,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.bev import even_cells, rotate_image
-from sglpr_jax.data.levelling import mountings_of, upright_odometry
+from sglpr_jax.data.levelling import uprights
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
-from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.same_place import NEGATIVE_M
 
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
@@ -97,17 +96,9 @@ SAME_PASS_M = 50.0
 
 
 def calibrated(
-    params: Params,
-    recording: Recording,
-    odometry: Float[np.ndarray, "n 4 4"],
-    *,
-    pairs: int = 200,
-    seed: int = 0,
-    model: LoopModel | None = None,
-    config: CandidateConfig = CandidateConfig(),
-    on_progress: Callable[[int], None] = lambda done: None,
+    params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], *, pairs: int = 200, seed: int = 0
 ) -> LoopModel:
-    """Scale and shift the log odds of a loop model to fit a drive with odometry.
+    """Scale and shift the log odds of the shipped loop model to fit a drive with odometry.
 
     Arguments:
       params: Weights of the model that describes the scans.
@@ -115,31 +106,19 @@ def calibrated(
       odometry: Pose of the LiDAR at each scan.
       pairs: Number of frames drawn for positive pairs, and number of frames drawn for negative pairs.
       seed: Seed of the random choice.
-      model: Model to calibrate, by default the one shipped for the weights.
-      config: Settings of the retrieval.
-      on_progress: Called with the number of frames done.
 
     Raises:
       ValueError: If the odometry has another length, if a scan is bad (`scan_stream`), or if the drive has no pairs of
         one kind.
     """
-    evidence, is_loop = certain_pairs(
-        params, recording, odometry, pairs=pairs, seed=seed, config=config, on_progress=on_progress
-    )
-    shipped = default_model() if model is None else model
+    evidence, is_loop = certain_pairs(params, recording, odometry, pairs=pairs, seed=seed)
+    shipped = default_model()
     made_with = f"{shipped.made_with}; {is_loop.sum()} loops and {(~is_loop).sum()} others of {recording.name}"
     return recalibrated(shipped, evidence, is_loop, made_with=made_with)
 
 
 def certain_pairs(
-    params: Params,
-    recording: Recording,
-    odometry: Float[np.ndarray, "n 4 4"],
-    *,
-    pairs: int,
-    seed: int = 0,
-    config: CandidateConfig = CandidateConfig(),
-    on_progress: Callable[[int], None] = lambda done: None,
+    params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], *, pairs: int, seed: int = 0
 ) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
     """Evidence of positive and negative pairs of a drive, and whether each pair is a loop. See `calibrated`."""
     n = len(recording)
@@ -147,7 +126,7 @@ def certain_pairs(
         raise ValueError(
             f"expected odometry of {n} poses, one for each scan of {recording.name}, found {len(odometry)}"
         )
-    drive = _Drive(params, recording, odometry, config)
+    drive = _Drive(params, recording, odometry)
     rng = np.random.default_rng(seed)
     evidence, is_loop = [], []
     for done, frame in enumerate(rng.permutation(n)[: 2 * pairs].tolist()):
@@ -155,7 +134,6 @@ def certain_pairs(
         if pair is not None:
             evidence.append(pair.evidence)
             is_loop.append(bool(done % 2))
-        on_progress(done + 1)
     if not evidence or all(is_loop) or not any(is_loop):
         raise ValueError(
             f"{recording.name}: expected frames {NEAR_M[0]:g} to {NEAR_M[1]:g} m apart, and frames farther apart than "
@@ -167,18 +145,15 @@ def certain_pairs(
 class _Drive:
     """Stored scans of a drive, and its odometry with a last frame of unknown pose for queries."""
 
-    def __init__(
-        self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], config: CandidateConfig
-    ):
-        self.finder, self.recording = CandidateFinder(params, config=config), recording
-        self.motion = Motion.of(upright_odometry(odometry, mountings_of(recording)))
+    def __init__(self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"]):
+        self.finder, self.recording = CandidateFinder(params), recording
+        self.motion = Motion.of(level_odometry(odometry, uprights(recording)))
         self.motion.add(0.0, continues=False)
-        self.stored = StoredScans(self.finder.index, verification=VerificationConfig())
+        self.stored = StoredScans(self.finder.index)
         for row, seen in scan_stream(recording, lambda row, record: self.finder.seen(record)):
             assert seen is not None  # the stream raises the error of a bad scan
             self.stored.add(row, seen.descriptor, np.asarray(within_reach(seen.image)))
-        nothing = np.zeros((0, 2), np.int64)
-        self.comparer = Comparer(self.motion, DriftModel(), np.eye(3), config, VerificationConfig(), nothing)
+        self.comparer = Comparer(self.motion, DriftModel())
 
     def pair(self, frame: int, angle: float, *, positive: bool) -> Candidate | None:
         """Pair of a frame that is rotated by `angle` (radians) and a near or far one, or None."""
@@ -191,7 +166,7 @@ class _Drive:
         scans = self.stored.some(far | near if positive else far)
         fits = self.comparer.compare(query, scans, possible=near if positive else far)
         matches = np.isin(fits.frames, frames[near if positive else far])
-        found = self.comparer.candidates(query, fits, self.stored.image_of, possible=matches)
+        found = self.comparer.candidates(query, fits, self.stored, possible=matches)
         return found[0] if found else None
 
     def rotated(self, frame: int, angle: float) -> Query:

@@ -4,15 +4,15 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from sglpr_jax.data.levelling import Mountings, upright_from_lidar
+from sglpr_jax.data.levelling import is_tilted, upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query
-from sglpr_jax.loops.config import MIN_CELLS, CandidateConfig
+from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.keyframes import Seen, StoredScans, described, image_spectrum
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
@@ -23,16 +23,13 @@ from sglpr_jax.registration.background import Background
 from sglpr_jax.registration.bev_alignment import refined
 from sglpr_jax.registration.bev_search import Peak, search_near
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
-
-
 AGREE_M, AGREE_DEG = 0.8, 6.0
-"""Maximum distance and angle between two poses that agree, in metres and degrees."""
+"""Maximum distance and angle between two poses of a scan in one frame that agree, in metres and degrees."""
 
 
 class Compared(NamedTuple):
@@ -44,47 +41,33 @@ class Compared(NamedTuple):
     """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
-def agree(first: Link, second: Link) -> bool:
-    """Whether two poses of a scan in one frame agree."""
-    apart, turned = np.hypot(first.x - second.x, first.y - second.y), first.angle_to(float(second.yaw))
-    return bool(apart <= AGREE_M and turned <= np.radians(AGREE_DEG))
-
-
 class CandidateFinder:
     """Finds candidates in a stream of scans. Stores descriptor and compressed image of each scan that is not empty.
 
-    The number of image comparisons for a frame is constant. The search for the nearest descriptor (a matrix product) is
-    proportional to the number of stored scans. Times, motion and drift are compared with those of all frames.
+    Each frame takes a constant number of image comparisons, and a matrix product for the nearest descriptors.
     """
 
-    def __init__(
-        self,
-        params: Params,
-        *,
-        config: CandidateConfig = CandidateConfig(),
-        verification: VerificationConfig = VerificationConfig(),
-        drift: DriftModel = DriftModel(),
-        keyframe_m: float = 0.0,
-        max_places: int | None = None,
-    ):
-        """Create a finder without frames. The arguments are those of `DetectorConfig`."""
+    def __init__(self, params: Params, config: DetectorConfig = DetectorConfig()):
+        """Create a finder without frames."""
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
-        self.params, self.config, self.verification = params, config, verification
-        self.drift = drift
+        self.params, self.config, self.verification = params, config.candidates, config.verification
+        self.drift = config.drift
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
-        self.stored = StoredScans(index, verification=verification, keyframe_m=keyframe_m, max_places=max_places)
+        limits = {"keyframe_m": config.keyframe_m, "max_places": config.max_places}
+        self.stored = StoredScans(index, verification=config.verification, **limits)
         """Descriptors, and centres of the images without the background, for comparison."""
         self.compared = Compared(NO_FITS, None)
         """Comparisons of the last frame."""
         self.has_odometry = False
         """Whether the frames have poses from odometry. If so, `motion` holds them."""
-        self.mountings = Mountings()
+        self.mountings: list[Mounting | None] = []
         """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
         self.motion = Motion()
-        self._joined = GrowingArray(np.empty((0, 2), np.int64))
+        self.joined = GrowingArray(np.empty((0, 2), np.int64))
+        """Frames of the query and the match of each accepted loop."""
         self.background = Background()
         self.missing: list[int] = []
         """Frames whose scans cannot be read."""
@@ -111,34 +94,14 @@ class CandidateFinder:
         return self._times.rows if len(self._times) else None
 
     @property
-    def _last_mounting(self) -> Mounting | None:
-        return self.mountings[len(self) - 1] if len(self) else None
-
-    @property
     def empty(self) -> Bool[np.ndarray, " n"]:
-        """Whether each frame is almost empty (`is_empty`)."""
+        """Whether each frame is almost empty: it has fewer than `MIN_CELLS` occupied cells."""
         return self._empty.rows
 
     @property
     def nbytes(self) -> int:
         """Number of bytes of all frames: descriptors, compressed images, poses and times."""
-        arrays = self.stored, self.motion, self._times, self._empty, self.mountings
-        return sum(one.nbytes for one in arrays)
-
-    def add(
-        self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
-    ) -> list[Candidate]:
-        """Describe a scan or image, add it, and return its candidate, or an empty list.
-
-        Arguments:
-          record: The scan or image.
-          time: Time of the scan, in seconds.
-          odometry: Pose of the LiDAR in any fixed frame.
-
-        Raises:
-          ValueError: If only some frames have a time or a pose, or if times decrease.
-        """
-        return self.add_seen(self.seen(record), time=time, odometry=odometry)
+        return sum(one.nbytes for one in (self.stored, self.motion, self._times, self._empty))
 
     def add_seen(
         self,
@@ -149,25 +112,29 @@ class CandidateFinder:
         compared: Compared | None = None,
         continues: bool = True,
     ) -> list[Candidate]:
-        """Add a frame that is already described, and return its candidate. Raises the errors of `add`.
+        """Add a described scan or image, and return its candidate, or an empty list.
 
         Arguments:
           seen: Descriptor and image, or None for a scan that cannot be read.
           time: Time of the scan, in seconds.
           odometry: Pose of the LiDAR in any fixed frame.
-          compared: Comparisons of an earlier run. If they are given, they are not repeated.
+          compared: Comparisons of an earlier run (`loops.checkpoint`), which are then not repeated.
           continues: See `LoopDetector.add`.
+
+        Raises:
+          ValueError: If only some frames have a time or a pose, or if times decrease.
         """
         self._check(seen, time, odometry)
         frame = len(self)
         if seen is None:
             self.missing.append(frame)
-            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self._last_mounting)
-        pose = None if odometry is None else np.asarray(odometry, np.float64)
+            mounting = self.mountings[-1] if self.mountings else None
+            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), mounting)
+        to_upright = upright_from_lidar(seen.mounting)
+        pose = None if odometry is None else np.asarray(odometry, np.float64) @ inverse(to_upright)
         clock = float(frame) if time is None else time
-        upright = None if pose is None else pose @ inverse(upright_from_lidar(seen.mounting))
         middle = np.asarray(within_reach(seen.image, self.verification)) if seen.image.size else seen.image
-        empty = self.is_empty(seen.image)
+        empty = np.count_nonzero(seen.image) < MIN_CELLS  # too few cells to recognise a place
         if not empty:
             self.stored.check(frame, middle)
         detail, keyframe = self.background.without(middle), self.motion.keyframe
@@ -177,16 +144,17 @@ class CandidateFinder:
         link = None if compared is None else compared.link
         if not continues:
             self.odometry_check.restart()
-        if upright is not None:
-            link = self._check_odometry(query, upright, link, known=compared is not None)
+        if pose is not None:
+            link = self._check_odometry(query, pose, link, known=compared is not None)
         elif compared is None and continues:
             link = self._link(query, clock)
-        self.motion.add(clock, pose=upright, link=link, continues=continues)
+        self.motion.add(clock, pose=pose, link=link, continues=continues)
         self.mountings.append(seen.mounting)
-        comparer = self.comparer
+        self.motion.path.tilted |= is_tilted(to_upright)
+        comparer = Comparer(self.motion, self.present_drift, self.config, self.verification, self.joined.rows)
         if compared is None:
             compared = Compared(NO_FITS if query is None else comparer.compare(query, self.stored), link)
-        candidates = [] if query is None else comparer.candidates(query, compared.fits, self.stored.image_of)
+        candidates = [] if query is None else comparer.candidates(query, compared.fits, self.stored)
         if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
         self._last = None if empty else (frame, detail)
@@ -201,17 +169,6 @@ class CandidateFinder:
         return candidates
 
     @property
-    def comparer(self) -> Comparer:
-        """Comparison with the stored scans, after the motion so far."""
-        level = self.motion.path.level(self.mountings)
-        return Comparer(self.motion, self.present_drift, level, self.config, self.verification, self.joined)
-
-    @property
-    def joined(self) -> Int[np.ndarray, "l 2"]:
-        """Frames of the query and the match of each accepted loop."""
-        return self._joined.rows
-
-    @property
     def present_drift(self) -> DriftModel:
         """Drift of the odometry or, without odometry, of the motion estimated from the images."""
         return self.odometry_check.drift(self.drift) if self.has_odometry else MOTION_DRIFT
@@ -223,16 +180,12 @@ class CandidateFinder:
 
     def close_loop(self, query: int, match: int) -> None:
         """Note an accepted loop between two frames."""
-        self._joined.append((query, match))
+        self.joined.append((query, match))
         self.stored.close_loop(query, match)
 
     def seen(self, record: Record) -> Seen:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
         return described(self.params, record)
-
-    def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
-        """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""
-        return bool(np.count_nonzero(image) < MIN_CELLS)
 
     def _link(self, query: Query | None, clock: float) -> Link | None:
         """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
@@ -255,8 +208,12 @@ class CandidateFinder:
                 x, y, yaw = prior
                 ridge = self._from_keyframe(best._replace(x=x, y=y, yaw=yaw), frame)
             found.append(self._from_keyframe(near, frame))
-        certain = not any(map(self.motion.is_ridge, found))
-        return found[0] if len(found) > 1 and certain and agree(*found) else ridge
+        if len(found) == 2 and not any(map(self.motion.is_ridge, found)):
+            first, second = found
+            apart_m, turned = np.hypot(first.x - second.x, first.y - second.y), first.angle_to(float(second.yaw))
+            if apart_m <= AGREE_M and turned <= np.radians(AGREE_DEG):
+                return first
+        return ridge
 
     def _check_odometry(
         self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Link | None, *, known: bool

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.levelling import AnyMounting, lidar_pose, upright_from_lidar, upright_poses, uprights
+from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.odometry.config import DriftModel
@@ -86,8 +86,24 @@ class Loop:
 
     @property
     def is_degenerate(self) -> bool:
-        """Whether the position has a standard deviation of more than `DEGENERATE_M` in some horizontal direction."""
-        return is_degenerate(self.covariance)
+        """Whether the position is uncertain by more than `DEGENERATE_M` in some horizontal direction."""
+        return position_deviation(self.covariance) > DEGENERATE_M
+
+
+def to_upright(loop: Loop, *, query: Mounting | None, match: Mounting | None) -> Loop:
+    """The loop between the gravity-aligned frames of two sensors, from that between their LiDAR frames."""
+    return _between_frames(loop, upright_from_lidar(query), upright_from_lidar(match))
+
+
+def to_lidar(loop: Loop, *, query: Mounting | None, match: Mounting | None) -> Loop:
+    """The loop between the LiDAR frames of two sensors, from that between their gravity-aligned frames."""
+    return _between_frames(loop, inverse(upright_from_lidar(query)), inverse(upright_from_lidar(match)))
+
+
+def _between_frames(loop: Loop, query: Float[np.ndarray, "4 4"], match: Float[np.ndarray, "4 4"]) -> Loop:
+    """The loop between other frames of its scans, given the poses of the old frames in the new ones."""
+    pose = match @ loop.match_from_query @ inverse(query)
+    return dataclasses.replace(loop, match_from_query=pose, covariance=moved_covariance(loop.covariance, query))
 
 
 def unseen_covariance(
@@ -97,57 +113,28 @@ def unseen_covariance(
 
     Suspension and bumps tilt vehicles. With a tilt or a slope, the height error grows with the distance. If a mounting
     was estimated from its scan, its deviations count. A wrong tilt of the match lifts the query by its distance.
-
-    Arguments:
-      match_from_query: Pose of the gravity-aligned query in the plane.
-      query: Mounting of the query's sensor.
-      match: Mounting of the match's sensor.
     """
     apart_m = float(np.hypot(*match_from_query[:2, 3]))
-    if not (_is_estimated(query) or _is_estimated(match)):
+    if not any(sensor is not None and sensor.tilt_deviation_deg is not None for sensor in (query, match)):
         height = np.hypot(UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M * apart_m)
         tilt = np.radians(np.hypot(UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M * apart_m))
         return np.diag([0.0, 0.0, height, tilt, tilt, 0.0]) ** 2
-    ground = _diagonal(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)
-    own, other = (_diagonal(*_deviations(mounting)) for mounting in (query, match))
+    deviations = [(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)]
+    for sensor in (query, match):
+        if sensor is None or sensor.height_deviation_m is None or sensor.tilt_deviation_deg is None:
+            deviations.append((UNSEEN_HEIGHT_M / 2**0.5, UNSEEN_TILT_DEG / 2**0.5))
+        else:
+            deviations.append((sensor.height_deviation_m, sensor.tilt_deviation_deg))
+    ground, own, other = (np.diag([0, 0, up, np.radians(tilt), np.radians(tilt), 0]) ** 2 for up, tilt in deviations)
     return own + moved_covariance(other, inverse(match_from_query)) + ground
-
-
-def _is_estimated(mounting: Mounting | None) -> bool:
-    """Whether the mounting was estimated from its own scan."""
-    return mounting is not None and mounting.tilt_deviation_deg is not None
-
-
-def _deviations(mounting: Mounting | None) -> tuple[float, float]:
-    """Standard deviations of height (metres) and tilt (degrees) of one scan."""
-    if mounting is None or mounting.height_deviation_m is None or mounting.tilt_deviation_deg is None:
-        return UNSEEN_HEIGHT_M / 2**0.5, UNSEEN_TILT_DEG / 2**0.5
-    return mounting.height_deviation_m, mounting.tilt_deviation_deg
-
-
-def _diagonal(height_m: float, tilt_deg: float) -> Float[np.ndarray, "6 6"]:
-    """Covariance of independent height, roll and pitch."""
-    tilt = np.radians(tilt_deg)
-    return np.diag([0.0, 0.0, height_m, tilt, tilt, 0.0]) ** 2
 
 
 def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
     """Largest standard deviation of the position in the plane, over all directions, in metres.
 
-    Arguments:
-      covariance: Covariance of (x, y, yaw), as in `Alignment`, or of all 6 degrees of freedom, as in `Loop`.
+    The covariance is that of (x, y, yaw), as in `Alignment`, or of all 6 degrees of freedom, as in `Loop`.
     """
     return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance, np.float64)[:2, :2])[-1], 0)))
-
-
-def is_degenerate(covariance: Float[np.ndarray | Array, "n n"], *, threshold_m: float = DEGENERATE_M) -> bool:
-    """Whether a position is uncertain in some horizontal direction, for example parallel to a long featureless wall.
-
-    Arguments:
-      covariance: See `position_deviation`.
-      threshold_m: Maximum standard deviation of a pose that is not degenerate, in metres.
-    """
-    return position_deviation(covariance) > threshold_m
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -165,29 +152,19 @@ def planar_loop(
     *,
     probability: float,
     knows_height: bool = True,
-    query_mounting: Mounting | None = None,
-    match_mounting: Mounting | None = None,
+    sensors: tuple[Mounting | None, Mounting | None] = (None, None),
 ) -> Loop:
-    """Returns the loop of two aligned images, in the plane of the ground.
+    """Return the loop of two aligned images, between gravity-aligned frames.
 
-    Arguments:
-      query: Frame of the query.
-      match: Frame of the match.
-      alignment: Pose of the query's image in the match's image, and its covariance.
-      probability: Probability that both frames show one place.
-      knows_height: Whether the odometry measures height. If not, the storey is unknown.
-      query_mounting: Mounting of the query's sensor. Its points were gravity-aligned for the image.
-      match_mounting: Mounting of the match's sensor.
+    If the odometry does not measure height (`knows_height`), the storey is unknown. The deviations of the `sensors` at
+    query and match count (`unseen_covariance`).
     """
-    upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
-    covariance = unseen_covariance(upright, query_mounting, match_mounting)
+    pose = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
+    covariance = unseen_covariance(pose, *sensors)
     covariance[2, 2] += 0.0 if knows_height else UNKNOWN_HEIGHT_M**2
-    seen = np.array([0, 1, 5])
     to_query = np.eye(3)
-    to_query[:2, :2] = upright[:2, :2].T  # the alignment's covariance is in the match's frame
-    covariance[np.ix_(seen, seen)] = to_query @ np.asarray(alignment.covariance, np.float64) @ to_query.T
-    pose = lidar_pose(upright, query=query_mounting, match=match_mounting)
-    covariance = moved_covariance(covariance, inverse(upright_from_lidar(query_mounting)))
+    to_query[:2, :2] = pose[:2, :2].T  # the alignment's covariance is in the match's frame
+    covariance[SEEN[:, None], SEEN] = to_query @ np.asarray(alignment.covariance, np.float64) @ to_query.T
     return Loop(query, match, pose, covariance, float(probability))
 
 
@@ -203,7 +180,7 @@ def planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:
     return np.concatenate([poses[:, :2, 3], yaw_of(poses)[:, None]], axis=1)
 
 
-def planar_loops(loops: Sequence[Loop], mounting: AnyMounting) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
+def planar_loops(loops: Sequence[Loop]) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
     """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries.
 
     Standard deviations are limited to `DEGENERATE_M` along every direction. Otherwise a pose that may lie anywhere
@@ -211,16 +188,8 @@ def planar_loops(loops: Sequence[Loop], mounting: AnyMounting) -> tuple[Planar, 
     """
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
     covariances = np.array([loop.covariance for loop in loops], np.float64).reshape(-1, 6, 6)
-    query, match = frames_of(loops)
-    covariances = moved_covariance(covariances, uprights(mounting, query))
-    upright = upright_poses(poses, mounting, query=query, match=match)
-    return planar(upright), _bounded(covariances[:, SEEN[:, None], SEEN])
-
-
-def _bounded(covariances: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Covariances with eigenvalues of at most `DEGENERATE_M` squared."""
-    variances, axes = np.linalg.eigh(covariances)
-    return (axes * np.minimum(variances, DEGENERATE_M**2)[:, None]) @ np.swapaxes(axes, 1, 2)
+    variances, axes = np.linalg.eigh(covariances[:, SEEN[:, None], SEEN])
+    return planar(poses), (axes * np.minimum(variances, DEGENERATE_M**2)[:, None]) @ np.swapaxes(axes, 1, 2)
 
 
 def frames_of(loops: Sequence[Loop]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:

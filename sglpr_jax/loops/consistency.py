@@ -1,8 +1,7 @@
 """Consistency of loops with each other and with the odometry.
 
-Two loops and the odometry between their frames form a cycle. If the cycle does not close within the drift and the
-loops' own errors, one of the two loops is wrong. After Mangelson et al., Pairwise Consistent Measurement Set
-Maximization (ICRA 2018), in the plane.
+Two loops and the odometry between their frames form a cycle. If it does not close within the drift and the loops' own
+errors, one of them is wrong. After Mangelson et al., Pairwise Consistent Measurement Set Maximization (ICRA 2018).
 """
 
 from collections.abc import Sequence
@@ -10,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.levelling import AnyMounting
 from sglpr_jax.loops.closure import Loop, Reason, Rejected, compose, frames_of, inverted, planar, planar_loops, relative
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
@@ -30,24 +28,20 @@ def agree(
     others: Sequence[Loop] | None = None,
     *,
     way: Float[np.ndarray, " n"] | None = None,
-    mounting: AnyMounting = None,
     drift: DriftModel = DriftModel(),
 ) -> Bool[np.ndarray, "a b"]:
-    """Pairs of loops that are consistent, given the path of all frames. The length of the path does not cost time.
+    """Whether each loop is consistent with each of the `others`, by default with each of `loops`.
 
     Arguments:
-      loops: Loops between LiDAR frames.
-      path: Path of all frames.
-      others: Loops to compare with, by default `loops`.
+      loops: Loops between gravity-aligned frames.
+      path: Path of all frames. Its length costs no time.
+      others: Loops to compare with.
       way: Travelled distance at each frame in metres, by default that of the path.
-      mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
       drift: Drift model of the path.
-
-    Returns:
-      Whether loop i of `loops` is consistent with loop j of `others`.
+      config: Thresholds.
     """
     way = path.travelled if way is None else way
-    a, b = (_columns(each, path, way, mounting) for each in (loops, loops if others is None else others))
+    a, b = (_columns(each, path, way) for each in (loops, loops if others is None else others))
     pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)
     for start in range(0, len(pairs), BLOCK):
         rows = slice(start, start + BLOCK)
@@ -58,8 +52,8 @@ def agree(
 def largest_consistent_set(pairs: Bool[np.ndarray, "n n"], *, starts: int = 20) -> Int[np.ndarray, " k"]:
     """Indices, in order, of a large set in which every pair is consistent.
 
-    Finding the largest set is NP-hard. This search is greedy: it starts from each of the `starts` loops that are
-    consistent with most others, and always adds the loop that leaves most candidates.
+    The search is greedy, as the problem is NP-hard: it starts from each of the `starts` loops that are consistent with
+    most others, and always adds the loop that leaves most candidates.
     """
     pairs = pairs & pairs.T
     degrees = pairs.sum(0)
@@ -88,13 +82,10 @@ def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[
         chosen = np.argmax(np.where(left, degrees, -1))
 
 
-def _columns(
-    loops: Sequence[Loop], path: DrivenPath, way: Float[np.ndarray, " n"], mounting: AnyMounting
-) -> dict[str, np.ndarray]:
+def _columns(loops: Sequence[Loop], path: DrivenPath, way: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
     query, match = frames_of(loops)
-    level = path.level(mounting)
-    query_pose, match_pose = (planar(path.leveled(frames, level)) for frames in (query, match))
-    poses, covariances = planar_loops(loops, mounting)
+    query_pose, match_pose = (planar(path.leveled(frames)) for frames in (query, match))
+    poses, covariances = planar_loops(loops)
     return {
         "pose": poses,
         "query_pose": query_pose,
@@ -132,14 +123,13 @@ MAX_RIVAL = 0.5
 
 
 def accepted_between(
-    loops: Sequence[Loop], motion: Motion, *, mounting: AnyMounting, drift: DriftModel
+    loops: Sequence[Loop], motion: Motion, *, drift: DriftModel
 ) -> tuple[list[list[Loop]], list[Rejected]]:
     """Accept sets of consistent loops between two sessions, at most one for each segment of each session.
 
     Arguments:
-      loops: Loops in the order of their queries. Their frames are rows of the motion.
+      loops: Loops between gravity-aligned frames, rows of the motion, in the order of their queries.
       motion: Motion of both sessions (`Motion.joined`). Poses of different segments are not comparable.
-      mounting: Mounting of the LiDAR at each row.
       drift: Drift model of the motion.
 
     Returns:
@@ -150,14 +140,14 @@ def accepted_between(
     found, rejected = [], []
     for pair in np.unique(segments, axis=0):
         some = [loops[row] for row in np.flatnonzero((segments == pair).all(axis=1)).tolist()]
-        rules = {"way": motion.travelled, "mounting": mounting, "drift": drift}
-        pairs = agree(some, motion.path, **rules)
+        pairs = agree(some, motion.path, way=motion.travelled, drift=drift)
         members = largest_consistent_set(pairs).tolist()
         others = np.setdiff1d(np.arange(len(some)), members)
         rival = largest_consistent_set(pairs[np.ix_(others, others)])
         chosen = [some[k] for k in members]
         reason: Reason = "contradicts other loops"
-        if not _is_enough(chosen, motion.travelled):
+        ways = [np.ptp(motion.travelled[frames]) for frames in frames_of(chosen) if len(frames)]
+        if len(chosen) < MIN_LOOPS or min(ways) < MIN_TRAVELLED_M:
             reason, others = "too few neighbours", np.arange(len(some))
         elif len(rival) > MAX_RIVAL * len(members):
             others = np.arange(len(some))
@@ -165,8 +155,3 @@ def accepted_between(
             found.append(chosen)
         rejected += [Rejected(some[k], reason) for k in others]
     return sorted(found, key=len, reverse=True), rejected
-
-
-def _is_enough(loops: Sequence[Loop], way: Float[np.ndarray, " n"]) -> bool:
-    """Whether there are enough loops, over enough travelled distance in both sessions."""
-    return len(loops) >= MIN_LOOPS and all(np.ptp(way[frames]) >= MIN_TRAVELLED_M for frames in frames_of(loops))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from sglpr_jax.data.recording import Record
 from sglpr_jax.loops.arguments import given_pose, given_record, given_time
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.closure import Loop, Reason, Rejected
+from sglpr_jax.loops.closure import Loop, Reason, Rejected, to_lidar
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
@@ -25,9 +25,8 @@ MAX_WAITING = 240
 class LoopDetector:
     """Finds loop closures in a stream of scans or images, with or without times and odometry.
 
-    `LoopModel` computes the probability of a pair from the evidence that `Comparer` collects. The sequential test
-    (`loops.sequence`) adds the evidence of neighbouring frames. Pairs that contradict the odometry are rejected.
-    Without odometry, pairs that contradict the motion estimated from the images are rejected. The first loops of a
+    The sequential test (`loops.sequence`) adds the evidence of neighbouring frames to that of each pair. Pairs that
+    contradict the odometry or, without it, the motion estimated from the images, are rejected. The first loops of a
     revisit may be returned some frames late, together with others.
 
     Example:
@@ -44,21 +43,8 @@ class LoopDetector:
         model: LoopModel | None = None,
         config: DetectorConfig = DetectorConfig(),
     ):
-        """Create a detector without frames.
-
-        Arguments:
-          params: Weights of the model that describes the scans.
-          model: Model of the probabilities, by default the one shipped for the weights.
-          config: Thresholds.
-        """
-        self.finder = CandidateFinder(
-            params,
-            config=config.candidates,
-            verification=config.verification,
-            drift=config.drift,
-            keyframe_m=config.keyframe_m,
-            max_places=config.max_places,
-        )
+        """Create a detector without frames. The default `model` of the probabilities is the one shipped."""
+        self.finder = CandidateFinder(params, config)
         self.model = default_model() if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
@@ -77,8 +63,7 @@ class LoopDetector:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of all frames. The results (`loops`, `rejected`, `candidates`) are not counted,
-        nor are the spectra of the last compared scans (13 MB at most).
+        """Number of bytes of all frames, without results and the spectra of the last compared scans (13 MB at most).
 
         With `max_places`, only poses and times still grow: 305 bytes a frame, and up to as much in spare capacity.
         """
@@ -118,15 +103,7 @@ class LoopDetector:
         compared: Compared | None = None,
         continues: bool = True,
     ) -> list[Loop]:
-        """Add a frame that is already described, and return loops as `add` does.
-
-        Arguments:
-          seen: Descriptor and image, or None for a scan that cannot be read.
-          time: Time of the scan, in seconds.
-          odometry: Pose of the LiDAR in a fixed frame.
-          compared: Comparisons of an earlier run (`loops.checkpoint`).
-          continues: See `add`.
-        """
+        """Add a described frame (`CandidateFinder.add_seen`), and return loops as `add` does."""
         candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared, continues=continues)
         self.candidates += candidates
         if self.config.max_places is not None:
@@ -159,9 +136,8 @@ class LoopDetector:
     def _probable(self, pairs: Sequence[Pair], done: set[int]) -> list[Loop]:
         """Pairs that are probable enough given their neighbours. Queries that are `done` are left out, and noted."""
         finder = self.finder
-        rules = {"mounting": finder.mountings, "drift": finder.present_drift, "config": self.config}
-        found = probable_loops(pairs, self.model, finder.motion.path, **rules)
-        new = [loop for loop in found if loop is not None and loop.query not in done]
+        found = probable_loops(pairs, self.model, finder.motion.path, drift=finder.present_drift, config=self.config)
+        new = [self._handed_out(loop) for loop in found if loop is not None and loop.query not in done]
         done |= {loop.query for loop in new}
         return new
 
@@ -172,4 +148,9 @@ class LoopDetector:
     def _verdicts(self, pairs: Sequence[Pair]) -> list[Rejected]:
         """Reasons why pairs that were not returned are no loops."""
         left = [one for one in pairs if one.loop.query not in self._returned and self._is_allowed(one)]
-        return [Rejected(one.loop, verdict(one, self.model, self.config.min_probability)) for one in left]
+        least = self.config.min_probability
+        return [Rejected(self._handed_out(one.loop), verdict(one, self.model, least)) for one in left]
+
+    def _handed_out(self, loop: Loop) -> Loop:
+        """The loop between LiDAR frames."""
+        return to_lidar(loop, query=self.finder.mountings[loop.query], match=self.finder.mountings[loop.match])

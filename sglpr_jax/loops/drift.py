@@ -5,10 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.levelling import AnyMounting, upright_poses
 from sglpr_jax.loops.closure import Loop, Planar, compose, frames_of, planar, planar_loops, wrapped
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.odometry.path import Between, DrivenPath
+from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import travelled
 
 GRAPH_M = 100.0
@@ -17,32 +16,22 @@ STEP_M, STEP_DEG = 0.005, 0.005
 """Smallest standard deviation of an odometry step in a graph, for a sensor that stands still."""
 
 
-def deviations(
-    loops: Sequence[Loop], path: DrivenPath, *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
-) -> Float[np.ndarray, " k"]:
-    """Mahalanobis distance of each loop from the odometry between its frames.
+def deviations(loops: Sequence[Loop], path: DrivenPath, *, drift: DriftModel = DriftModel()) -> Float[np.ndarray, " k"]:
+    """Mahalanobis distance of each loop from the odometry between its gravity-aligned frames.
 
     The distance is `sqrt(e' S^-1 e)` with 3 degrees of freedom. e is x, y and yaw of the query by the loop minus those
-    by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model.
+    by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model. If
+    the loop has no errors, the distance is the smallest RMS drift that explains the loop, as a multiple of the model's
+    drift.
 
-    If the loop has no errors, the distance is the smallest RMS drift along the path that explains the loop, as a
-    multiple of the model's drift. If position and heading drift at constant rates, f and g times those of the model,
-    the distance is at most `sqrt(f^2 + g^2)`.
-
-    If the deviation in height alone is larger (`height_deviations`), it is returned instead. Floors of a building look
-    alike, so a difference in height must not be outweighed by a good fit in the plane.
-
-    Arguments:
-      loops: Loops between frames of the path. The time is independent of the length of the path.
-      path: Path of the sensor by odometry.
-      drift: Drift model.
-      mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
+    If the deviation in height alone is larger, it is returned instead. Floors of a building look alike, so a difference
+    in height must not be outweighed by a good fit in the plane. The length of the path costs no time.
     """
-    poses, covariances = planar_loops(loops, mounting)
-    query, match = frames_of(loops)
-    options = {"drift": drift, "level": path.level(mounting), "covariances": covariances}
-    in_plane = planar_deviations(path, query, match, poses, **options)
-    return np.maximum(in_plane, height_deviations(path, loops, drift=drift, mounting=mounting))
+    poses, covariances = planar_loops(loops)
+    heights = np.array([loop.match_from_query[2, 3] for loop in loops])
+    variances = np.array([loop.covariance[2, 2] for loop in loops])
+    errors = {"covariances": covariances, "heights": heights, "height_variances": variances}
+    return planar_deviations(path, *frames_of(loops), poses, drift=drift, **errors)
 
 
 def planar_deviations(
@@ -52,102 +41,35 @@ def planar_deviations(
     match_from_query: Planar,
     *,
     drift: DriftModel,
-    level: Float[np.ndarray, "3 3"],
     covariances: Float[np.ndarray, "k 3 3"] | float = 0.0,
+    heights: Float[np.ndarray, " k"] | float = 0.0,
+    height_variances: Float[np.ndarray, " k"] | float = 0.0,
 ) -> Float[np.ndarray, " k"]:
-    """Return `deviations` of poses in the plane, without the height.
+    """Return `deviations` of poses in the plane, with the heights of the queries in the frames of the matches.
 
-    Arguments:
-      path: Path of the sensor.
-      query: Frames of the queries.
-      match: Frames of the matches, earlier or later than the queries.
-      match_from_query: Gravity-aligned poses of the queries in the frames of the matches.
-      drift: Drift model of the path.
-      level: Rotation that makes the z axis of the path's world point up (`DrivenPath.level`).
-      covariances: Covariances of the poses, in the frames of the queries.
+    The matches may be earlier or later than the queries. The covariances are in the frames of the queries.
     """
-    start, last = (planar(path.leveled(frames, level)) for frames in (match, query))
-    by_loop = compose(start, match_from_query)
-    error = by_loop - last
+    start, last = path.leveled(match), path.leveled(query)
+    by_loop = compose(planar(start), match_from_query)
+    error = by_loop - planar(last)
     error[:, 2] = wrapped(error[:, 2])
-    spread = planar_spread(path, query, match, drift=drift, level=level)
+    spread = planar_spread(path, query, match, drift=drift)
     spread += _turned(np.broadcast_to(covariances, spread.shape), by_loop[:, 2])
-    return np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
+    in_plane = np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
+    shifts = np.column_stack([match_from_query[:, :2], np.broadcast_to(heights, len(error))])
+    apart = np.einsum("kj,kj->k", start[:, 2, :3], shifts) + start[:, 2, 3] - last[:, 2, 3]
+    height_spread = np.hypot(drift.height_m, drift.height_per_metre * (path.travelled[query] - path.travelled[match]))
+    return np.maximum(in_plane, np.abs(apart) / np.sqrt(height_spread**2 + height_variances))
 
 
 def planar_spread(
-    path: DrivenPath,
-    query: Int[np.ndarray, " k"],
-    match: Int[np.ndarray, " k"],
-    *,
-    drift: DriftModel,
-    level: Float[np.ndarray, "3 3"],
+    path: DrivenPath, query: Int[np.ndarray, " k"], match: Int[np.ndarray, " k"], *, drift: DriftModel
 ) -> Float[np.ndarray, "k 3 3"]:
-    """Covariance of x, y, yaw of each query relative to its match by a path. Arguments as in `planar_deviations`."""
-    last = path.leveled(query, level)[:, :2, 3]
-    spread = _drifted(path.between(match, query).turned(level[:2]), last, drift)
-    return spread + np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
-
-
-def floor_deviations(
-    path: DrivenPath,
-    query: Int[np.ndarray, " k"],
-    match: Int[np.ndarray, " k"],
-    match_from_query: Planar,
-    *,
-    drift: DriftModel,
-    level: Float[np.ndarray, "3 3"],
-) -> Float[np.ndarray, " k"]:
-    """Deviation of poses in the plane from a path in height, in standard deviations. Floors of a building look alike.
-
-    The query is assumed in the x-y plane of the match. The arguments are those of `planar_deviations`.
-    """
-    start, end = (path.leveled(frames, level) for frames in (match, query))
-    shifts = np.pad(match_from_query[:, :2], ((0, 0), (0, 1)))
-    heights = np.einsum("kj,kj->k", start[:, 2, :3], shifts) + start[:, 2, 3] - end[:, 2, 3]
-    spread = _height_spread(path.travelled[query] - path.travelled[match], drift)
-    return np.abs(heights) / spread
-
-
-def height_deviations(
-    path: DrivenPath, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
-) -> Float[np.ndarray, " k"]:
-    """Deviation of each loop from a path in height, in standard deviations. Arguments as in `deviations`."""
-    query, match = frames_of(loops)
-    poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
-    by_loop = path.poses[match] @ upright_poses(poses, mounting, query=query, match=match)
-    apart = (by_loop - path.poses[query])[:, :3, 3] @ path.level(mounting)[2]
-    variance = np.array([loop.covariance[2, 2] for loop in loops])
-    spread = np.sqrt(_height_spread(path.travelled[query] - path.travelled[match], drift) ** 2 + variance)
-    return np.abs(apart) / spread
-
-
-def _height_spread(travelled_m: Float[np.ndarray, " k"], drift: DriftModel) -> Float[np.ndarray, " k"]:
-    """Standard deviation of a difference in height after a travelled distance, in metres."""
-    return np.hypot(drift.height_m, drift.height_per_metre * travelled_m)
-
-
-def step_deviations(
-    odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Standard deviations of the steps of a pose graph, in metres and radians.
-
-    Steps of a graph are independent, so their variances add up in proportion to the distance. The variances of the
-    model grow with the square of the distance. Both are equal after `GRAPH_M`.
-    """
-    root = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
-    metres, degrees = (
-        np.hypot(drift.metres_per_metre * root, STEP_M),
-        np.hypot(drift.degrees_per_metre * root, STEP_DEG),
-    )
-    return metres, np.radians(degrees)
-
-
-def _drifted(between: Between, last: Float[np.ndarray, "k 2"], drift: DriftModel) -> Float[np.ndarray, "k 3 3"]:
-    """Covariance of x, y, yaw of the last frame of some paths in the plane, whose position is `last`, by odometry.
+    """Covariance of x, y, yaw of each query relative to its match by a path.
 
     The rates of drift along the path are independent. Their integral has the variance of a constant rate.
     """
+    last, between = path.leveled(query)[:, :2, 3], path.between(match, query).turned(path.level[:2])
     length = between.length[:, None, None]
     crossed = last[:, :, None] * between.first[:, None]
     levers = length * last[:, :, None] * last[:, None] - crossed - np.swapaxes(crossed, 1, 2) + between.squares
@@ -160,7 +82,23 @@ def _drifted(between: Between, last: Float[np.ndarray, "k 2"], drift: DriftModel
     share = drift.sideways**2
     directions = (1 - share) * between.directions + share * length * np.eye(2)
     found[:, :2, :2] += drift.metres_per_metre**2 * directions
-    return found * length
+    return found * length + np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
+
+
+def step_deviations(
+    odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Standard deviations of the steps of a pose graph, in metres and radians.
+
+    Steps of a graph are independent: their variances add up with the distance, while those of the model grow with its
+    square. Both are equal after `GRAPH_M`.
+    """
+    root = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
+    metres, degrees = (
+        np.hypot(drift.metres_per_metre * root, STEP_M),
+        np.hypot(drift.degrees_per_metre * root, STEP_DEG),
+    )
+    return metres, np.radians(degrees)
 
 
 def _turned(covariances: Float[np.ndarray, "k 3 3"], yaw: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3 3"]:

@@ -20,16 +20,6 @@ SMALL = 1e-9
 """Step in metres and radians at which the estimate is final."""
 
 
-class FrameAlignment(NamedTuple):
-    """Transform between the frames of two sessions."""
-
-    match_from_query: Float[np.ndarray, "4 4"]
-    """Pose of the query recording's frame in the match recording's frame, in metres."""
-    covariance: Float[np.ndarray, "6 6"]
-    """Covariance of a small motion of the query recording's frame in itself: x, y, z in metres, then rotations about x,
-    y, z in radians."""
-
-
 class Part(NamedTuple):
     """Frames of a session whose poses are known in one frame: all of them if there is odometry."""
 
@@ -46,18 +36,21 @@ class AlignedParts(NamedTuple):
 
     match: Part
     query: Part
-    alignment: FrameAlignment
+    match_from_query: Float[np.ndarray, "4 4"]
+    """Pose of the query's frame in the match's frame, in metres."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Covariance of a small motion of the query's frame in itself: x, y, z in metres, then rotations in radians."""
     loops: int
     """Number of loops from which the transform was estimated."""
 
     def in_metres(self, scale: Scale) -> "AlignedParts":
         """The transform before all lengths were multiplied by `scale`."""
-        pose = scaled_poses(self.alignment.match_from_query, 1 / scale)
-        return self._replace(alignment=FrameAlignment(pose, covariance_in_metres(self.alignment.covariance, scale)))
+        pose = scaled_poses(self.match_from_query, 1 / scale)
+        return self._replace(match_from_query=pose, covariance=covariance_in_metres(self.covariance, scale))
 
     def __str__(self) -> str:
-        (x, y, z), sigma = self.alignment.match_from_query[:3, 3], np.sqrt(np.diag(self.alignment.covariance))
-        yaw, parts = np.degrees(yaw_of(self.alignment.match_from_query)), ""
+        (x, y, z), sigma = self.match_from_query[:3, 3], np.sqrt(np.diag(self.covariance))
+        yaw, parts = np.degrees(yaw_of(self.match_from_query)), ""
         if not self.match.is_odometry:
             parts = f" of scans {self.match.first}-{self.match.last} and {self.query.first}-{self.query.last}"
         return (
@@ -74,13 +67,12 @@ def aligned_frames(
     match_way: Float[np.ndarray, " n"],
     query_way: Float[np.ndarray, " m"],
     drift: DriftModel,
-) -> FrameAlignment:
-    """Estimate the transform by robust least squares (iteratively reweighted, with Cauchy's cost).
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
+    """Estimate a transform and its covariance by iteratively reweighted least squares, with Cauchy's cost.
 
-    Each loop predicts the transform. Its weight follows from its covariance and from the drift between the loop and the
-    middle of all loops. Neighbouring loops see the same walls, so the weights of loops closer than `independent_m` are
-    reduced in proportion to their distance. The transform is best where the loops are. Its covariance also contains the
-    drift over the path between the loops, which does not average out.
+    The weight of a loop follows from its covariance and from the drift between it and the middle of all loops. Loops
+    closer than `INDEPENDENT_M` see the same walls, so their weights are reduced in proportion to their distance. The
+    covariance also contains the drift over the path between the loops, which does not average out.
 
     Arguments:
       loops: At least one loop. Its match is a row of `match_poses`, its query a row of `query_poses`.
@@ -97,32 +89,27 @@ def aligned_frames(
     spread = np.stack([loop.covariance for loop in loops]) + drifted
     fresh = _fresh(query_way[query])
     jacobians = np.stack([adjoint(inverse(pose)) for pose in there])
-    found = (measured @ inverse(there))[_middle(measured, there)]
+    # The first estimate is by the loop that moves the queries nearest to where the others see them: least median.
+    moved = (measured @ inverse(there))[:, None] @ there[None]
+    apart_m = np.linalg.norm(moved[..., :3, 3] - measured[None, :, :3, 3], axis=2)
+    found = (measured @ inverse(there))[int(np.median(apart_m, axis=1).argmin())]
     for _ in range(ROUNDS):
-        error = _logarithm(inverse(measured) @ found @ there)
+        error = logarithm(inverse(measured) @ found @ there)
         weighted = np.linalg.solve(spread, np.concatenate([error[..., None], jacobians], axis=2))
         distance = np.einsum("ni,ni->n", error, weighted[..., 0])
         weights = fresh / (1 + distance / 6)
         gradient = np.einsum("n,nij,ni->j", weights, jacobians, weighted[..., 0])
         hessian = np.einsum("n,nij,nik->jk", weights, jacobians, weighted[..., 1:])
         step = -np.linalg.solve(hessian, gradient)
-        found = found @ _exponential(step)
+        small = np.eye(4)
+        small[:3, :3], small[:3, 3] = Rotation.from_rotvec(step[3:]).as_matrix(), step[:3]
+        found = found @ small
         if np.abs(step).max() < SMALL:
             break
-    return FrameAlignment(found, np.linalg.inv(hessian) + _common(drifted, there))
-
-
-def _common(drifted: Float[np.ndarray, "k 6 6"], there: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, "6 6"]:
-    """Mean drift of the loops, as the covariance of a motion of the frame about the middle of the loops."""
     middle = np.eye(4)
     middle[:3, 3] = np.median(there[:, :3, 3], axis=0)
-    return moved_covariance(drifted.mean(axis=0), middle)
-
-
-def _middle(measured: Float[np.ndarray, "n 4 4"], there: Float[np.ndarray, "n 4 4"]) -> int:
-    """The loop whose transform moves the queries nearest to where the other loops see them: least median distance."""
-    moved = (measured @ inverse(there))[:, None] @ there[None]
-    return int(np.median(np.linalg.norm(moved[..., :3, 3] - measured[None, :, :3, 3], axis=2), axis=1).argmin())
+    common = moved_covariance(drifted.mean(axis=0), middle)  # drift does not average out
+    return found, np.linalg.inv(hessian) + common
 
 
 def _drifted(
@@ -146,14 +133,6 @@ def _fresh(way: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
     return weights
 
 
-def _logarithm(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6"]:
+def logarithm(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6"]:
     """Translation and rotation vector of small motions."""
     return np.concatenate([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()], axis=1)
-
-
-def _exponential(step: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "4 4"]:
-    """Small motion with this translation and rotation vector."""
-    found = np.eye(4)
-    found[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
-    found[:3, 3] = step[:3]
-    return found

@@ -1,5 +1,6 @@
 """Description of a scan for the loop search: its descriptor and its density image."""
 
+import abc
 import copy
 import zlib
 from collections import OrderedDict
@@ -68,7 +69,38 @@ PARTS = 16
 """The stored scans are forgotten in this many parts, because each removal moves all rows that follow."""
 
 
-class StoredScans:
+class Keyframes(abc.ABC):
+    """Described scans with which queries are compared: those of a session, or the places of a map."""
+
+    index: Index
+    """Descriptor of each scan."""
+
+    @property
+    @abc.abstractmethod
+    def frames(self) -> Int[np.ndarray, " n"]:
+        """Frame of each scan in the motion."""
+
+    @abc.abstractmethod
+    def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
+        """Image of a scan."""
+
+    def image_of(self, frame: int) -> UInt8[np.ndarray, "m m"]:
+        """Image of the scan of a frame."""
+        return self.image(int(np.searchsorted(self.frames, frame)))
+
+    def nearest(
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " j"]:
+        """Up to k (0 or more) scans with the nearest descriptors among those with a flag, nearest first."""
+        rows = self.index.query(descriptor, k, exclude=~among).rows if k else np.zeros(0, np.int64)
+        return rows[rows >= 0]
+
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
+        """Spectrum of each scan's image (`match_spectra`)."""
+        return [image_spectrum(self.image(row), VerificationConfig()) for row in rows.tolist()]
+
+
+class StoredScans(Keyframes):
     """Scans in the order they were added: row i of the index is scan i. Images are compressed without loss."""
 
     def __init__(
@@ -96,7 +128,7 @@ class StoredScans:
 
     @property
     def frames(self) -> Int[np.ndarray, " n"]:
-        """Frame number of each scan, in increasing order."""
+        """See `Keyframes`. They increase."""
         return self._frames.rows + self._first
 
     def shifted(self, first: int) -> "StoredScans":
@@ -114,12 +146,8 @@ class StoredScans:
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k (0 or more) scans with the nearest descriptors among those with a flag, nearest first."""
-        if not k:
-            return np.zeros(0, np.int64)
-        among = among if self._kept is None else among & self._kept
-        rows = self.index.query(descriptor, k, exclude=~among).rows
-        return rows[rows >= 0]
+        """See `Keyframes`."""
+        return super().nearest(descriptor, k, among if self._kept is None else among & self._kept)
 
     @property
     def nbytes(self) -> int:
@@ -170,26 +198,20 @@ class StoredScans:
         return bool(row < len(self) and self.frames[row] == frame)
 
     def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
-        """Image of a scan."""
+        """See `Keyframes`."""
         return np.frombuffer(zlib.decompress(self._packed[row]), np.uint8).reshape(self._shape)
 
-    def image_of(self, frame: int) -> UInt8[np.ndarray, "m m"]:
-        """Image of the scan of a frame."""
-        return self.image(int(np.searchsorted(self.frames, frame)))
-
     def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        """Spectrum of each scan's image (`match_spectra`)."""
-        found = [self._spectrum(row) for row in rows.tolist()]
+        """See `Keyframes`. The last ones are kept."""
+        found = []
+        for row, frame in zip(rows.tolist(), self._frames.rows[rows].tolist(), strict=True):
+            if frame not in self._spectra:
+                self._spectra[frame] = image_spectrum(self.image(row), self.verification)
+            self._spectra.move_to_end(frame)
+            found.append(self._spectra[frame])
         while len(self._spectra) > SPECTRA:
             self._spectra.popitem(last=False)
         return found
-
-    def _spectrum(self, row: int) -> Complex64[np.ndarray, "s f"]:
-        frame = int(self._frames.rows[row])
-        if frame not in self._spectra:
-            self._spectra[frame] = image_spectrum(self.image(row), self.verification)
-        self._spectra.move_to_end(frame)
-        return self._spectra[frame]
 
 
 def image_spectrum(image: UInt8[np.ndarray, "m m"], config: VerificationConfig) -> Complex64[np.ndarray, "s f"]:

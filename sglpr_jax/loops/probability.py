@@ -1,9 +1,7 @@
 """Probability that two scans show one place: a monotone additive model of the evidence.
 
-The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. Three further functions add what
-neighbouring pairs say. One of them takes the surprise again, because all neighbours may match a lookalike if the motion
-is unknown. The functions are monotone and bounded. Therefore a perfect fit of the images cannot outweigh other places
-that fit as well.
+The log odds are a sum of bounded, monotone, piecewise linear functions, one for each field of `Evidence`, so that a
+perfect fit of the images cannot outweigh other places that fit as well. Three more add what neighbouring pairs say.
 """
 
 import dataclasses
@@ -102,25 +100,19 @@ class AdditiveModel:
 
     @classmethod
     def from_json(cls, value: Any, names: Sequence[str]) -> "AdditiveModel":
-        """Build a model of some of these arguments from the output of `to_json`.
-
-        Raises ValueError if the value is invalid.
-        """
+        """Build a model of some of these arguments from the output of `to_json`. Raises ValueError if it is invalid."""
         try:
             curves = {name: Curve(tuple(one["knots"]), tuple(one["values"])) for name, one in value["curves"].items()}
             found = cls(curves, value["bias"])
             numbers = [found.bias, *(number for one in curves.values() for number in (*one.knots, *one.values))]
             fits = set(curves) <= set(names) and all(math.isfinite(number) for number in numbers)
-            fits = fits and all(_is_curve(curve) for curve in curves.values())
+            fits = fits and all(len(one.knots) == len(one.values) > 0 for one in curves.values())
+            fits = fits and all((np.diff(one.knots) > 0).all() for one in curves.values())
         except (TypeError, KeyError, AttributeError, OverflowError):
             fits = False
         if not fits:
             raise ValueError(f"expected curves of {', '.join(names)} and a bias, found others")
         return found
-
-
-def _is_curve(curve: Curve) -> bool:
-    return len(curve.knots) == len(curve.values) > 0 and bool(np.all(np.diff(curve.knots) > 0))
 
 
 _SAME = Curve((-50.0, 50.0), (-50.0, 50.0))
@@ -170,10 +162,7 @@ class LoopModel:
 
     @classmethod
     def from_json(cls, value: Any, *, source: str) -> "LoopModel":
-        """Build a model from the output of `to_json`.
-
-        Raises ValueError if it is invalid. The message names `source`, its file.
-        """
+        """Build a model from the output of `to_json`. Raises ValueError, which names its file `source`, if invalid."""
         try:
             alone, tested = value["alone"], value["tested"]
             return cls(AdditiveModel.from_json(alone, ALL), value["made_with"], AdditiveModel.from_json(tested, TESTED))
@@ -189,20 +178,19 @@ def fit(
     *,
     weights: Float[np.ndarray, " n"] | None = None,
 ) -> AdditiveModel:
-    """Fit a monotone model to labelled pairs by maximum likelihood.
+    """Fit a monotone model to labelled pairs by maximum likelihood, by default with equal weights.
 
-    Arguments:
-      values: Arguments of the model, with names of `KNOTS`, at each pair.
-      is_loop: Whether each pair is a loop.
-      weights: Weights of the pairs, by default all equal.
-
-    Raises:
-      ValueError: If all pairs are loops or no pair is.
+    `values` has an argument of the model, with a name of `KNOTS`, at each pair. Raises ValueError if all pairs are
+    loops, or no pair is.
     """
     if is_loop.all() or not is_loop.any():
         raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
     weights = np.ones(len(is_loop)) if weights is None else weights
-    columns = [_rises(name, numbers) for name, numbers in values.items()]
+    columns = []
+    for name, numbers in values.items():  # for each interval of knots, the way from its worse end, from 0 to 1
+        knots = np.array(KNOTS[name])
+        rises = np.clip((np.asarray(numbers)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
+        columns.append(rises if name in RISING else 1 - rises)
     columns = np.concatenate([*columns, np.ones((len(is_loop), 1))], axis=1)
     sign = np.where(is_loop, 1.0, -1.0)
 
@@ -224,22 +212,8 @@ def fit(
     return AdditiveModel(curves, float(steps[-1]))
 
 
-def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
-    """For each value and each interval of knots, how far the value is from the worse end of the interval, from 0 to
-    1.
-    """
-    knots = np.array(KNOTS[name])
-    made = np.clip((np.asarray(values)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
-    return made if name in RISING else 1 - made
-
-
 def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, made_with: str) -> LoopModel:
-    """Calibrate a model for another sensor: scale and shift its log odds by maximum likelihood.
-
-    These are only two numbers, so a few hundred pairs are enough. Raises the errors of `fit`.
-    """
-    if is_loop.all() or not is_loop.any():
-        raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
+    """Scale and shift the log odds of a model for another sensor by maximum likelihood, from labelled pairs."""
     log_odds, sign = model.log_odds(evidence), np.where(is_loop, 1.0, -1.0)
 
     def cost(line: Float[np.ndarray, " 2"]) -> float:
@@ -250,12 +224,7 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
 
 
 def default_model(path: Path = DEFAULT) -> LoopModel:
-    """Read the shipped model, or that of another file.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If the file is invalid.
-    """
+    """Read the shipped model, or that of another file. Raises FileNotFoundError, or ValueError if it is invalid."""
     try:
         found = json.loads(path.read_text())
     except ValueError as error:

@@ -60,26 +60,6 @@ class FoundLoops:
     """Whether the search between sessions was stopped before its end."""
 
     @property
-    def recording(self) -> Recording:
-        """Recording of the first session."""
-        return self.sessions[0].recording
-
-    @property
-    def frames(self) -> int:
-        """Number of scans of the first session that were searched."""
-        return self.sessions[0].frames
-
-    @property
-    def odometry(self) -> Float[np.ndarray, "n 4 4"] | None:
-        """Pose of the LiDAR at every scan of the first session."""
-        return self.sessions[0].odometry
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Compared pairs of the first session."""
-        return self.sessions[0].candidates
-
-    @property
     def whole(self) -> bool:
         """Whether the search was completed."""
         ended = (one.frames == len(one.recording) and not one.unregistered for one in self.sessions)
@@ -119,7 +99,7 @@ class FoundLoops:
         """
         kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
         others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
-        return dataclasses.replace(self, loops=kept, rejected=ordered_rejections([*self.rejected, *others]))
+        return dataclasses.replace(self, loops=kept, rejected=tuple(ordered_rejections([*self.rejected, *others])))
 
     def __str__(self) -> str:
         within = (self.within(number)._session_in_words() for number in range(len(self.sessions)))
@@ -151,14 +131,14 @@ def _ends(loop: Loop) -> tuple[int, int]:
     return loop.match_session, loop.query_session
 
 
-def ordered_rejections(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
+def ordered_rejections(rejected: Iterable[Rejected]) -> list[Rejected]:
     """Pairs within the sessions, then those between them, in the order of their frames."""
 
     def order(one: Rejected) -> tuple[bool, tuple[int, int], int, int]:
         match, query = _ends(one.loop)
         return match != query, (match, query), one.loop.query, one.loop.match
 
-    return tuple(sorted(rejected, key=order))
+    return sorted(rejected, key=order)
 
 
 def why_none(found: FoundLoops) -> list[str]:

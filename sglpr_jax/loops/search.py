@@ -5,7 +5,6 @@ Comparison, probability and sequential test are the same as within a session. Sc
 """
 
 import dataclasses
-import functools
 import hashlib
 import itertools
 from collections.abc import Callable, Sequence
@@ -18,16 +17,16 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
-from sglpr_jax.data.levelling import Mountings, check_level, mountings_of
+from sglpr_jax.data.levelling import check_level, uprights
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.acceptance import AXES, check_odometry, registered_loops, settled
+from sglpr_jax.loops.acceptance import AXES, accepted, check_odometry, registered_loops
 from sglpr_jax.loops.arguments import check_is, given_poses
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import Loop, Rejected, in_metres, scaled_drift
+from sglpr_jax.loops.closure import Loop, Rejected, in_metres, scaled_drift, to_lidar, to_upright
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import accepted_between
@@ -97,9 +96,8 @@ def find_loops(
     Arguments:
       recordings: The scans of one recording, or several recordings.
       params: Weights of the model that describes them.
-      odometry: Pose of the LiDAR at each scan, with drift (`config.drift`). Candidates and loops beyond the drift are
-        rejected. Of the remaining loops the largest consistent set is kept. For a sequence of recordings, a sequence
-        with the odometry of each one.
+      odometry: Pose of the LiDAR at each scan, with drift (`config.drift`), for several recordings one array each.
+        Candidates and loops beyond the drift are rejected. Of the others the largest consistent set is kept.
       model: Model of the probabilities, by default the one shipped for the weights.
       config: Settings of the detector.
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap
@@ -109,12 +107,12 @@ def find_loops(
         of the scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
-      kept_in: Checkpoint directory. If recordings, odometry, weights and settings are the same, the search resumes from
-        it. The directory is not removed. With several recordings it gets a folder for each one.
+      kept_in: Checkpoint directory, from which a search of the same input resumes. It is not removed. With several
+        recordings it gets a folder for each one.
       should_stop: If it returns True, the search ends with the loops that were found. Loops that were not registered by
         then have no overlap.
-      on_progress: Called with the number of finished steps. A search takes one step for each scan. The comparison of
-        two recordings takes one step for each scan of the second one.
+      on_progress: Called with the number of finished steps: one for each scan of a search, and one for each scan of the
+        second recording in the comparison of two.
 
     Raises:
       ValueError: If there is no recording, if the odometry has another length or shape, if no scan can be read, or if
@@ -125,40 +123,47 @@ def find_loops(
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
-    given, registered = _inputs(recordings, odometry, config, registered=registered)
+    several = isinstance(recordings, list | tuple)
+    some: Any = recordings if several else [recordings]
+    poses: Any = odometry if several else [odometry]
+    poses = [None] * len(some) if poses is None else list(poses)
+    if not some or len(poses) != len(some):
+        raise ValueError(f"expected recordings with odometry of each, found {len(some)} with odometry of {len(poses)}")
+    for one in some:
+        check_is(one, Recording, by="open_recording")
+    registered = all(map(can_register, some)) if registered is None else registered
+    given = [_checked(*pair, config, registered=registered) for pair in zip(some, poses, strict=True)]
+    options = {"registered": registered, "should_stop": should_stop}
     steps, searches = 0, list[Searched]()
+    loops, rejected, transforms = [], [], []
     for number, one in enumerate(given):
         folder = None if kept_in is None else Path(kept_in) / f"{number}" if len(given) > 1 else Path(kept_in)
-        found = search_session(
-            one.scaled(scale),
-            params,
-            model=model,
-            registered=registered,
+        large = one.scaled(scale)
+        found = _search_session(
+            large,
+            LoopDetector(params, model=model, config=large.config),
             scale=scale,
             on_bad_scan=on_bad_scan,
             kept_in=folder,
-            should_stop=should_stop,
             on_progress=lambda done, before=steps: on_progress(before + done),
+            **options,
         )
         searches.append(found)
-        steps += len(one.recording)
-    loops, rejected, transforms = [], [], []
-    for number, one in enumerate(searches):
         own = {"match_session": number, "query_session": number}
-        loops += [dataclasses.replace(loop, **own) for loop in one.loops]
-        rejected += [dataclasses.replace(other, loop=dataclasses.replace(other.loop, **own)) for other in one.rejected]
+        loops += [dataclasses.replace(loop, **own) for loop in found.loops]
+        rejected += [Rejected(dataclasses.replace(other.loop, **own), other.reason) for other in found.rejected]
+        steps += len(one.recording)
     for match, query in itertools.combinations(range(len(given)), 2):
-        options = {"registered": registered, "should_stop": should_stop}
-        options["on_progress"] = lambda done, before=steps: on_progress(before + done)
-        for all_found, some in zip(
-            (loops, rejected, transforms), search_pair(match, query, searches, **options), strict=True
-        ):
-            all_found += some
+        pair = _search_pair(
+            match, query, searches, on_progress=lambda done, before=steps: on_progress(before + done), **options
+        )
+        for all_found, new in zip((loops, rejected, transforms), pair, strict=True):
+            all_found += new
         steps += len(given[query].recording)
     return FoundLoops(
         tuple(_session(one, found, scale, registered) for one, found in zip(given, searches, strict=True)),
         tuple(in_metres(loop, scale) for loop in loops),
-        tuple(dataclasses.replace(one, loop=in_metres(one.loop, scale)) for one in rejected),
+        tuple(Rejected(in_metres(one.loop, scale), one.reason) for one in rejected),
         tuple(one.in_metres(scale) for one in transforms),
         model=searches[0].detector.model,
         config=config,
@@ -167,19 +172,26 @@ def find_loops(
     )
 
 
-def _inputs(
-    recordings: Any, odometry: Any, config: DetectorConfig, *, registered: bool | None
-) -> tuple[list[Input], bool]:
-    """Checked input of each session, and whether loops are registered."""
-    several = isinstance(recordings, list | tuple)
-    some, poses = (recordings, odometry) if several else ([recordings], [odometry])
-    poses = [None] * len(some) if poses is None else list(poses)
-    if not some or len(poses) != len(some):
-        raise ValueError(f"expected recordings with odometry of each, found {len(some)} with odometry of {len(poses)}")
-    for one in some:
-        check_is(one, Recording, by="open_recording")
-    registered = all(map(can_register, some)) if registered is None else registered
-    return [prepared(*pair, config, registered=registered) for pair in zip(some, poses, strict=True)], registered
+def can_register(recording: Recording) -> bool:
+    """Whether the scans of a recording can be registered: it has scans, not images, and the extra is installed."""
+    return not recording.has_images and is_installed()
+
+
+def _checked(recording: Recording, odometry: ArrayLike | None, config: DetectorConfig, *, registered: bool) -> Input:
+    """Check recording and odometry before any work. Returns the odometry as an array, and gravity of scans by it."""
+    poses = None if odometry is None else given_poses(odometry, of="odometry")
+    if poses is not None and len(poses) != len(recording):
+        raise ValueError(
+            f"expected odometry of {len(recording)} poses, one for each scan of {recording.name}, found {len(poses)}"
+        )
+    if registered and recording.has_images:
+        raise ValueError(f"sequence {recording.name}: expected scans to register, found ready-made images")
+    if registered:
+        check_installed()
+    if poses is not None:
+        check_level(poses, recording)
+        recording = with_odometry(recording, poses)
+    return Input(recording, poses, config)
 
 
 def _session(given: Input, found: Searched, scale: Scale, registered: bool) -> Session:
@@ -197,89 +209,107 @@ def _session(given: Input, found: Searched, scale: Scale, registered: bool) -> S
     )
 
 
-def search_session(
+def _search_session(
     given: Input,
-    params: Params,
+    detector: LoopDetector,
     *,
-    model: LoopModel | None = None,
-    registered: bool = False,
-    scale: Scale = 1,
-    on_bad_scan: OnBadScan | None = None,
-    kept_in: Path | str | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
-    on_progress: Callable[[int], None] = lambda done: None,
+    registered: bool,
+    scale: Scale,
+    on_bad_scan: OnBadScan | None,
+    kept_in: Path | None,
+    should_stop: Callable[[], bool],
+    on_progress: Callable[[int], None],
 ) -> Searched:
-    """Search one session. The arguments are those of `find_loops`; the input is already checked and scaled."""
-    recording, odometry, config = given
-    detector = LoopDetector(params, model=model, config=config)
+    """Search one session with a detector without frames. The input is already checked and scaled."""
+    (recording, odometry, config), finder = given, detector.finder
+    stream = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
+
+    def add(seen: Seen | None, compared: Compared | None) -> None:
+        row = len(detector)
+        time = None if recording.times is None else float(recording.times[row])
+        detector.add_seen(seen, time=time, odometry=None if odometry is None else odometry[row], compared=compared)
+
+    # With a limit of places, the loops decide which scans are stored, and so does all that decides about loops.
+    decisive = None if config.max_places is None else repr((config, detector.model)).encode()
     add_scans(
         recording,
-        detector.finder,
-        functools.partial(_add, detector, recording, odometry),
+        finder,
+        add,
         kept_in=kept_in,
-        on_bad_scan=on_bad_scan,
-        should_stop=should_stop,
-        on_progress=on_progress,
         odometry=odometry,
         keyframe_m=config.keyframe_m,
         max_places=config.max_places,
-        acceptance=_acceptance(detector),
+        acceptance=None if decisive is None else hashlib.sha256(decisive).hexdigest()[:16],
+        **stream,
     )
-    finder = detector.finder
-    _check_scans(finder, recording)
+    check_readable(recording, len(recording) - len(finder.missing))
+    if finder.empty.all() and len(finder) == len(recording):
+        raise ValueError(
+            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
+        )
     if odometry is not None and finder.odometry_check.is_unusable:
         warn(
             f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored; check "
             f"that the poses belong to these scans and use these axes: {AXES}"
         )
-        options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-        given = given._replace(odometry=None)
-        return search_session(given, params, model=model, registered=registered, scale=scale, **options)
+        again = LoopDetector(finder.params, model=detector.model, config=config)
+        options = {"registered": registered, "scale": scale, "kept_in": None, **stream}
+        return _search_session(given._replace(odometry=None), again, **options)
+    loops, rejected, path = detector.loops, list[Rejected](), finder.motion.path
     if odometry is not None:
         config = dataclasses.replace(config, drift=finder.present_drift)
-    options = {"registered": registered, "knows_height": finder.knows_height, "should_stop": should_stop}
-    loops, rejected = settled(recording, detector.loops, odometry, config, **options)
-    rejected = list(ordered_rejections([*rejected, *detector.rejected, *detector.undecided()]))
+        kept, others = accepted([_moved(to_upright, loop, finder) for loop in loops], path, drift=config.drift)
+        loops = [_moved(to_lidar, loop, finder) for loop in kept]
+        rejected = [Rejected(_moved(to_lidar, one.loop, finder), one.reason) for one in others]
+    if registered:
+        options = {"knows_height": finder.knows_height, "should_stop": should_stop}
+        loops, others = registered_loops(recording, recording, loops, **options)
+        rejected += others
+    rejected = ordered_rejections([*rejected, *detector.rejected, *detector.undecided()])
     if odometry is not None:
-        sensors = mountings_of(recording)
-        check_odometry(recording.name, loops, rejected, odometry, config, mounting=sensors, scale=scale)
+        against = [_moved(to_upright, one.loop, finder) for one in rejected if one.reason == "contradicts the odometry"]
+        check_odometry(recording.name, loops, against, path, config, scale)
     return Searched(given._replace(config=config), detector, loops, rejected)
 
 
-def search_pair(
+def _moved(to_frames: Callable[..., Loop], loop: Loop, finder: CandidateFinder) -> Loop:
+    """A loop within a session between the gravity-aligned frames (`to_upright`) or the LiDAR frames (`to_lidar`)."""
+    return to_frames(loop, query=finder.mountings[loop.query], match=finder.mountings[loop.match])
+
+
+def _search_pair(
     match: int,
     query: int,
     searches: Sequence[Searched],
     *,
-    registered: bool = False,
-    should_stop: Callable[[], bool] = lambda: False,
-    on_progress: Callable[[int], None] = lambda done: None,
+    registered: bool,
+    should_stop: Callable[[], bool],
+    on_progress: Callable[[int], None],
 ) -> tuple[list[Loop], list[Rejected], list[AlignedParts]]:
     """Loops, rejected pairs and transforms between two sessions, numbers `match` and `query` of the searched ones."""
     both = searches[match], searches[query]
     finders = both[0].detector.finder, both[1].detector.finder
-    levels = [finder.motion.path.level(finder.mountings) for finder in finders]
-    motion = Motion.joined([finder.motion for finder in finders], levels)
-    mountings = Mountings(finder.mountings[row] for finder in finders for row in range(len(finder)))
+    motion = Motion.joined([finder.motion for finder in finders])
+    mountings = [*finders[0].mountings, *finders[1].mountings]
     knows_height = all(finder.knows_height for finder in finders)
-    model, config = both[0].detector.model, both[0].given.config
+    model, config, drift = both[0].detector.model, both[0].given.config, finders[1].present_drift
     candidates = _candidates_between(*finders, motion, should_stop=should_stop, on_progress=on_progress)
     pairs = [pair_of(one, model, motion, mountings, knows_height=knows_height) for one in candidates]
-    rules = {"mounting": mountings, "drift": finders[1].present_drift}
-    probable = probable_loops(pairs, model, motion.path, config=config, **rules)
-    rejected = [
+    probable = probable_loops(pairs, model, motion.path, drift=drift, config=config)
+    improbable = [
         Rejected(pair.loop, verdict(pair, model, config.min_probability))
         for pair, loop in zip(pairs, probable, strict=True)
         if loop is None
     ]
     likely = [loop for loop in probable if loop is not None]
-    sets, contradicting = accepted_between(likely, motion, **rules)
+    sets, contradicting = accepted_between(likely, motion, drift=drift)
     offset, ends = len(finders[0]), {"match_session": match, "query_session": query}
 
     def of_sessions(loop: Loop) -> Loop:
+        loop = to_lidar(loop, query=mountings[loop.query], match=mountings[loop.match])
         return dataclasses.replace(loop, query=loop.query - offset, **ends)
 
-    rejected = [Rejected(of_sessions(one.loop), one.reason) for one in [*rejected, *contradicting]]
+    rejected = [Rejected(of_sessions(one.loop), one.reason) for one in [*improbable, *contradicting]]
     loops, transforms = [], []
     for some in sets:
         some = list(map(of_sessions, some))
@@ -289,9 +319,9 @@ def search_pair(
             some, little = registered_loops(*recordings, some, **options)
             rejected += little
         if some:
-            transforms.append(_aligned(some, both, motion, rules["drift"]))
+            transforms.append(_aligned(some, both, motion, drift))
             loops += some
-    return sorted(loops, key=lambda loop: (loop.query, loop.match)), list(ordered_rejections(rejected)), transforms
+    return sorted(loops, key=lambda loop: (loop.query, loop.match)), ordered_rejections(rejected), transforms
 
 
 def _candidates_between(
@@ -304,8 +334,7 @@ def _candidates_between(
 ) -> list[Candidate]:
     """Best match of each stored scan of a session in another one, by their joined motion.
 
-    Raises:
-      ValueError: If the images of the two sessions have other sizes.
+    Raises ValueError if the images of the two sessions have other sizes.
     """
     found, offset = list[Candidate](), len(matches)
     if not len(queries.stored) or not len(matches.stored):
@@ -313,8 +342,8 @@ def _candidates_between(
     ours, theirs = (finder.stored.image(0).shape for finder in (queries, matches))
     if ours != theirs:
         raise ValueError(f"expected images of one size in both recordings, found {theirs} and {ours} cells")
-    joined = np.concatenate([matches.joined, queries.joined + offset])
-    comparer = Comparer(motion, queries.present_drift, np.eye(3), matches.config, matches.verification, joined)
+    joined = np.concatenate([matches.joined.rows, queries.joined.rows + offset])
+    comparer = Comparer(motion, queries.present_drift, matches.config, matches.verification, joined)
     own = queries.stored.shifted(offset)
     for row, frame in enumerate(own.frames.tolist()):
         if should_stop():
@@ -323,7 +352,7 @@ def _candidates_between(
         spectra = query_spectra(image, config=matches.verification)
         query = Query(frame, own.index.descriptors[row], image, spectra)
         fits = comparer.compare(query, matches.stored, own)
-        found += comparer.candidates(query, fits, matches.stored.image_of, possible=fits.frames < offset)
+        found += comparer.candidates(query, fits, matches.stored, possible=fits.frames < offset)
         on_progress(row + 1)
     return found
 
@@ -338,61 +367,10 @@ def _aligned(loops: Sequence[Loop], both: Sequence[Searched], motion: Motion, dr
         rows = np.flatnonzero(finder.motion.segments == finder.motion.segments[frame])
         parts.append(Part(session, int(rows[0]), int(rows[-1]), odometry is not None))
         if odometry is None:
-            seen = finder.motion.poses @ finder.mountings.uprights(np.arange(len(finder)))
+            seen = finder.motion.poses @ uprights(one.given.recording)[: len(finder)]
             poses.append(inverse(seen[rows[0]]) @ seen)
         else:
             poses.append(odometry[: len(finder)])
     match_way, query_way = np.split(motion.travelled, [len(poses[0])])
-    alignment = aligned_frames(loops, *poses, match_way=match_way, query_way=query_way, drift=drift)
-    return AlignedParts(parts[0], parts[1], alignment, len(loops))
-
-
-def can_register(recording: Recording) -> bool:
-    """Whether the scans of a recording can be registered: it has scans, not images, and the extra is installed."""
-    return not recording.has_images and is_installed()
-
-
-def _acceptance(detector: LoopDetector) -> str | None:
-    """Hash of all that decides about loops, if the loops decide which scans are stored."""
-    if detector.config.max_places is None:
-        return None
-    return hashlib.sha256(repr((detector.config, detector.model)).encode()).hexdigest()[:16]
-
-
-def prepared(recording: Recording, odometry: ArrayLike | None, config: DetectorConfig, *, registered: bool) -> Input:
-    """Check recording and odometry before any work. Return the odometry as an array, and gravity of scans by it."""
-    poses = None if odometry is None else given_poses(odometry, of="odometry")
-    if poses is not None and len(poses) != len(recording):
-        raise ValueError(
-            f"expected odometry of {len(recording)} poses, one for each scan of {recording.name}, found {len(poses)}"
-        )
-    if registered and recording.has_images:
-        raise ValueError(f"sequence {recording.name}: expected scans to register, found ready-made images")
-    if registered:
-        check_installed()
-    if poses is not None:
-        check_level(poses, mountings_of(recording), name=recording.name)
-        recording = with_odometry(recording, poses)
-    return Input(recording, poses, config)
-
-
-def _add(
-    detector: LoopDetector,
-    recording: Recording,
-    odometry: Float[np.ndarray, "n 4 4"] | None,
-    seen: Seen | None,
-    compared: Compared | None,
-) -> None:
-    """Add the next frame to the detector, with its time and odometry."""
-    i = len(detector)
-    time = None if recording.times is None else float(recording.times[i])
-    detector.add_seen(seen, time=time, odometry=None if odometry is None else odometry[i], compared=compared)
-
-
-def _check_scans(finder: CandidateFinder, recording: Recording) -> None:
-    """Raise ValueError if all scans of a recording are unreadable or almost empty."""
-    check_readable(recording, len(recording) - len(finder.missing))
-    if finder.empty.all() and len(finder) == len(recording):
-        raise ValueError(
-            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
-        )
+    found = aligned_frames(loops, *poses, match_way=match_way, query_way=query_way, drift=drift)
+    return AlignedParts(parts[0], parts[1], *found, len(loops))

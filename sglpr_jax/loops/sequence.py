@@ -1,8 +1,7 @@
 """Sequential test: what neighbouring frames say about a pair.
 
-Neighbouring pairs support a pair if their matches move as their queries do, and speak against it if they match
-elsewhere. Neighbours that see the same walls are not independent, so the weight of a frame depends on the distance
-travelled since the previous one. Only what their images say counts: the motion between the two passes is common to all.
+Neighbouring pairs support a pair if their matches move as their queries do, and oppose it otherwise. Neighbours that
+see the same walls are not independent, so the weight of a frame depends on the distance travelled since the last one.
 """
 
 import dataclasses
@@ -13,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit, logit
 
-from sglpr_jax.data.levelling import AnyMounting, Mountings
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.closure import Loop, Reason, planar_loop
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
@@ -35,50 +34,29 @@ class Pair(NamedTuple):
     """Two frames that may be a loop."""
 
     loop: Loop
-    """The pair with its probability alone."""
+    """The pair between gravity-aligned frames, with its probability alone."""
     evidence: Evidence
     way_m: float
     """Travelled distance at the query, in metres."""
 
 
-def pair_of(one: Candidate, model: LoopModel, motion: Motion, mountings: Mountings, *, knows_height: bool) -> Pair:
-    """The pair of a candidate with its probability alone.
-
-    Arguments:
-      one: Candidate between two rows of the motion.
-      model: Model of the probabilities.
-      motion: Motion of all frames.
-      mountings: Mounting of the sensor at each frame.
-      knows_height: Whether the odometry measures height.
-    """
-    probability = float(model.probability(one.evidence))
-    sensors = {"query_mounting": mountings[one.query], "match_mounting": mountings[one.match]}
-    loop = planar_loop(
-        one.query, one.match, one.alignment, probability=probability, knows_height=knows_height, **sensors
-    )
-    return Pair(loop, one.evidence, float(motion.travelled[one.query]))
+def pair_of(
+    one: Candidate, model: LoopModel, motion: Motion, mountings: Sequence[Mounting | None], *, knows_height: bool
+) -> Pair:
+    """The pair of a candidate. `knows_height`: whether the odometry measures height."""
+    probability, sensors = float(model.probability(one.evidence)), (mountings[one.query], mountings[one.match])
+    about = {"probability": probability, "knows_height": knows_height, "sensors": sensors}
+    return Pair(planar_loop(*one[:3], **about), one.evidence, float(motion.travelled[one.query]))
 
 
 def probable_loops(
-    pairs: Sequence[Pair],
-    model: LoopModel,
-    path: DrivenPath,
-    *,
-    mounting: AnyMounting,
-    drift: DriftModel,
-    config: DetectorConfig,
+    pairs: Sequence[Pair], model: LoopModel, path: DrivenPath, *, drift: DriftModel, config: DetectorConfig
 ) -> list[Loop | None]:
     """For each pair, the loop with its probability given the neighbours, or None below `config.min_probability`.
 
-    Arguments:
-      pairs: Pairs in the order of their queries.
-      model: Model of the probabilities.
-      path: Path of all frames.
-      mounting: Mounting of the sensor, or that at each frame.
-      drift: Drift model of the path.
-      config: Thresholds.
+    The pairs are in the order of their queries. `path` and its `drift` are those of all frames.
     """
-    found = tested_log_odds(pairs, model, path, mounting=mounting, drift=drift, config=config)
+    found = tested_log_odds(pairs, model, path, drift=drift, config=config)
     least = logit(config.min_probability)
     return [
         dataclasses.replace(one.loop, probability=float(expit(value))) if value >= least else None
@@ -91,7 +69,6 @@ def tested_log_odds(
     model: LoopModel,
     path: DrivenPath,
     *,
-    mounting: AnyMounting,
     drift: DriftModel,
     config: DetectorConfig = DetectorConfig(),
 ) -> Float[np.ndarray, " n"]:
@@ -105,18 +82,16 @@ def tested_log_odds(
         end = min(start + BLOCK, len(pairs))
         first = int(np.searchsorted(way_m, way_m[start] - WINDOW_M))
         last = int(np.searchsorted(way_m, way_m[end - 1] + WINDOW_M, side="right"))
-        agreeing = agree(loops[start:end], path, loops[first:last], mounting=mounting, drift=drift)
+        agreeing = agree(loops[start:end], path, loops[first:last], drift=drift)
         weights = neighbour_weights(way_m[first:last], np.arange(start, end) - first)
         support[start:end] = (np.where(agreeing, 1.0, -1.0) * weights) @ strength[first:last]
     return model.tested_log_odds(evidence, support)
 
 
 def neighbour_weights(way_m: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k n"]:
-    """Weight of each pair as neighbour of some pairs: the share of it that is new on the way to them.
+    """Weight of each pair as neighbour of the pairs in `rows`: the share of it that is new on the way to them.
 
-    Arguments:
-      way_m: Travelled distance at each query, in metres, in increasing order.
-      rows: The pairs whose neighbours are weighed.
+    `way_m` is the travelled distance at each query, in metres, in increasing order.
     """
     fresh = 1 - np.exp(-np.concatenate([[0.0], np.diff(way_m), [0.0]]) / INDEPENDENT_M)
     before = rows[:, None] > np.arange(len(way_m))[None]

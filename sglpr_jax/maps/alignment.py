@@ -4,15 +4,15 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from sglpr_jax.data.levelling import upright_from_lidar
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import to_upright
 from sglpr_jax.loops.consistency import accepted_between
-from sglpr_jax.loops.frame_alignment import FrameAlignment, aligned_frames
+from sglpr_jax.loops.frame_alignment import aligned_frames
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.se3 import inverse, moved_covariance, travelled
+from sglpr_jax.se3 import travelled, yaw_of
 
 SAMPLE = 300
 """Maximum number of places of the new map that are located in the existing map. They are evenly spaced."""
@@ -25,18 +25,18 @@ MAX_APART_M = 5.0
 class MapAlignment(NamedTuple):
     """Transform from the world frame of a new map to that of an existing map."""
 
-    frames: FrameAlignment
-    """`match_from_query` is the pose of the new world frame in the existing one."""
+    old_from_new: Float[np.ndarray, "4 4"]
+    """Pose of the new world frame in the existing one."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Covariance of a small motion of the new frame in itself: x, y, z in metres, then rotations in radians."""
     places: int
     """Number of common places from which the transform was estimated."""
     apart_m: float
     """Median distance between the positions of these places in both maps, as if the frames were the same."""
 
     def __str__(self) -> str:
-        x, y, z = self.frames.match_from_query[:3, 3]
-        rotation = self.frames.match_from_query[:3, :3]
-        yaw = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
-        along, across, *_, turn = np.sqrt(np.diag(self.frames.covariance))
+        (x, y, z), yaw = self.old_from_new[:3, 3], np.degrees(yaw_of(self.old_from_new))
+        along, across, *_, turn = np.sqrt(np.diag(self.covariance))
         return (
             f"transform x {x:.2f} m, y {y:.2f} m, z {z:.2f} m, yaw {yaw:.2f} degrees from {self.places} common places "
             f"(standard deviations {along:.2f} m, {across:.2f} m, {np.degrees(turn):.2f} degrees)"
@@ -44,29 +44,29 @@ class MapAlignment(NamedTuple):
 
 
 def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
-    """Locate places of a new map in an existing map, and estimate the transform between their world frames.
+    """Locate places of a new map in an existing one, and estimate the transform between their world frames, if any.
 
-    Arguments:
-      before: Existing map.
-      new: Map of one drive, made with the same weights, with its places in order.
-
-    Returns:
-      The transform, or None if the maps have no common place.
-
-    Raises:
-      ValueError: If the maps were made with other weights, or if their images have other sizes.
+    `new` is the map of one drive, with its places in order. Raises ValueError if the maps were made with other weights,
+    or if their images have other sizes.
     """
-    loops = _located(before, new)
+    loops = []
+    for row in np.unique(np.linspace(0, len(new) - 1, min(len(new), SAMPLE)).astype(int)).tolist():
+        answers = before.relocate_seen(new.seen(row), weights_hash=new.index.weights_hash)
+        if answers and answers[0].probability >= MIN_PROBABILITY:
+            loops.append(dataclasses.replace(answers[0].loop, query=row))
     if not loops:
         return None
-    upright, offset = [_upright_loop(loop, before, new) for loop in loops], len(before)
-    motion = Motion.joined([Motion.of(one.upright_poses()) for one in (before, new)], [np.eye(3)] * 2)
-    sets, _ = accepted_between(upright, motion, mounting=None, drift=DriftModel())
+    offset, upright = len(before), []
+    for loop in loops:
+        level = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
+        upright.append(dataclasses.replace(level, query=offset + loop.query))
+    motion = Motion.joined([Motion.of(one.upright_poses()) for one in (before, new)])
+    sets, _ = accepted_between(upright, motion, drift=DriftModel())
     if not sets:
         return None
     accepted = {loop.query - offset for loop in sets[0]}
     common = [loop for loop in loops if loop.query in accepted]
-    frames = aligned_frames(
+    found = aligned_frames(
         common,
         before.world_from_place,
         new.world_from_place,
@@ -77,15 +77,11 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     there = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])
     here = new.world_from_place[[loop.query for loop in common]]
     apart = np.linalg.norm(there[:, :3, 3] - here[:, :3, 3], axis=1)
-    return MapAlignment(frames, len(common), float(np.median(apart)))
+    return MapAlignment(*found, len(common), float(np.median(apart)))
 
 
 def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
-    """Check that two maps are in one world frame, as far as they have common places.
-
-    Raises:
-      ValueError: If the common places have other positions in the two maps.
-    """
+    """Raise ValueError if common places of two maps have other positions, so that their world frames differ."""
     found = align_maps(before, new)
     if found is not None and found.apart_m > MAX_APART_M:
         raise ValueError(
@@ -99,21 +95,3 @@ def without_known_places(before: PlaceMap, new: PlaceMap) -> PlaceMap:
     """The new map without the places whose descriptors the existing map has, so that no scan is added twice."""
     known = {descriptor.tobytes() for descriptor in before.index.descriptors}
     return new.some([row for row, found in enumerate(new.index.descriptors) if found.tobytes() not in known])
-
-
-def _located(before: PlaceMap, new: PlaceMap) -> list[Loop]:
-    """Loops from places of the new map (query) to the existing map (match)."""
-    loops = []
-    for row in np.unique(np.linspace(0, len(new) - 1, min(len(new), SAMPLE)).astype(int)).tolist():
-        answers = before.relocate_seen(new.seen(row), weights_hash=new.index.weights_hash)
-        if answers and answers[0].probability >= MIN_PROBABILITY:
-            loops.append(dataclasses.replace(answers[0].loop, query=row))
-    return loops
-
-
-def _upright_loop(loop: Loop, before: PlaceMap, new: PlaceMap) -> Loop:
-    """The loop in gravity-aligned frames. The rows of the new map follow those of the existing map."""
-    ours = upright_from_lidar(new.mounting(loop.query))
-    pose = upright_from_lidar(before.mounting(loop.match)) @ loop.match_from_query @ inverse(ours)
-    covariance = moved_covariance(loop.covariance, ours)
-    return dataclasses.replace(loop, query=len(before) + loop.query, match_from_query=pose, covariance=covariance)

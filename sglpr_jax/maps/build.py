@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
-from sglpr_jax.data.levelling import check_level, mountings_of
+from sglpr_jax.data.levelling import check_level
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
@@ -21,45 +21,9 @@ from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.loops.keyframes import Seen
-from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.maps.place_names import place_names
+from sglpr_jax.maps.place_map import PlaceMap, place_names
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
-
-
-class _PlaceScans:
-    """Scans at least `spacing_m` from the last place. Bad and almost empty scans do not become places."""
-
-    def __init__(self, finder: CandidateFinder, positions: Float[np.ndarray, "n 3"], spacing_m: float):
-        self._finder, self._positions, self._spacing_m = finder, positions, spacing_m
-        self.looked_at: list[int] = []
-        """Rows of the recording that are frames of the finder."""
-        self.frames: list[int] = []
-        """Frames of the finder that are places."""
-        self.rows: list[int] = []
-        """Rows of the recording that are places."""
-        self.done = 0
-        """Number of processed rows."""
-
-    def unseen(self) -> Iterator[int]:
-        """Yields the rows that have to be read. The caller adds each to the finder before it takes the next one."""
-        for row in range(len(self._positions)):
-            self.done = row
-            if self._is_far(row):
-                frame = len(self.looked_at)
-                if frame == len(self._finder):  # not seen by an earlier run
-                    yield row
-                if not self._finder.empty[frame]:
-                    self.frames.append(frame)
-                    self.rows.append(row)
-                self.looked_at.append(row)
-        self.done = len(self._positions)
-
-    def _is_far(self, row: int) -> bool:
-        """Whether a scan is far enough from the last place."""
-        if not self.rows:
-            return True
-        return bool(np.linalg.norm(self._positions[row] - self._positions[self.rows[-1]]) >= self._spacing_m)
 
 
 class Mapped(NamedTuple):
@@ -84,9 +48,7 @@ def map_recording(
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Mapped:
-    """Create the map of a recording with known poses.
-
-    The id of a place is `RECORDING/SCAN`. Scans that are almost empty are skipped.
+    """Create the map of a recording with known poses. Places have ids RECORDING/SCAN. Empty scans are skipped.
 
     Arguments:
       recording: The scans.
@@ -107,21 +69,35 @@ def map_recording(
     poses = given_poses(poses, of="poses")
     if len(poses) != len(recording) or not len(recording):
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
-    check_level(poses, mountings_of(recording), name=recording.name)
+    check_level(poses, recording)
     recording = with_odometry(recording, poses)
-    finder = CandidateFinder(params)
-    chosen = _PlaceScans(finder, poses[:, :3, 3], spacing_m)
-    seen_scans: list[Seen | None] = []
+    finder, descriptions = CandidateFinder(params), list[Seen | None]()
+    looked_at, places, done = list[int](), list[tuple[int, int]](), 0
+    """Rows that are frames of the finder, frame and row of each place, and number of processed rows."""
+
+    def rows_to_read() -> Iterator[int]:
+        """Rows far enough from the last place. Each is added to the finder before the next one is taken."""
+        nonlocal done
+        for done in range(len(poses)):
+            if places and np.linalg.norm(poses[done, :3, 3] - poses[places[-1][1], :3, 3]) < spacing_m:
+                continue
+            frame = len(looked_at)
+            if frame == len(finder):  # not seen by an earlier run
+                yield done
+            if not finder.empty[frame]:
+                places.append((frame, done))
+            looked_at.append(done)
+        done = len(poses)
 
     def add(seen: Seen | None, compared: Compared | None) -> None:
-        seen_scans.append(seen)
+        descriptions.append(seen)
         finder.add_seen(seen, compared=Compared(NO_FITS, None))
 
     add_scans(
         scaled(recording, scale),
         finder,
         add,
-        rows=chosen.unseen(),
+        rows=rows_to_read(),
         kept_in=kept_in,
         on_bad_scan=on_bad_scan,
         should_stop=should_stop,
@@ -129,23 +105,19 @@ def map_recording(
         poses=poses,
         spacing_m=spacing_m,
     )
-    on_progress(chosen.done)
-    if not chosen.rows and chosen.done == len(recording):
+    on_progress(done)
+    if not places and done == len(recording):
         raise ValueError(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )
-    skipped = tuple(recording.ids[chosen.looked_at[frame]] for frame in finder.missing)
+    skipped = tuple(recording.ids[looked_at[frame]] for frame in finder.missing)
     index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
-    seen = [one for one in (seen_scans[frame] for frame in chosen.frames) if one is not None]
-    return Mapped(_places(index, recording, poses, chosen.rows, seen), chosen.done, skipped)
+    seen = [one for one in (descriptions[frame] for frame, _ in places) if one is not None]
+    return Mapped(_places(index, recording, poses, [row for _, row in places], seen), done, skipped)
 
 
 def _places(
-    index: Index,
-    recording: Recording,
-    poses: Float[np.ndarray, "n 4 4"],
-    rows: Sequence[int],
-    seen: Sequence[Seen],
+    index: Index, recording: Recording, poses: Float[np.ndarray, "n 4 4"], rows: Sequence[int], seen: Sequence[Seen]
 ) -> PlaceMap:
     """Map of some scans of a recording, added to an index without places."""
     names = place_names(recording)

@@ -2,35 +2,34 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex64, Float, Float32, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scaled import scaled_poses, scaled_record
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, replacing
 from sglpr_jax.loops.arguments import given_poses, given_record
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.closure import Loop, in_metres, planar_loop
-from sglpr_jax.loops.comparison import Candidate, Comparer, Query
+from sglpr_jax.loops.closure import Loop, in_metres, planar_loop, to_lidar
+from sglpr_jax.loops.comparison import Comparer, Query
 from sglpr_jax.loops.config import CANDIDATES, MIN_CELLS, CandidateConfig, PlaceCount
-from sglpr_jax.loops.keyframes import Seen, image_spectrum
+from sglpr_jax.loops.keyframes import Keyframes, Seen
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.maps.place_names import Content, free_names
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index, check_scale, check_weights
 from sglpr_jax.same_place import NEGATIVE_M
 from sglpr_jax.schema import Column, check_columns
@@ -55,28 +54,19 @@ class Relocated(NamedTuple):
 
 def with_shared_probability(answers: Sequence[Relocated], *, apart_m: float = NEGATIVE_M) -> list[Relocated]:
     """Sort answers by probability, scaled so that those of answers more than `apart_m` apart add up to at most 1."""
-    groups: list[list[Relocated]] = []
-    for one in _most_probable_first(answers):
+    answers = sorted(answers, key=lambda one: -one.probability)
+    best: list[Relocated] = []
+    for one in answers:
         position = one.world_from_query[:3, 3]
-        near = (group for group in groups if np.linalg.norm(group[0].world_from_query[:3, 3] - position) <= apart_m)
-        group = next(near, None)
-        if group is None:
-            groups.append([one])
-        else:
-            group.append(one)
-    total = max(1.0, sum(group[0].probability for group in groups))
-    return _most_probable_first(
-        [one._replace(loop=dataclasses.replace(one.loop, probability=one.probability / total)) for one in answers]
-    )
-
-
-def _most_probable_first(answers: Sequence[Relocated]) -> list[Relocated]:
-    return sorted(answers, key=lambda one: -one.probability)
+        if all(np.linalg.norm(other.world_from_query[:3, 3] - position) > apart_m for other in best):
+            best.append(one)
+    total = max(1.0, sum(one.probability for one in best))
+    shared = [one._replace(loop=dataclasses.replace(one.loop, probability=one.probability / total)) for one in answers]
+    return sorted(shared, key=lambda one: -one.probability)
 
 
 NO_DRIFT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=1e-3)
 """Drift of the poses of a map. It is small, but large over the unknown motion of a query (`motion.UNKNOWN_M`)."""
-NO_LOOPS = np.zeros((0, 2), np.int64)
 ARRAYS = {
     "images": Column("uint8", ("n", "h", "h")),
     "world_from_place": Column("float64", ("n", 4, 4)),
@@ -87,7 +77,7 @@ ARRAYS = {
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PlaceMap:
+class PlaceMap(Keyframes):
     """Places in one world frame, from one or more drives: the keyframes of sessions with known poses.
 
     Example:
@@ -137,12 +127,9 @@ class PlaceMap:
     def merged(self, other: "PlaceMap", *, drive: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> "PlaceMap":
         """Merge two maps in one world frame. Places that are in both are stored once.
 
-        If ids of `other` are taken by other places, its recordings are renamed with the suffix ~2, ~3 and so on.
-
-        Arguments:
-          other: Map to add.
-          drive: Poses of all scans of the recording of `other` (`poses_by_id`). They are needed if `other` is not
-            complete, so that its places get the same ids as in the complete map.
+        If ids of `other` are taken by other places, its recordings are renamed with the suffix ~2, ~3 and so on. If
+        `other` is not complete, `drive` has the poses of all scans of its recording (`poses_by_id`), so that the ids
+        are those of the complete map.
 
         Raises:
           ValueError: If the maps were made with other weights or another scale, or have images of another size.
@@ -155,7 +142,7 @@ class PlaceMap:
         coming: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in (drive or {}).items()}
         coming |= zip(other.index.ids, other._contents(), strict=True)
         taken = dict(zip(self.index.ids, self._contents(), strict=True))
-        new_ids = free_names([other.index.ids[row] for row in new], coming, taken=taken)
+        new_ids = _free_names([other.index.ids[row] for row in new], coming, taken=taken)
         index = self.index.without_places()
         for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
             places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
@@ -199,14 +186,7 @@ class PlaceMap:
     def relocate_seen(
         self, seen: Seen, *, weights_hash: str | None, model: LoopModel | None = None, candidates: int = CANDIDATES
     ) -> list[Relocated]:
-        """Locate a described scan in the map. The arguments and answers are those of `relocate`.
-
-        Arguments:
-          seen: Description of the scan, with the scale of the map.
-          weights_hash: Hash of the weights that described it.
-          model: Model of the probabilities, by default the one shipped for the weights.
-          candidates: Maximum number of poses.
-        """
+        """Locate a scan, described with the map's scale by weights with this hash. See `relocate`."""
         check_weights(self.index.weights_hash, weights_hash)
         image = seen.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
@@ -216,34 +196,28 @@ class PlaceMap:
         model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
         query = Query(len(self), seen.descriptor, image, query_spectra(image))
-        comparer = Comparer(self._motion, NO_DRIFT, np.eye(3), config, VerificationConfig(), NO_LOOPS)
+        comparer = Comparer(self._motion, NO_DRIFT, config)
         fits = comparer.compare(query, self)
         order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
-        best = order[np.sort(first)][:candidates].tolist()
-        found = [comparer.candidate(query, fits, row, self.image) for row in best]
-        answers = [self._answer(one, seen, float(model.probability(one.evidence))) for one in found]
+        answers = []
+        for row in order[np.sort(first)][:candidates].tolist():
+            one = comparer.candidate(query, fits, row, self)
+            sensors = seen.mounting, self.mounting(one.match).scaled(self.scale)
+            loop = planar_loop(*one[:3], probability=float(model.probability(one.evidence)), sensors=sensors)
+            loop = in_metres(to_lidar(loop, query=sensors[0], match=sensors[1]), self.scale)
+            pose = self.world_from_place[one.match] @ loop.match_from_query
+            answers.append(Relocated(self.index.ids[one.match], pose, loop))
         return with_shared_probability(answers, apart_m=NEGATIVE_M / self.scale)
 
     @property
     def frames(self) -> Int[np.ndarray, " n"]:
-        """Number of each place."""
+        """See `Keyframes`."""
         return np.arange(len(self))
 
-    def nearest(
-        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
-    ) -> Int[np.ndarray, " j"]:
-        """Up to k (0 or more) places with the nearest descriptors among those with a flag, nearest first."""
-        rows = self.index.query(descriptor, k, exclude=~among).rows if k else np.zeros(0, np.int64)
-        return rows[rows >= 0]
-
     def image(self, row: int) -> UInt8[np.ndarray, "h h"]:
-        """Image of a place."""
+        """See `Keyframes`."""
         return self.images[row]
-
-    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        """Spectrum of each place's image (`match_spectra`)."""
-        return [image_spectrum(self.images[row], VerificationConfig()) for row in rows.tolist()]
 
     @functools.cached_property
     def _motion(self) -> Motion:
@@ -262,26 +236,16 @@ class PlaceMap:
         return Seen(self.index.descriptors[row], self.images[row], self.mounting(row).scaled(self.scale))
 
     def some(self, rows: Sequence[int]) -> "PlaceMap":
-        """Return a map of some of the places.
-
-        Arguments:
-          rows: Numbers of the places.
-        """
-        index = self.index.without_places()
+        """Return a map of some of the places, by their numbers."""
+        rows, index = list(rows), self.index.without_places()
         ids, positions = [self.index.ids[row] for row in rows], self.world_from_place[rows, :3, 3]
         index.add(self.index.descriptors[rows], ids=ids, positions=positions)
         return PlaceMap(index, *(getattr(self, name)[rows] for name in ARRAYS))
 
     def moved(self, world_from_old: Float[np.ndarray, "4 4"]) -> "PlaceMap":
-        """Return the map in another world frame.
-
-        Arguments:
-          world_from_old: Pose of the old world frame in the new one.
-        """
-        poses = world_from_old @ self.world_from_place
-        index = self.index.without_places()
-        index.add(self.index.descriptors, ids=self.index.ids, positions=poses[:, :3, 3])
-        return dataclasses.replace(self, index=index, world_from_place=poses)
+        """Return the map in another world frame, given the pose of the old one in it."""
+        moved = dataclasses.replace(self, world_from_place=world_from_old @ self.world_from_place)
+        return moved.some(range(len(self)))
 
     def save(self, path: Path | str) -> None:
         """Write the map atomically to one file: an index file with additional arrays (`ARRAYS`)."""
@@ -306,14 +270,6 @@ class PlaceMap:
         for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
             yield descriptor.tobytes(), pose.tobytes()
 
-    def _answer(self, one: Candidate, seen: Seen, probability: float) -> Relocated:
-        """Pose of a query by a place."""
-        match_mounting = self.mounting(one.match).scaled(self.scale)
-        mountings = {"query_mounting": seen.mounting, "match_mounting": match_mounting}
-        loop = planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
-        loop = in_metres(loop, self.scale)
-        return Relocated(self.index.ids[one.match], self.world_from_place[one.match] @ loop.match_from_query, loop)
-
 
 def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError if the content of a file is not that of a map."""
@@ -327,3 +283,43 @@ def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
         Mounting(height, tuple(up))
         if abs(np.linalg.norm(up) - 1) > ROTATION_TOLERANCE:
             raise ValueError(f"expected up directions of length 1 in mountings, found {up}")
+
+
+Content = tuple[bytes | None, bytes]
+"""Identity of a place: its descriptor (None if not known yet) and its pose, as bytes."""
+
+
+def place_names(recording: Recording) -> list[str]:
+    """Name of the place of each scan, whether or not the scan is in a map."""
+    return [f"{recording.name}/{scan}" for scan in recording.ids]
+
+
+def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Pose of each scan by the id of its place, whether or not the scan is in the map."""
+    return dict(zip(place_names(recording), np.asarray(poses, np.float64), strict=True))
+
+
+def _free_names(names: Sequence[str], coming: Mapping[str, Content], *, taken: Mapping[str, Content]) -> list[str]:
+    """Names for new places, with the first suffix of "", ~2, ~3, ... after the recording that makes them free.
+
+    `coming` has all scans of the drive, because the suffix must not depend on how much of it is mapped. `taken` has the
+    places of the map.
+    """
+    recordings = {name.rpartition("/")[0] for name in names}
+    drive = {name: content for name, content in coming.items() if name.rpartition("/")[0] in recordings}
+
+    def is_free(suffix: str) -> bool:
+        """Whether no scan of the drive has, with the suffix, the name of another place."""
+        for name, (descriptor, pose) in drive.items():
+            there = taken.get(_with_suffix(name, suffix))
+            if there is not None and (there[1] != pose or descriptor not in (None, there[0])):
+                return False
+        return True
+
+    suffix = next(filter(is_free, itertools.chain([""], (f"~{number}" for number in itertools.count(2)))))
+    return [_with_suffix(name, suffix) for name in names]
+
+
+def _with_suffix(name: str, suffix: str) -> str:
+    recording, slash, scan = name.rpartition("/")
+    return f"{recording}{suffix}{slash}{scan}"

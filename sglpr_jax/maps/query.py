@@ -22,8 +22,7 @@ def read_query(
     Arguments:
       path: File of a scan, or of an image (.png).
       places: Map in which the query will be located.
-      format: Format of the scan. "auto" uses the file name. For a .bin whose name does not state the format, it uses
-        the content, as for a folder of scans.
+      format: Format of the scan. "auto" uses the file name or, for a .bin that does not state the format, the content.
       sensor_height: Height of the sensor above the ground, in metres. "estimate" estimates height and tilt from the
         scan. "auto" uses `PlaceMap.query_mounting`.
 

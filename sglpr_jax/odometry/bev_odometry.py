@@ -1,10 +1,8 @@
 """Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
 
-The decision about a loop needs to know which scans show other places. The motion is accurate enough for this purpose
-over some hundred metres. It does not replace odometry. Where the surroundings show the position across a direction
-only, as in a tunnel, the sensor is assumed to move on as before, and the drift grows fast. Where they show nothing,
-the motion is unknown and a new segment begins. Only ratios of times count, so a drive at another speed has the same
-motion.
+It is accurate enough over some hundred metres to tell which scans show other places. Where the surroundings show only
+the position across a direction, as in a tunnel, the sensor is assumed to move on as before, and the drift grows fast.
+Where they show nothing, a new segment begins. Only ratios of times count, so a faster drive has the same motion.
 """
 
 import math
@@ -111,24 +109,17 @@ class Motion:
         return found
 
     @classmethod
-    def joined(cls, motions: "Sequence[Motion]", levels: Sequence[Float[np.ndarray, "3 3"]]) -> "Motion":
-        """Motion of several recordings, one after the other, in worlds whose z axes point up.
-
-        Poses between two recordings are unknown.
-
-        Arguments:
-          motions: Motions of the recordings.
-          levels: Rotations that make the z axes of their worlds point up (`DrivenPath.level`).
-        """
+    def joined(cls, motions: "Sequence[Motion]") -> "Motion":
+        """Motion of several recordings, one after the other, in level worlds. Poses between two of them are unknown."""
         found = cls()
-        for one, level in zip(motions, levels, strict=True):
+        for one in motions:
             numbers, last = one._numbers.rows.copy(), found._numbers.rows[-1:]
             numbers["guessed_m"] += UNKNOWN_M * len(last)
             numbers["travelled"] += GAP_M * len(last)
             for name in ("segment", "travelled", "guessed_m") if len(last) else ():
                 numbers[name] += last[name] + (name == "segment")
             found._numbers.extend(numbers)
-            found.path.extend(one.path.leveled(np.arange(len(one)), level), numbers["guessed_m"])
+            found.path.extend(one.path.leveled(np.arange(len(one))), numbers["guessed_m"])
         return found
 
     @property
@@ -166,11 +157,18 @@ class Motion:
     ) -> None:
         """Add a frame at `time`, by its `pose` from odometry or its `link` with the keyframe.
 
-        An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown, as
-        after a restart.
+        An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown.
         """
         if len(self) and not continues:
-            return self._begin(time, self.poses[-1] if pose is None else pose)
+            self._append(
+                time,
+                self.poses[-1] if pose is None else pose,
+                segment=int(self.segments[-1]) + 1,
+                travelled=self.travelled[-1] + GAP_M,
+                guessed_m=self.guessed_m[-1] + UNKNOWN_M,
+            )
+            self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
+            return
         key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
         if pose is None and link is not None:
             prior = self.prior(time, key)
@@ -193,12 +191,10 @@ class Motion:
                 drifted_m = self._drifted_m(time, share=1.0 if coasts else AMBIGUOUS_SHARE)
                 guessed_m = min(drifted_m, self.guessed_m[-1] + M_PER_UNCERTAIN_M * along_m)
             self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
-            if not (self._is_far(moved, rotation) or coasts or ambiguous):
+            is_far = moved > KEYFRAME_M or rotation > np.radians(KEYFRAME_DEG)
+            if not (is_far or coasts or ambiguous):
                 return
         self.keyframe = len(self) - 1
-
-    def _is_far(self, metres: float, radians: float) -> bool:
-        return bool(metres > KEYFRAME_M or radians > np.radians(KEYFRAME_DEG))
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
         """Expected x, y and yaw in the frame of an earlier frame, at constant velocity. NaN if unknown."""
@@ -254,12 +250,6 @@ class Motion:
             guessed_m=self._drifted_m(time),
         )
 
-    def _begin(self, time: float, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add the first frame after an unknown motion."""
-        segment, guessed_m = int(self.segments[-1]) + 1, self.guessed_m[-1] + UNKNOWN_M
-        self._append(time, pose, segment=segment, travelled=self.travelled[-1] + GAP_M, guessed_m=guessed_m)
-        self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
-
     def _drifted_m(self, time: float, *, share: float = 1.0) -> float:
         """Next value of `guessed_m`, if the motion since the last frame is a guess, or if this share of it is."""
         step_m = max(self._guessed_step_m(time), LEAST_STEP_M)
@@ -280,15 +270,9 @@ class Motion:
         return float(np.linalg.norm(np.diff(ends, axis=0), axis=1).max(initial=0.0))
 
     def _append(
-        self,
-        time: float,
-        pose: Float[np.ndarray, "4 4"],
-        *,
-        segment: int,
-        travelled: float,
-        guessed_m: float,
+        self, time: float, pose: Float[np.ndarray, "4 4"], *, segment: int, travelled: float, guessed_m: float
     ) -> None:
-        self.path.add(pose, guessed_m=guessed_m)
+        self.path.extend(pose[None], np.array([guessed_m]))
         self._numbers.append((time, segment, travelled, guessed_m))
 
     @property

@@ -52,15 +52,11 @@ class OdometryCheck:
         self._frames += 1
 
     def add(self, pose: Float[np.ndarray, "4 4"], link: Link | None) -> None:
-        """Add a compared scan.
-
-        Arguments:
-          pose: Gravity-aligned pose by odometry.
-          link: Pose in the frame of the last compared scan by the images. None if unknown.
-        """
+        """Add a compared scan: its gravity-aligned pose, and by the images that in the last compared one."""
         step = np.eye(4) if self._last is None else inverse(self._last) @ pose
         far = float(np.linalg.norm(step[:3, 3])) > MAX_STEP_M
-        if self._last is None or link is None or far or not _is_clear(link):
+        is_clear = link is not None and link.second <= MAX_SECOND and link.along_m <= MAX_ALONG_M
+        if self._last is None or link is None or far or not is_clear:
             self._by_odometry, self._by_images, self._way_m = np.eye(4), np.eye(4), 0.0
         else:
             seen = transform(float(link.x), float(link.y), float(link.yaw))
@@ -95,8 +91,3 @@ class OdometryCheck:
             metres_per_metre=max(stated.metres_per_metre, length),
             degrees_per_metre=max(stated.degrees_per_metre, angle),
         )
-
-
-def _is_clear(link: Link) -> bool:
-    """Whether no other pose fits about as well."""
-    return bool(link.second <= MAX_SECOND and link.along_m <= MAX_ALONG_M)

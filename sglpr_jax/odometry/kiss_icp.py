@@ -58,7 +58,7 @@ def scan_odometry(
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Compute odometry from the scans of a recording.
+    """Compute odometry from the scans of a recording, in the frame of the first scan. Fewer poses if stopped.
 
     If scans and points have times, the motion within scans is removed, and each pose is that at the time of its scan.
     Scans that are unreadable or have few points get an extrapolated pose. A warning names them, and scans that do not
@@ -68,14 +68,10 @@ def scan_odometry(
       recording: The scans, about 10 a second.
       config: Settings of kiss-icp.
       scale: Factor for all lengths, as in `find_loops`. With 4, the default range is 25 m and the voxels .25 m.
-      kept_in: File of a checkpoint (.npz). If the scans and settings are the same, an interrupted run resumes from it
-        with the same result. The file is not removed.
-      on_bad_scan: Called with id and error of an unreadable scan. Without it the error is raised.
-      should_stop: If it returns True, the poses until then are returned.
-      on_progress: Called with the number of scans.
-
-    Returns:
-      world_from_lidar, the pose of the LiDAR at each scan, in the frame of the first scan. Fewer if stopped.
+      kept_in: Checkpoint file (.npz) of this recording and these settings, from which a stopped call resumes. It stays.
+      on_bad_scan: Called with id and error of an unreadable scan.
+      should_stop: If it returns True, the poses of the scans so far are returned.
+      on_progress: Called with the number of processed scans.
 
     Raises:
       ValueError: If the recording has ready-made images, or if no scan is readable or has enough points.
@@ -122,9 +118,8 @@ class _FrontEnd:
     def __init__(self, config: OdometryConfig):
         library, used = _library(), config.effective
         data = {"max_range": used.max_range_m, "min_range": used.min_range_m, "deskew": True}
-        settings = importlib.import_module("kiss_icp.config").KISSConfig(
-            data=data, mapping={"voxel_size": used.voxel_m}
-        )
+        of_library = importlib.import_module("kiss_icp.config")
+        settings = of_library.KISSConfig(data=data, mapping={"voxel_size": used.voxel_m})
         self._icp, self._voxel_m = library.KissICP(settings), float(used.voxel_m or 0)
         self._before: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
 
@@ -142,21 +137,20 @@ class _FrontEnd:
         if len(source) < MIN_POINTS:
             icp.last_pose = guess
             return _Registered(guess, len(source), 1.0)
-        pose = self._aligned(source, guess) if known is None else known
+        pose = known
+        if pose is None:
+            sigma = icp.adaptive_threshold.get_threshold()
+            pose = icp.registration.align_points_to_map(
+                points=source,
+                voxel_map=icp.local_map,
+                initial_guess=guess,
+                max_correspondance_distance=3 * sigma,
+                kernel=sigma,
+            )
         icp.adaptive_threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         icp.local_map.update(mapped, pose)
         icp.last_delta, icp.last_pose = np.linalg.inv(icp.last_pose) @ pose, pose
         return _Registered(pose, len(source), self._overlap(source, mapped, pose))
-
-    def _aligned(self, source: np.ndarray, guess: np.ndarray) -> Float[np.ndarray, "4 4"]:
-        sigma = self._icp.adaptive_threshold.get_threshold()
-        return self._icp.registration.align_points_to_map(
-            points=source,
-            voxel_map=self._icp.local_map,
-            initial_guess=guess,
-            max_correspondance_distance=3 * sigma,
-            kernel=sigma,
-        )
 
     def _overlap(self, source: np.ndarray, mapped: np.ndarray, pose: np.ndarray) -> float:
         """Share of points with a point of the previous scans within a voxel."""

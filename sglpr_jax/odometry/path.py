@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.levelling import AnyMounting, is_tilted, uprights
+from sglpr_jax.data.levelling import is_tilted
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.odometry.config import DriftModel
@@ -39,24 +39,22 @@ class Between(NamedTuple):
 class DrivenPath:
     """Gravity-aligned poses of the sensor in one fixed frame. Adding a pose takes constant time."""
 
-    def __init__(self):
+    def __init__(
+        self,
+        poses: Float[np.ndarray, "n 4 4"] | None = None,
+        guessed_m: Float[np.ndarray, " n"] | None = None,
+        *,
+        tilted: bool = False,
+    ):
+        """Start with some poses, as in `extend`."""
+        self.tilted = tilted
+        """Whether the sensor is tilted. If not, the z axis of the fixed frame counts as up."""
         self._poses = GrowingArray(np.empty((0, 4, 4)))
         self._sums = GrowingArray(np.empty((0, SUMS)))
         self._guessed_m = 0.0
         self._up = np.zeros(3)
-
-    @classmethod
-    def of(
-        cls,
-        odometry: Float[np.ndarray, "n 4 4"],
-        *,
-        mounting: AnyMounting = None,
-        guessed_m: Float[np.ndarray, " n"] | None = None,
-    ) -> "DrivenPath":
-        """Path of the odometry of a LiDAR with this `mounting`. For `guessed_m` see `extend`."""
-        found = cls()
-        found.extend(odometry @ inverse(uprights(mounting, np.arange(len(odometry)))), guessed_m)
-        return found
+        if poses is not None:
+            self.extend(poses, guessed_m)
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -77,20 +75,20 @@ class DrivenPath:
         return self._poses.nbytes + self._sums.nbytes
 
     @property
-    def up(self) -> Float[np.ndarray, " 3"]:
-        """Average direction of up in the fixed frame, a unit vector. Without poses this is the z axis."""
-        return self._up / np.linalg.norm(self._up) if len(self) else np.array([0.0, 0.0, 1.0])
+    def level(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation from the fixed frame to one whose z axis points up.
 
-    def add(self, pose: Float[np.ndarray, "4 4"], *, guessed_m: float = 0.0) -> None:
-        """Add the pose of the next frame. For `guessed_m` see `extend`."""
-        self.extend(pose[None], np.array([guessed_m]))
+        Odometry often starts with the identity, so its world is tilted like the sensor. Up is the average over all
+        poses.
+        """
+        if not self.tilted or not len(self):
+            return np.eye(3)
+        return Mounting(0.0, tuple((self._up / np.linalg.norm(self._up)).tolist())).upright_from_lidar
 
     def extend(self, poses: Float[np.ndarray, "n 4 4"], guessed_m: Float[np.ndarray, " n"] | None = None) -> None:
-        """Add the poses of the next frames.
+        """Add the poses of the next frames, and the guessed motion up to each of them (`Motion.guessed_m`).
 
-        Arguments:
-          poses: Gravity-aligned poses of the sensor.
-          guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
+        Guessed motion drifts like a path of unknown direction.
         """
         guessed_m = np.full(len(poses), self._guessed_m) if guessed_m is None else guessed_m
         if len(self):
@@ -104,20 +102,12 @@ class DrivenPath:
         self._up += poses[:, :3, 2].sum(axis=0)
         self._guessed_m = float(guessed_m[-1]) if len(poses) else self._guessed_m
 
-    def level(self, mounting: AnyMounting) -> Float[np.ndarray, "3 3"]:
-        """Rotation from the fixed frame to one whose z axis points up, if the sensor has this `mounting`.
-
-        Odometry often starts with the identity, so its world is tilted like the sensor. The world of a sensor that is
-        not tilted counts as level.
-        """
-        return Mounting(0.0, tuple(self.up.tolist())).upright_from_lidar if is_tilted(mounting) else np.eye(3)
-
-    def leveled(self, frames: Int[np.ndarray, " k"], level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "k 4 4"]:
-        """Poses of some frames in rotated coordinates, with positions counted from that of the first frame."""
+    def leveled(self, frames: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 4 4"]:
+        """Poses of some frames in a level world, with positions counted from that of the first frame."""
         poses = self.poses[frames]
         if len(self):
             poses[:, :3, 3] -= self.poses[0, :3, 3]
-        poses[:, :3] = level @ poses[:, :3]
+        poses[:, :3] = self.level @ poses[:, :3]
         return poses
 
     def between(self, start: Int[np.ndarray, " k"], end: Int[np.ndarray, " k"]) -> Between:
@@ -135,6 +125,16 @@ class DrivenPath:
         lever, length = np.abs(sums @ weights), np.abs(sums[:, 0])
         across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
         return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
+
+
+def level_odometry(
+    odometry: Float[np.ndarray, "n 4 4"], upright_from_lidar: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Gravity-aligned poses of the sensor in a level world, from poses of the LiDAR."""
+    path = DrivenPath(odometry @ inverse(upright_from_lidar), tilted=is_tilted(upright_from_lidar))
+    poses = path.poses.copy()
+    poses[:, :3] = path.level @ poses[:, :3]
+    return poses
 
 
 def _integrals(positions: Float[np.ndarray, "n 3"], guessed_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m s"]:

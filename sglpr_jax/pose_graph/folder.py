@@ -136,8 +136,8 @@ def _transform(names: Sequence[str], aligned: AlignedParts, found: FoundLoops) -
         "query_recording": names[aligned.query.session],
         "match_frame": _frame(aligned.match, found),
         "query_frame": _frame(aligned.query, found),
-        "match_from_query": aligned.alignment.match_from_query.tolist(),
-        "covariance": aligned.alignment.covariance.tolist(),
+        "match_from_query": aligned.match_from_query.tolist(),
+        "covariance": aligned.covariance.tolist(),
         "loops": aligned.loops,
     }
 

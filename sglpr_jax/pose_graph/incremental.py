@@ -1,6 +1,6 @@
 """Correction of a trajectory while it is driven: an incremental pose graph, solved by gtsam's iSAM2 (extra `gtsam`).
 
-`optimization` solves a graph of all frames and loops at the end, and removes wrong loops. Here a robust cost (Cauchy)
+`optimize` solves a graph of all frames and loops at the end, and removes wrong loops. Here a robust cost (Cauchy)
 limits the influence of a wrong loop.
 """
 
@@ -35,11 +35,8 @@ class IncrementalTrajectory:
     """A trajectory of odometry that loops correct frame by frame.
 
     The loops should come from a `LoopDetector` with the same odometry, which rejects loops that contradict it. A
-    segment is a part of the trajectory whose motion is known. A new segment is part of the graph as soon as a loop
-    connects it with a segment in the graph.
-
-    The graph has a node every few metres. A loop connects the nodes before its query and its match. Loops that agree
-    with the graph are used every `LOOP_EVERY_M` only.
+    segment, a part whose motion is known, enters the graph as soon as a loop connects it with a segment in the graph.
+    The graph has a node every few metres. A loop connects the nodes before its query and its match.
 
     Example:
       trajectory = IncrementalTrajectory()
@@ -49,14 +46,7 @@ class IncrementalTrajectory:
     """
 
     def __init__(self, *, drift: DriftModel = DriftModel()):
-        """Create a trajectory without frames.
-
-        Arguments:
-          drift: Stated drift of the odometry.
-
-        Raises:
-          ImportError: If the extra `gtsam` is not installed.
-        """
+        """Create a trajectory without frames. Raises ImportError if the extra `gtsam` is not installed."""
         self._gtsam, self._drift = gtsam_library(), drift
         settings = self._gtsam.ISAM2Params()
         settings.setRelinearizeThreshold(RELINEARIZE)
@@ -93,48 +83,32 @@ class IncrementalTrajectory:
     def add(
         self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[Loop] = (), *, continues: bool = True
     ) -> None:
-        """Add the next frame, and new loops of this and of earlier frames.
+        """Add the pose of the LiDAR by odometry at the next frame, and new loops of this and of earlier frames.
 
-        Arguments:
-          world_from_lidar: Pose of the LiDAR by odometry.
-          loops: New loops.
-          continues: False if the motion since the last frame is unknown. The odometry may then begin in another frame.
+        With `continues=False`, the motion since the last frame is unknown, and the odometry may begin in another frame.
         """
         frame, before = len(self), self._odometry.rows[-1:]
         self._odometry.append(world_from_lidar)
         step = float(np.linalg.norm(world_from_lidar[:3, 3] - before[-1, :3, 3])) if frame and continues else 0.0
         self._travelled.append(self._travelled.rows[-1] + step if frame else 0.0)
-        if not frame:
-            self._begin(world_from_lidar)
-        elif not continues:
-            self._add_node(frame, self._segments[-1] + 1)
-        elif self._travelled.rows[-1] - self._travelled.rows[self._nodes[-1]] >= NODE_EVERY_M:
-            self._continue(frame)
+        last = self._nodes[-1] if frame else 0
+        if not frame or not continues or self._travelled.rows[-1] - self._travelled.rows[last] >= NODE_EVERY_M:
+            segment = self._segments[-1] + (not continues) if frame else 0
+            self._nodes.append(frame)
+            self._segments.append(segment)
+            if not frame:  # the first pose is fixed
+                self._placed.add(0)
+                self._values.insert(0, self._gtsam.Pose3(world_from_lidar))
+                first = self._gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
+                self._graph.add(self._gtsam.PriorFactorPose3(0, self._gtsam.Pose3(world_from_lidar), first))
+            elif continues and segment in self._placed:
+                self._values.insert(frame, self._gtsam.Pose3(self._correction(last) @ world_from_lidar))
+                self._chain(last, frame)
         self._waiting += loops
         self._use_loops()
         if self._values.size() or self._graph.size():
             self._solver.update(self._graph, self._values)
             self._graph, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
-
-    def _begin(self, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Insert the first frame, whose pose is fixed."""
-        first = self._gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
-        self._add_node(0, 0)
-        self._placed.add(0)
-        self._values.insert(0, self._gtsam.Pose3(pose))
-        self._graph.add(self._gtsam.PriorFactorPose3(0, self._gtsam.Pose3(pose), first))
-
-    def _continue(self, frame: int) -> None:
-        """Add a node to the segment of the last one."""
-        before, segment = self._nodes[-1], self._segments[-1]
-        self._add_node(frame, segment)
-        if segment in self._placed:
-            self._values.insert(frame, self._gtsam.Pose3(self._correction(before) @ self._odometry.rows[frame]))
-            self._chain(before, frame)
-
-    def _add_node(self, frame: int, segment: int) -> None:
-        self._nodes.append(frame)
-        self._segments.append(segment)
 
     def _chain(self, before: int, frame: int) -> None:
         """Connect two nodes by odometry."""
@@ -160,7 +134,9 @@ class IncrementalTrajectory:
     def _use(self, loop: Loop) -> None:
         """Connect the nodes of a loop. The covariance is that of the loop, because the nodes are near its frames."""
         query, match = self._node(loop.query), self._node(loop.match)
-        pose = self._from_node(match, loop.match) @ loop.match_from_query @ inverse(self._from_node(query, loop.query))
+        ends = (loop.match, match), (loop.query, query)
+        match_moved, query_moved = (inverse(self._odometry.rows[node]) @ self._odometry.rows[one] for one, node in ends)
+        pose = match_moved @ loop.match_from_query @ inverse(query_moved)
         if self._segment(query) not in self._placed:
             self._place(query, self._pose(match) @ pose)
         elif self._segment(match) not in self._placed:
@@ -202,10 +178,6 @@ class IncrementalTrajectory:
 
     def _segment(self, frame: int) -> int:
         return self._segments[bisect.bisect_right(self._nodes, frame) - 1]
-
-    def _from_node(self, node: int, frame: int) -> Float[np.ndarray, "4 4"]:
-        """Pose of a frame in that of a node, by odometry."""
-        return inverse(self._odometry.rows[node]) @ self._odometry.rows[frame]
 
     def _correction(self, node: int) -> Float[np.ndarray, "4 4"]:
         """Correction of the odometry at a node in the graph."""

@@ -1,7 +1,7 @@
 """Correction of a trajectory by its loops: a pose graph, solved with gtsam (extra `gtsam`).
 
-In least squares, every wrong loop bends the graph. Graduated non-convexity (Yang et al., RA-L 2020) starts with a
-convex cost and ends with one that ignores outliers. The result is compared with the stated drift of the odometry.
+In least squares, every wrong loop bends the graph. Graduated non-convexity (Yang et al., RA-L 2020) ignores outliers.
+The result is compared with the stated drift of the odometry.
 """
 
 import dataclasses
@@ -14,14 +14,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.levelling import mountings_of, upright_from_lidar, upright_odometry, uprights
+from sglpr_jax.data.levelling import is_tilted, uprights
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.closure import FrameId, Loop, frames_of
+from sglpr_jax.loops.closure import FrameId, Loop, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
 from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.se3 import inverse, moved_covariance
+from sglpr_jax.se3 import inverse
 
 FIRST_POSE = 1e-6
 """Standard deviation of the first pose, which stays fixed, in metres and radians."""
@@ -66,9 +66,6 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     Sessions that loops connect get one frame, that of the first one. It takes about a second for a few hundred frames,
     and minutes for a few thousand.
 
-    Arguments:
-      found: Loops found with odometry.
-
     Raises:
       ValueError: If the loops were found without odometry.
       ImportError: If the extra `gtsam` is not installed.
@@ -80,19 +77,25 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     without = next((one.recording.name for one in found.sessions if one.odometry is None), None)
     if without is not None:
         raise ValueError(f"{without}: expected loops found with odometry, found loops without it")
-    placed = placements(found)
+    placed, sessions = placements(found), found.sessions
     poses, inliers = dict[int, np.ndarray](), np.zeros(len(found.loops), bool)
     solved = []
     for group in dict.fromkeys(group for group, _ in placed):
         members = {number: to_first for number, (other, to_first) in enumerate(placed) if other == group}
         rows = [row for row, loop in enumerate(found.loops) if loop.query_session in members]
-        graph, to_level = _upright_graph(found, members, [found.loops[row] for row in rows])
+        turned = {number: uprights(sessions[number].recording)[: sessions[number].frames] for number in members}
+        given = {number: np.asarray(sessions[number].odometry)[: sessions[number].frames] for number in members}
+        upright = {number: members[number] @ given[number] @ inverse(turned[number]) for number in members}
+        level = np.eye(4)
+        level[:3, :3] = DrivenPath(upright[group], tilted=is_tilted(turned[group])).level
+        loops = [_upright(found.loops[row], sessions) for row in rows]
+        graph = PoseGraph({number: level @ one for number, one in upright.items()}, loops, sessions[group].drift)
         solved.append(graph.solve())
         inliers[rows] = solved[-1].inliers
-        for number, upright in zip(members, _split(solved[-1].poses, graph), strict=True):
-            sensors = uprights(mountings_of(found.sessions[number].recording), np.arange(len(upright)))
-            poses[number] = inverse(to_level) @ upright @ sensors
-            _check_heights(found.sessions[number], members[number], poses[number])
+        ends = np.cumsum([len(one) for one in upright.values()])[:-1]
+        for number, one in zip(members, np.split(solved[-1].poses, ends), strict=True):
+            poses[number] = inverse(level) @ one @ turned[number]
+            _check_heights(sessions[number], members[number], poses[number])
     moved = [one.moved_rms_m**2 * len(one.poses) for one in solved]
     return OptimizedTrajectory(
         np.concatenate([poses[number] for number in range(len(found.sessions))]),
@@ -104,34 +107,10 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     )
 
 
-def _upright_graph(
-    found: FoundLoops, members: Mapping[int, Float[np.ndarray, "4 4"]], loops: Sequence[Loop]
-) -> tuple["PoseGraph", Float[np.ndarray, "4 4"]]:
-    """Graph of connected sessions in gravity-aligned frames, because their mountings may differ.
-
-    Also returns the transform from the frame of the first session to that of the graph.
-    """
-    sessions = {number: found.sessions[number] for number in members}
-    level, odometry = np.eye(4), {}
-    for number, one in sessions.items():
-        assert one.odometry is not None
-        given, mounting = one.odometry[: one.frames], mountings_of(one.recording)
-        upright = members[number] @ given @ inverse(uprights(mounting, np.arange(len(given))))
-        if not odometry and len(given):
-            level = upright_odometry(given, mounting)[0] @ inverse(upright[0])
-        odometry[number] = level @ upright
-    edges = []
-    for loop in loops:
-        ours = upright_from_lidar(sessions[loop.query_session].recording.mounting_of(loop.query))
-        theirs = upright_from_lidar(sessions[loop.match_session].recording.mounting_of(loop.match))
-        pose, covariance = theirs @ loop.match_from_query @ inverse(ours), moved_covariance(loop.covariance, ours)
-        edges.append(dataclasses.replace(loop, match_from_query=pose, covariance=covariance))
-    return PoseGraph(odometry, edges, next(iter(sessions.values())).drift), level
-
-
-def _split(poses: Float[np.ndarray, "n 4 4"], graph: "PoseGraph") -> list[Float[np.ndarray, "_ 4 4"]]:
-    """Divide the poses of all nodes by session."""
-    return np.split(poses, np.cumsum([len(one) for one in graph.odometry.values()])[:-1])
+def _upright(loop: Loop, sessions: Sequence[Session]) -> Loop:
+    """The loop between the gravity-aligned frames of its sessions, whose mountings may differ."""
+    query = sessions[loop.query_session].recording.mounting_of(loop.query)
+    return to_upright(loop, query=query, match=sessions[loop.match_session].recording.mounting_of(loop.match))
 
 
 def _check_heights(session: Session, to_first: Float[np.ndarray, "4 4"], corrected: Float[np.ndarray, "n 4 4"]) -> None:
@@ -158,8 +137,8 @@ def placements(found: FoundLoops) -> tuple[tuple[int, Float[np.ndarray, "4 4"]],
         (known, new, pose)
         for one in links
         for known, new, pose in (
-            (one.match.session, one.query.session, one.alignment.match_from_query),
-            (one.query.session, one.match.session, inverse(one.alignment.match_from_query)),
+            (one.match.session, one.query.session, one.match_from_query),
+            (one.query.session, one.match.session, inverse(one.match_from_query)),
         )
     ]
     for root in range(len(found.sessions)):
@@ -188,15 +167,12 @@ class PoseGraph:
         return [FrameId(session, frame) for session, poses in self.odometry.items() for frame in range(len(poses))]
 
     def solve(self) -> OptimizedTrajectory:
-        """Solve the graph of odometry and loops.
+        """Solve the graph of odometry and loops. Raises ImportError if the extra `gtsam` is not installed.
 
         Loops that contradict the odometry are dropped. If the solution contradicts the odometry between the frames of a
-        loop, that loop is dropped, too, and the graph is solved again. If a contradiction remains after `ROUNDS`
-        solutions, the odometry is returned without inliers. Between two sessions there is no odometry, and loops
-        between them cannot contradict it.
-
-        Raises:
-          ImportError: If the extra `gtsam` is not installed.
+        loop, that loop is dropped, too, and the graph is solved again, up to `ROUNDS` times. If a contradiction
+        remains, the odometry is returned without inliers. Loops between two sessions, where no odometry is, cannot
+        contradict it.
         """
         gtsam, drift, rows = gtsam_library(), self.drift, {node: row for row, node in enumerate(self.nodes)}
         odometry, sessions = np.concatenate(list(self.odometry.values())), np.array([node.session for node in rows])
@@ -253,7 +229,7 @@ def _contradictions(
 ) -> Float[np.ndarray, " k"]:
     """Deviation of each loop from the odometry (`deviations`). It is 0 for loops between two sessions."""
     query, match = frames_of(loops)
-    return np.where(sessions[query] == sessions[match], deviations(loops, DrivenPath.of(odometry), drift=drift), 0.0)
+    return np.where(sessions[query] == sessions[match], deviations(loops, DrivenPath(odometry), drift=drift), 0.0)
 
 
 def _bend(
@@ -265,22 +241,18 @@ def _bend(
 ) -> Float[np.ndarray, " k"]:
     """Deviation of the solved poses from the odometry at each loop, in standard deviations.
 
-    Deviations are measured along the path between the two frames of the loop, and along the paths from each of them to
-    the next earlier and later frame of any loop. The largest one counts.
+    It is the largest one along the path between the two frames of the loop, and along the paths from each of them to
+    the next earlier and later frame of any loop.
     """
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
     solved = [Loop(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
     found = _contradictions(solved, odometry, sessions, drift)
-    return np.array(
-        [max(found[k], *(found[len(loops) :][_touching(frames, loop)]), 0.0) for k, loop in enumerate(loops)]
-    )
-
-
-def _touching(frames: np.ndarray, loop: Loop) -> Bool[np.ndarray, " m"]:
-    """Whether each path between consecutive `frames` starts or ends at a frame of the loop."""
-    ends = np.isin(frames, [loop.match, loop.query])
-    return ends[:-1] | ends[1:]
+    bends = []
+    for k, loop in enumerate(loops):
+        own = np.isin(frames, [loop.match, loop.query])  # a path that starts or ends at one of these counts
+        bends.append(max(found[k], *found[len(loops) :][own[:-1] | own[1:]], 0.0))
+    return np.array(bends)
 
 
 def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndarray, "n 3"]) -> float:

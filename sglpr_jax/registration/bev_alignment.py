@@ -1,7 +1,7 @@
-"""Covariance of a pose from the shape of the correlation peak: small at a corner, long along a wall.
+"""Alignment of two images, and its covariance from the shape of the peak: small at a corner, long along a wall.
 
-It is the sum of three parts: least squares at the peak (curvature and image noise), the extent of the ridge under the
-peak, and small fixed errors. The constants were fitted on simulated drives (`benchmarks/quality/poses.py`).
+The covariance sums least squares at the peak, the extent of the ridge under it, and small fixed errors. The constants
+were fitted on simulated drives (`benchmarks/quality/poses.py`).
 """
 
 import functools
@@ -78,13 +78,12 @@ def ridge_covariance(
 ) -> Float[Array, "3 3"]:
     """Return the covariance of (x, y, yaw) along the weak axis of a peak, as far as the correlation stays high there.
 
-    Along a wall the correlation falls only because the two images share less area. A pattern that moves with the sensor
-    can leave a small peak on top of this ridge. In a bend the ridge rotates with the distance, so the best of several
-    rotations counts. Samples beyond a minimum belong to another peak and count no more than the minimum.
+    Along a wall the correlation falls only because the two images share less area. In a bend the ridge rotates with the
+    distance, so the best of several rotations counts. Samples beyond a minimum belong to another peak and count no more
+    than the minimum.
 
     Arguments:
-      products: Fourier transform (`rfft2`) of the correlation for each rotation of the query. The first is that of the
-        peak.
+      products: Fourier transform (`rfft2`) of the correlation for each rotation of the query, that of the peak first.
       pose: x (right) and y (up) of the peak, in metres, and its yaw, in radians.
       yaws: Rotations, in radians.
       curvature: Negative Hessian of the correlation at the peak, over x, y and yaw.
@@ -153,10 +152,6 @@ class Alignment(NamedTuple):
     second: Float[Array, "*b"]
     """Second-peak ratio: height of the second peak divided by the first. It is near 1 if another pose fits as well."""
 
-    def one(self, k: int) -> "Alignment":
-        """The k-th alignment."""
-        return Alignment(*(value[k] for value in self))
-
     @property
     def along_m(self) -> float:
         """Standard deviation of the position of one alignment along its least certain direction, in metres."""
@@ -180,18 +175,10 @@ def align(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Alignment:
-    """Estimate the pose of a query in the frame of a match from their images.
+    """Estimate the pose of a query in the frame of a match from their images, also under `jit` and `vmap`.
 
-    The function works under `jit` and `vmap`. For one query and several matches use `align_all`, which rotates the
-    query only once.
-
-    Arguments:
-      query: Square image of counts in the orientation of eq. 1, with an even number of cells per side.
-      match: Image of the same size.
-      config: Settings of the comparison.
-
-    Raises:
-      ValueError: If the images are not square or have an odd number of cells.
+    Both are square images of counts in the orientation of eq. 1, with an even number of cells per side. Raises
+    ValueError for other images.
     """
     peak = jax.tree.map(lambda values: values[0], search(query, jnp.asarray(match)[None], config=config))
     return refined(query, match, peak, config=config)
@@ -211,19 +198,6 @@ def refined(
     pose, correlation, covariance = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
     yaw = jnp.mod(pose[2] + jnp.pi, 2 * jnp.pi) - jnp.pi
     return Alignment(pose[0], pose[1], yaw, covariance, correlation, second)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def align_all(
-    query: Num[Array | np.ndarray, "h w"],
-    matches: Num[Array | np.ndarray, "k h w"],
-    *,
-    config: VerificationConfig = DEFAULT,
-) -> Alignment:
-    """Align one query with each of k matches. Every field of the result has a leading axis of k."""
-    matches = jnp.asarray(matches)
-    peaks = search(query, matches, config=config)
-    return jax.lax.map(lambda one: refined(query, *one, config=config), (matches, peaks))
 
 
 def _refined(

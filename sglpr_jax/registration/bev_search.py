@@ -1,7 +1,7 @@
-"""Coarse comparison of images, which tells at little cost which scans may show the place of a query.
+"""Search for the best pose of an image in another one, exactly or, at little cost, coarsely.
 
-It has half as many rotations as the search, cells twice as large and blurs twice as wide, and takes a sixth of the
-time. It replaces the descriptors where these do not tell places apart, for instance among trunks.
+The coarse comparison has half as many rotations, cells and blurs twice as large, and takes a sixth of the time. It
+replaces the descriptors where these do not tell places apart, for instance among trunks.
 """
 
 import functools
@@ -40,13 +40,9 @@ def coarse_correlations(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Float[Array, " k"]:
-    """Highest correlation of a query with each of k matches at any pose, by the coarse comparison.
+    """Highest correlation of a query with each match at any pose, by the coarse comparison.
 
-    Arguments:
-      query: Result of `spectra.query_spectra`.
-      matches: Result of `spectra.match_spectra`.
-      count: Number of compared matches, by default all. The others get -1.
-      config: Settings of the exact comparison.
+    The arguments are those of `search_spectra`. Matches beyond `count` get -1.
     """
     turned = quarters(lower_half(jnp.asarray(query)[:, :, ::2].swapaxes(1, 2), config).swapaxes(1, 2))
     matches = lower_half(jnp.asarray(matches), config)
@@ -89,16 +85,8 @@ def search(
 ) -> Peak:
     """Return the best pose of a query in the frame of each of k matches.
 
-    Arguments:
-      query: Square image of counts in the orientation of eq. 1, with an even number of cells per side.
-      matches: Images of the same size.
-      config: Settings of the comparison.
-
-    Returns:
-      Peaks with a leading axis of k.
-
-    Raises:
-      ValueError: If the images are not square or have an odd number of cells.
+    The images are square, of counts in the orientation of eq. 1, with an even number of cells per side. Raises
+    ValueError for other images.
     """
     return search_spectra(query_spectra(query, config=config), match_spectra(matches, config=config), config=config)
 
@@ -140,9 +128,6 @@ def search_near(
       match: Row of `match_spectra`.
       prior: Expected x, y (metres) and yaw (radians). NaN if there is no expected pose.
       config: Settings of the comparison.
-
-    Returns:
-      Peaks with a leading axis of 2.
     """
     found = correlations(quarters(jnp.asarray(query)), jnp.asarray(match), _reach(config))
     priors = jnp.stack([jnp.full(3, jnp.nan), jnp.asarray(prior, jnp.float32)])

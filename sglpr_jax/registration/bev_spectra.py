@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Num
+from jaxtyping import Array, Complex, Float, Float32, Int, Num
 from scipy.fft import next_fast_len
 
 from sglpr_jax.bev import centre_crop, rotate_image
@@ -20,8 +20,7 @@ AnyArray = Array | np.ndarray
 def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAULT) -> Num[AnyArray, "m m"]:
     """Central part of an image that is compared. m is a multiple of two merged cells.
 
-    Raises:
-      ValueError: If the image is not square or has an odd number of cells.
+    Raises ValueError if the image is not square or has an odd number of cells.
     """
     if image.shape[0] != image.shape[1] or image.shape[0] % 2:
         raise ValueError(f"expected a square image of an even number of cells, found {image.shape}")
@@ -45,18 +44,6 @@ def merged(image: Float[Array, "m m"], side: int) -> Float[Array, "k k"]:
     return image.reshape(size, side, size, side).mean((1, 3))
 
 
-def occupied(image: Num[np.ndarray, "h w"], config: VerificationConfig = DEFAULT) -> float:
-    """Number of occupied cells within reach."""
-    return float(np.count_nonzero(image[_within(image.shape, config.reach_m / DENSITY_RESOLUTION_M)]))
-
-
-@functools.cache
-def _within(shape: tuple[int, int], radius: float) -> Bool[np.ndarray, "h w"]:
-    """Whether each cell lies within a radius (in cells) of the centre."""
-    down, right = (np.arange(n) - (n - 1) / 2 for n in shape)
-    return np.hypot(down[:, None], right[None]) < radius
-
-
 def cells(metres: float, cell_m: float) -> int:
     """Number of cells that cover a length, both in metres."""
     return int(np.ceil(metres / cell_m))
@@ -66,12 +53,7 @@ def cells(metres: float, cell_m: float) -> int:
 def query_spectra(query: Num[AnyArray, "h w"], *, config: VerificationConfig = DEFAULT) -> Complex[Array, "2 s t f"]:
     """Compute the spectra of a query on merged cells, at the t rotations of the first and of the second quarter turn.
 
-    Arguments:
-      query: Square image of counts in the orientation of eq. 1, with an even number of cells per side.
-      config: Settings of the comparison.
-
-    Raises:
-      ValueError: If the image is not square or has an odd number of cells.
+    The image is square, of counts in the orientation of eq. 1. Raises the error of `within_reach`.
     """
     angles = np.arange(config.turns // 4, dtype=np.float32) * np.float32(2 * np.pi / config.turns)
     rotated = rotations(merged(prepared(query, config), config.coarse), jnp.asarray(angles))
@@ -161,10 +143,8 @@ def _sources(size: int) -> tuple[Int[np.ndarray, " n"], Float32[np.ndarray, " n"
     """Value at row r and column c of a spectrum rotated by 90 degrees: that at row c and column -r.
 
     Columns below 0 are conjugates of the opposite frequencies. Row size / 2 is stored as row -size / 2, which changes
-    the sign, because the centre of an even number of cells lies between two of them.
-
-    Returns:
-      Index into the flattened half spectrum, factor of the imaginary part (-1 for conjugates), and sign.
+    the sign, because the centre of an even number of cells lies between two of them. Returns the index into the
+    flattened half spectrum, the factor of the imaginary part (-1 for conjugates), and the sign.
     """
     rows = np.rint(np.fft.fftfreq(size) * size).astype(int)[:, None]
     columns = np.arange(size // 2 + 1)[None]
@@ -190,10 +170,7 @@ def quarters(query: Complex[Array, "2 s t f"]) -> list[Halves]:
 def correlations(query: list[Halves], match: Complex[Array, "s f"], reach: int) -> Float[Array, "d _ d"]:
     """Correlation of a match with every rotated query at every shift: rows down, rotations, columns to the right.
 
-    Arguments:
-      query: Result of `quarters`.
-      match: Spectrum of a match.
-      reach: Maximum shift down and to the right, in cells.
+    The query is the result of `quarters`. `reach` is the maximum shift down and to the right, in cells.
     """
     first, second = (jnp.split(_quarter(half, match, reach), 2, axis=1) for half in query)
     return jnp.concatenate([first[0], second[0], first[1], second[1]], axis=1)

@@ -2,39 +2,53 @@
 
 Neither method detects whether the scans show one place. If GICP starts 3 m off along a road, its result is 3 m off,
 too. The overlap shows such errors. It is the share of the space of one scan that the other scan fills, too.
+
+Points on one surface, ring or vehicle have correlated errors. For the covariance, their contributions are summed in
+blocks of space, and the scatter of the blocks gives the noise (a sandwich estimator). The constants were fitted on
+simulated drives with 64, 32 and 16 beams (`benchmarks/quality/poses.py`).
 """
 
 import importlib.util
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
-from sglpr_jax.registration.covariance import NEIGHBOURS, matched_points, registration_covariance
 from sglpr_jax.se3 import transformed
 
+NEIGHBOURS = 20
+"""Number of neighbours from which the normal of a point is estimated. With 10, normals on the rings of 16 beams are
+arbitrary, and GICP aligns the rings of the two scans. Roll and pitch were 0.3 degrees off."""
+POINTS = 4000
+"""Target number of points of the query for the covariance. Clouds with fewer points are not thinned."""
+BLOCK_M = 8.0
+"""Edge of the blocks of space with independent errors, in metres."""
+SCALE, HEIGHT_SCALE = 1.15, 0.8
+"""Factor of all standard deviations, and additional factor of the height."""
+SPARSE, SPARSE_TILT = 3.2, 9.0
+"""Growth of standard deviations with the share of sparse ground: of x, y and yaw, and of roll and pitch. Ground is
+sparse where the neighbours of a point lie on one line, so that its normal is arbitrary."""
+FLAT_COSINE = 0.9
+"""Minimum cosine between the z axis and the normal of a surface that is ground."""
+LINE = 0.05
+"""Maximum ratio of the second to the first variance of neighbours that lie on a line."""
+SLIDING = 0.04
+"""Share of the squared components of all normals below which a direction is degenerate: scans can slide along it."""
+UNKNOWN_M = 3.0
+"""Standard deviation along a degenerate direction if the first guess has no covariance, in metres."""
 
-@dataclass(frozen=True)
-class RegistrationConfig:
-    """Settings of the registration of two scans."""
 
-    voxel_m: float = 1.0
-    """Edge of KISS-Matcher's voxels, in metres."""
-    fine_voxel_m: float = 0.25
-    """Edge of GICP's voxels, in metres."""
-    max_apart_m: float = 1.0
-    """Maximum distance of corresponding points in GICP, in metres."""
-    iterations: int = 40
-    """Maximum number of GICP iterations."""
-    overlap_voxel_m: float = 1.0
-    """Edge of the voxels of the overlap, in metres."""
-    overlap_reach_m: float = 40.0
-    """Maximum distance from both sensors of points that count in the overlap, in metres."""
-    min_position_m: float = 0.002
-    min_rotation_deg: float = 0.005
-    """Standard deviations added to every covariance, in metres and degrees."""
+COARSE_VOXEL_M, VOXEL_M = 1.0, 0.25
+"""Edges of the voxels of KISS-Matcher and of GICP, in metres."""
+MAX_APART_M = 1.0
+"""Maximum distance of corresponding points in GICP, in metres."""
+ITERATIONS = 40
+"""Maximum number of GICP iterations."""
+OVERLAP_VOXEL_M, OVERLAP_REACH_M = 1.0, 40.0
+"""Edge of the voxels of the overlap, and maximum distance from both sensors of points that count in it, in metres."""
+LEAST_POSITION_M, LEAST_ROTATION_DEG = 0.002, 0.005
+"""Standard deviations added to every covariance, in metres and degrees."""
 
 
 class Registration(NamedTuple):
@@ -55,7 +69,6 @@ def register(
     *,
     initial: Float[np.ndarray, "4 4"] | None = None,
     initial_covariance: Float[np.ndarray, "6 6"] | None = None,
-    config: RegistrationConfig = RegistrationConfig(),
 ) -> Registration:
     """Register the scan of a query to the scan of a match.
 
@@ -66,7 +79,6 @@ def register(
         one, which takes half a second.
       initial_covariance: Covariance of the first guess, of a small motion of the query in its own frame. The result
         keeps it along directions in which the scans can slide on each other, as in a tunnel.
-      config: Settings of the registration.
 
     Raises:
       ImportError: If small-gicp or, without `initial`, KISS-Matcher is not installed.
@@ -78,70 +90,53 @@ def register(
     """
     gicp = _library("small_gicp")
     query, match = _finite(query, "query"), _finite(match, "match")
-    initial = coarse_pose(query, match, voxel_m=config.voxel_m) if initial is None else initial
-    target, tree = _preprocessed(match, config)
-    source, _ = _preprocessed(query, config)
+    initial = coarse_pose(query, match) if initial is None else initial
+    target, tree = _preprocessed(match)
+    source, _ = _preprocessed(query)
     found = gicp.align(
         target,
         source,
         tree,
         init_T_target_source=np.asarray(initial, np.float64),
         registration_type="GICP",
-        max_correspondence_distance=config.max_apart_m,
-        max_iterations=config.iterations,
+        max_correspondence_distance=MAX_APART_M,
+        max_iterations=ITERATIONS,
     )
     pose = np.asarray(found.T_target_source)
     order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp puts rotation first
     information = np.asarray(found.H)[order][:, order]
-    matched = matched_points(target, tree, source, pose, max_apart_m=config.max_apart_m)
-    covariance = registration_covariance(information, matched, pose, initial_covariance)
-    least = np.repeat([config.min_position_m, np.radians(config.min_rotation_deg)], 3) ** 2
-    return Registration(pose, covariance + np.diag(least), overlap(query, match, pose, config=config))
+    matched = _matched_points(target, tree, source, pose)
+    covariance = _registration_covariance(information, matched, pose, initial_covariance)
+    least = np.repeat([LEAST_POSITION_M, np.radians(LEAST_ROTATION_DEG)], 3) ** 2
+    return Registration(pose, covariance + np.diag(least), overlap(query, match, pose))
 
 
-def coarse_pose(
-    query: Float32[np.ndarray, "n 3"], match: Float32[np.ndarray, "m 3"], *, voxel_m: float = 1.0
-) -> Float[np.ndarray, "4 4"]:
+def coarse_pose(query: Float32[np.ndarray, "n 3"], match: Float32[np.ndarray, "m 3"]) -> Float[np.ndarray, "4 4"]:
     """Estimate `match_from_query` with KISS-Matcher, without a first guess. Raises ImportError without extra `slam`."""
     matcher = _library("kiss_matcher")
-    found = matcher.KISSMatcher(matcher.KISSMatcherConfig(voxel_m)).estimate(query, match)
+    found = matcher.KISSMatcher(matcher.KISSMatcherConfig(COARSE_VOXEL_M)).estimate(query, match)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = found.rotation, found.translation
     return pose
 
 
 def overlap(
-    query: Float[np.ndarray, "n 3"],
-    match: Float[np.ndarray, "m 3"],
-    match_from_query: Float[np.ndarray, "4 4"],
-    *,
-    config: RegistrationConfig = RegistrationConfig(),
+    query: Float[np.ndarray, "n 3"], match: Float[np.ndarray, "m 3"], match_from_query: Float[np.ndarray, "4 4"]
 ) -> float:
     """Number of voxels that both scans fill, divided by the number that the smaller scan fills, near both sensors."""
-    moved = transformed(match_from_query, query)
-    sensors = np.stack([np.zeros(3), match_from_query[:3, 3]])
-    ours, theirs = (_voxels(cloud[_near(cloud, sensors, config)], config) for cloud in (moved, match))
-    fewer = min(len(ours), len(theirs))
-    return len(np.intersect1d(ours, theirs, assume_unique=True)) / fewer if fewer else 0.0
+    sensors, side, filled = (np.zeros(3), match_from_query[:3, 3]), 2 * int(OVERLAP_REACH_M / OVERLAP_VOXEL_M) + 4, []
+    for cloud in (transformed(match_from_query, query), match):
+        near = np.all([np.linalg.norm(cloud - sensor, axis=1) < OVERLAP_REACH_M for sensor in sensors], axis=0)
+        x, y, z = np.floor(cloud[near] / OVERLAP_VOXEL_M).astype(np.int64).T + side // 2
+        filled.append(np.unique((z * side + y) * side + x))
+    fewer = min(map(len, filled))
+    return len(np.intersect1d(*filled, assume_unique=True)) / fewer if fewer else 0.0
 
 
-def _near(
-    cloud: Float[np.ndarray, "n 3"], sensors: Float[np.ndarray, "2 3"], config: RegistrationConfig
-) -> Bool[np.ndarray, " n"]:
-    return np.all([np.linalg.norm(cloud - sensor, axis=1) < config.overlap_reach_m for sensor in sensors], axis=0)
-
-
-def _voxels(cloud: Float[np.ndarray, "n 3"], config: RegistrationConfig) -> Int[np.ndarray, " v"]:
-    """Occupied voxels, one number each."""
-    side = 2 * int(config.overlap_reach_m / config.overlap_voxel_m) + 4
-    x, y, z = np.floor(cloud / config.overlap_voxel_m).astype(np.int64).T + side // 2
-    return np.unique((z * side + y) * side + x)
-
-
-def _preprocessed(cloud: Float32[np.ndarray, "n 3"], config: RegistrationConfig) -> tuple[Any, Any]:
+def _preprocessed(cloud: Float32[np.ndarray, "n 3"]) -> tuple[Any, Any]:
     """Downsampled cloud with the covariances of its surface, and its search tree."""
-    points, size = cloud.astype(np.float64), config.fine_voxel_m
-    return _library("small_gicp").preprocess_points(points, downsampling_resolution=size, num_neighbors=NEIGHBOURS)
+    options = {"downsampling_resolution": VOXEL_M, "num_neighbors": NEIGHBOURS}
+    return _library("small_gicp").preprocess_points(cloud.astype(np.float64), **options)
 
 
 def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray, "n 3"]:
@@ -149,6 +144,98 @@ def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray
     if len(points) < 100:
         raise ValueError(f"expected a {name} of 100 finite points or more to register, found {len(points)}")
     return points
+
+
+class _Matched(NamedTuple):
+    """Points of a query, each with its nearest neighbour in the match."""
+
+    points: Float[np.ndarray, "k 3"]
+    """Points in the query's frame, in metres."""
+    residuals: Float[np.ndarray, "k 3"]
+    """Vector from each transformed point to its neighbour, in the match's frame."""
+    weights: Float[np.ndarray, "k 3 3"]
+    """Inverse covariances of the residuals, as in GICP."""
+    normals: Float[np.ndarray, "k 3"]
+    """Normals of the neighbours' surfaces, in the query's frame."""
+    each: int
+    """Number of points of the query that each of these represents."""
+    sparse: float
+    """Share of the ground where the neighbours of a point lie on one line."""
+
+
+def _registration_covariance(
+    information: Float[np.ndarray, "6 6"],
+    matched: _Matched,
+    match_from_query: Float[np.ndarray, "4 4"],
+    initial_covariance: Float[np.ndarray, "6 6"] | None,
+) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of a small motion of the query in its own frame: metres, then radians.
+
+    `information` is GICP's matrix of the same motion. The covariance of the first guess is kept along degenerate
+    directions.
+    """
+    inverse = np.linalg.pinv(information, hermitian=True)
+    grow = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * matched.sparse), 3)
+    grow[[2, 5]] = SCALE * HEIGHT_SCALE, grow[0]
+    found = (inverse @ _noise(matched, match_from_query) @ inverse) * np.outer(grow, grow)
+    found[:3, :3] += _sliding(matched.normals, initial_covariance)
+    return found
+
+
+def _matched_points(match: Any, tree: Any, query: Any, match_from_query: Float[np.ndarray, "4 4"]) -> _Matched:
+    """Find the nearest neighbours of a subset of the query's points, at most `MAX_APART_M` away.
+
+    `match`, its search tree `tree`, and `query` are results of small_gicp's `preprocess_points`.
+    """
+    turn = match_from_query[:3, :3]
+    points, theirs = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))
+    each = max(1, len(points) // POINTS)
+    moved = points[::each] @ turn.T + match_from_query[:3, 3]
+    nearest, squares = (np.asarray(values) for values in tree.batch_nearest_neighbor_search(moved))
+    near = np.flatnonzero(squares < MAX_APART_M**2)
+    nearest = nearest[near].astype(np.int64)
+    ours_spread = np.stack([query.cov(int(i) * each)[:3, :3] for i in near]) if len(near) else np.zeros((0, 3, 3))
+    theirs_spread = np.stack([match.cov(int(i))[:3, :3] for i in nearest]) if len(near) else np.zeros((0, 3, 3))
+    return _Matched(
+        points=points[::each][near],
+        residuals=theirs[nearest] - moved[near],
+        weights=np.linalg.inv(theirs_spread + turn @ ours_spread @ turn.T),
+        normals=np.linalg.eigh(theirs_spread)[1][:, :, 0] @ turn,
+        each=each,
+        sparse=_sparse_ground(theirs, tree, nearest[::4]),
+    )
+
+
+def _noise(matched: _Matched, match_from_query: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+    """Scatter of the gradient of GICP's error over blocks of space."""
+    pull = np.einsum("kij,kj->ki", matched.weights, matched.residuals) @ match_from_query[:3, :3]
+    gradient = np.concatenate([pull, np.cross(matched.points, pull)], axis=1)
+    _, block = np.unique(np.floor(matched.points / BLOCK_M).astype(np.int64), axis=0, return_inverse=True)
+    sums = np.zeros((block.max(initial=-1) + 1, 6))
+    np.add.at(sums, block.reshape(-1), gradient)
+    return sums.T @ sums * matched.each**2
+
+
+def _sliding(
+    normals: Float[np.ndarray, "k 3"], initial_covariance: Float[np.ndarray, "6 6"] | None
+) -> Float[np.ndarray, "3 3"]:
+    """Position covariance of the first guess along degenerate directions."""
+    strengths, directions = np.linalg.eigh(normals.T @ normals)
+    shares = strengths / max(strengths.sum(), 1e-9)
+    guess = np.eye(3) * UNKNOWN_M**2 if initial_covariance is None else initial_covariance[:3, :3]
+    kept = np.exp(-((shares / SLIDING) ** 2)) * np.einsum("ij,ik,kj->j", directions, guess, directions)
+    return (directions * kept) @ directions.T
+
+
+def _sparse_ground(cloud: Float[np.ndarray, "n 3"], tree: Any, rows: Int[np.ndarray, " k"]) -> float:
+    """Share of the points of flat ground whose neighbours lie on one line."""
+    if not len(rows):
+        return 1.0
+    neighbours = cloud[np.asarray(tree.batch_knn_search(cloud[rows], NEIGHBOURS)[0]).astype(np.int64)]
+    neighbours = neighbours - neighbours.mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(np.einsum("kna,knb->kab", neighbours, neighbours))
+    flat = np.abs(axes[:, 2, 0]) > FLAT_COSINE
+    return float(np.mean(spread[flat, 1] < LINE * spread[flat, 2])) if flat.any() else 1.0
 
 
 def is_installed() -> bool:

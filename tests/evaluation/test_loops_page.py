@@ -9,7 +9,7 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.loops_page import loops_page
 from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.frame_alignment import AlignedParts, FrameAlignment, Part
+from sglpr_jax.loops.frame_alignment import AlignedParts, Part
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.result import FoundLoops
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
@@ -73,7 +73,7 @@ def known(found) -> FoundLoops:
     model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((8, 3))
     positions[:, 0] = [0, 1, 2, 3, 4, 5, 6, 97]
-    recording = dataclasses.replace(found.recording, positions=positions, pose_source="poses.txt")
+    recording = dataclasses.replace(found.sessions[0].recording, positions=positions, pose_source="poses.txt")
     pairs = [(5, 1, 6.0), (6, 2, 7.0), (7, 3, -6.0)]
     candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, 0.0, c)) for q, m, c in pairs)
     return with_session(dataclasses.replace(found, model=model), recording=recording, candidates=candidates)
@@ -89,8 +89,8 @@ def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known
 
 
 def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, monkeypatch):
-    optimized = OptimizedTrajectory(known.odometry + 0.0, np.array([True, True, False]))
-    optimized.poses[:, :3, 3] = known.recording.positions
+    optimized = OptimizedTrajectory(known.sessions[0].odometry + 0.0, np.array([True, True, False]))
+    optimized.poses[:, :3, 3] = known.sessions[0].recording.positions
     page = Parsed(loops_page(known, optimized=optimized))
     assert [headline for headline, _ in page.images].count("Corrected") == 1
     said = page.texts["Corrected"]
@@ -106,8 +106,8 @@ def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, m
 def several(found) -> FoundLoops:
     loop = Loop(2, 3, transform(1.0, 2.0, 0.3), np.eye(6), 0.995, query_session=1)
     second = (dataclasses.replace(one, query_session=1, match_session=1) for one in found.loops)
-    alignment = FrameAlignment(transform(10.0, 0.0, 0.5), 0.01 * np.eye(6))
-    transforms = (AlignedParts(Part(0, 0, 7, True), Part(1, 0, 7, True), alignment, 1),)
+    alignment = transform(10.0, 0.0, 0.5), 0.01 * np.eye(6)
+    transforms = (AlignedParts(Part(0, 0, 7, True), Part(1, 0, 7, True), *alignment, 1),)
     return FoundLoops(2 * found.sessions, (*found.loops, *second, loop), transforms=transforms)
 
 

@@ -28,8 +28,8 @@ def entities(path: Path) -> set[str]:
 
 
 def test_both_trajectories_and_each_loop_are_there(found_loops, tmp_path):
-    corrected = OptimizedTrajectory(found_loops.odometry @ transform(0.1, 0.0, 0.0), np.ones(3, bool))
-    write_rerun(found_loops, tmp_path / "a.rrd", optimized=corrected)
+    moved = found_loops.sessions[0].odometry @ transform(0.1, 0.0, 0.0)
+    write_rerun(found_loops, tmp_path / "a.rrd", optimized=OptimizedTrajectory(moved, np.ones(3, bool)))
     there = entities(tmp_path / "a.rrd")
     expected = {"/map/trajectory/given", "/map/trajectory/corrected", "/map/sensor", "/map/loops/5", "/map/loops/6"}
     assert expected | {"/pair", "/evidence/loop"} <= there

@@ -33,7 +33,7 @@ def compare_only(monkeypatch) -> Callable[[Mapping[int, tuple[int, np.ndarray]]]
     with clear images, and with the deviation of this pose from the motion."""
 
     def only(pairs: Mapping[int, tuple[int, np.ndarray]]) -> None:
-        def candidates(self, query, fits, image_of, **_) -> list[Candidate]:
+        def candidates(self, query, fits, searched, **_) -> list[Candidate]:
             if query.frame not in pairs:
                 return []
             match, pose = pairs[query.frame]

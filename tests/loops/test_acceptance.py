@@ -19,7 +19,7 @@ from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.pose_graph.optimize import PoseGraph, trajectory_error
 from sglpr_jax.registration.gicp import Registration
-from sglpr_jax.se3 import transform
+from sglpr_jax.se3 import transform, travelled
 
 SERPENTINE = along([(0, 0), (150, 0), (150, 26), (0, 26), (0, 52), (150, 52), (150, 78), (0, 78)], 2.0)
 
@@ -45,8 +45,8 @@ def of_a_car_park() -> tuple[np.ndarray, list[Loop]]:
 @pytest.mark.parametrize("scene", [of_rooms, of_a_corridor, of_a_car_park])
 def test_of_places_that_repeat_no_loop_is_accepted_and_the_odometry_stays(scene):
     odometry, wrong = scene()
-    assert len(wrong) >= 50 and deviations(wrong, DrivenPath.of(odometry)).min() > 8
-    kept, rejected = accepted(wrong, odometry)
+    assert len(wrong) >= 50 and deviations(wrong, DrivenPath(odometry)).min() > 8
+    kept, rejected = accepted(wrong, DrivenPath(odometry))
     assert not kept and {one.reason for one in rejected} == {"contradicts the odometry"}
     found = PoseGraph({0: odometry}, wrong).solve()
     np.testing.assert_array_equal(found.poses, odometry)
@@ -58,8 +58,8 @@ def test_true_loops_are_kept_and_correct_the_drift():
     true = town()
     odometry = drifted(true, percent=1, deg_per_100m=0.5, noise=1.0)
     loops = true_loops(true, every=6)
-    assert len(loops) >= 52 and deviations(loops, DrivenPath.of(odometry)).max() < 1.7
-    kept, rejected = accepted(loops, odometry)
+    assert len(loops) >= 52 and deviations(loops, DrivenPath(odometry)).max() < 1.7
+    kept, rejected = accepted(loops, DrivenPath(odometry))
     assert kept == loops and not rejected
     found = PoseGraph({0: odometry}, kept).solve()
     assert found.inliers.all() and found.deviation < 2
@@ -75,7 +75,7 @@ def test_a_loop_within_the_drift_that_contradicts_the_others_is_rejected():
     loops = true_loops(true, every=6)
     wrong = dataclasses.replace(loops[-5], match_from_query=loops[-5].match_from_query @ transform(6.0, 0.0, 0.0))
     odometry = drifted(true, percent=1, deg_per_100m=0.5)
-    kept, rejected = accepted([*loops, wrong], odometry)
+    kept, rejected = accepted([*loops, wrong], DrivenPath(odometry))
     assert kept == loops and [(one.loop, one.reason) for one in rejected] == [(wrong, "contradicts other loops")]
 
 
@@ -83,10 +83,10 @@ def test_a_loop_within_the_drift_that_contradicts_the_others_is_rejected():
 def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_can_be_stated():
     true = town()
     odometry, loops = drifted(true, percent=10, deg_per_100m=5), true_loops(true, every=3)
-    kept, rejected = accepted(loops, odometry)
+    kept, rejected = accepted(loops, DrivenPath(odometry))
     assert not kept
     with pytest.warns(DataWarning, match="Either places repeat, or the odometry drifts by about") as told:
-        check_odometry("08", kept, rejected, odometry, DetectorConfig())
+        check_odometry("08", kept, [one.loop for one in rejected], DrivenPath(odometry), DetectorConfig(), 1)
     message = str(told[0].message)
     assert (
         "the odometry contradicts the loops of 106 of 106 frames" in message
@@ -98,7 +98,7 @@ def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_ca
     )
     assert 5 < percent < 20 and 2 < degrees < 10
     drift = DriftModel(percent / 100, degrees / 100)
-    kept, _ = accepted(loops, odometry, drift=drift)
+    kept, _ = accepted(loops, DrivenPath(odometry), drift=drift)
     assert len(kept) > 0.98 * len(loops)
     found = PoseGraph({0: odometry}, kept, drift).solve()
     assert trajectory_error(found.poses, true[:, :3, 3]) < 0.3 * trajectory_error(odometry, true[:, :3, 3])
@@ -108,18 +108,19 @@ def test_a_few_wrong_loops_among_many_true_ones_are_no_reason_to_doubt_the_odome
     true = town()
     loops = true_loops(true, every=6)
     wrong = [Loop(300 + i, 100 + i, np.eye(4), loops[0].covariance, 1.0) for i in range(20)]
-    kept, rejected = accepted([*wrong, *loops], true)
+    kept, rejected = accepted([*wrong, *loops], DrivenPath(true))
     assert kept == loops and len(rejected) == 20
-    check_odometry("08", kept, rejected, true, DetectorConfig())  # a warning is an error
+    against = [one.loop for one in rejected]
+    check_odometry("08", kept, against, DrivenPath(true), DetectorConfig(), 1)  # a warning is an error
 
 
 def test_loops_in_a_row_are_one_part_of_the_drive():
     poses = along([(0, 0), (600, 0)])
     at = [*range(300, 320), *range(400, 402), *range(500, 510)]
     loops = [Loop(query, query - 300, np.eye(4), np.eye(6), 1.0) for query in at]
-    assert stretches(loops, poses) == 2 and stretches([], poses) == 0
+    assert stretches(loops, travelled(poses)) == 2 and stretches([], travelled(poses)) == 0
     same_match = [Loop(query, 100 + i, np.eye(4), np.eye(6), 1.0) for i, query in enumerate(at)]
-    assert stretches(same_match, poses) == 1
+    assert stretches(same_match, travelled(poses)) == 1
 
 
 @pytest.mark.slow
@@ -132,7 +133,7 @@ def test_a_solution_beyond_the_drift_loses_the_loops_that_bend_it_or_is_not_take
         dataclasses.replace(one, match_from_query=one.match_from_query @ transform(0.0, 8.0, 0.0))
         for one in loops[-wrong:]
     ]
-    assert deviations(aside, DrivenPath.of(true)).max() < 1
+    assert deviations(aside, DrivenPath(true)).max() < 1
     found = PoseGraph({0: true}, (*loops[:-wrong], *aside)).solve()
     assert found.inliers.sum() == right and not found.inliers[-wrong:].any()
     assert found.deviation < 1 and found.moved_m < 1
@@ -151,7 +152,7 @@ def test_scans_that_overlap_little_are_a_loop_if_both_poses_agree(monkeypatch, o
     monkeypatch.setattr(acceptance, "register", registered)
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
     loop = Loop(1, 0, np.eye(4), 0.01 * np.eye(6), 0.99)
-    loops, rejected = acceptance.settled(recording, [loop], None, DetectorConfig(), registered=True)
+    loops, rejected = acceptance.registered_loops(recording, recording, [loop], should_stop=lambda: False)
     (found,) = loops if kept else [one.loop for one in rejected]
     assert found.overlap == overlap and found.match_from_query[0, 3] == off_m
     assert [one.reason for one in rejected] == ([] if kept else ["little overlap"])

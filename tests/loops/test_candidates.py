@@ -7,6 +7,7 @@ from scenes import seen_from
 import sglpr_jax
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
 
 GRID = Grid(resolution_m=0.4, height=152, width=152)
@@ -18,7 +19,7 @@ POSTS = np.repeat(RNG.uniform((-60, -5), (POSTS_UNTIL_M, 5), (60, 2)), 20, axis=
 
 @pytest.mark.parametrize("step_m", [0.7, 1.0])
 def test_between_plain_walls_the_sensor_moves_on_and_drifts(step_m):
-    finder = CandidateFinder(sglpr_jax.load("circular"))
+    finder = CandidateFinder(sglpr_jax.load("circular"), DetectorConfig(keyframe_m=0.0))
     descriptor, world = np.zeros(finder.index.width, np.float32), np.concatenate([WALLS, POSTS])
     for frame in range(FRAMES):
         image = seen_from(world, (step_m * frame, 0.0, 0.0), grid=GRID, seed=frame)

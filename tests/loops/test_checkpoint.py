@@ -77,7 +77,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
         found = find_loops(
             recording, params, **options, should_stop=stopping_after(frames, []), on_progress=done.append
         )
-        reached.append(found.frames)
+        reached.append(found.sessions[0].frames)
         assert done[0] == (reached[-2] if len(reached) > 1 else 1)
     assert reached == [3, 7, 16, 24]
     assert contents(found, tmp_path / "found") == files
@@ -144,7 +144,7 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
     said = []
     options["on_bad_scan"] = lambda scan, error: said.append((scan, str(error)))
     first = find_loops(bad, params, **options, should_stop=stopping_after(9, []))
-    assert first.frames == 9
+    assert first.sessions[0].frames == 9
     found = find_loops(bad, params, **options)
     ids = tuple(recording.ids[row] for row in (0, 6, 17))
     assert found.sessions[0].skipped == ids and [scan for scan, _ in said] == list(ids)

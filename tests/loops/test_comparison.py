@@ -7,12 +7,10 @@ import pytest
 from scenes import place, seen_from
 
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
-from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 
@@ -46,13 +44,13 @@ def compared(
         stored.add(frame, np.ones(2, np.float32), one)
     shown = image(TRUE, THERE, noise=1) if shown is None else shown
     query = Query(len(images), np.ones(2, np.float32), shown, query_spectra(shown))
-    return comparer.candidates(query, comparer.compare(query, stored), stored.image_of)
+    return comparer.candidates(query, comparer.compare(query, stored), stored)
 
 
 def comparer_along(poses: Sequence[np.ndarray], *, drift: DriftModel = EXACT, joined=()) -> Comparer:
     joined = np.array(joined, np.int64).reshape(-1, 2)
     motion = Motion.of(np.stack(poses))
-    return Comparer(motion, drift, np.eye(3), CandidateConfig(), VerificationConfig(), joined)
+    return Comparer(motion, drift, joined=joined)
 
 
 def test_the_place_is_found_and_no_other_place_fits_as_well():

@@ -44,7 +44,7 @@ def test_right_loops_agree_and_wrong_ones_do_not(seed):
     odometry = drifted(poses, percent=rng.normal(), deg_per_100m=rng.normal(scale=0.5))
     right = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[0.1, 0.1, 0.005]))) for i in range(210, 290, 4)]
     wrong = [loop_of(poses, i, i - 200, (15.0 * (-1) ** i, 5.0, 0.0)) for i in range(212, 290, 13)]
-    pairs = agree(right + wrong, DrivenPath.of(odometry))
+    pairs = agree(right + wrong, DrivenPath(odometry))
     assert pairs[:20, :20].mean() > 0.98
     near = np.abs(np.subtract.outer([one.query for one in right], [one.query for one in wrong])) < 20
     assert not pairs[:20, 20:][near].any()
@@ -56,19 +56,19 @@ def test_a_loop_in_the_other_direction_agrees_with_one_in_the_same():
     poses = square_drive()
     back = poses.copy()
     back[200:] = poses[200:] @ transform(0.0, 0.0, np.pi)
-    assert agree([loop_of(back, 230, 30), loop_of(back, 240, 40)], DrivenPath.of(back)).all()
+    assert agree([loop_of(back, 230, 30), loop_of(back, 240, 40)], DrivenPath(back)).all()
     turned = [loop_of(back, 230, 30), loop_of(back, 240, 40, (0.0, 0.0, np.pi))]
-    assert not agree(turned, DrivenPath.of(back))[0, 1]
+    assert not agree(turned, DrivenPath(back))[0, 1]
 
 
 def test_agreement_goes_both_ways_and_with_itself():
     poses = square_drive()
     rng = np.random.default_rng(0)
     loops = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[2, 2, 0.1]))) for i in range(205, 285, 5)]
-    pairs = agree(loops, DrivenPath.of(drifted(poses, percent=1, deg_per_100m=0.5)))
+    pairs = agree(loops, DrivenPath(drifted(poses, percent=1, deg_per_100m=0.5)))
     assert pairs.diagonal().all()
     assert (pairs == pairs.T).mean() > 0.9  # the lever is that of one of the two
-    path = DrivenPath.of(poses)
+    path = DrivenPath(poses)
     np.testing.assert_array_equal(agree(loops, path, loops[:3]), agree(loops, path)[:, :3])
 
 
@@ -119,9 +119,9 @@ def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
     np.testing.assert_allclose(np.cov(moved.T), covariance[:2, :2], atol=0.3)
 
 
-RULES = {"mounting": None, "drift": DriftModel()}
+RULES = {"drift": DriftModel()}
 FIRST, SECOND, TRUE = two_drives()
-MOTION = Motion.joined([Motion.of(FIRST), Motion.of(SECOND)], [np.eye(3)] * 2)
+MOTION = Motion.joined([Motion.of(FIRST), Motion.of(SECOND)])
 
 
 def joined_loops(true: np.ndarray) -> list[Loop]:
@@ -166,5 +166,5 @@ def test_parts_without_known_motion_are_accepted_one_by_one():
     middle = int(np.median([loop.query for loop in loops]))
     offset, parts = middle - len(FIRST) + 1, [Motion.of(FIRST)]
     parts += [Motion.of(some) for some in (SECOND[:offset], SECOND[offset:])]
-    sets, rejected = accepted_between(loops, Motion.joined(parts, [np.eye(3)] * 3), **RULES)
+    sets, rejected = accepted_between(loops, Motion.joined(parts), **RULES)
     assert len(sets) == 2 and sum(map(len, sets)) == len(loops) and not rejected

@@ -20,7 +20,7 @@ from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
-NOW = CandidateConfig(recent_m=1e-9)
+NOW = DetectorConfig(candidates=CandidateConfig(recent_m=1e-9), keyframe_m=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
     poses = drive.poses.world_from_lidar
     done = []
     found = find_loops(drive, params, odometry=poses, registered=True, on_progress=done.append)
-    assert done == list(range(1, len(drive) + 1)) and found.frames == len(drive)
+    assert done == list(range(1, len(drive) + 1)) and found.sessions[0].frames == len(drive)
     assert len(found.loops) + len(found.rejected) == sum(
         map(len, (streamed[0].loops, streamed[0].rejected, streamed[0].undecided()))
     )
@@ -78,15 +78,15 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
         error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
         assert loop.overlap >= LITTLE_OVERLAP and np.linalg.norm(error[:3, 3]) < 0.5
     stopped = find_loops(drive, params, should_stop=lambda: True)
-    assert stopped.frames == 0 and stopped.loops == ()
+    assert stopped.sessions[0].frames == 0 and stopped.loops == ()
 
 
 def test_images_and_scans_are_the_same_to_it(drive, params, revisit):
     points = drive.points(revisit[1])
-    scans, images = CandidateFinder(params, config=NOW), CandidateFinder(params, config=NOW)
+    scans, images = CandidateFinder(params, NOW), CandidateFinder(params, NOW)
     for cloud in (points, drive.points(revisit[0])):
-        found = scans.add(Record(points=cloud))
-        same = images.add(Record(image=sglpr_jax.density_bev(cloud)))
+        found = scans.add_seen(scans.seen(Record(points=cloud)))
+        same = images.add_seen(images.seen(Record(image=sglpr_jax.density_bev(cloud))))
     assert (found[0].query, found[0].match) == (1, 0)
     for one, other in zip(found[0].alignment, same[0].alignment, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5)
@@ -100,9 +100,9 @@ def test_odometry_that_is_far_off_contradicts_a_match(drive, params, revisit):
     query, match = (drive.points(frame) for frame in revisit)
     true = inverse(drive.poses.world_from_lidar[revisit[1]]) @ drive.poses.world_from_lidar[revisit[0]]
     for metres, allowed in ((0.0, True), (12.0, False)):
-        finder = CandidateFinder(params, config=NOW)
-        finder.add(Record(points=match), odometry=np.eye(4))
-        (found,) = finder.add(Record(points=query), odometry=transform(metres, 0.0, 0.0) @ true)
+        finder = CandidateFinder(params, NOW)
+        finder.add_seen(finder.seen(Record(points=match)), odometry=np.eye(4))
+        (found,) = finder.add_seen(finder.seen(Record(points=query)), odometry=transform(metres, 0.0, 0.0) @ true)
         assert (found.evidence.deviation <= finder.drift.max_deviation) == allowed
 
 
@@ -111,7 +111,7 @@ def test_scans_of_one_pass_are_no_candidates(drive, params, revisit, metres, the
     """The sensor drives that share of `recent_m` away from a place, and back."""
     finder, points = CandidateFinder(params), drive.points(revisit[0])
     for x in (0.0, metres * finder.config.recent_m, 0.0):
-        found = finder.add(Record(points=points), odometry=transform(x, 0.0, 0.0))
+        found = finder.add_seen(finder.seen(Record(points=points)), odometry=transform(x, 0.0, 0.0))
     assert len(found) == there
 
 
@@ -184,7 +184,7 @@ def test_the_height_of_a_loop_is_unknown_unless_the_odometry_measures_it(streame
 
 
 def test_scans_without_points_or_with_one_close_no_loops(params):
-    detector = LoopDetector(params, config=DetectorConfig(candidates=NOW))
+    detector = LoopDetector(params, config=DetectorConfig(candidates=NOW.candidates))
     for cloud in (np.zeros((0, 3)), np.array([[5.0, 3, 1]]), np.full((4, 3), np.nan)) * 3:
         assert detector.add(cloud) == []
     assert len(detector) == 9 and not detector.candidates

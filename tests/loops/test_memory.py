@@ -48,7 +48,7 @@ def test_loops_with_limits_are_right_and_limits_that_are_not_reached_change_noth
 
 def driven(params, step_m: float, turn_deg: float = 0.0, *, frames: int = 41, **limits) -> CandidateFinder:
     """A finder after frames that are `step_m` metres apart, all with one image."""
-    finder = CandidateFinder(params, **limits)
+    finder = CandidateFinder(params, DetectorConfig(**{"keyframe_m": 0.0, **limits}))
     seen = Seen(np.zeros(finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
     for frame in range(frames):
         pose = transform(step_m * frame, 0.0, np.radians(turn_deg * frame))
@@ -64,7 +64,7 @@ def test_a_scan_near_the_last_stored_one_is_not_stored_unless_the_sensor_turned(
 
 
 def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):
-    finder = CandidateFinder(params, keyframe_m=1e9)
+    finder = CandidateFinder(params, DetectorConfig(keyframe_m=1e9))
     seen = Seen(np.zeros(finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
     for _ in range(3):
         finder.add_seen(seen, compared=Compared(NO_FITS, None))  # without links the motion is unknown

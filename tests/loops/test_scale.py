@@ -46,8 +46,8 @@ def test_loops_of_scaled_scans_are_in_metres(params, compare_only, there_and_bac
         np.testing.assert_allclose(loop.match_from_query, true, atol=1e-6)
         np.testing.assert_allclose(loop.covariance[:3, :3], one.covariance[:3, :3] / SCALE**2)
         np.testing.assert_allclose(loop.covariance[3:, 3:], one.covariance[3:, 3:])
-    np.testing.assert_array_equal(found.odometry, there_and_back)
-    assert found.recording is recording and found.scale == SCALE
+    np.testing.assert_array_equal(found.sessions[0].odometry, there_and_back)
+    assert found.sessions[0].recording is recording and found.scale == SCALE
     assert found.config == CONFIG
 
 
@@ -66,8 +66,8 @@ def test_odometry_drifts_as_much_at_any_scale(there_and_back):
     large = [in_metres(loop, 1) for loop in loops]
     for loop in large:
         loop.match_from_query[:3, 3] *= SCALE
-    expected = deviations(loops, DrivenPath.of(there_and_back), drift=drift)
-    path = DrivenPath.of(scaled_poses(there_and_back, float(SCALE)))
+    expected = deviations(loops, DrivenPath(there_and_back), drift=drift)
+    path = DrivenPath(scaled_poses(there_and_back, float(SCALE)))
     found = deviations(large, path, drift=scaled_drift(drift, float(SCALE)))
     np.testing.assert_allclose(found, expected, rtol=0.02)
 

@@ -50,7 +50,7 @@ def test_neighbours_whose_matches_move_as_they_do_support_a_loop_and_others_oppo
     loops = [Loop(*one, 1e-4 * np.eye(6), 0.9) for one in [*true, wrong]]
     evidence = Evidence.of(0.5, 0.1, 1.0, 0.0)  # log odds of 2 alone
     pairs = [Pair(loop, evidence, 2.0 * loop.query) for loop in loops]
-    path, rules = DrivenPath.of(poses), {"mounting": None, "drift": DriftModel()}
+    path, rules = DrivenPath(poses), {"drift": DriftModel()}
     found = sequence.tested_log_odds(pairs, MODEL, path, **rules)
     assert (found[:10] > 2).all() and found[10] < 2
     monkeypatch.setattr(sequence, "BLOCK", 3)

@@ -7,17 +7,15 @@ import pytest
 from recordings import reading_scans
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.levelling import Mountings, lidar_pose, upright_from_lidar, upright_odometry, upright_poses
+from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.closure import planar_loop
-from sglpr_jax.loops.config import CandidateConfig
-from sglpr_jax.loops.consistency import agree
-from sglpr_jax.loops.drift import deviations
+from sglpr_jax.loops.closure import Loop, planar_loop, to_lidar, to_upright
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import inverse, moved_covariance, transform, transformed
@@ -57,12 +55,12 @@ def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 @pytest.mark.slow
 def test_the_pose_of_a_revisit_is_that_of_the_raw_points_and_is_registered(drive, revisit, params):
     recording, poses = tilted_drive(drive, TILTS["upside down"])
-    finder = CandidateFinder(params, config=CandidateConfig(recent_m=1e-9))
+    finder = CandidateFinder(params, DetectorConfig(candidates=CandidateConfig(recent_m=1e-9), keyframe_m=0.0))
     query, match = revisit
-    finder.add(recording.record(match))
-    (found,) = finder.add(recording.record(query))
-    mountings = dict.fromkeys(("query_mounting", "match_mounting"), recording.mounting)
-    loop = planar_loop(1, 0, found.alignment, probability=1.0, **mountings)
+    finder.add_seen(finder.seen(recording.record(match)))
+    (found,) = finder.add_seen(finder.seen(recording.record(query)))
+    upright = planar_loop(1, 0, found.alignment, probability=1.0)
+    loop = to_lidar(upright, query=recording.mounting, match=recording.mounting)
     expected = inverse(poses[match]) @ poses[query]
     metres, turned = error_of(loop.match_from_query, expected)
     assert metres < 1.0 and turned < 4  # the road's own tilt and height are not seen
@@ -110,8 +108,11 @@ def test_poses_go_there_and_back_and_points_with_them(degrees):
     level = transformed(upright_from_lidar(mounting), cloud)
     np.testing.assert_allclose(level, mounting.level(cloud), atol=1e-5)
     pose = transform(3.0, -2.0, 0.7)
-    of_lidar = lidar_pose(pose, query=mounting, match=mounting)
-    np.testing.assert_allclose(upright_poses(of_lidar, mounting), pose, atol=1e-12)
+    upright = Loop(1, 0, pose, np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), 1.0)
+    loop = to_lidar(upright, query=mounting, match=mounting)
+    back, of_lidar = to_upright(loop, query=mounting, match=mounting), loop.match_from_query
+    np.testing.assert_allclose(back.match_from_query, pose, atol=1e-12)
+    np.testing.assert_allclose(back.covariance, upright.covariance, atol=1e-12)
     in_match = transformed(of_lidar, cloud)
     np.testing.assert_allclose(mounting.level(in_match.astype(np.float32)), transformed(pose, level), atol=1e-4)
     np.testing.assert_array_equal(upright_from_lidar(None), np.eye(4))
@@ -123,12 +124,11 @@ def test_odometry_of_a_tilted_sensor_is_laid_level_whatever_its_world():
     mounting = mounting_of(tilted)
     of_lidar = level @ inverse(tilted)
     for odometry in (of_lidar, inverse(of_lidar[0]) @ of_lidar):
-        found = upright_odometry(odometry, mounting)
+        found = level_odometry(odometry, np.tile(upright_from_lidar(mounting), (20, 1, 1)))
         steps, expected = inverse(found[:-1]) @ found[1:], inverse(level[:-1]) @ level[1:]
         np.testing.assert_allclose(np.linalg.norm(steps[:, :3, 3], axis=1), np.linalg.norm(expected[:, :3, 3], axis=1))
         np.testing.assert_allclose(steps[:, 2, 3], 0, atol=1e-12)
         np.testing.assert_allclose(found[:, :3, 2], np.tile([0, 0, 1.0], (20, 1)), atol=1e-12)
-    assert upright_odometry(of_lidar, Mounting(2.5)) is of_lidar and upright_odometry(of_lidar, None) is of_lidar
 
 
 def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
@@ -145,33 +145,6 @@ def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
     np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.05 * expected.diagonal().max())
 
 
-def test_loops_of_frames_with_different_tilts_agree_with_their_odometry():
-    rng = np.random.default_rng(3)
-    level = np.stack([transform(20 * np.cos(a), 20 * np.sin(a), a) for a in np.linspace(0, 12, 120)])
-    mountings = Mountings(mounting_of(tilted_from_level(rng.uniform(-15, 15, 3))) for _ in level)
-    odometry = level @ mountings.uprights(np.arange(len(level)))
-    pairs, spread = [(70, 7), (75, 12), (90, 27)], np.diag([0.05, 0.05, 0.002]).astype(np.float32)
-    loops = []
-    for query, match in pairs:
-        pose = inverse(level[match]) @ level[query]
-        alignment = Alignment(pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0]), spread, 1.0, 0.0)
-        options = {"query_mounting": mountings[query], "match_mounting": mountings[match]}
-        loops.append(planar_loop(query, match, alignment, probability=1.0, **options))
-    path = DrivenPath.of(odometry, mounting=mountings)
-    assert agree(loops, path, mounting=mountings).all()
-    np.testing.assert_allclose(deviations(loops, path, mounting=mountings), 0, atol=1e-3)
-    assert (deviations(loops, DrivenPath.of(odometry)) > 0.3).any()  # with the mean mounting
-
-
-def test_frames_with_one_mounting_are_stored_once():
-    mountings = Mountings([Mounting(2.5)] * 9)
-    assert len(mountings) == 9 and not mountings.differ and mountings.nbytes == 0
-    np.testing.assert_array_equal(mountings.uprights(np.arange(4)), upright_from_lidar(Mounting(2.5)))
-    mountings.append(None)
-    assert len(mountings) == 10 and mountings[8] == Mounting(2.5) and mountings[9] is None
-    np.testing.assert_array_equal(mountings.uprights(np.array([8, 9]))[:, 2, 3], [2.5 - MODEL_HEIGHT_M, 0])
-
-
 @pytest.mark.slow
 def test_the_covariance_of_estimated_mountings_is_that_of_drawn_ones():
     rng = np.random.default_rng(0)
@@ -181,7 +154,8 @@ def test_the_covariance_of_estimated_mountings_is_that_of_drawn_ones():
     )
     upright, none = transform(3.0, -2.0, 2.0), np.zeros((3, 3), np.float32)
     alignment = Alignment(3.0, -2.0, 2.0, none, 1.0, 0.0)
-    loop = planar_loop(1, 0, alignment, probability=1.0, query_mounting=query, match_mounting=match)
+    level = planar_loop(1, 0, alignment, probability=1.0, sensors=(query, match))
+    loop = to_lidar(level, query=query, match=match)
 
     def drawn(mounting):
         off = rng.normal(size=3) * [np.radians(1.0), np.radians(1.0), 0.04]

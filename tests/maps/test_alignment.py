@@ -35,10 +35,10 @@ def test_a_map_in_another_frame_is_moved_to_the_existing_one(maps):
     first, second = maps
     found = align_maps(first, second.moved(WORLD_FROM_OTHER))
     assert found is not None and found.places >= 5
-    error = WORLD_FROM_OTHER @ found.frames.match_from_query
+    error = WORLD_FROM_OTHER @ found.old_from_new
     assert np.linalg.norm(error[:2, 3]) < 0.3 and abs(np.degrees(yaw_of(error))) < 0.5
-    deviations = np.sqrt(np.diag(found.frames.covariance))
-    at_street = inverse(second.world_from_place[0]) @ inverse(WORLD_FROM_OTHER) @ inverse(found.frames.match_from_query)
+    deviations = np.sqrt(np.diag(found.covariance))
+    at_street = inverse(second.world_from_place[0]) @ inverse(WORLD_FROM_OTHER) @ inverse(found.old_from_new)
     assert np.isfinite(at_street).all() and (deviations[:2] > 0).all()
     assert f"from {found.places} common places" in str(found)
 

@@ -112,7 +112,7 @@ def straight(frames: int) -> Motion:
 
 def test_joined_motions_keep_their_poses_and_are_apart():
     first, second = straight(5), straight(3)
-    joined = Motion.joined([first, second], [np.eye(3)] * 2)
+    joined = Motion.joined([first, second])
     assert joined.segments.tolist() == [0] * 5 + [1] * 3 and len(joined) == 8
     np.testing.assert_array_equal(joined.poses[5:], second.poses)
     np.testing.assert_allclose(np.diff(joined.travelled), [4, 4, 4, 4, GAP_M, 4, 4])

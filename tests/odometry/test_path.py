@@ -7,16 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.se3 import travelled
+from sglpr_jax.se3 import inverse, travelled
 
 
 def test_one_by_one_is_at_once():
     poses = town()
-    whole, found = DrivenPath.of(poses), DrivenPath()
+    whole, found = DrivenPath(poses), DrivenPath()
     for pose in poses:
-        found.add(pose)
+        found.extend(pose[None])
     np.testing.assert_array_equal(found.poses, poses)
     np.testing.assert_allclose(found.travelled, travelled(poses), rtol=1e-12)
     rows = np.arange(len(poses))
@@ -35,7 +36,7 @@ def test_the_integrals_are_sums_over_small_steps(positions, guesses, ends):
     poses[:, :3, 3] = positions
     guessed_m = guesses.cumsum()
     start, end = ends
-    found = DrivenPath.of(poses, guessed_m=guessed_m).between(np.array([start]), np.array([end]))
+    found = DrivenPath(poses, guessed_m=guessed_m).between(np.array([start]), np.array([end]))
     sign, (first, last) = (1, (start, end)) if start <= end else (-1, (end, start))
     length, place, squares = 0.0, np.zeros(3), np.zeros((3, 3))
     for k in range(first, last):
@@ -55,18 +56,17 @@ def test_the_integrals_are_sums_over_small_steps(positions, guesses, ends):
 def test_positions_drift_along_and_by_the_turns_before():
     poses = along([(0, 0), (101, 0)])
     rows = np.arange(len(poses))
-    found = DrivenPath.of(poses).position_deviations(rows, 100)
+    found = DrivenPath(poses).position_deviations(rows, 100)
     assert found[100] == 0 and (np.diff(found) < 0).all()
     lever = np.radians(0.5) * 100 / np.sqrt(3)
     assert found[0] == pytest.approx(np.sqrt(1 + 0.25**2 + lever**2), rel=1e-3)
-    np.testing.assert_allclose(DrivenPath.of(poses[::-1]).position_deviations(rows, 0), found[::-1], atol=1e-6)
+    np.testing.assert_allclose(DrivenPath(poses[::-1]).position_deviations(rows, 0), found[::-1], atol=1e-6)
 
 
-def test_up_is_that_of_the_sensor_on_average_and_level_only_where_the_sensor_is_tilted():
-    poses = town()
-    tilted = Mounting(1.0, (0.5, 0.0, np.sqrt(0.75)))
-    path = DrivenPath.of(poses, mounting=tilted)
-    rotation = path.level(tilted)
-    np.testing.assert_allclose(rotation @ path.up, [0, 0, 1], atol=1e-12)
-    assert not np.allclose(rotation, np.eye(3)) and (path.level(None) == np.eye(3)).all()
-    assert len(DrivenPath()) == 0 and (DrivenPath().up == [0, 0, 1]).all()
+def test_a_level_world_has_up_of_the_sensor_on_average_and_only_a_tilted_sensor_turns_it():
+    tilted = upright_from_lidar(Mounting(1.73, (0.5, 0.0, np.sqrt(0.75))))
+    level, nods = (DrivenPath(inverse(tilted) @ town(), tilted=flag) for flag in (False, True))
+    np.testing.assert_allclose(
+        nods.leveled(np.arange(len(nods)))[:, :3, 2], np.tile([0, 0, 1.0], (len(nods), 1)), atol=1e-12
+    )
+    assert (level.level == np.eye(3)).all() and (DrivenPath(tilted=True).level == np.eye(3)).all()

@@ -49,9 +49,11 @@ def test_all_files_are_of_the_searched_frames(found, tmp_path):
     graph = read_g2o(tmp_path / "out" / "loops.g2o")
     assert len(graph.poses) == 5 and [(i, j) for i, j, *_ in graph.edges] == [(0, 1), (1, 2), (2, 3), (3, 4), (0, 4)]
     poses, times = read_tum(tmp_path / "out" / "trajectory.tum")
-    np.testing.assert_allclose(poses, found.odometry[:5], atol=1e-6)
-    np.testing.assert_allclose(times, found.recording.times[:5])
-    np.testing.assert_allclose(read_kitti(tmp_path / "out" / "trajectory.kitti"), found.odometry[:5], atol=1e-6)
+    np.testing.assert_allclose(poses, found.sessions[0].odometry[:5], atol=1e-6)
+    np.testing.assert_allclose(times, found.sessions[0].recording.times[:5])
+    np.testing.assert_allclose(
+        read_kitti(tmp_path / "out" / "trajectory.kitti"), found.sessions[0].odometry[:5], atol=1e-6
+    )
     lines, table = read_loops_jsonl(tmp_path / "out/loops.jsonl"), read_loops_csv(tmp_path / "out/loops.csv")
     assert len(lines) == 1 == len(table)
 
@@ -93,7 +95,7 @@ def test_a_full_disk_leaves_the_files_of_the_earlier_run(found, tmp_path, monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(folder, "write_kitti", full)
-    none = with_session(dataclasses.replace(found, loops=()), odometry=2 * found.odometry)
+    none = with_session(dataclasses.replace(found, loops=()), odometry=2 * found.sessions[0].odometry)
     with pytest.raises(WriteError, match=rf"^{tmp_path}/trajectory.kitti: cannot be written: No space left on device"):
         write_found(none, tmp_path, optimized=corrected(found), texts={"index.html": "new"})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
@@ -140,7 +142,7 @@ def test_rows_name_the_recordings_and_the_transform_is_in_frames_json(pair, tmp_
     assert [one["first_vertex"] for one in frames["recordings"]] == [0, FIRST_VERTEX]
     (written,) = frames["transforms"]
     assert written["match_frame"]["frame"] == "odometry" and written["loops"] == len(loops)
-    np.testing.assert_allclose(written["match_from_query"], pair.transforms[0].alignment.match_from_query)
+    np.testing.assert_allclose(written["match_from_query"], pair.transforms[0].match_from_query)
 
 
 def test_trajectories_of_several_sessions_have_names_and_older_ones_a_warning(pair, tmp_path):

@@ -98,7 +98,7 @@ def test_a_third_session_is_placed_through_the_second():
     pair = found_pair()
     (first,) = pair.transforms
     second = first._replace(match=first.match._replace(session=1), query=first.query._replace(session=2))
-    step = first.alignment.match_from_query
+    step = first.match_from_query
     chain = dataclasses.replace(pair, sessions=(*pair.sessions, pair.sessions[1]), transforms=(first, second))
     np.testing.assert_allclose([to for _, to in placements(chain)], [np.eye(4), step, step @ step], atol=1e-9)
     around = second._replace(match=first.match)

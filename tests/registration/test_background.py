@@ -5,6 +5,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.models.params import Params
 from sglpr_jax.registration import background as background_module
@@ -52,7 +53,7 @@ def test_rings_do_not_hold_the_motion(monkeypatch):
 
 def _moved(params: Params, posts: np.ndarray) -> float:
     """How far the motion moved, in metres, over 29 m."""
-    finder = CandidateFinder(params)
+    finder = CandidateFinder(params, DetectorConfig(keyframe_m=0.0))
     descriptor = np.zeros(finder.index.width, np.float32)
     for k in range(30):
         finder.add_seen(Seen(descriptor, _image(posts - (k, 0.0)), None), time=0.1 * k)

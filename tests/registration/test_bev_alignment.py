@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scenes import difference, place, relative, seen_from
 from scipy import ndimage, signal
 
-from sglpr_jax.data.levelling import upright_poses
-from sglpr_jax.loops.closure import is_degenerate, position_deviation
+from sglpr_jax.data.levelling import uprights
+from sglpr_jax.loops.closure import position_deviation
 from sglpr_jax.loops.keyframes import square_image
-from sglpr_jax.registration.bev_alignment import DEFAULT, _parabola, align, align_all
+from sglpr_jax.registration.bev_alignment import DEFAULT, _parabola, align
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import inverse, yaw_of
 
@@ -105,12 +105,12 @@ def test_between_two_plain_walls_the_place_along_them_is_unknown(yaw):
     across = np.array([np.sin(yaw), np.cos(yaw)])
     assert np.sqrt(direction @ covariance[:2, :2] @ direction) >= 2
     assert np.sqrt(across @ covariance[:2, :2] @ across) <= 0.3
-    assert is_degenerate(covariance) and position_deviation(covariance) >= 2
+    assert position_deviation(covariance) >= 2
 
 
 @pytest.mark.slow
 def test_errors_in_a_town_are_as_large_as_the_covariance_says(drive):
-    poses = upright_poses(drive.poses.world_from_lidar, drive.mounting)
+    poses = drive.poses.world_from_lidar @ inverse(uprights(drive))
     apart = np.linalg.norm(drive.positions[:, None] - drive.positions[None], axis=2)
     apart[np.subtract.outer(drive.times, drive.times) < 30] = np.inf
     queries = np.flatnonzero(apart.min(1) < 8)[::2]
@@ -136,14 +136,12 @@ def test_other_places_correlate_less_and_another_pose_fits_as_well():
 
 
 @pytest.mark.slow
-def test_under_jit_and_vmap_and_of_several_matches_the_same():
+def test_under_jit_and_vmap_the_same():
     query, matches = seen_from(place(0), (0.5, 0.3, 1.0)), np.stack([seen_from(place(s), (0.0,) * 3) for s in (0, 1)])
-    together = align_all(query, matches, config=SMALL)
     mapped = jax.jit(jax.vmap(lambda q, m: align(q, m, config=SMALL)))(np.stack([query] * 2), matches)
     for k, match in enumerate(matches):
         alone = align(query, match, config=SMALL)
-        for one, several, others in zip(alone, together, mapped, strict=True):
-            np.testing.assert_allclose(several[k], one, rtol=1e-3, atol=1e-4)
+        for one, others in zip(alone, mapped, strict=True):
             np.testing.assert_allclose(others[k], one, rtol=1e-3, atol=1e-4)
 
 

@@ -8,7 +8,7 @@ from scenes import place, seen_from
 
 import sglpr_jax
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.registration.bev_search import coarse_correlations, search
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
@@ -53,7 +53,7 @@ def test_the_correlation_is_that_of_larger_cells_and_wider_blurs(images, query):
 @pytest.mark.parametrize(("further", "found"), [(1, False), (PLACES, True)])
 def test_places_with_distant_descriptors_are_found_by_further_comparisons(images, query, further, found):
     config = CandidateConfig(candidates=1, further=further, recent_m=1e-9, cohort=0, near_cohort=0)
-    finder = CandidateFinder(sglpr_jax.load("circular"), config=config)
+    finder = CandidateFinder(sglpr_jax.load("circular"), DetectorConfig(candidates=config, keyframe_m=0.0))
     descriptors = np.eye(PLACES + 1, finder.index.width, dtype=np.float32)
     for image, descriptor in zip(images, descriptors, strict=False):
         finder.add_seen(Seen(descriptor, image, None))
@@ -65,7 +65,7 @@ def test_places_with_distant_descriptors_are_found_by_further_comparisons(images
 @pytest.mark.slow
 def test_a_good_fit_on_another_floor_does_not_end_the_search(images, query):
     config = CandidateConfig(candidates=1, further=PLACES, recent_m=1e-9, cohort=0, near_cohort=0)
-    finder = CandidateFinder(sglpr_jax.load("circular"), config=config)
+    finder = CandidateFinder(sglpr_jax.load("circular"), DetectorConfig(candidates=config, keyframe_m=0.0))
     descriptors = np.eye(PLACES, finder.index.width, dtype=np.float32)
     upstairs = [images[TRUE], *images[1:]]  # the first place has the same walls as the true one, 8 m higher
     for frame, (image, descriptor) in enumerate(zip(upstairs, descriptors, strict=True)):
