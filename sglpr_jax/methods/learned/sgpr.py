@@ -1,11 +1,7 @@
 """SGPR (Kong et al., 2020): a network on the semantic graph of a scan, with a learned comparison of two graphs.
 
-Published recipe: Adam 1e-3 with weight decay 5e-4, for 500 epochs of batches of 128 pairs. A pair within 3 m is
-positive, one beyond 20 m negative. The loss is the binary cross-entropy of both orders of a pair. Graphs are rotated,
-scaled, jittered, shifted and mirrored.
-
-Recipe here: the same loss, optimiser and distances. The pairs are those of an anchor with the places of its tuple.
-Graphs are only rotated.
+Differences from the published recipe: the pairs are those of an anchor with the places of its tuple, and graphs are
+only rotated.
 """
 
 from typing import NamedTuple
@@ -19,13 +15,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from sglpr_jax.bev import rotate_points
 from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.data.views import classes_of
+from sglpr_jax.methods.cells import means, voxels
 from sglpr_jax.methods.learned.layers import batch_norm, maximum
-from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
+from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables, rotated_points
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
-from sglpr_jax.methods.voxel_means import voxels
 
 NEIGHBOURS = 10
 WIDTHS = (64, 64, 32)
@@ -70,11 +65,9 @@ FINER = 4
 def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
     """Return up to 100 nodes: x, y, z of the centre in metres, and the class as 12 numbers, one 1 and eleven 0.
 
-    Missing nodes are zeros. If a scan has more than 100 clusters, those with the most points remain. The published
-    graph has 100 random ones, and takes clusters from the instances of SemanticKITTI where a scan has them.
-
-    Raises:
-      ValueError: If the scan shows no place, or has no labels or no cluster.
+    Missing nodes are zeros. Of more than 100 clusters, those with the most points remain. The published graph has 100
+    random ones, and takes clusters from the instances of SemanticKITTI where a scan has them. Raises ValueError if the
+    scan shows no place, or has no labels or no cluster.
     """
     points, classes = record.upright_points, classes_of(record, 20)
     check_cloud(points, name=record.name)
@@ -96,9 +89,8 @@ def _nodes(
     """Return the numbers of points and the nodes of the clusters of one class."""
     cluster = clusters(points, rule.gap_m)
     counts = np.bincount(cluster)
-    sums = [np.bincount(cluster, weights=axis) for axis in points.T.astype(np.float64)]
     kept = (counts >= rule.points) & (counts <= MOST_POINTS)
-    centres = np.stack(sums, axis=1)[kept] / counts[kept, None]
+    centres = means(points, cluster, counts)[kept]
     kinds = np.broadcast_to(np.eye(len(RULES))[column], (len(centres), len(RULES)))
     return counts[kept], np.concatenate([centres, kinds], axis=1).astype(np.float32)
 
@@ -111,9 +103,8 @@ def clusters(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, 
     if len(points) == 0:
         return np.zeros(0, np.int64)
     voxel, counts = voxels(points, gap_m / FINER)
-    means = np.stack([np.bincount(voxel, weights=axis) for axis in points.T], axis=1) / counts[:, None]
-    pairs = KDTree(means).query_pairs(gap_m, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(means), len(means)))
+    pairs = KDTree(means(points, voxel, counts)).query_pairs(gap_m, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(counts), len(counts)))
     return connected_components(links, directed=False)[1][voxel].astype(np.int64)
 
 
@@ -179,9 +170,9 @@ class TensorNetwork(nn.Module):
 class Sgpr(nn.Module):
     """Three layers of EdgeConv on positions and on classes, and attention: a vector of 32 numbers.
 
-    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others, as
-    published. Classes have equal distances, so the published neighbours of the first layer depend on the order of the
-    nodes. Here nodes that are nearer in space come first, and the order has no effect.
+    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others. Classes
+    have equal distances, so the published neighbours of the first layer depend on the order of the nodes. Here nodes
+    that are nearer in space come first.
     """
 
     def setup(self):
@@ -228,12 +219,6 @@ def compare(variables: Variables, queries: Float[Array, "q 32"], database: Float
     return jax.lax.map(lambda query: nn.softplus(-_logits(variables, query[None], database)[0]), queries)
 
 
-def turned(key: Array, graphs: Float[Array, "b n 15"]) -> Float[Array, "b n 15"]:
-    """Rotate each graph about z by a random angle."""
-    angles = jax.random.uniform(key, (len(graphs),), maxval=2 * jnp.pi)
-    return graphs.at[..., :3].set(rotate_points(graphs[..., :3], angles))
-
-
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     """Return the mean binary cross-entropy of each anchor with its positives (1) and negatives (0), in both orders."""
 
@@ -254,7 +239,7 @@ SGPR = LearnedMethod(
     weights=47_985,
     network=NETWORK,
     prepare=semantic_graph,
-    turned=turned,
+    turned=rotated_points,
     loss=loss,
     recipe=Recipe(
         published=(
