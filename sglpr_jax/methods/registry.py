@@ -38,14 +38,10 @@ def method_named(name: str, params: Params | None, recording: Recording) -> Meth
 
 
 def method_beside(trained: Params, name: str, recording: Recording, *, seed: int = 0) -> Method:
-    """Return a method for comparison with a newly trained network. On images it has the same window.
+    """Return the method called `name`, one of `BesideName`, for comparison with a newly trained network.
 
-    Arguments:
-      trained: Weights of the trained network.
-      name: One of `BesideName`. `untrained` is the same network with random weights from `seed`, `shipped` has the
-        `DEFAULT_WEIGHTS`.
-      recording: Recording to describe.
-      seed: Seed of the random weights.
+    `untrained` is the same network with random weights from `seed`, `shipped` has the `DEFAULT_WEIGHTS`. A handcrafted
+    method on images has the window of the network.
     """
     if name == UNTRAINED:
         return network(init(jax.random.key(seed + 1), config=trained.config))

@@ -151,7 +151,7 @@ def train_learned(
       data: Training recordings and their inputs.
       settings: Settings of the run.
       out: Folder of the run.
-      score: Scores each snapshot. The scores are written to `scores.jsonl`.
+      score: Scores each snapshot, for `scores.jsonl`.
       resume: Continue the run in the folder.
       stopped: Asked after every step. If it returns True, the state is saved and the training stops.
       report: Receives a line about the progress every 30 s.
@@ -296,15 +296,7 @@ def best_rate(
     The folder gets the trainings and `rates.json` with all scores. Finished trainings are not repeated. A rate whose
     loss is not finite has no score. Of equal scores, the smaller rate wins.
 
-    Arguments:
-      method: Method to train.
-      data: Training recordings and their inputs.
-      score: Scores weights on a held-out recording.
-      out: Folder of the search.
-      seconds: Training time of each rate.
-      seed: Seed of each training.
-      report: Receives lines about the progress.
-      options: Further options of `train_learned`.
+    Each rate is trained for `seconds` with the options of `train_learned`.
 
     Raises:
       FloatingPointError: If the loss is not finite with any rate.

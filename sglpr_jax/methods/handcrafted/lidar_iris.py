@@ -1,7 +1,6 @@
 """LiDAR Iris (Wang et al., 2020): the scan as an iris image with a binary texture, compared by a shifted Hamming
 distance."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -66,7 +65,7 @@ class Spectra(NamedTuple):
     log_polar: Complex[Array, "*n rows frequencies"]
 
 
-Words = UInt64[np.ndarray, "*n 360 words"]
+Words = UInt64[np.ndarray, "... 360 words"]
 """The bits of each column: of all rings, filters and parts."""
 
 
@@ -138,13 +137,21 @@ def _hamming(bits: Words, faint: Words, shifts: Int[np.ndarray, "n 2"], others: 
 
 @jax.jit
 def spectra(images: Float[Array, "n rows columns"]) -> Spectra:
-    """Return the spectra of images with an even number of rows and columns."""
-    filtered = _high_pass(*images.shape[1:])
-    places = list(_log_polar_places(*images.shape[1:]))
+    """Return the spectra of images with an even number of rows and columns.
+
+    The log-polar image has half a revolution of angles by radii. Its amplitudes have the gain (1 - c) (2 - c), where c
+    is the product of two half cosines.
+    """
+    rows, columns = images.shape[1:]
+    low = np.outer(*(np.cos(np.pi * (np.arange(size) / size - 0.5)) for size in (rows, columns)))
+    filtered = ((1 - low) * (2 - low)).astype(np.float32)
+    angle = np.pi / 2 + np.pi * np.arange(rows)[:, None] / rows
+    radius = _log_base(rows, columns) ** np.arange(columns)[None, :]
+    places = np.stack([rows // 2 + radius * np.cos(angle), columns // 2 + radius * np.sin(angle)]).astype(np.float32)
 
     def of_one(image):
         amplitudes = jnp.fft.fftshift(jnp.abs(jnp.fft.fft2(image))) / image.size * filtered
-        return Spectra(image, jnp.fft.rfft2(image), jnp.fft.rfft2(map_coordinates(amplitudes, places, order=1)))
+        return Spectra(image, jnp.fft.rfft2(image), jnp.fft.rfft2(map_coordinates(amplitudes, list(places), order=1)))
 
     return jax.lax.map(of_one, images)
 
@@ -222,19 +229,3 @@ def _turned_and_scaled(
 def _log_base(rows: int, columns: int) -> float:
     """Return the ratio of the radii of neighbouring columns of a log-polar image."""
     return float(np.hypot(rows // 2, columns // 2) ** (1 / columns))
-
-
-@functools.cache
-def _log_polar_places(rows: int, columns: int) -> Float32[np.ndarray, "2 rows columns"]:
-    """Return row and column of each cell of a log-polar image: half a revolution of angles by radii."""
-    angle = np.pi / 2 + np.pi * np.arange(rows)[:, None] / rows
-    radius = _log_base(rows, columns) ** np.arange(columns)[None, :]
-    return np.stack([rows // 2 + radius * np.cos(angle), columns // 2 + radius * np.sin(angle)]).astype(np.float32)
-
-
-@functools.cache
-def _high_pass(rows: int, columns: int) -> Float32[np.ndarray, "rows columns"]:
-    """Return the gain (1 - c) (2 - c) of each frequency, where c is the product of two half cosines."""
-    down, right = (np.cos(np.pi * (np.arange(size) / size - 0.5)) for size in (rows, columns))
-    product = np.outer(down, right)
-    return ((1 - product) * (2 - product)).astype(np.float32)

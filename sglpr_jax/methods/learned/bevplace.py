@@ -6,7 +6,6 @@ a step of 24 images already needs 6 GB.
 """
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -128,12 +127,8 @@ def turned_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
     return jnp.concatenate([*parts[:4], between]).reshape(8, -1, *maps.shape[1:])
 
 
-class Taps(NamedTuple):
-    """The 16 pixels around each point of a resampled image, by row and column, and their weights."""
-
-    pixels: Int32[np.ndarray, "points 16"]
-    """Index in the flattened image. Pixels outside have the weight 0."""
-    weights: Float32[np.ndarray, "points 16"]
+Taps = tuple[Int32[np.ndarray, "points 16"], Float32[np.ndarray, "points 16"]]
+"""Index in the flattened image of the 16 pixels around each point of a resampled image, and their weights."""
 
 
 @functools.cache
@@ -148,7 +143,7 @@ def turned_taps(size: int, degrees: int) -> Taps:
     rows, columns = (line.clip(0, size - 1).astype(np.int32) for line in (rows, columns))
     pixels = rows[:, :, None] * size + columns[:, None]
     weights = (down[:, :, None] * right[:, None]).astype(np.float32)
-    return Taps(pixels.reshape(-1, 16), weights.reshape(-1, 16))
+    return pixels.reshape(-1, 16), weights.reshape(-1, 16)
 
 
 def cubic(distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
@@ -162,14 +157,15 @@ def cubic(distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
 def resampled(images: Float[Array, "b h h"], taps: Taps) -> Float[Array, "b h h"]:
     """Return images resampled by a table of the same size."""
     flat = images.reshape(len(images), -1)
-    parts = (flat[:, pixels] * weights[None] for pixels, weights in zip(taps.pixels.T, taps.weights.T, strict=True))
+    parts = (flat[:, pixels] * weights[None] for pixels, weights in zip(taps[0].T, taps[1].T, strict=True))
     return functools.reduce(jnp.add, parts).reshape(images.shape)
 
 
 def resampled_maps(maps: Float[Array, "b h h c"], taps: Taps) -> Float[Array, "b h h c"]:
     """Return small maps of many channels resampled by a table, as a product with a dense matrix."""
-    matrix = np.zeros((len(taps.pixels),) * 2, np.float32)
-    np.add.at(matrix, (np.arange(len(matrix))[:, None], taps.pixels), taps.weights)
+    pixels, weights = taps
+    matrix = np.zeros((len(pixels),) * 2, np.float32)
+    np.add.at(matrix, (np.arange(len(matrix))[:, None], pixels), weights)
     return jnp.einsum("pq,bqc->bpc", matrix, maps.reshape(len(maps), -1, maps.shape[-1])).reshape(maps.shape)
 
 

@@ -4,8 +4,6 @@ Differences from the published recipe: the pairs are those of an anchor with the
 only rotated.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,30 +30,22 @@ TIE = 1e-4
 NODES = 100
 
 
-class Rule(NamedTuple):
-    """Clustering of a class."""
-
-    gap_m: float
-    """Maximum distance of neighbouring points of a cluster, in metres."""
-    points: int
-    """Minimum number of points of a cluster."""
-
-
 RULES = {
-    1: Rule(0.5, 100),  # car
-    4: Rule(0.5, 100),  # truck
-    5: Rule(0.5, 100),  # other vehicle
-    11: Rule(2.0, 300),  # sidewalk
-    12: Rule(2.0, 300),  # other ground
-    13: Rule(2.0, 300),  # building
-    14: Rule(0.5, 100),  # fence
-    15: Rule(2.0, 200),  # vegetation
-    16: Rule(0.2, 50),  # trunk
-    17: Rule(2.0, 300),  # terrain
-    18: Rule(0.2, 100),  # pole
-    19: Rule(0.2, 50),  # traffic sign
+    1: (0.5, 100),  # car
+    4: (0.5, 100),  # truck
+    5: (0.5, 100),  # other vehicle
+    11: (2.0, 300),  # sidewalk
+    12: (2.0, 300),  # other ground
+    13: (2.0, 300),  # building
+    14: (0.5, 100),  # fence
+    15: (2.0, 200),  # vegetation
+    16: (0.2, 50),  # trunk
+    17: (2.0, 300),  # terrain
+    18: (0.2, 100),  # pole
+    19: (0.2, 50),  # traffic sign
 }
-"""Published rules of the 12 classes of nodes. Other classes are ignored."""
+"""Published rules of the 12 classes of nodes: the maximum distance of neighbouring points of a cluster, in metres, and
+the minimum number of points of a cluster. Other classes are ignored."""
 MOST_POINTS = 50_000
 """Larger clusters are dropped."""
 FINER = 4
@@ -73,7 +63,7 @@ def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
     check_cloud(points, name=record.name)
     finite = np.isfinite(points).all(axis=1)
     points, classes = points[finite], classes[finite]
-    found = [_nodes(points[classes == category], column, rule) for column, (category, rule) in enumerate(RULES.items())]
+    found = [_nodes(points[classes == kind], column, *rule) for column, (kind, rule) in enumerate(RULES.items())]
     counts, nodes = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if len(nodes) == 0:
         raise ValueError(
@@ -84,12 +74,12 @@ def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
 
 
 def _nodes(
-    points: Float32[np.ndarray, "n 3"], column: int, rule: Rule
+    points: Float32[np.ndarray, "n 3"], column: int, gap_m: float, fewest: int
 ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, "k 15"]]:
     """Return the numbers of points and the nodes of the clusters of one class."""
-    cluster = clusters(points, rule.gap_m)
+    cluster = clusters(points, gap_m)
     counts = np.bincount(cluster)
-    kept = (counts >= rule.points) & (counts <= MOST_POINTS)
+    kept = (counts >= fewest) & (counts <= MOST_POINTS)
     centres = means(points, cluster, counts)[kept]
     kinds = np.broadcast_to(np.eye(len(RULES))[column], (len(centres), len(RULES)))
     return counts[kept], np.concatenate([centres, kinds], axis=1).astype(np.float32)

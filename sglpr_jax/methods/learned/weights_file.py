@@ -14,9 +14,9 @@ from sglpr_jax.models.weights import as_tree, by_name, hash_of
 from sglpr_jax.models.weights_file import (
     CONFIG_FILE,
     WEIGHTS_FILE,
-    check_checksum,
+    check_leaves,
     last_weights,
-    opened,
+    read_tensors,
     write_weights,
 )
 
@@ -44,7 +44,7 @@ def save_variables(folder: Path, method: LearnedMethod, variables: Variables, ab
 
     Raises OSError if the folder cannot be written or holds other files than earlier weights.
     """
-    write_weights(folder, _arrays(variables), {"method": method.name, **about}, {})
+    write_weights(folder, by_name(variables), {"method": method.name, **about}, {})
 
 
 def load_variables(source: Path | str, method: LearnedMethod) -> Variables:
@@ -70,12 +70,9 @@ def load_variables(source: Path | str, method: LearnedMethod) -> Variables:
         raise ValueError(
             f"{folder}: expected weights of the method {method.name!r}, found those of {found or 'sglpr'!r}"
         )
-    path = folder / WEIGHTS_FILE
-    with opened(path) as file:
-        values = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        metadata = file.metadata() or {}
-    check_checksum(values, metadata, source=path)
-    check_leaves(values, by_name(jax.eval_shape(lambda: random_variables(method, seed=0))), source=path)
+    values = read_tensors(folder / WEIGHTS_FILE)
+    expected = by_name(jax.eval_shape(lambda: random_variables(method, seed=0)))
+    check_leaves(values, expected, source=folder / WEIGHTS_FILE)
     return jax.device_put(as_tree(values))
 
 
@@ -86,27 +83,6 @@ def method_of(folder: Path) -> str | None:
     return found if isinstance(found, str) else None
 
 
-def check_leaves(values: Mapping[str, Any], expected: Mapping[str, Any], *, source: Path) -> None:
-    """Raise ValueError unless arrays, or descriptions of them, have the expected names, shapes and types.
-
-    Arrays must be finite.
-    """
-    for name in sorted(values.keys() | expected.keys()):
-        wanted, found = (
-            f"{some[name].dtype} {tuple(some[name].shape)}" if name in some else "no array"
-            for some in (expected, values)
-        )
-        if wanted != found:
-            raise ValueError(f"{source}: expected {name} as {wanted}, found {found}")
-        array = values[name]
-        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ValueError(f"{source}: expected finite values of {name}, found others")
-
-
 def variables_hash(variables: Variables) -> str:
     """Return the SHA-256 of names, shapes, types and values of all variables."""
-    return hash_of(_arrays(variables))
-
-
-def _arrays(variables: Variables) -> dict[str, np.ndarray]:
-    return {name: np.asarray(leaf) for name, leaf in by_name(variables).items()}
+    return hash_of({name: np.asarray(leaf) for name, leaf in by_name(variables).items()})
