@@ -1,8 +1,7 @@
 """RINet (Li et al., 2022): rings of 360 degrees, one for each of 12 classes, and a learned distance. Variant attention.
 
-Differences from the published recipe: 512 tuples of one positive and one negative, that is 1024 pairs, half of the
-positives come from another visit, each scan has its own draw of the lost columns, and scans are not paired with
-themselves.
+Differences from the published recipe: 512 tuples of one positive and one negative, that is 1024 pairs, and half of the
+positives from another visit. Each scan has its own draw of the lost columns. Scans are not paired with themselves.
 """
 
 import jax
