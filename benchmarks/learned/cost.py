@@ -19,13 +19,11 @@ from benchmarks.learned.score import Entry, entry
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Record, Recording
-from sglpr_jax.data.views import view
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.describe import apply_network
-from sglpr_jax.methods.learned.weights_file import example_inputs, random_variables, weight_count
-from sglpr_jax.methods.method import ImageMethod, RecordMethod
+from sglpr_jax.methods.learned.weights_file import example_inputs, random_variables
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.shipped import shipped_weights
 from sglpr_jax.models.weights_file import load
@@ -72,13 +70,12 @@ def _describe_next(of_scan: DescribeRecord, records: Iterator[Record]) -> None:
 def _describer(contender: Entry, recording: Recording) -> DescribeRecord:
     """Return a function from a scan to its descriptor."""
     method = contender.method(recording)
-    if isinstance(method, RecordMethod):
-        return lambda record: np.asarray(method.describe(method.prepare(record)[None]))
-    if isinstance(method, ImageMethod):
-        return lambda record: np.asarray(
-            method.describe(np.asarray(view(record, method.grid, image=method.image).image)[None])
-        )
-    return lambda record: method.describe(record.upright_points, record.classes(20) if method.labels else None)
+
+    def of_scan(record: Record) -> np.ndarray:
+        inputs = jax.tree.map(lambda one: np.asarray(one)[None], method.prepare(record, None))
+        return np.asarray(method.describe(inputs))
+
+    return of_scan
 
 
 def _network(contender: Entry) -> Mapping[str, Any]:
@@ -88,7 +85,7 @@ def _network(contender: Entry) -> Mapping[str, Any]:
         method = LEARNED[name]
         variables, inputs = random_variables(method, seed=0), example_inputs(method)
         cost = apply_network.lower(variables, inputs, method=method).cost_analysis()
-        return {"weights": weight_count(variables), "gflop": float(cost["flops"]) / 1e9}
+        return {"weights": method.weights, "gflop": float(cost["flops"]) / 1e9}
     if name in HANDCRAFTED:
         return {}
     params = load(name) if name in shipped_weights() else init(jax.random.key(0), preset=name)

@@ -29,11 +29,12 @@ from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
-from sglpr_jax.methods.learned.weights_file import LAST, RANDOM
+from sglpr_jax.methods.learned.weights_file import RANDOM
 from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
+from sglpr_jax.models.weights_file import LAST
 from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.reproduce.runs import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile

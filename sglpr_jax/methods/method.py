@@ -1,28 +1,24 @@
 """Interface of a method: how it describes scans or images, its inputs, and how its descriptors are compared."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, Shaped
+from jaxtyping import Float, Float32
 
 from sglpr_jax.data.recording import Record, Recording
-from sglpr_jax.grid import Grid, ImageKind
 
-Takes = Literal["images", "points", "labelled points"]
-"""Input of a method."""
-DescribeFn = Callable[..., Float[Any, "b d"]]
-"""Maps images of point counts (b, h, w), and maps of classes (b, h, w) if requested, to one descriptor each."""
-DescribeScanFn = Callable[[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None], Float32[np.ndarray, " d"]]
-"""Maps the points of one scan, and their classes if requested, to its descriptor."""
+Takes = Literal["images", "points", "labelled points", "labelled images"]
+"""Content of a record that a method needs. Methods on images accept ready-made images and scans."""
+LABELLED: tuple[Takes, ...] = ("labelled points", "labelled images")
 DistanceFn = Callable[[Float32[np.ndarray, "q d"], Float32[np.ndarray, "n d"]], Float32[np.ndarray, "q n"]]
 """Maps the descriptors of queries and of a database to distances. Smaller distances mean more similar places."""
 
 
 @dataclass(frozen=True)
 class HandcraftedMethod:
-    """A method without training, as declared by its file in `handcrafted/`."""
+    """A method without training, an entry of the table in `handcrafted/`."""
 
     name: str
     """Name on the command line."""
@@ -44,69 +40,35 @@ class HandcraftedMethod:
 
 
 @dataclass(frozen=True)
-class ImageMethod:
-    """A method that describes images: the function, its window (None: whole images), and a description of the
-    method."""
+class Method:
+    """A method as `retrieval.embed` runs it: it prepares the input of each record and describes inputs in batches."""
 
-    describe: DescribeFn
-    grid: Grid | None
     about: dict[str, Any]
-    """Name of the method and its configuration, as JSON values."""
-    weights_hash: str = ""
-    categories: int = 0
-    """Number of categories of the class maps that the function also needs. 0: no class maps."""
-    image: ImageKind = "points"
-    """Kind of image that is made of raw scans."""
-    field: Bool[np.ndarray, "h w"] | None = None
-    """Cells that the function uses. None: all cells."""
-
-
-@dataclass(frozen=True)
-class ScanMethod:
-    """A method that describes the points of a scan: the function, whether it needs labels, and its distance."""
-
-    describe: DescribeScanFn
-    labels: bool
-    distance: str
-    """Name of a distance in `retrieval.distances`."""
-    about: dict[str, Any]
-    """Description of the method, as JSON values."""
-    weights_hash: str = ""
-
-
-@dataclass(frozen=True)
-class RecordMethod:
-    """A learned method of another publication: it prepares the input of each record and describes inputs in batches."""
-
-    prepare: Callable[[Record], Shaped[np.ndarray, "..."]]
-    describe: Callable[[Shaped[np.ndarray, "b ..."]], Float[Any, "b d"]]
+    """Name of the method (`method`) and its configuration, as JSON values."""
     takes: Takes
-    """Content that `prepare` needs. Methods that take images accept ready-made images and scans."""
-    distance: str
+    prepare: Callable[[Record, float | None], Any]
+    """Returns the input of a record that is first rotated about z by an angle in radians, if there is one. Called in
+    several threads."""
+    describe: Callable[[Any], Float[Any, "b d"]]
+    """Maps a batch of inputs, stacked along a new first axis, to descriptors."""
+    distance: str = "l2"
     """Name of a distance in `retrieval.distances`. A learned distance also names its weights."""
-    about: dict[str, Any]
-    """Description of the method, as JSON values."""
-    weights_hash: str
+    weights_hash: str = ""
 
-
-Method = ImageMethod | ScanMethod | RecordMethod
-"""A method that `retrieval.embed` accepts."""
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return self.about["method"]
 
 
 def require_content(name: str, takes: Takes, recording: Recording, *, every_label: bool = False) -> None:
     """Raise ValueError, in one line, if a recording lacks the points or labels of the method called `name`.
 
-    Arguments:
-      name: Name of the method.
-      takes: Input of the method. Methods on images also accept scans.
-      recording: Recording to check.
-      every_label: Whether every scan must have labels. Otherwise one label file suffices.
+    With `every_label` every scan must have labels. Otherwise one label file suffices.
     """
-    if takes == "images":
-        return
-    if recording.has_images:
-        raise ValueError(f"{name} needs points, found only images in sequence {recording.name}")
-    if takes != "labelled points":
+    if takes.endswith("points") and recording.has_images:
+        raise ValueError(f"{name} needs points, found only images in sequence {recording.name}; use polar-fft")
+    if takes not in LABELLED:
         return
     if not recording.has_labels:
         raise ValueError(f"{name} needs labels beside the scans, found none in sequence {recording.name}")
@@ -116,3 +78,14 @@ def require_content(name: str, takes: Takes, recording: Recording, *, every_labe
             f"{name} needs labels of every scan, found none for {len(missing)} scans of sequence {recording.name}, "
             f"the first is {missing[0]}"
         )
+
+
+def check_descriptors(method: str, descriptors: np.ndarray, names: Sequence[str]) -> None:
+    """Raise ValueError, with the method and the scan, unless each of the scans called `names` has a descriptor (d,)
+    that is finite and not zero."""
+    if descriptors.ndim != 2 or len(descriptors) != len(names):
+        raise ValueError(f"{method}: expected {len(names)} descriptors ({len(names)}, d), found {descriptors.shape}")
+    broken, empty = ~np.isfinite(descriptors).all(axis=1), ~descriptors.any(axis=1)
+    for bad, what in ((broken, "values that are not finite"), (empty, "only zeros")):
+        if bad.any():
+            raise ValueError(f"{method}: expected a descriptor of {names[int(bad.argmax())]}, found {what}")

@@ -3,28 +3,8 @@
 from typing import TYPE_CHECKING, Literal
 
 NETWORK = "sglpr"
-HANDCRAFTED_NAMES = (
-    "scan-context",
-    "m2dp",
-    "lidar-iris",
-    "ssc",
-    "ssc-24",
-    "solid",
-    "ring",
-    "probe",
-    "polar-fft",
-)
-METHODS = (NETWORK, *HANDCRAFTED_NAMES)
-"""Names of the methods that need no trained weights of their own, or have shipped ones."""
-LEARNED_NAMES = (
-    "rinet",
-    "bevplace++",
-    "resnet34-netvlad",
-    "disco",
-    "overlap-transformer",
-    "pointnetvlad",
-    "sgpr",
-)
+HANDCRAFTED_NAMES = ("scan-context", "m2dp", "lidar-iris", "ssc", "ssc-24", "solid", "ring", "probe", "polar-fft")
+LEARNED_NAMES = ("rinet", "bevplace++", "resnet34-netvlad", "disco", "overlap-transformer", "pointnetvlad", "sgpr")
 """Names of the networks of other publications. Their weights are trained by the user."""
 UNTRAINED, SHIPPED = "untrained", "shipped"
 """Methods for comparison with a newly trained network: the same network with random weights, and the default
@@ -33,10 +13,9 @@ BESIDE = (UNTRAINED, "polar-fft")
 """Default methods for comparison with a newly trained network."""
 
 if TYPE_CHECKING:
-    MethodName = BesideName = LearnedName = AnyMethodName = str
+    BesideName = LearnedName = AnyMethodName = str
 else:
-    MethodName = Literal[METHODS]
     BesideName = Literal[(UNTRAINED, SHIPPED, *HANDCRAFTED_NAMES)]
     LearnedName = Literal[LEARNED_NAMES]
-    AnyMethodName = Literal[(*METHODS, *LEARNED_NAMES)]
+    AnyMethodName = Literal[(NETWORK, *HANDCRAFTED_NAMES, *LEARNED_NAMES)]
 """One of these names. Command lines list them in the help and reject others."""

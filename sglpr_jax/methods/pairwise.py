@@ -23,15 +23,8 @@ def in_blocks(
 ) -> Float32[np.ndarray, "q n"]:
     """Return `compare(prepare(queries), prepare(database))`, computed for at most `block` x `block` pairs at a time.
 
-    Arguments:
-      compare: Returns the distances between prepared queries and prepared rows of the database.
-      queries: Descriptors of the queries.
-      database: Descriptors of the database.
-      block: Maximum number of rows on each side of a block.
-      prepare: Prepares rows for `compare`.
-      prepare_database: Replaces `prepare` for the database.
-      threads: Number of blocks that are computed at the same time. None: the number of cores. More than one helps if
-        `compare` uses only one core.
+    `prepare_database` replaces `prepare` for the database. `threads` is the number of blocks at the same time (None:
+    the number of cores), which helps if `compare` uses only one core.
     """
     out = np.empty((len(queries), len(database)), np.float32)
 

@@ -1,24 +1,28 @@
-"""All methods: the network and the handcrafted methods."""
+"""Methods by name or by weights, as `retrieval.embed` runs them: networks, and handcrafted methods."""
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.grid import Grid
+from sglpr_jax.bev import rotate_image
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.views import View, classes_of, rotated, view
+from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.describe import apply_network, stated_distance
 from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.weights_file import load_variables, method_of, variables_hash
-from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, RecordMethod, ScanMethod
+from sglpr_jax.methods.method import LABELLED, HandcraftedMethod, Method
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.models.config import model_preset
-from sglpr_jax.models.input_image import field_of_view
+from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -33,21 +37,11 @@ def method_named(name: str, params: Params | None, recording: Recording) -> Meth
     return network(load(DEFAULT_WEIGHTS) if params is None else params)
 
 
-def methods_named(names: Sequence[str], params: Params | None, recording: Recording) -> dict[str, Method]:
-    """Return the methods with these names. The network comes first if weights are given, or if nothing is given."""
-    described_first = [NETWORK] if params is not None or not names else []
-    return {name: method_named(name, params, recording) for name in dict.fromkeys([*described_first, *names])}
-
-
 def method_beside(trained: Params, name: str, recording: Recording, *, seed: int = 0) -> Method:
-    """Return a method for comparison with a newly trained network. On images it has the same window.
+    """Return the method called `name`, one of `BesideName`, for comparison with a newly trained network.
 
-    Arguments:
-      trained: Weights of the trained network.
-      name: One of `BesideName`. `untrained` is the same network with random weights from `seed`, `shipped` has the
-        `DEFAULT_WEIGHTS`.
-      recording: Recording to describe.
-      seed: Seed of the random weights.
+    `untrained` is the same network with random weights from `seed`, `shipped` has the `DEFAULT_WEIGHTS`. A handcrafted
+    method on images has the window of the network.
     """
     if name == UNTRAINED:
         return network(init(jax.random.key(seed + 1), config=trained.config))
@@ -65,40 +59,42 @@ def method_with_weights(weights: str) -> Method:
     return trained_method(LEARNED[name], weights) if name in LEARNED else network(load(weights))
 
 
-def trained_method(method: LearnedMethod, weights: str) -> RecordMethod:
-    """Return a learned method with weights of `bin/peers train`.
-
-    Arguments:
-      method: Method, from `LEARNED`.
-      weights: Folder of weights or of a run, or `random:SEED` for an untrained network.
+def trained_method(method: LearnedMethod, weights: str) -> Method:
+    """Return a learned method with weights: a folder of weights or of a run, or `random:SEED`.
 
     Raises the errors of `load_variables`.
     """
     variables = load_variables(weights, method)
     hashed = variables_hash(variables)
-    return RecordMethod(
-        prepare=method.prepare,
-        describe=functools.partial(apply_network, variables, method=method),
-        takes=method.takes,
+
+    def prepare(record: Record, angle: float | None) -> Any:
+        return method.prepare(record if angle is None else rotated_record(record, angle))
+
+    return Method(
+        {"method": method.name, "weights": weights},
+        method.takes,
+        prepare,
+        functools.partial(apply_network, variables, method=method),
         distance="l2" if method.compare is None else stated_distance(method.name, weights, hashed),
-        about={"method": method.name, "weights": weights},
         weights_hash=hashed,
     )
 
 
-def network(params: Params) -> ImageMethod:
+def network(params: Params) -> Method:
     """Return the method that describes images with `params`."""
     config = params.config
-    about = {"method": NETWORK, "model": dataclasses.asdict(config)}
-    describe_views = functools.partial(describe, params)
-    return ImageMethod(
-        describe_views,
-        config.grid,
-        about,
-        weights_hash(params),
-        config.categories_read,
-        config.image,
-        field=field_of_view(config)[0],
+    return Method(
+        {"method": NETWORK, "model": dataclasses.asdict(config)},
+        "labelled images" if config.categories_read else "images",
+        functools.partial(
+            checked_view,
+            grid=config.grid,
+            image=config.image,
+            categories=config.categories_read,
+            field=field_of_view(config)[0],
+        ),
+        lambda views: describe(params, *views),
+        weights_hash=weights_hash(params),
     )
 
 
@@ -110,21 +106,54 @@ def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
     if name not in HANDCRAFTED:
         raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
     method = HANDCRAFTED[name]
-    return _on_images(method, recording, grid) if method.takes == "images" else _on_points(method)
+    if method.takes != "images":
+        prepare = functools.partial(_describe_points, method)
+        return Method({"method": name}, method.takes, prepare, lambda rows: rows, method.distance_name)
+    ready_made = recording.has_images
+    describe_images = (ready_made and method.describe_ready_made) or method.describe
+    return Method(
+        {"method": name, **({} if ready_made else {"grid": dataclasses.asdict(grid)})},
+        method.takes,
+        functools.partial(checked_view, grid=None if ready_made else grid),
+        lambda views: describe_images(views.image),
+        method.distance_name,
+    )
 
 
-def _on_images(method: HandcraftedMethod, recording: Recording, grid: Grid) -> ImageMethod:
-    if recording.has_images:
-        describe, window, about = method.describe_ready_made or method.describe, None, {}
-    else:
-        describe, window, about = method.describe, grid, {"grid": dataclasses.asdict(grid)}
-    return ImageMethod(lambda images: describe(np.asarray(images)), window, {"method": method.name, **about})
+def _describe_points(method: HandcraftedMethod, record: Record, angle: float | None) -> np.ndarray:
+    """Return the descriptor of the finite points of a scan, and of their classes if the method needs them."""
+    assert record.points is not None
+    finite = np.isfinite(record.points).all(axis=1)
+    points = record.upright_points[finite]
+    classes = [classes_of(record, 20)[finite]] if method.takes in LABELLED else []
+    return method.describe(points if angle is None else rotated(points, angle), *classes)
 
 
-def _on_points(method: HandcraftedMethod) -> ScanMethod:
-    labels = method.takes == "labelled points"
+def checked_view(
+    record: Record,
+    angle: float | None,
+    *,
+    grid: Grid | None,
+    image: ImageKind = "points",
+    categories: int = 0,
+    field: Bool[np.ndarray, "h w"] | None = None,
+) -> View:
+    """Return the `view` of a record. Raises ValueError if too few cells within `field` (None: all) are occupied."""
+    turn = None if angle is None else jnp.float32(angle)
+    found = view(record, grid, image=image, categories=categories, angle=turn)
+    seen = np.asarray(found.image)
+    cells = np.count_nonzero(seen if field is None else seen * field)
+    if cells < FEWEST_CELLS:
+        raise ValueError(
+            f"{record.name}: expected points in at least {FEWEST_CELLS} cells of the window of {seen.shape[0]} x"
+            f" {seen.shape[1]} cells, found points in {cells}"
+        )
+    return found
 
-    def describe_scan(points, classes):
-        return method.describe(points, classes) if labels else method.describe(points)
 
-    return ScanMethod(describe_scan, labels, method.distance_name, {"method": method.name})
+def rotated_record(record: Record, angle: float) -> Record:
+    """Return a record whose scan or image is rotated by an angle in radians, counter-clockwise."""
+    if record.points is not None:
+        return dataclasses.replace(record, points=rotated(record.upright_points, angle), mounting=None)
+    assert record.image is not None
+    return dataclasses.replace(record, image=np.asarray(rotate_image(jnp.asarray(record.image), jnp.float32(angle))))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models import initial
-from sglpr_jax.models.initial import Initial
+from sglpr_jax.models.initial import Initializer
 from sglpr_jax.models.layers import product, weight
 
 FEW_INPUTS = 16
@@ -36,16 +36,18 @@ class Convolution(nn.Module):
     strides: tuple[int, int] = (1, 1)
     """Strides along rows and columns."""
     circular: bool = False
-    kernel_init: Initial = initial.he_normal
+    kernel_init: Initializer = initial.he_normal
+    use_bias: bool = True
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.features}"]:
         """Convolve images. With padding, an odd kernel gives ceil(size / stride) rows and columns."""
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = jnp.asarray(weight(self, "kernel", self.kernel_init, shape), x.dtype)
-        bias = weight(self, "bias", initial.zeros, (self.features,)).astype(x.dtype)
         y = convolve(x, kernel, self.strides, self.circular)
-        return y + bias[None, None, None]
+        if not self.use_bias:
+            return y
+        return y + weight(self, "bias", initial.zeros, (self.features,)).astype(x.dtype)[None, None, None]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))

@@ -33,6 +33,10 @@ class Initial:
         return drawn[""]
 
 
+Initializer = Initial | Callable[[Array, tuple[int, ...]], Array]
+"""Initial values of a weight of a model, or of one of Flax."""
+
+
 def draw_all(key: Array, initial: Any, shapes: Any) -> Any:
     """Draw the values of all weights of a tree. The key may be traced.
 

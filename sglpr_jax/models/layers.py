@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models import initial
-from sglpr_jax.models.initial import Initial
+from sglpr_jax.models.initial import Initial, Initializer
 
 NORM_FLOOR = 1e-12
 
@@ -30,10 +30,10 @@ class Seen(NamedTuple):
     """All maps by name, for pictures and tests."""
 
 
-def weight(module: nn.Module, name: str, init: Initial, shape: tuple[int, ...]) -> Any:
+def weight(module: nn.Module, name: str, init: Initializer, shape: tuple[int, ...]) -> Any:
     """Return a weight of the calling module, and create it at initialisation.
 
-    At initialisation, the collection `initial` also gets the distribution `init`, for `draw_all`.
+    At initialisation, the collection `initial` also gets the distribution `init`, for `draw_all`, if it is mutable.
 
     Flax's `param` traces `init` in every call to find the shape. This takes half of the time of tracing a network.
 
@@ -41,7 +41,7 @@ def weight(module: nn.Module, name: str, init: Initial, shape: tuple[int, ...]) 
       ValueError: If the weight has another shape.
     """
     if not module.has_variable("params", name):
-        if module.is_initializing():
+        if module.is_initializing() and module.is_mutable_collection("initial"):
             module.put_variable("initial", name, init)
         return module.param(name, init, shape)
     value = module.get_variable("params", name)

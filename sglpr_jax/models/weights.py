@@ -39,10 +39,9 @@ def as_tree(named: dict[str, Any]) -> Any:
 
 
 @functools.cache
-def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every weight of a configuration, without computing the weights."""
-    fresh = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
-    return {name: leaf.shape for name, leaf in by_name(fresh.weights).items()}
+def weight_shapes(config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shape and type of every weight of a configuration, without computing the weights."""
+    return by_name(jax.eval_shape(lambda: init(jax.random.key(0), config=config)).weights)
 
 
 def graft(given: Params, fresh: Params) -> Params:

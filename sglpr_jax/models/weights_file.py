@@ -1,9 +1,12 @@
-"""Weights on disk: a folder with config.json and model.safetensors, so that weights and configuration stay together."""
+"""Weights on disk: a folder with config.json and model.safetensors, so that weights and configuration stay together.
+
+The networks of other publications use the same files (`methods/learned/weights_file.py`).
+"""
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +15,22 @@ import numpy as np
 import safetensors
 
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.files import check_holds_only, in_short, read_json, replacing
-from sglpr_jax.models.config import ModelConfig, config_from_dict
+from sglpr_jax.files import check_holds_only, in_short, json_text, read_json, replacing
+from sglpr_jax.models.config import config_from_dict
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import weights_folder
 from sglpr_jax.models.weights import as_tree, by_name, hash_of, weight_shapes
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
+LAST = "weights"
+"""Folder of the last weights in the folder of a training run."""
 CHECKSUM = "sha256"
 """Key in the header of the weights file for the `hash_of` the stored values."""
 CHECKED_FOR = "config_sha256"
 """Key in the header for the checksum of the configuration that the weights were saved with. If it matches, the expected
 shapes need not be computed, which saves half a second."""
-STORED = ("F32", "F16")
-"""Data types of stored weights, with their safetensors names."""
+LARGEST = np.finfo(np.float16).max
 
 
 def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
@@ -45,23 +49,30 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
       ValueError: If a weight is not float32, is not finite, has another shape than the configuration requires, or is
         too large for float16. The message names the weight.
     """
-    folder = Path(folder)
+    folder, config = Path(folder), dataclasses.asdict(params.config)
+    values = {name: np.asarray(leaf) for name, leaf in by_name(params.weights).items()}
     check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
-    # safetensors writes memory in its physical order, so a transposed view would be read in the wrong order.
-    values = {name: np.asarray(leaf, order="C") for name, leaf in by_name(params.weights).items()}
-    _check_shapes({name: leaf.shape for name, leaf in values.items()}, params.config, source=folder)
-    for name, leaf in values.items():
-        if leaf.dtype != np.float32:
-            raise ValueError(f"{folder}: expected {name} as float32, found {leaf.dtype}")
-        _check_finite(name, leaf, source=folder)
-    values = {name: _halved(name, leaf) for name, leaf in values.items()} if half else values
+    check_leaves(values, weight_shapes(params.config), source=folder)
+    for name, leaf in values.items() if half else ():
+        if np.abs(leaf).max(initial=0) > LARGEST:
+            raise ValueError(f"{name}: expected values up to {LARGEST}, the limit of float16, found larger values")
+        values[name] = leaf.astype(np.float16)
+    write_weights(folder, values, config, {CHECKED_FOR: _hash_of(config)})
+    return folder
+
+
+def write_weights(
+    folder: Path, values: Mapping[str, Any], config: Mapping[str, Any], header: Mapping[str, str]
+) -> None:
+    """Write arrays with their checksum, and a configuration, to a folder, completely or not at all.
+
+    Raises OSError if the folder cannot be written or holds other files.
+    """
+    check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
     with replacing(folder) as new:
         new.mkdir()
-        config = _hash_of(dataclasses.asdict(params.config))
-        content = tensors_as_bytes(values, {CHECKSUM: hash_of(values), CHECKED_FOR: config})
-        (new / WEIGHTS_FILE).write_bytes(content)  # save_file hides the OSError of a full disk
-        (new / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
-    return folder
+        (new / WEIGHTS_FILE).write_bytes(checked_tensors(values, header))  # save_file hides the OSError of a full disk
+        (new / CONFIG_FILE).write_text(json_text(config))
 
 
 def load(weights: Path | str) -> Params:
@@ -77,75 +88,82 @@ def load(weights: Path | str) -> Params:
       FileNotFoundError: If neither exists, or if a file is missing.
       ValueError: If a file is damaged, or if the weights were saved with another configuration.
     """
-    folder = weights_folder(weights)
-    if (folder / "weights").is_dir():
-        folder = folder / "weights"
+    folder = last_weights(weights_folder(weights))
+    stored = read_json(folder / CONFIG_FILE)
+    config = config_from_dict(stored, source=folder / CONFIG_FILE)
+    known = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}  # fields added later are not in older files
+    path = folder / WEIGHTS_FILE
+    values, header = _read(path)
+    halved = {name: leaf.astype(np.float32) if leaf.dtype == np.float16 else leaf for name, leaf in values.items()}
+    if header.get(CHECKED_FOR) not in known:
+        check_leaves(halved, weight_shapes(config), source=path)
+        if CHECKED_FOR in header:  # files of earlier versions have none
+            raise ValueError(f"{path}: expected the {CONFIG_FILE} that it was saved with, found a changed one")
+    if header:  # files of earlier versions have none
+        _check_checksum(values, header, source=path)
+    return Params(jax.device_put(as_tree(halved)), config)  # JAX would copy arrays of NumPy in every call
+
+
+def last_weights(folder: Path) -> Path:
+    """Return a folder of weights, or that of the last weights of a training run. Raises FileNotFoundError if a file is
+    missing."""
+    folder = folder / LAST if (folder / LAST).is_dir() else folder
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
             raise FileNotFoundError(
                 f"{folder}: expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}, {name} is missing"
             )
-    stored = read_json(folder / CONFIG_FILE)
-    config = config_from_dict(stored, source=folder / CONFIG_FILE)
-    known = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}  # fields added later are not in older files
-    values = _read_tensors(folder / WEIGHTS_FILE, config, known)
-    values = {name: np.asarray(leaf, np.float32) for name, leaf in values.items()}
-    return Params(jax.device_put(as_tree(values)), config)  # JAX would copy arrays of NumPy in every call
+    return folder
 
 
-def _read_tensors(path: Path, config: ModelConfig, known: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the stored weights and check their names, shapes, types, values and checksums.
+def checked_tensors(values: Mapping[str, Any], header: Mapping[str, str] | None = None) -> bytes:
+    """Return the content of a safetensors file of arrays, with their checksum for `read_tensors` in the header."""
+    # safetensors writes memory in its physical order, so a transposed view would be read in the wrong order.
+    ordered = {name: np.asarray(leaf, order="C") for name, leaf in values.items()}
+    return tensors_as_bytes(ordered, {CHECKSUM: hash_of(ordered), **(header or {})})
 
-    `known` are the checksums of the configuration.
-    """
+
+def read_tensors(path: Path) -> dict[str, np.ndarray]:
+    """Read a safetensors file. Raises ValueError if it is damaged or its values do not have the stored checksum."""
+    values, header = _read(path)
+    _check_checksum(values, header, source=path)
+    return values
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     try:
         with safetensors.safe_open(path, framework="np") as file:
-            about = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-            metadata = file.metadata() or {}
-            if metadata.get(CHECKED_FOR) not in known:
-                _check_shapes({name: tuple(part.get_shape()) for name, part in about.items()}, config, source=path)
-                if CHECKED_FOR in metadata:  # files of earlier versions have none
-                    raise ValueError(f"{path}: expected the {CONFIG_FILE} that it was saved with, found a changed one")
-            for name, part in about.items():
-                if part.get_dtype() not in STORED or 0 in part.get_shape():
-                    found = f"{part.get_dtype()} {tuple(part.get_shape())}"
-                    raise ValueError(f"{path}: expected {name} as {' or '.join(STORED)} with values, found {found}")
-            values = {name: file.get_tensor(name) for name in about}
-    except (safetensors.SafetensorError, UnicodeDecodeError) as error:
+            values = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            return values, file.metadata() or {}
+    except (safetensors.SafetensorError, UnicodeDecodeError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path}: expected a whole safetensors file, found a damaged one ({in_short(error)})"
         ) from error
-    for name, leaf in values.items():
-        _check_finite(name, leaf, source=path)
-    if metadata and metadata.get(CHECKSUM) != (found := hash_of(values)):  # files of earlier versions have none
-        said = metadata.get(CHECKSUM, "none")
-        raise ValueError(f"{path}: expected weights with the SHA-256 of the header, {said}, found {found}")
-    return values
+
+
+def _check_checksum(values: Mapping[str, np.ndarray], header: Mapping[str, str], *, source: Path) -> None:
+    said, found = header.get(CHECKSUM, "none"), hash_of(values)
+    if said != found:
+        raise ValueError(f"{source}: expected weights with the SHA-256 of the header, {said}, found {found}")
+
+
+def check_leaves(values: Mapping[str, Any], expected: Mapping[str, Any], *, source: Path) -> None:
+    """Raise ValueError unless arrays, or descriptions of them, have the expected names, shapes and types.
+
+    Arrays must be finite.
+    """
+    for name in sorted(values.keys() | expected.keys()):
+        wanted, found = (
+            f"{some[name].dtype} {tuple(some[name].shape)}" if name in some else "no array"
+            for some in (expected, values)
+        )
+        if wanted != found:
+            raise ValueError(f"{source}: expected {name} as {wanted}, found {found}")
+        array = values[name]
+        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all():
+            broken = array.size - np.isfinite(array).sum()
+            raise ValueError(f"{source}: expected finite weights, found {broken} of {array.size} not finite in {name}")
 
 
 def _hash_of(config: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
-
-
-def _check_shapes(found: Mapping[str, tuple[int, ...]], config: ModelConfig, *, source: Path) -> None:
-    """Raise ValueError if names or shapes differ from the configuration. The message names one such weight."""
-    expected = weight_shapes(config)
-    if expected != found:
-        name = min(set(expected.items()) ^ set(found.items()))[0]
-        raise ValueError(
-            f"{source}: expected the weights of its configuration, {name} of shape "
-            f"{expected.get(name, 'none (unknown weight)')}, found {found.get(name, 'none (missing)')}"
-        )
-
-
-def _check_finite(name: str, leaf: np.ndarray, *, source: Path) -> None:
-    broken = leaf.size - int(np.isfinite(leaf).sum())
-    if broken:
-        raise ValueError(f"{source}: expected finite weights, found {broken} of {leaf.size} not finite in {name}")
-
-
-def _halved(name: str, leaf: np.ndarray) -> np.ndarray:
-    largest = np.finfo(np.float16).max
-    if np.abs(leaf).max(initial=0) > largest:
-        raise ValueError(f"{name}: expected values up to {largest}, the limit of float16, found larger values")
-    return leaf.astype(np.float16)

@@ -13,9 +13,9 @@ from typing import Any
 import flax.struct
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
-from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.record import check_cloud
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import View, check_ready_made, cloud_view, image_view, picture
 from sglpr_jax.grid import Grid, ImageKind
@@ -91,17 +91,22 @@ def read_batch(
     Raises:
       ValueError: If the batch mixes scans and images, images differ in size, or a scan shows no place.
     """
-    flat = frames.reshape(-1)
-    negatives = pool.far_apart(frames[:, :1], flat[None, :])
+    tuples, size = frames.shape
+    negatives = pool.far_apart(frames[:, :1], frames.reshape(1, -1))
     if not share_negatives:
-        negatives &= _own_negatives(frames.shape, positives=pool.config.positives)
+        negatives &= np.kron(np.eye(tuples, dtype=bool), np.arange(size) > pool.config.positives)
     has_labels = categories > 0 and any(recording.has_labels for recording in recordings)
     images = recordings[0].has_images
     places = [(recordings[int(pool.recording[f])], int(pool.frame[f])) for f in frames[part].reshape(-1)]
     pictures = images or image == "density"
 
     def read(recording: Recording, frame: int) -> Place:
-        record = _read(recording, frame, images=images, labels=has_labels)
+        if recording.has_images != images:
+            expected, found = ("images", "scans") if images else ("scans", "images")
+            raise ValueError(f"expected only {expected} in a batch, found {found} in recording {recording.name}")
+        record = recording.record(frame, labels=has_labels)
+        if record.points is not None:
+            check_cloud(record.points, name=record.name)
         check_ready_made(record, image)
         classes = record.classes(categories) if has_labels else None
         return picture(record, classes) if pictures else (record.upright_points, classes)
@@ -111,8 +116,12 @@ def read_batch(
     common = {"labelled": labelled, "negatives": negatives[part], "positives": pool.config.positives}
     if pictures:
         _require_one_size(places, found)
-        stacked, maps = _stacked(found)
-        return Batch(**common, images=stacked, maps=maps if has_labels else None)
+        stacked, maps = np.stack([one for one, _ in found]), None
+        if has_labels:
+            maps = np.stack(
+                [np.full(one.shape, UNLABELLED, np.int32) if kinds is None else kinds for one, kinds in found]
+            )
+        return Batch(**common, images=stacked, maps=maps)
     points, count, classes = _padded(found, max_points)
     return Batch(**common, points=points, count=count, classes=classes if has_labels else None)
 
@@ -128,37 +137,17 @@ def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
     Returns:
       Images, and maps of classes or None if no place has labels.
     """
+    if batch.also is None and batch.images is not None:
+        return image_view(batch.images, batch.maps, grid, angles)
     if batch.also is None:
-        return _views(batch, angles, grid)
+        return cloud_view(batch.points, batch.classes, batch.count, grid, angles)
     own, others = (None, None) if angles is None else (angles[: batch.places], angles[batch.places :])
-    parts = [_views(batch, own, grid), _views(batch.also, others, grid)]
+    parts = [views(dataclasses.replace(batch, also=None), own, grid), views(batch.also, others, grid)]
     images = jnp.concatenate([image for image, _ in parts])
     if all(maps is None for _, maps in parts):
         return View(images)
     unlabelled = [jnp.full(image.shape, UNLABELLED) if maps is None else maps for image, maps in parts]
     return View(images, jnp.concatenate(unlabelled))
-
-
-def _views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
-    if batch.images is not None:
-        return image_view(batch.images, batch.maps, grid, angles)
-    return cloud_view(batch.points, batch.classes, batch.count, grid, angles)
-
-
-def _own_negatives(shape: tuple[int, int], *, positives: int) -> Bool[np.ndarray, "t b"]:
-    tuples, places = shape
-    is_negative = np.arange(places) > positives
-    return np.kron(np.eye(tuples, dtype=bool), is_negative)
-
-
-def _read(recording: Recording, frame: int, *, images: bool, labels: bool) -> Record:
-    if recording.has_images != images:
-        expected, found = ("images", "scans") if images else ("scans", "images")
-        raise ValueError(f"expected only {expected} in a batch, found {found} in recording {recording.name}")
-    record = recording.record(frame, labels=labels)
-    if record.points is not None:
-        check_cloud(record.points, name=record.name)
-    return record
 
 
 def _require_one_size(places: list[tuple[Recording, int]], pictures: list[Place]) -> None:
@@ -169,12 +158,6 @@ def _require_one_size(places: list[tuple[Recording, int]], pictures: list[Place]
                 f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of {expected[0]} x"
                 f" {expected[1]} pixels, as in {places[0][0].name}, found {image.shape[0]} x {image.shape[1]}"
             )
-
-
-def _stacked(pictures: list[Place]) -> tuple[np.ndarray, np.ndarray]:
-    """Stack images and maps of classes. Missing maps are filled with UNLABELLED."""
-    maps = [np.full(image.shape, UNLABELLED, np.int32) if classes is None else classes for image, classes in pictures]
-    return np.stack([image for image, _ in pictures]), np.stack(maps)
 
 
 def _padded(scans: list[Place], max_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -243,10 +226,7 @@ def positions_of(recording: Recording) -> Float[np.ndarray, "n 3"]:
 
 
 class TupleBatches(BatchSource):
-    """Batches of the tuples that `pool` draws. With mining, negatives are places that were similar at the last refresh.
-
-    Batches depend only on the seed, the step and the mined descriptors.
-    """
+    """Batches of the tuples that `pool` draws, which depend only on the seed, the step and the mined descriptors."""
 
     def __init__(
         self,
@@ -259,17 +239,7 @@ class TupleBatches(BatchSource):
         mining: Mining | None = None,
         random_places: bool = False,
     ):
-        """Draw tuples of a pool.
-
-        Arguments:
-          recordings: Recordings of the pool.
-          pool: Pool of the tuples.
-          read: Reads the batch of some frames of the pool.
-          seed: Seed of the tuples.
-          tuples: Number of tuples in a step.
-          mining: Descriptors for hard negatives.
-          random_places: Draw any places instead of tuples.
-        """
+        """Draw `tuples` tuples a step, or any places with `random_places`, and read the batch of their frames."""
         self._recordings, self._pool, self._read, self._mining = recordings, pool, read, mining
         self._draw = pool.draw_places if random_places else pool.draw
         self._options = {"seed": seed, "tuples": tuples}
@@ -286,7 +256,11 @@ class TupleBatches(BatchSource):
 
     def places(self, step: int) -> str:
         """Name the recordings and scans in the batch of a step."""
-        return "; ".join(_named(self._recordings, self._pool, self._frames(step)))
+        places, named = np.unique(self._frames(step)), []
+        for number, recording in enumerate(self._recordings):
+            ids = [recording.ids[self._pool.frame[f]] for f in places[self._pool.recording[places] == number]]
+            named += [f"recording {recording.name} frames {' '.join(ids)}"] if ids else []
+        return "; ".join(named)
 
     def _frames(self, step: int) -> Int[np.ndarray, "t k"]:
         mined: dict[str, Any] = {} if self._mining is None else {"cache": self._mining.cache}
@@ -335,12 +309,3 @@ def batches_of(
         random_places=not config.also_triplets,
     )
     return MixedBatches(main, second, functools.partial(mix, triplets=config.also_triplets, share_negatives=share))
-
-
-def _named(recordings: Sequence[Recording], pool: TuplePool, frames: Int[np.ndarray, "t k"]) -> list[str]:
-    """Return the recordings and scan ids of the given frames, as text for messages."""
-    places, named = np.unique(frames), []
-    for number, recording in enumerate(recordings):
-        ids = [recording.ids[pool.frame[f]] for f in places[pool.recording[places] == number]]
-        named += [f"recording {recording.name} frames {' '.join(ids)}"] if ids else []
-    return named

@@ -20,7 +20,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from sglpr_jax.files import in_short, read_json, replacing, write_json
-from sglpr_jax.methods.learned.weights_file import check_leaves
+from sglpr_jax.models.weights_file import check_leaves
 from sglpr_jax.training.devices import is_first_host, on_all_hosts
 from sglpr_jax.training.step import TrainState
 

@@ -98,7 +98,9 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
         return summarize(dataclasses.replace(params, weights=weights), chunk, config)
 
     def loss(summaries: Summary):
-        return joint_loss(_merge(summaries), batch, config)
+        descriptors, sums = summaries
+        merged = Summary(descriptors.reshape(-1, descriptors.shape[-1]), jax.tree.map(lambda s: s.sum(0), sums))
+        return joint_loss(merged, batch, config)
 
     if chunks.images.shape[0] == 1:
         only = jax.tree.map(lambda x: x[0], chunks)
@@ -155,12 +157,6 @@ def _angles(key: Array, config: TrainConfig) -> Array:
         return angles
     by_quarters = jax.random.bernoulli(jax.random.fold_in(key, 3), config.quarter_turns, angles.shape)
     return jnp.where(by_quarters, jnp.floor(angles / (jnp.pi / 2)) * (jnp.pi / 2), angles)
-
-
-def _merge(summaries: Summary) -> Summary:
-    """Merge the summaries of all chunks: concatenate descriptors, add sums."""
-    descriptors, sums = summaries
-    return Summary(descriptors.reshape(-1, descriptors.shape[-1]), jax.tree.map(lambda s: s.sum(0), sums))
 
 
 def visible(key: Array, images: int, grid: Grid, config: OcclusionConfig) -> Bool[Array, "b h w"]:

@@ -1,6 +1,5 @@
 """Inputs of the network for all scans of recordings. They are computed once and kept as memory-mapped files."""
 
-import functools
 import hashlib
 import inspect
 import json
@@ -15,7 +14,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import check_readable, scan_stream
 from sglpr_jax.files import file_name, in_short, replacing
 from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.method import require_content
+from sglpr_jax.methods.method import LABELLED, require_content
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.training.tuples import TuplePool
 
@@ -41,14 +40,8 @@ def prepared(
 ) -> Prepared:
     """Compute the inputs of all scans, or read them from the cache.
 
-    Each recording becomes one file, which is complete or does not exist. A repeated call continues with the missing
-    recordings.
-
-    Arguments:
-      method: Method whose `prepare` computes the inputs.
-      recordings: Recordings with poses.
-      cache: Folder of the files.
-      progress: Displays the number of finished scans.
+    Each recording becomes one file in the folder `cache`, which is complete or does not exist. A repeated call
+    continues with the missing recordings.
 
     Raises:
       ValueError: If a recording has no poses or lacks what the method needs, if a scan is invalid, or if inputs differ
@@ -82,10 +75,8 @@ def _inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: 
 def _write(path: Path, method: LearnedMethod, recording: Recording, show) -> None:
     """Write the inputs of a recording, completely or not at all."""
     check_readable(recording, len(recording))
-    labels = method.takes == "labelled points"
-    made = scan_stream(
-        recording, lambda row, record: method.prepare(record), labels=labels, ahead=SCANS_AHEAD, on_progress=show
-    )
+    options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD, "on_progress": show}
+    made = scan_stream(recording, lambda row, record: method.prepare(record), **options)
     with replacing(path) as temporary:
         file = None
         for row, one in made:
@@ -107,26 +98,14 @@ def _require_alike(found: np.ndarray, expected: np.ndarray, *, name: str) -> Non
 
 
 def _identity(method: LearnedMethod, recording: Recording) -> str:
-    """Identify the inputs: the files of a recording, their read options, and the code that prepares them."""
+    """Identify the inputs: the files of a recording, their read options, and the file that declares `prepare`."""
     paths = [path for path in (*recording.paths, *recording.label_paths, *recording.containers) if path is not None]
-    files = [(str(path.absolute()), _stamp(path)) for path in paths]
+    stats = [path.stat() if path.exists() else None for path in paths]  # None for a scan inside another file
+    stamps = [None if stat is None else (stat.st_size, stat.st_mtime_ns) for stat in stats]
+    files = [(str(path.absolute()), stamp) for path, stamp in zip(paths, stamps, strict=True)]
     mountings = [str(recording.mounting_of(row)) for row in range(len(recording))]
-    source = [method.name, _code(method), recording.name, recording.read_options, files, mountings]
+    code = hashlib.sha256(Path(inspect.getfile(method.prepare)).read_bytes()).hexdigest()
+    source = [method.name, code, recording.name, recording.read_options, files, mountings]
     if not recording.on_disk and recording.positions is not None:  # a simulated recording has no files
         source.append(recording.positions.tolist())
     return hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """Size and time of a file, or None for a scan inside another file."""
-    stat = path.stat() if path.exists() else None
-    return None if stat is None else (stat.st_size, stat.st_mtime_ns)
-
-
-def _code(method: LearnedMethod) -> str:
-    """Hash of the file that declares `prepare`, so that a change of the method gives new inputs."""
-    prepare = method.prepare.func if isinstance(method.prepare, functools.partial) else method.prepare
-    try:
-        return hashlib.sha256(Path(inspect.getfile(prepare)).read_bytes()).hexdigest()
-    except (OSError, TypeError):  # a function without a file
-        return ""

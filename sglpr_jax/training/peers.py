@@ -1,6 +1,5 @@
 """Training of the networks of other publications (`methods/learned/`), and the search of their learning rate."""
 
-import contextlib
 import dataclasses
 import functools
 import math
@@ -19,7 +18,8 @@ from sglpr_jax.fields import CountOrNone, NotNegative, Positive, check_fields
 from sglpr_jax.files import read_json, write_json
 from sglpr_jax.methods.learned.describe import describe_inputs, learned_distance
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
-from sglpr_jax.methods.learned.weights_file import LAST, random_variables, save_variables
+from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
+from sglpr_jax.models.weights_file import LAST
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.training.batches import TupleBatches
 from sglpr_jax.training.callbacks import Callback
@@ -151,14 +151,11 @@ def train_learned(
       data: Training recordings and their inputs.
       settings: Settings of the run.
       out: Folder of the run.
-      score: Scores each snapshot. The scores are written to `scores.jsonl`.
+      score: Scores each snapshot, for `scores.jsonl`.
       resume: Continue the run in the folder.
       stopped: Asked after every step. If it returns True, the state is saved and the training stops.
       report: Receives a line about the progress every 30 s.
       progress: Displays the training time.
-
-    Returns:
-      The last state, the number of images and the training time.
 
     Raises:
       FloatingPointError: The loss is not finite. The message names the step.
@@ -185,13 +182,15 @@ def train_learned(
             save(run, f"{LAST}-{snapshot}")
         return {} if score is None else score(variables_of(run.state))
 
-    with contextlib.ExitStack() as opened:
-        config = _as_config(method, data, settings)
-        opened.enter_context(claimed(out, config, seed=settings.seed, resume=resume, limits=LIMITS))
+    recipe = dataclasses.asdict(method.recipe)
+    del recipe["learning_rates"]  # the settings have the chosen one
+    recordings = [{"name": one.name, "scans": len(one)} for one in data.recordings]
+    config = {"method": method.name, "settings": dataclasses.asdict(settings), "recipe": recipe}
+    claim = claimed(out, config | {"recordings": recordings}, seed=settings.seed, resume=resume, limits=LIMITS)
+    with claim, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
         pool = TuplePool(
             [one.positions for one in data.recordings if one.positions is not None], method.recipe.sampling
         )
-        show = opened.enter_context(progress(f"train {method.name}", math.ceil(settings.seconds)))
         run = run_steps(
             network,
             _batches(network, data, pool, out),
@@ -257,24 +256,11 @@ def _batches(network: PeerNetwork, data: Prepared, pool: TuplePool, out: Path) -
     return TupleBatches(data.recordings, pool, read, seed=seed, tuples=recipe.tuples, mining=mining)
 
 
-def _as_config(method: LearnedMethod, data: Prepared, settings: RunSettings) -> dict[str, Any]:
-    """Return the content of config.json."""
-    recipe = {name: value for name, value in dataclasses.asdict(method.recipe).items() if name != "learning_rates"}
-    recordings = [{"name": one.name, "scans": len(one)} for one in data.recordings]
-    return {
-        "method": method.name,
-        "settings": dataclasses.asdict(settings),
-        "recipe": recipe,
-        "recordings": recordings,
-    }
-
-
 def held_out_score(method: LearnedMethod, held_out: Prepared) -> ScoreFn:
     """Return a function that scores weights on held-out recordings.
 
-    The entries of a score are `recall_at_1`, the mean, and `recall_at_1 NAME` for each recording.
-
-    Raises ValueError if a recording has no revisits.
+    The entries of a score are `recall_at_1`, the mean, and `recall_at_1 NAME` for each recording. Raises ValueError if
+    a recording has no revisits.
     """
     require_revisits(held_out.recordings)
 
@@ -302,63 +288,39 @@ def best_rate(
     *,
     seconds: float = 300.0,
     seed: int = 0,
-    stopped: Callable[[], bool] = lambda: False,
     report: Callable[[str], None] = lambda line: None,
-    progress: Progress = no_progress,
+    **options: Any,
 ) -> float:
     """Train with each of the three learning rates and return the one with the highest Recall@1.
 
     The folder gets the trainings and `rates.json` with all scores. Finished trainings are not repeated. A rate whose
     loss is not finite has no score. Of equal scores, the smaller rate wins.
 
-    Arguments:
-      method: Method to train.
-      data: Training recordings and their inputs.
-      score: Scores weights on a held-out recording.
-      out: Folder of the search.
-      seconds: Training time of each rate.
-      seed: Seed of each training.
-      stopped: Asked after every step.
-      report: Receives lines about the progress.
-      progress: Displays the training time.
+    Each rate is trained for `seconds` with the options of `train_learned`.
 
     Raises:
       FloatingPointError: If the loss is not finite with any rate.
       Stopped: If the search was asked to stop.
     """
-    scores: dict[float, float | None] = {}
+    recalls: dict[float, float | None] = {}
     for rate in method.recipe.learning_rates:
-        settings = RunSettings(learning_rate=rate, seed=seed, seconds=seconds)
-        options = {"stopped": stopped, "report": report, "progress": progress}
-        scores[rate] = _score_of_rate(method, data, score, settings, out / f"rate-{rate:g}", options)
-        report(f"learning rate {rate:g}: {RECALL} {scores[rate]}")
-    finite = {rate: found for rate, found in scores.items() if found is not None}
+        settings, folder = RunSettings(rate, seed=seed, seconds=seconds), out / f"rate-{rate:g}"
+        resume, kept = (folder / CONFIG_FILE).is_file(), folder / "score.json"
+        try:
+            found = train_learned(method, data, settings, folder, resume=resume, report=report, **options)
+            if found.seconds < seconds:
+                raise Stopped
+            if not kept.is_file():
+                write_json(kept, score(variables_of(found.state)))
+            recalls[rate] = float(read_json(kept)[RECALL])
+        except FloatingPointError:
+            recalls[rate] = None
+        report(f"learning rate {rate:g}: {RECALL} {recalls[rate]}")
+    finite = {rate: recall for rate, recall in recalls.items() if recall is not None}
     if not finite:
         raise FloatingPointError(f"{out}: the loss of {method.name} is not finite with any of its learning rates")
     best = max(finite, key=lambda rate: finite[rate])
-    recalls = {f"{rate:g}": found for rate, found in scores.items()}
     about = {"method": method.name, "seconds": seconds, "seed": seed}
-    write_json(out / RATES_FILE, {**about, RECALL: recalls, "best": best})
+    named = {f"{rate:g}": recall for rate, recall in recalls.items()}
+    write_json(out / RATES_FILE, {**about, RECALL: named, "best": best})
     return best
-
-
-def _score_of_rate(
-    method: LearnedMethod,
-    data: Prepared,
-    score: ScoreFn,
-    settings: RunSettings,
-    folder: Path,
-    options: dict[str, Any],
-) -> float | None:
-    """Train with one rate and return its Recall@1, or None if its loss is not finite."""
-    try:
-        resume = (folder / CONFIG_FILE).is_file()
-        found = train_learned(method, data, settings, folder, resume=resume, **options)
-    except FloatingPointError:
-        return None
-    if found.seconds < settings.seconds:
-        raise Stopped
-    kept = folder / "score.json"
-    if not kept.is_file():
-        write_json(kept, score(variables_of(found.state)))
-    return float(read_json(kept)[RECALL])

@@ -190,10 +190,10 @@ def _source_and_score(
 ) -> tuple[BatchSource, ScoreFn]:
     """Return the batches of the training places, and the score: on held-out places, if there are any."""
     splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
-    pool = tuple_pool(recordings, config, frames=[split.training for split in splits])
+    pool = tuple_pool(recordings, config, frames=[training for training, _ in splits])
     mining = _mining(recordings, pool, config, folder) if config.sampling.mining == "hardest" else None
     if config.validation.share:
-        score = validation_score(recordings, [split.validation for split in splits], config)
+        score = validation_score(recordings, [held_out for _, held_out in splits], config)
     else:
         score = training_recall(recordings, pool, config)
     return batches_of(recordings, pool, config, also=also, mining=mining), score

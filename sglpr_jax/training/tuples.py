@@ -97,20 +97,13 @@ class TuplePool:
         anchors = source.anchors
         if cache is not None:
             anchors = _unless_empty(np.intersect1d(anchors, cache.places), anchors)
-        if cluster:
-            anchors = _unless_empty(self._alike_or_near(cluster, anchors, cache), anchors)
+        if cluster and cache is None:
+            anchors = _unless_empty(anchors[self._within(cluster[0], anchors, self.config.cluster_m)], anchors)
+        elif cluster and cache is not None:  # similar to the first anchor and far from all
+            far = self.far_apart(np.array(cluster)[:, None], anchors[None]).all(0)
+            anchors = _unless_empty(cache.nearest(cluster[0], anchors[far], self.config.hardest), anchors)
         anchor = int(rng.choice(anchors))
         return [anchor, *source.draw(rng, anchor, self.config.positives).tolist()]
-
-    def _alike_or_near(
-        self, cluster: list[int], anchors: Int[np.ndarray, "_"], cache: DescriptorCache | None
-    ) -> Int[np.ndarray, "_"]:
-        """Select anchors that fit a cluster: near its first anchor or, with a cache, similar to it and far from all
-        anchors."""
-        if cache is None:
-            return anchors[self._within(cluster[0], anchors, self.config.cluster_m)]
-        far = self.far_apart(np.array(cluster)[:, None], anchors[None]).all(0)
-        return cache.nearest(cluster[0], anchors[far], self.config.hardest)
 
     def _draw_negatives(
         self, rng: np.random.Generator, anchor: int, cache: DescriptorCache | None
@@ -153,19 +146,10 @@ def _unless_empty(wanted: Int[np.ndarray, "_"], otherwise: Int[np.ndarray, "_"])
     return wanted if len(wanted) else otherwise
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Split:
-    """Training and validation frames of one recording, in ascending order.
-
-    Frames close to a validation frame are in neither.
-    """
-
-    training: Int[np.ndarray, "_"]
-    validation: Int[np.ndarray, "_"]
-
-
-def hold_out(positions: Float[np.ndarray, "n 3"], config: ValidationConfig, sampling: TupleConfig) -> Split:
-    """Split a recording: a stretch of frames with all its revisits for validation, and distant frames for training.
+def hold_out(
+    positions: Float[np.ndarray, "n 3"], config: ValidationConfig, sampling: TupleConfig
+) -> tuple[Int[np.ndarray, "training"], Int[np.ndarray, "validation"]]:
+    """Split a recording: distant frames for training, and a stretch of frames with all its revisits for validation.
 
     Every validation frame is within the positive distance of the stretch. Every training frame is beyond the negative
     distance of all validation frames, so that no house is visible in both parts. Both distances are horizontal. The
@@ -174,21 +158,16 @@ def hold_out(positions: Float[np.ndarray, "n 3"], config: ValidationConfig, samp
     n = len(positions)
     length = round(config.share * n)
     if length == 0:
-        return Split(np.arange(n), np.arange(0))
+        return np.arange(n), np.arange(0)
     places = positions[:, :2]
-    revisiting = _revisiting(places, sampling)
+    pairs = close_pairs(places, closer_than_m=sampling.positive_m)
+    revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
+    revisiting = np.isin(np.arange(n), revisits)
     inside = np.convolve(revisiting, np.ones(length), mode="valid")
     start = int(np.abs(inside - config.share * revisiting.sum()).argmin())
     validation = _within(places, places[start : start + length], np.nextafter(sampling.positive_m, 0))
     near = _within(places, places[validation], sampling.negative_m)
-    return Split(np.flatnonzero(~near), np.flatnonzero(validation))
-
-
-def _revisiting(places: Float[np.ndarray, "n 2"], sampling: TupleConfig) -> Bool[np.ndarray, "n"]:
-    """Mark the frames that have a positive in another visit."""
-    pairs = close_pairs(places, closer_than_m=sampling.positive_m)
-    revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
-    return np.isin(np.arange(len(places)), revisits)
+    return np.flatnonzero(~near), np.flatnonzero(validation)
 
 
 def _within(places: Float[np.ndarray, "n 2"], some: Float[np.ndarray, "m 2"], metres: float) -> Bool[np.ndarray, "n"]:

@@ -37,9 +37,8 @@ def training_recall(
     """Return a function that scores weights by Recall@1 among fixed places of the training recordings.
 
     The places are pairs of an anchor and a positive, each rotated at random. A pair counts as found if the nearest of
-    all positive descriptors belongs to a place within the positive distance of the anchor. The test recording is not
-    used, so the score may select checkpoints. The places are training places, so the score says little about new
-    places.
+    all positive descriptors belongs to a place within the positive distance of the anchor. The score says little about
+    new places.
     """
     frames = pool.draw(seed=_SEED, step=0, tuples=PLACES)[:, :2]
     offset = pool.positions[frames[:, :1], :2] - pool.positions[None, frames[:, 1], :2]
@@ -119,18 +118,8 @@ def describe_places(
     angles: Float[np.ndarray, "n"],
     config: TrainConfig,
 ) -> Float32[np.ndarray, "n d"]:
-    """Describe places of the training recordings.
-
-    Arguments:
-      params: Weights of the model.
-      recordings: Recordings of the pool.
-      pool: Pool of the places.
-      places: Frame numbers of the pool.
-      angles: Rotation of each place about z, in radians.
-      config: Settings of the run.
-
-    Raises the errors of reading a scan.
-    """
+    """Describe places of the training recordings, given as frame numbers of the pool, each rotated about z by its
+    angle in radians. Raises the errors of reading a scan."""
     described = []
     for start in range(0, len(places), CHUNK):
         rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)  # the last batch is padded with its last place

@@ -10,8 +10,9 @@ from recordings import of_scans
 from sglpr_jax.data.corruption import Corruption, corrupted
 from sglpr_jax.data.formats import bin_records, scan_files
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.methods.method import ScanMethod
+from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
+from sglpr_jax.methods.registry import handcrafted
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.training.batches import read_batch
 from sglpr_jax.training.tuples import TuplePool
@@ -69,7 +70,7 @@ def test_a_batch_and_an_embedding_open_each_file_once_a_place(recording, opened)
         name: 3 for name in ("000000.bin", "000000.label", "000003.bin", "000003.label")
     }
     opened.clear()
-    embed(ScanMethod(lambda points, _: points[0], labels=False, distance="l2", about={"method": "first"}), recording)
+    embed(handcrafted("solid", recording, Grid()), recording)
     assert sum(opened.values()) == 3
 
 

@@ -131,7 +131,7 @@ CONFIG = ModelConfig(
     categories=0,
 )
 CONFIG_JSON = json.dumps(dataclasses.asdict(CONFIG), indent=2).encode()
-WEIGHTS = {name: RNG.normal(size=shape).astype(np.float32) for name, shape in weight_shapes(CONFIG).items()}
+WEIGHTS = {name: RNG.normal(size=leaf.shape).astype(np.float32) for name, leaf in weight_shapes(CONFIG).items()}
 IDS = tuple(f"{i:06d}" for i in range(N))
 ABOUT = {"sequence": "08", "pose_source": "poses.txt", "config": {"method": "m"}, "weights_hash": "ab"}
 DESCRIBED = DescriptorFile(ids=IDS, positions=POSITIONS, times=TIMES, descriptors=DESCRIPTORS, distance="l2", **ABOUT)

@@ -16,13 +16,23 @@ def places() -> list[tuple[np.ndarray, np.ndarray]]:
             for _ in range(count):
                 start = rng.uniform(-38, 38, 2)
                 along = rng.normal(size=2) * (8.0 if category == 13 else 0.1)
-                n = 150 if category == 13 else 40
+                n = 150 if category == 13 else 60
                 xy = start + rng.uniform(0, 1, (n, 1)) * along
                 parts.append(np.column_stack([xy, rng.uniform(-1.7, height, n)]))
                 classes.append(np.full(n, category))
         return np.concatenate(parts).astype(np.float32), np.concatenate(classes).astype(np.int32)
 
     return [place() for _ in range(4)]
+
+
+@pytest.fixture(scope="session")
+def wide() -> tuple[np.ndarray, np.ndarray]:
+    """Return points beyond every limit, some on borders of cells, and their classes."""
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-95, 95, (2500, 2)), rng.uniform(-25, 25, 2500)])
+    points[:, :2] *= rng.uniform(0, 1, (2500, 1))
+    borders = [(4, 0, 1), (4.001, 1e-3, 1), (0, 80, -5), (10, -1e-3, 0), (30, 0, 0.5)]
+    return np.concatenate([points, borders]).astype(np.float32), rng.integers(0, 20, 2505).astype(np.int32)
 
 
 @pytest.fixture(scope="session")

@@ -1,3 +1,5 @@
+"""SSC: its cells, its alignment and its distance are those of its authors."""
+
 import functools
 
 import jax.numpy as jnp
@@ -6,12 +8,11 @@ import pytest
 
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import to_classes
-from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, align, best_move, best_shift, ssc, ssc_distance
+from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, align, best_move, ssc, ssc_distance
 from tests.methods import published_ssc as published
 
 SETTINGS = {PAPER: {"rings": 50, "nearest": 0.0}, NEWEST: {"rings": 24, "nearest": 5.0}}
 STRONGER = (0, 17, 9, 10, 11, 12, 15, 13, 14, 16, 18, 19)
-LANDMARK, ROAD = 13, 9
 
 
 def unpack(row, grid):
@@ -48,35 +49,6 @@ def test_the_descriptor_is_the_strongest_class_of_each_cell_and_the_outline(plac
         np.testing.assert_allclose(outline, published.outline_of(points, classes), rtol=1e-6)
 
 
-def test_an_outline_keeps_the_last_landmark_of_a_sector():
-    points = np.array([[8.0, 0.05, 0], [20.0, 0.1, 0], [12.0, 0.05, 0], [5.0, 0.02, 0]], np.float32)
-    classes = np.array([LANDMARK, 18, 14, ROAD], np.int32)
-    _, outline = unpack(ssc(points, classes), PAPER)
-    assert outline.any(axis=0).sum() == 1
-    np.testing.assert_allclose(outline[:, 180], [12.0, 0.05])
-
-
-def test_rings_begin_at_the_sensor_or_at_five_metres():
-    # Two roads that agree up to 5 m and nowhere else: 5 of 5 + 2 x 5 cells of one sector.
-    def road(*radii):
-        points = np.array([[r + 0.5, 0.01, 0] for r in radii], np.float32)
-        return points, np.full(len(points), ROAD, np.int32)
-
-    here, there = road(*range(5), *range(10, 20, 2)), road(*range(5), *range(21, 31, 2))
-    for grid, expected in ((PAPER, 1 - 5 / 15), (NEWEST, 1.0)):
-        assert ssc_distance(ssc(*here, grid)[None], ssc(*there, grid)[None], grid)[0, 0] == pytest.approx(expected)
-
-
-def test_cells_empty_in_one_scan_count_against_it():
-    points = np.array([[10.0 + k, 0.01, 0] for k in range(8)], np.float32)
-    row = ssc(points, np.full(8, ROAD, np.int32))[None]
-    half = ssc(points[:4], np.full(4, ROAD, np.int32))[None]
-    other = ssc(points, np.array([ROAD] * 6 + [11] * 2, np.int32))[None]
-    assert ssc_distance(row, row)[0, 0] == 0
-    assert ssc_distance(row, half)[0, 0] == ssc_distance(half, row)[0, 0] == pytest.approx(0.5)
-    assert ssc_distance(row, other)[0, 0] == pytest.approx(0.25)
-
-
 def chain(offsets):
     """Outlines of landmarks far apart from each other, of which the k-th is offsets[k] metres behind in x."""
     query, other = np.zeros((2, 2, 360), np.float32)
@@ -90,7 +62,6 @@ def chain(offsets):
 @pytest.mark.parametrize(
     ("offsets", "moved"),
     [
-        ((2.0,), 2.0),
         ((2.0, 5.5), 2.0),  # beyond the gate of 3 m, and it stays there
         ((2.0, 4.5), 3.25),  # beyond it at first
         ((2.0, 4.999, 6.499), 4.499),  # joins so late that 20 steps do not end
@@ -125,7 +96,7 @@ def outline(seed):
     return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)]).astype(np.float32)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_outlines_are_aligned_as_published(seed):
     query = outline(seed)
     turned = published.rotate(np.roll(query, 100 + seed, axis=1), 100 + seed)
@@ -134,20 +105,6 @@ def test_outlines_are_aligned_as_published(seed):
         expected = published.alignment(query.astype(float), other.astype(float))
         assert int(shift) == expected[0]
         np.testing.assert_allclose(move, expected[1], atol=1e-3)
-
-
-def test_landmarks_of_different_classes_are_partners(places, turn_points):
-    points, classes = places[0]
-    move = np.float32([1.2, -0.7, 0])
-    landmarks = np.isin(classes, published.LANDMARKS)
-    renamed = np.where(landmarks, 13 + 14 - np.clip(classes, 13, 14), classes).astype(np.int32)
-    here, there = ssc(points, classes), ssc(points - move, renamed)
-    assert (classes != renamed).sum() > 1000
-    shift, found = align(jnp.asarray(here[-720:].reshape(2, 360)), jnp.asarray(there[-720:].reshape(2, 360)))
-    assert int(shift) == 0
-    np.testing.assert_allclose(found, move[:2], atol=0.3)
-    turned = ssc(turn_points(points, np.radians(77)), classes)[-720:].reshape(2, 360)
-    assert abs(int(best_shift(jnp.hypot(*here[-720:].reshape(2, 360)), jnp.hypot(*turned))) - 77) <= 1
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def test_a_damaged_configuration_is_named(params, tmp_path, text, expected):
 def test_the_weights_of_another_preset_are_refused(params, tmp_path):
     folder = save(params, tmp_path / "weights")
     (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("circular"))))
-    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected the weights of its configuration, \S+ of shape"):
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected \S+ as "):
         load(folder)
 
 
@@ -104,11 +104,13 @@ def test_a_weight_too_many_or_too_few_is_named(params, tmp_path):
     folder = save(params, tmp_path / "weights")
     flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
     safetensors.numpy.save_file({**flat, "extra": np.zeros(3, np.float32)}, folder / WEIGHTS_FILE)
-    with pytest.raises(ValueError, match=r"extra of shape none \(unknown weight\), found \(3,\)"):
+    with pytest.raises(ValueError, match=r"expected extra as no array, found float32 \(3,\)"):
         load(folder)
     kernel = flat.pop("segmentation_head/kernel")
     safetensors.numpy.save_file(flat, folder / WEIGHTS_FILE)
-    with pytest.raises(ValueError, match=rf"segmentation_head/kernel of shape \({kernel.shape[0]}, 20\), found none"):
+    with pytest.raises(
+        ValueError, match=rf"segmentation_head/kernel as float32 \({kernel.shape[0]}, 20\), found no array"
+    ):
         load(folder)
 
 
@@ -134,12 +136,10 @@ def test_weights_of_another_type_are_refused_on_load_and_on_export(params, tmp_p
     flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
     other = flat["segmentation_head/kernel"].astype(dtype)
     safetensors.numpy.save_file({**flat, "segmentation_head/kernel": other}, folder / WEIGHTS_FILE)
-    with pytest.raises(
-        ValueError, match=rf"{WEIGHTS_FILE}: expected segmentation_head/kernel as F32 or F16 with values, found "
-    ):
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected segmentation_head/kernel as float32 .*, found "):
         load(folder)
     weights = {**params.weights, "segmentation_head": {"kernel": other}}
-    with pytest.raises(ValueError, match="new: expected segmentation_head/kernel as float32, found "):
+    with pytest.raises(ValueError, match=r"new: expected segmentation_head/kernel as float32 .*, found "):
         save(Params(weights, params.config), tmp_path / "new")
 
 

@@ -1,6 +1,7 @@
 """Every scan gets the descriptor of its own image, whatever the batches; a bad scan never passes in silence."""
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -14,7 +15,9 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import rotated
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
-from sglpr_jax.methods.method import ImageMethod, RecordMethod, ScanMethod
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.method import HandcraftedMethod, Method
+from sglpr_jax.methods.registry import checked_view, handcrafted, rotated_record
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 
@@ -30,15 +33,24 @@ def flatten(images):
 
 def embed_images(describe, recording, grid, *, config, rotation_seed=None, batch=8, on_bad_scan=None, **options):
     """The descriptor file of a method on images."""
-    about = {name: options.pop(name) for name in ("weights_hash", "categories", "image", "field") if name in options}
-    method = ImageMethod(describe, grid, about={"method": "pixels", **config}, **about)
+    kinds = {name: options.pop(name) for name in ("categories", "image") if name in options}
+    method = Method(
+        {"method": "pixels", **config},
+        "labelled images" if "categories" in kinds else "images",
+        functools.partial(checked_view, grid=grid, **kinds),
+        lambda views: describe(*(part for part in views if part is not None)),
+        weights_hash=options.pop("weights_hash", ""),
+    )
     options |= {"rotation_seed": rotation_seed, "batch": batch, "on_bad_scan": on_bad_scan}
     return embed(method, recording, **options)
 
 
-def embed_scans(describe, recording, *, config, distance, labels=False, **options):
-    """The descriptor file of a method on points."""
-    method = ScanMethod(describe, labels=labels, distance=distance, about={"method": "mean", **config})
+def embed_scans(describe, recording, *, distance, labels=False, **options):
+    """The descriptor file of a handcrafted method on points."""
+    made = HandcraftedMethod("mean", "this test", "labelled points" if labels else "points", describe)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(HANDCRAFTED, "mean", made)
+        method = dataclasses.replace(handcrafted("mean", recording, GRID), distance=distance)
     return embed(method, recording, **options)
 
 
@@ -61,7 +73,7 @@ def pictures() -> Recording:
     return of_images(by_path, name="06", positions=np.zeros((SCANS, 3)), pose_source="06/pose.txt")
 
 
-def mean_point(points, classes):
+def mean_point(points, classes=None):
     """A method on points whose descriptor is their mean and, where there are classes, the mean class."""
     return np.append(points.mean(axis=0), [] if classes is None else classes.mean()).astype(np.float32)
 
@@ -198,13 +210,13 @@ def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(sc
         expected = rasterize_labels(turned, classes, grid=GRID)
         assert expected.max() == 25  # the moving car
         np.testing.assert_array_equal(descriptor, np.asarray(expected).reshape(-1))
-    with pytest.raises(ValueError, match="expected labels beside the scans, found none in sequence 08"):
+    with pytest.raises(ValueError, match="pixels needs labels beside the scans, found none in sequence 08"):
         embed_images(maps, scans, GRID, config={}, categories=25)
 
 
 def test_points_are_described_scan_by_scan(scans):
     seen = []
-    found = embed_scans(mean_point, scans, config={"method": "mean"}, distance="cosine", on_progress=seen.append)
+    found = embed_scans(mean_point, scans, distance="cosine", on_progress=seen.append)
     np.testing.assert_array_equal(found.descriptors, [cloud.mean(axis=0) for cloud in clouds()])
     assert (found.distance, found.weights_hash, found.ids, seen) == ("cosine", "", scans.ids, [*range(1, SCANS + 1)])
     assert found.config == {"data": "08", "method": "mean", "rotation_seed": None}
@@ -222,16 +234,16 @@ def test_points_that_are_not_finite_are_left_out_with_their_labels(scans, tmp_pa
         return points
 
     labelled = dataclasses.replace(with_points(scans, points_of), label_paths=paths)
-    found = embed_scans(mean_point, labelled, config={}, distance="l2", labels=True)
+    found = embed_scans(mean_point, labelled, distance="l2", labels=True)
     classes = np.select([raw[0] == 10, raw[0] == 50], [1, 13], 16)
     np.testing.assert_allclose(found.descriptors[0], [*clouds()[0][1:].mean(axis=0), classes[1:].mean()], rtol=1e-5)
 
     partly = dataclasses.replace(labelled, label_paths=(*paths[:2], None, *paths[3:]))
     with pytest.raises(ValueError, match="scan 000004 of sequence 08: expected labels, found none"):
-        embed_scans(mean_point, partly, config={}, distance="l2", labels=True)
+        embed_scans(mean_point, partly, distance="l2", labels=True)
     reported = []
     kept = embed_scans(
-        mean_point, partly, config={}, distance="l2", labels=True, on_bad_scan=lambda name, _: reported.append(name)
+        mean_point, partly, distance="l2", labels=True, on_bad_scan=lambda name, _: reported.append(name)
     )
     assert reported == ["000004"] and len(kept) == SCANS - 1
 
@@ -240,8 +252,13 @@ def mean_of(record):
     return record.upright_points.mean(axis=0)
 
 
-def learned(prepare=mean_of, describe=lambda inputs: inputs, takes="points") -> RecordMethod:
-    return RecordMethod(prepare, describe, takes, "l2", {"method": "mine"}, "hash")
+def learned(prepare=mean_of, describe=lambda inputs: inputs, takes="points") -> Method:
+    """A method with weights."""
+
+    def prepared(record, angle):
+        return prepare(record if angle is None else rotated_record(record, angle))
+
+    return Method({"method": "mine"}, takes, prepared, describe, weights_hash="hash")
 
 
 @pytest.mark.parametrize("batch", [1, 4])

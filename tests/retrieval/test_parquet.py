@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sglpr_jax
-from sglpr_jax.methods.method import ImageMethod
+from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import method_named
 from sglpr_jax.retrieval.parquet import POSE, embed_to_store, place_rows, read_places, stored_places
 
@@ -39,7 +39,7 @@ def scans(tmp_path) -> Path:
 
 
 @pytest.fixture
-def method(scans) -> ImageMethod:
+def method(scans) -> Method:
     """A method without weights."""
     return method_named("polar-fft", None, opened(scans))
 

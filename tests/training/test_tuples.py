@@ -228,34 +228,34 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 @given(seed=st.integers(0, 10**6), share=st.floats(0.02, 0.5))
 def test_no_training_frame_lies_within_the_negative_distance_of_a_validation_frame(seed, share):
     positions = wandering(seed)
-    split = hold_out(positions, ValidationConfig(share=share), SAMPLING)
-    assert not set(split.training) & set(split.validation)
-    assert len(split.validation) >= round(share * len(positions))
-    if len(split.training):
-        assert apart(positions[split.training], positions[split.validation]).min() > SAMPLING.negative_m
-    left_out = np.setdiff1d(np.arange(len(positions)), np.r_[split.training, split.validation])
+    training, validation = hold_out(positions, ValidationConfig(share=share), SAMPLING)
+    assert not set(training) & set(validation)
+    assert len(validation) >= round(share * len(positions))
+    if len(training):
+        assert apart(positions[training], positions[validation]).min() > SAMPLING.negative_m
+    left_out = np.setdiff1d(np.arange(len(positions)), np.r_[training, validation])
     if len(left_out):
-        assert apart(positions[left_out], positions[split.validation]).min(1).max() <= SAMPLING.negative_m
+        assert apart(positions[left_out], positions[validation]).min(1).max() <= SAMPLING.negative_m
 
 
 def test_the_stretch_comes_with_its_revisits_and_its_fair_share_of_them():
     out_and_back = np.r_[np.arange(0, 600, 2.0), np.arange(600, 300, -2.0)]  # the second half of the way out comes back
     positions = np.column_stack([out_and_back, np.zeros((len(out_and_back), 2))])
-    split = hold_out(positions, ValidationConfig(share=0.1), SAMPLING)
-    there, back = split.validation[split.validation < 300], split.validation[split.validation >= 300]
+    training, validation = hold_out(positions, ValidationConfig(share=0.1), SAMPLING)
+    there, back = validation[validation < 300], validation[validation >= 300]
     assert len(there) and len(back)
     assert apart(positions[there], positions[back]).min(0).max() < SAMPLING.positive_m
-    rows = split.training[split.training < 300]
+    rows = training[training < 300]
     assert (positions[rows, 0] > 300).sum() > 60  # most of what is revisited is still trained on
 
 
 def test_a_drive_without_revisits_gives_its_first_frames_and_share_0_nothing():
     positions = np.column_stack([np.arange(0, 400, 2.0), np.zeros((200, 2))])
-    split = hold_out(positions, ValidationConfig(share=0.25), SAMPLING)
-    np.testing.assert_array_equal(split.validation, np.arange(51))  # and the one frame less than 3 m further on
-    np.testing.assert_array_equal(split.training, np.arange(61, 200))
-    nothing = hold_out(positions, ValidationConfig(), SAMPLING)
-    assert len(nothing.validation) == 0 and len(nothing.training) == 200
+    training, validation = hold_out(positions, ValidationConfig(share=0.25), SAMPLING)
+    np.testing.assert_array_equal(validation, np.arange(51))  # and the one frame less than 3 m further on
+    np.testing.assert_array_equal(training, np.arange(61, 200))
+    training, validation = hold_out(positions, ValidationConfig(), SAMPLING)
+    assert len(validation) == 0 and len(training) == 200
 
 
 @pytest.mark.parametrize("share", [-0.1, 0.6])

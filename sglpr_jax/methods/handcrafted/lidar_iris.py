@@ -1,7 +1,6 @@
 """LiDAR Iris (Wang et al., 2020): the scan as an iris image with a binary texture, compared by a shifted Hamming
 distance."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Bool, Complex, Complex128, Float, Float32, Float64, Int, UInt64
 
-from sglpr_jax.methods.method import HandcraftedMethod
+from sglpr_jax.methods.cells import polar
 from sglpr_jax.methods.pairwise import in_blocks
 
 RINGS = 80
@@ -20,7 +19,6 @@ HEIGHT_BITS = 8
 LOWEST_DEG = -24.0
 """Elevation at which the first height bit begins, for the HDL-64E. A 16-beam sensor would need -15."""
 BIT_DEG = 4.0
-NUMBERS = RINGS * COLUMNS
 
 WAVELENGTHS = tuple(18 * 1.6**scale for scale in range(4))
 """Wavelengths of the four log-Gabor filters, in columns."""
@@ -46,17 +44,15 @@ def lidar_iris(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "28800
     """Return the LiDAR-Iris image, 80 rings of 1 m x 360 degrees, flattened: integers from 0 to 255.
 
     Bit k of a pixel is set if the pixel has a point (metres, z up) with floor((elevation + 24 degrees) / 4 degrees) =
-    k. Lower elevations count in the first bit, higher ones in the last, and points from 79 m on in the last ring.
-    Columns are degrees from the back, rounded to the nearest. Azimuths that round to 360 count in column 359, not in
-    column 0.
+    k. Elevations and ranges beyond the limits count in the nearest bit and ring. Columns are degrees from the back,
+    rounded to the nearest. Azimuths that round to 360 count in column 359.
     """
-    x, y, z = points.astype(np.float64).T
-    radius, azimuth = np.hypot(x, y), 180 + np.degrees(np.arctan2(y, x))
+    radius, azimuth, z = polar(points)
     ring = np.minimum(radius / RING_M, RINGS - 1).astype(np.int64)
-    column = np.minimum(azimuth + 0.5, COLUMNS - 1).astype(np.int64)
+    column = np.minimum(180 + np.degrees(azimuth) + 0.5, COLUMNS - 1).astype(np.int64)
     elevation = np.degrees(np.arctan2(z, radius))
     bit = np.clip((elevation - LOWEST_DEG) / BIT_DEG, 0, HEIGHT_BITS - 1).astype(np.int64)
-    image = np.zeros(NUMBERS, np.int64)
+    image = np.zeros(RINGS * COLUMNS, np.int64)
     np.bitwise_or.at(image, ring * COLUMNS + column, 1 << bit)
     return image.astype(np.float32)
 
@@ -69,12 +65,8 @@ class Spectra(NamedTuple):
     log_polar: Complex[Array, "*n rows frequencies"]
 
 
-class _Iris(NamedTuple):
-    """Prepared data of n images. The words of a column hold its bits of all rings, filters and parts."""
-
-    spectra: Spectra
-    bits: UInt64[np.ndarray, "n 360 words"]
-    faint: UInt64[np.ndarray, "n 360 words"]
+Words = UInt64[np.ndarray, "... 360 words"]
+"""The bits of each column: of all rings, filters and parts."""
 
 
 def lidar_iris_distance(
@@ -88,10 +80,9 @@ def lidar_iris_distance(
     """
 
     def compare(queries, database):
-        shifts = np.asarray(column_shifts(queries.spectra, database.spectra))
-        return np.stack(
-            [_hamming(bits, faint, database, row) for bits, faint, row in zip(*queries[1:], shifts, strict=True)]
-        )
+        (here, bits, faint), (there, *others) = queries, database
+        shifts = np.asarray(column_shifts(here, there))
+        return np.stack([_hamming(*one, others) for one in zip(bits, faint, shifts, strict=True)])
 
     return in_blocks(compare, queries, database, block=BLOCK, prepare=_prepare, threads=None)
 
@@ -109,31 +100,24 @@ def responses(image: Float64[np.ndarray, "80 360"]) -> Complex128[np.ndarray, "f
     return np.fft.ifft(np.fft.fft(image)[None] * gains[:, None])
 
 
-def _prepare(rows: Float32[np.ndarray, "n 28800"]) -> _Iris:
+def _prepare(rows: Float32[np.ndarray, "n 28800"]) -> tuple[Spectra, Words, Words]:
+    """Return the spectra of the images, the signs of their responses, and a mask of the faint ones."""
     images = rows.reshape(-1, RINGS, COLUMNS)
-    bits, faint = zip(*map(_encode, images), strict=True)
-    return _Iris(spectra(jnp.asarray(images) / 255), np.stack(bits), np.stack(faint))
+    bits, faint = [], []
+    for image in images:
+        found = responses(image.astype(np.float64))
+        bits.append(_pack(np.stack([np.real(found) > 0, np.imag(found) > 0])))
+        faint.append(_pack(np.stack([np.abs(found) < FAINT] * 2)))
+    return spectra(jnp.asarray(images) / 255), np.stack(bits), np.stack(faint)
 
 
-def _encode(image: Float32[np.ndarray, "80 360"]) -> tuple[UInt64[np.ndarray, "360 words"], ...]:
-    """Return the signs of an image's responses, and a mask of the faint ones."""
-    found = responses(image.astype(np.float64))
-    faint = np.abs(found) < FAINT
-    return _pack(np.stack([np.real(found) > 0, np.imag(found) > 0])), _pack(np.stack([faint, faint]))
-
-
-def _pack(bits: Bool[np.ndarray, "parts filters 80 360"]) -> UInt64[np.ndarray, "360 words"]:
+def _pack(bits: Bool[np.ndarray, "parts filters 80 360"]) -> Words:
     """Return the bits of every column as words of 64 bits."""
     by_column = bits.reshape(-1, COLUMNS).T
     return np.ascontiguousarray(np.packbits(by_column, axis=-1)).view(np.uint64)
 
 
-def _hamming(
-    bits: UInt64[np.ndarray, "360 words"],
-    faint: UInt64[np.ndarray, "360 words"],
-    database: _Iris,
-    shifts: Int[np.ndarray, "n 2"],
-) -> Float[np.ndarray, " n"]:
+def _hamming(bits: Words, faint: Words, shifts: Int[np.ndarray, "n 2"], others: list[Words]) -> Float[np.ndarray, " n"]:
     """Return the distance of one image to each image of the database, at the best shift near its alignments.
 
     The two alignments are mostly one column apart, so most shifts occur twice and are compared once.
@@ -143,8 +127,8 @@ def _hamming(
     for shift, new in zip(near.T, (np.diff(near, axis=1, prepend=-1) > 0).T, strict=True):
         columns = (np.arange(COLUMNS) + shift[new, None]) % COLUMNS
         there = new.nonzero()[0][:, None], columns
-        clear = ~(faint | database.faint[there])
-        unlike = np.bitwise_count((bits ^ database.bits[there]) & clear).sum(axis=(1, 2), dtype=np.int64)
+        clear = ~(faint | others[1][there])
+        unlike = np.bitwise_count((bits ^ others[0][there]) & clear).sum(axis=(1, 2), dtype=np.int64)
         counted = np.bitwise_count(clear).sum(axis=(1, 2), dtype=np.int64)
         found = np.divide(unlike, counted, out=np.ones(len(columns)), where=counted > 0)
         best[new] = np.minimum(best[new], found)
@@ -153,26 +137,32 @@ def _hamming(
 
 @jax.jit
 def spectra(images: Float[Array, "n rows columns"]) -> Spectra:
-    """Return the spectra of images with an even number of rows and columns."""
-    filtered = _high_pass(*images.shape[1:])
-    places = list(_log_polar_places(*images.shape[1:]))
+    """Return the spectra of images with an even number of rows and columns.
+
+    The log-polar image has half a revolution of angles by radii. Its amplitudes have the gain (1 - c) (2 - c), where c
+    is the product of two half cosines.
+    """
+    rows, columns = images.shape[1:]
+    low = np.outer(*(np.cos(np.pi * (np.arange(size) / size - 0.5)) for size in (rows, columns)))
+    filtered = ((1 - low) * (2 - low)).astype(np.float32)
+    angle = np.pi / 2 + np.pi * np.arange(rows)[:, None] / rows
+    radius = _log_base(rows, columns) ** np.arange(columns)[None, :]
+    places = np.stack([rows // 2 + radius * np.cos(angle), columns // 2 + radius * np.sin(angle)]).astype(np.float32)
 
     def of_one(image):
         amplitudes = jnp.fft.fftshift(jnp.abs(jnp.fft.fft2(image))) / image.size * filtered
-        return Spectra(image, jnp.fft.rfft2(image), jnp.fft.rfft2(map_coordinates(amplitudes, places, order=1)))
+        return Spectra(image, jnp.fft.rfft2(image), jnp.fft.rfft2(map_coordinates(amplitudes, list(places), order=1)))
 
     return jax.lax.map(of_one, images)
 
 
 @jax.jit
 def column_shifts(queries: Spectra, database: Spectra) -> Int[Array, "q n 2"]:
-    """Return two estimates of the shift to the right, in columns, that aligns each query with each image of the
-    database.
+    """Return two estimates of the shift to the right, in columns, that aligns each query with each database image.
 
     The query is first rotated and scaled according to the log-polar spectra. The first estimate is the position of the
-    correlation peak, rounded towards 0. For the second, the database image is rolled by half its columns, and the
-    result is corrected for the roll. The peak is the same, but it is rounded in the opposite direction and may be cut
-    by the border.
+    correlation peak, rounded towards 0. For the second, the database image is rolled by half its columns, so that the
+    peak is rounded in the opposite direction and may be cut by the border.
     """
 
     def shifts(query, other):
@@ -206,10 +196,8 @@ def _correlation(
 
 
 def _peak(surface: Float[Array, "rows columns"], rolled: tuple[int, int]) -> Float[Array, "2"]:
-    """Return the offset of the middle, down and right, from the centre of mass of the peak.
-
-    The offset is measured in the surface rolled by `rolled` rows and columns. Borders of this surface cut the peak.
-    """
+    """Return the offset of the middle, down and right, from the centre of mass of the peak in the surface rolled by
+    `rolled` rows and columns. The borders of this surface cut the peak."""
     shape = np.array(surface.shape)
     peak = jnp.stack(jnp.divmod(_argmax(surface), surface.shape[1]))
     place = (peak + np.array(rolled)) % shape
@@ -239,33 +227,5 @@ def _turned_and_scaled(
 
 
 def _log_base(rows: int, columns: int) -> float:
-    """Return the ratio of the radii of neighbouring columns of a log-polar image. The corner follows the last
-    column."""
+    """Return the ratio of the radii of neighbouring columns of a log-polar image."""
     return float(np.hypot(rows // 2, columns // 2) ** (1 / columns))
-
-
-@functools.cache
-def _log_polar_places(rows: int, columns: int) -> Float32[np.ndarray, "2 rows columns"]:
-    """Return row and column of each cell of a log-polar image. Its rows are angles over half a revolution, its columns
-    radii."""
-    angle = np.pi / 2 + np.pi * np.arange(rows)[:, None] / rows
-    radius = _log_base(rows, columns) ** np.arange(columns)[None, :]
-    return np.stack([rows // 2 + radius * np.cos(angle), columns // 2 + radius * np.sin(angle)]).astype(np.float32)
-
-
-@functools.cache
-def _high_pass(rows: int, columns: int) -> Float32[np.ndarray, "rows columns"]:
-    """Return the gain (1 - c) (2 - c) of each frequency, where c is the product of two half cosines. It is 0 in the
-    middle."""
-    down, right = (np.cos(np.pi * (np.arange(size) / size - 0.5)) for size in (rows, columns))
-    product = np.outer(down, right)
-    return ((1 - product) * (2 - product)).astype(np.float32)
-
-
-LIDAR_IRIS = HandcraftedMethod(
-    "lidar-iris",
-    'Wang et al., "LiDAR Iris for Loop-Closure Detection", IROS 2020',
-    "points",
-    lidar_iris,
-    distance=lidar_iris_distance,
-)

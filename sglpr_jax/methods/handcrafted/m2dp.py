@@ -3,15 +3,12 @@
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from sglpr_jax.methods.method import HandcraftedMethod
-
 AZIMUTHS = 4
 ELEVATIONS = 16
 RINGS = 8
 SECTORS = 16
-PLANES = AZIMUTHS * ELEVATIONS
 BINS = RINGS * SECTORS
-NUMBERS = PLANES + BINS
+NUMBERS = AZIMUTHS * ELEVATIONS + BINS
 
 
 def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
@@ -26,13 +23,12 @@ def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
 
 
 def signature(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "64 128"]:
-    """Return for every plane the fraction of the points in each of its 8 rings x 16 sectors. At least one point is
-    needed.
+    """Return for every plane the fraction of the points (at least one, in metres) in each of its 8 rings x 16 sectors.
 
-    The points (metres) are centred and rotated into their principal axes. Plane (theta, phi) contains the mean and has
-    the normal (cos theta cos phi, cos theta sin phi, sin theta), for 16 elevations theta from 0 to 90 degrees and 4
-    azimuths phi from -90 to 90 degrees. Its axes are those of `plane_axes`. The outer radius of ring k is (k sqrt(rho)
-    / 8)^2, where rho is the distance of the farthest point.
+    The points are centred and rotated into their principal axes. Plane (theta, phi) contains the mean and has the
+    normal (cos theta cos phi, cos theta sin phi, sin theta), for 16 elevations theta from 0 to 90 degrees and 4
+    azimuths phi from -90 to 90 degrees. The outer radius of ring k is (k sqrt(rho) / 8)^2, where rho is the distance of
+    the farthest point.
     """
     aligned = np.ascontiguousarray(_align(points.astype(np.float64)).T, np.float32)
     farthest = np.sqrt(np.max(np.sum(aligned**2, axis=0)))
@@ -43,8 +39,7 @@ def signature(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "64 128
 def plane_axes() -> Float32[np.ndarray, "64 2 3"]:
     """Return the axes p_x = e_x - (e_x . n) n and p_y = n x p_x of each plane with normal n.
 
-    The length of both axes is that of the projected x axis: between 1/2 and 1. The published code does not normalise
-    them. Points on planes oblique to x are therefore counted nearer to the centre.
+    As in the published code, the axes have the length of the projected x axis, between 1/2 and 1.
     """
     phi, theta = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, AZIMUTHS), np.linspace(0, np.pi / 2, ELEVATIONS), indexing="ij"
@@ -55,11 +50,8 @@ def plane_axes() -> Float32[np.ndarray, "64 2 3"]:
 
 
 def _align(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Return the centred points in their principal axes, the longest axis first.
-
-    The sign of a principal axis is ambiguous. The first two axes get the sign that makes the third moment positive,
-    which does not depend on the scan's rotation. The third axis makes the system right-handed.
-    """
+    """Return the centred points in their principal axes, the longest first. The first two have a positive third
+    moment, because their signs are ambiguous; the third makes the system right-handed."""
     centred = points - points.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     first, second = (axis if np.sum((centred @ axis) ** 3) >= 0 else -axis for axis in (axes[:, 2], axes[:, 1]))
@@ -74,11 +66,3 @@ def _count(projected: Float32[np.ndarray, "2 n"], farthest: np.float32) -> Float
     angle = np.arctan2(y, x) / np.float32(2 * np.pi) + np.float32(0.5)
     sector = np.minimum(angle * SECTORS, SECTORS - 1).astype(np.int32)
     return np.bincount(ring * SECTORS + sector, minlength=BINS).astype(np.float64)
-
-
-M2DP = HandcraftedMethod(
-    "m2dp",
-    'He, Wang and Zhang, "M2DP", IROS 2016',
-    "points",
-    m2dp,
-)

@@ -1,18 +1,14 @@
 """PROBE (Lee et al., 2026), rebuilt from the abstract: probabilities of occupancy and heights on a polar grid.
 
-The abstract names the parts: the blur of the angles, the smoothing of the probabilities, the KL divergence in a Jaccard
-index, the weights of uncertain cells, and the cosine similarity of heights. The formulas that combine these parts, and
-all numbers, are choices of this project.
+The abstract names the parts. The formulas that combine them, and all numbers, are choices of this project.
 """
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, Int
 
-from sglpr_jax.methods.method import HandcraftedMethod
+from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.pairwise import correlate, in_blocks, unit_length
 
 RINGS = 40
@@ -24,51 +20,33 @@ CLEARANCE_M = 0.3
 """Minimum height of the points that count, in metres above the ground."""
 MOVE_M = 2.0
 """Standard deviation of the translation between two visits, in metres."""
-NUMBERS = RINGS * SECTORS
+DEVIATIONS = MOVE_M / ((np.arange(RINGS) + 0.5) * (RADIUS_M / RINGS))
+"""Standard deviation of the azimuth in each ring, in radians."""
 
 BLOCK = 64
+Cells = Float32[np.ndarray, "n 40 60"]
 
 
 def probe(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "2400"]:
     """Return the height of 40 rings x 60 sectors above the ground, flattened: the highest point of each cell, or 0.
 
-    Points are in metres: x forward, y left, z up. Points below 0.3 m above the ground or from 80 m on are ignored.
+    Points (metres, z up) below 0.3 m above the ground or from 80 m on are ignored.
     """
-    x, y, z = points.astype(np.float64).T
-    radius, height = np.hypot(x, y), z - GROUND_M
+    radius, angle, z = polar(points)
+    height = z - GROUND_M
     counted = (radius < RADIUS_M) & (height > CLEARANCE_M)
     ring = np.floor(radius * (RINGS / RADIUS_M)).astype(np.int64)
-    sector = np.floor(np.arctan2(y, x) * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
-    heights = np.zeros(NUMBERS)
-    np.maximum.at(heights, (ring * SECTORS + sector)[counted], height[counted])
-    return heights.astype(np.float32)
+    sector = np.floor(angle * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
+    cell = (ring * SECTORS + sector)[counted]
+    return extreme(np.maximum, (RINGS * SECTORS,), cell, height[counted]).astype(np.float32)
 
 
-def deviations() -> Float64[np.ndarray, "40"]:
-    """Return the standard deviation of the azimuth in each ring, MOVE_M / radius, in radians."""
-    return MOVE_M / ((np.arange(RINGS) + 0.5) * (RADIUS_M / RINGS))
-
-
-def occupancy(heights: Float32[np.ndarray, "n 40 60"]) -> Float64[np.ndarray, "n 40 60"]:
-    """Return the probability of occupancy: the occupied cells, blurred along the sectors by a Gaussian.
-
-    The Gaussian has the standard deviation of its ring and the sum 1.
-    """
+def occupancy(heights: Cells) -> Float64[np.ndarray, "n 40 60"]:
+    """Return the probability of occupancy: the occupied cells, blurred along the sectors by a Gaussian."""
     sectors = np.minimum(np.arange(SECTORS), SECTORS - np.arange(SECTORS)) * (2 * np.pi / SECTORS)
-    kernel = np.exp(-((sectors[None] / deviations()[:, None]) ** 2) / 2)
+    kernel = np.exp(-((sectors[None] / DEVIATIONS[:, None]) ** 2) / 2)
     spectrum = np.fft.rfft(kernel / kernel.sum(axis=1, keepdims=True))
     return np.fft.irfft(np.fft.rfft(heights > 0) * spectrum[None], n=SECTORS).clip(0, 1)
-
-
-class _Prepared(NamedTuple):
-    """Prepared data of n scans. The probabilities before and after the smoothing are those of all cells."""
-
-    heights: Float32[np.ndarray, "n 40 60"]
-    """Heights, scaled to length 1."""
-    occupied: Float32[np.ndarray, "n 40 60"]
-    smoothed: Float32[np.ndarray, "n 40 60"]
-    logit: Float32[np.ndarray, "n 40 60"]
-    """log(p / (1 - p)) of the smoothed probability p."""
 
 
 def probe_distance(
@@ -76,8 +54,8 @@ def probe_distance(
 ) -> Float32[np.ndarray, "q n"]:
     """Return 1 - (Jaccard index) * (cosine similarity of the heights), at the rotation with the highest cosine.
 
-    In ring r, u = min(deviation in radians, 1) smooths a probability p to p' = (1 - u) p + u / 2. A probability is at
-    most 0.99 and at least 0.01 after the smoothing. The Jaccard index is
+    In ring r, u = min(deviation in radians, 1) smooths a probability p to p' = (1 - u) p + u / 2, within 0.01 and 0.99.
+    The Jaccard index is
 
         sum of w max(p, q) exp(-KL(p', q') - KL(q', p')) / sum of w max(p, q),
 
@@ -87,22 +65,21 @@ def probe_distance(
     """
 
     def compare(queries, database):
-        cosines = correlate(queries.heights, database.heights)
+        cosines = correlate(queries[0], database[0])
         shifts = cosines.argmax(axis=-1).astype(np.int32)
         return 1 - cosines.max(axis=-1) * np.asarray(_jaccard(queries[1:], database[1:], shifts))
 
     return in_blocks(compare, queries, database, block=BLOCK, prepare=_prepare)
 
 
-def _prepare(rows: Float32[np.ndarray, "n 2400"]) -> _Prepared:
+def _prepare(rows: Float32[np.ndarray, "n 2400"]) -> tuple[Cells, ...]:
+    """Return the heights, scaled to length 1, p, p', and log(p' / (1 - p'))."""
     heights = rows.reshape(-1, RINGS, SECTORS)
     occupied = occupancy(heights)
-    doubt = np.minimum(deviations(), 1)[None, :, None]
+    doubt = np.minimum(DEVIATIONS, 1)[None, :, None]
     smoothed = ((1 - doubt) * occupied + doubt / 2).clip(0.01, 0.99)
-    logit = np.log(smoothed / (1 - smoothed))
-    return _Prepared(
-        unit_length(rows).reshape(heights.shape), *(part.astype(np.float32) for part in (occupied, smoothed, logit))
-    )
+    parts = (part.astype(np.float32) for part in (occupied, smoothed, np.log(smoothed / (1 - smoothed))))
+    return unit_length(rows).reshape(heights.shape), *parts
 
 
 @jax.jit
@@ -112,26 +89,16 @@ def _jaccard(
     shifts: Int[Array, "q n"],
 ) -> Float[Array, "q n"]:
     """Return the Jaccard index of each pair, with the sectors of the query shifted by `shifts`."""
-    weights = np.exp(-deviations() * (SECTORS / (2 * np.pi))).astype(np.float32)[None, :, None]
-
+    weights = np.exp(-DEVIATIONS * (SECTORS / (2 * np.pi))).astype(np.float32)[None, :, None]
     places = (np.arange(SECTORS)[None, :] - np.arange(SECTORS)[:, None]) % SECTORS
 
     def of_query(query):
         *parts, shifts = query
-        turned = (jnp.moveaxis(part[:, places], 1, 0)[shifts] for part in parts)  # a table of all shifts is fast
-        (occupied, smoothed, logit), others = turned, database
-        divergence = (smoothed - others[1]) * (logit - others[2])  # of both directions together
-        union = weights * jnp.maximum(occupied, others[0])
+        # A table of all shifts is fast.
+        occupied, smoothed, logit = (jnp.moveaxis(part[:, places], 1, 0)[shifts] for part in parts)
+        divergence = (smoothed - database[1]) * (logit - database[2])  # of both directions together
+        union = weights * jnp.maximum(occupied, database[0])
         total = union.sum((1, 2))
         return (union * jnp.exp(-divergence)).sum((1, 2)) / jnp.where(total > 0, total, 1.0)
 
     return jax.lax.map(of_query, (*queries, shifts))
-
-
-PROBE = HandcraftedMethod(
-    "probe",
-    'this project, after the abstract of Lee et al., "PROBE", RA-L 2026',
-    "points",
-    probe,
-    distance=probe_distance,
-)

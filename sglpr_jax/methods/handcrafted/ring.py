@@ -7,7 +7,6 @@ rotation shifts the rows, which the distance compares at all shifts.
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from sglpr_jax.methods.method import HandcraftedMethod
 from sglpr_jax.methods.pairwise import correlate, in_blocks
 
 SIDE = 120
@@ -16,7 +15,7 @@ HALF_WIDTH_M = 70.0
 LOWEST_M, HIGHEST_M = -1.0, 10.0
 """Heights of the points that count, in metres above the sensor: the published limits for KITTI."""
 ANGLES = 60
-"""Number of angles, from 0 to 177 degrees. The published 120 angles cover 360 degrees. The second half has the rows of
+"""Number of angles, from 0 to 177 degrees. The published 120 angles cover 360 degrees; the second half has the rows of
 the first half in reverse, and therefore equal magnitudes."""
 FREQUENCIES = SIDE // 2 + 1
 NUMBERS = ANGLES * FREQUENCIES
@@ -25,43 +24,31 @@ BLOCK = 64
 
 
 def ring(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "3660"]:
-    """Return the magnitudes of 60 angles x 61 frequencies, flattened. No points above the ground give zeros.
-
-    The image has 120 x 120 cells over 140 m x 140 m. A cell is 1 if it has a point between 1 m below and 10 m above
-    the sensor. The spectrum of each angle is that of its 120 offsets, scaled by 1 / sqrt(120).
-    """
+    """Return the magnitudes of 60 angles x 61 frequencies of `sinogram`, scaled by 1 / sqrt(120) and flattened."""
     spectrum = np.abs(np.fft.rfft(sinogram(points), axis=1, norm="ortho"))
     return spectrum.astype(np.float32).ravel()
 
 
-def sinogram(points: Float32[np.ndarray, "n 3"], *, angles: int = ANGLES) -> Float64[np.ndarray, "{angles} 120"]:
+def sinogram(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "60 120"]:
     """Return the Radon transform of the occupied cells within the largest circle of the image.
 
-    The value at an angle and an offset is the number of cells on this line. The line of angle a and offset s has the
-    points with x cos(a) + y sin(a) = s. A cell between two offsets counts in both, in proportion to its nearness.
-
-    Arguments:
-      points: Points of a gravity-aligned sensor, in metres.
-      angles: Number of angles. They are 3 degrees apart.
+    The image has 120 x 120 cells over 140 m x 140 m. A cell is occupied if it has a point (metres, z up) between 1 m
+    below and 10 m above the sensor. The value at angle a and offset s is the number of cells on the line with x cos(a)
+    + y sin(a) = s. A cell between two offsets counts in both, in proportion to its nearness.
     """
-    x, y = _occupied(points)
-    turn = np.radians(180 / ANGLES * np.arange(angles))[:, None]
-    place = np.cos(turn) * x[None] + np.sin(turn) * y[None] + (SIDE - 1) / 2
-    low = np.floor(place).astype(np.int64)
-    flat, share = low + SIDE * np.arange(angles)[:, None], place - low
-    found = np.zeros(angles * SIDE)
-    for offset, part in ((0, 1 - share), (1, share)):
-        found += np.bincount((flat + offset).ravel(), part.ravel(), minlength=angles * SIDE)
-    return found.reshape(angles, SIDE)
-
-
-def _occupied(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "2 cells"]:
-    """Return x and y of the centre of each occupied cell, in cells from the sensor."""
     inside = (points[:, 2] > LOWEST_M) & (points[:, 2] < HIGHEST_M) & (np.abs(points[:, :2]) < HALF_WIDTH_M).all(axis=1)
     cells = np.floor((points[inside, :2].astype(np.float64) / HALF_WIDTH_M + 1) * SIDE / 2).astype(np.int64)
     occupied = np.bincount(cells @ [SIDE, 1], minlength=SIDE**2).reshape(SIDE, SIDE) > 0
     centres = np.stack(occupied.nonzero()) - (SIDE - 1) / 2
-    return centres[:, np.hypot(*centres) < (SIDE - 1) / 2]
+    x, y = centres[:, np.hypot(*centres) < (SIDE - 1) / 2]
+    turn = np.radians(180 / ANGLES * np.arange(ANGLES))[:, None]
+    place = np.cos(turn) * x[None] + np.sin(turn) * y[None] + (SIDE - 1) / 2
+    low = np.floor(place).astype(np.int64)
+    flat, share = low + SIDE * np.arange(ANGLES)[:, None], place - low
+    found = np.zeros(ANGLES * SIDE)
+    for offset, part in ((0, 1 - share), (1, share)):
+        found += np.bincount((flat + offset).ravel(), part.ravel(), minlength=ANGLES * SIDE)
+    return found.reshape(ANGLES, SIDE)
 
 
 def ring_distance(
@@ -69,10 +56,9 @@ def ring_distance(
 ) -> Float32[np.ndarray, "q n"]:
     """Return 1 - (the highest correlation coefficient of the magnitudes over all shifts of the angles), from 0 to 2.
 
-    All 120 frequencies count. A descriptor without points has the distance 1 from every other.
-
-    The published distance is 1 - m / (0.15 sqrt(120)) and differs in one point. Its m sums the absolute values of the
-    correlations of the frequencies, where this function sums the correlations.
+    All 120 frequencies count. A descriptor without points has the distance 1 from every other. The published distance
+    is 1 - m / (0.15 sqrt(120)), where m sums the absolute values of the correlations of the frequencies. This function
+    sums the correlations.
     """
 
     def compare(queries, database):
@@ -91,12 +77,3 @@ def _standardised(rows: Float32[np.ndarray, "n 3660"]) -> Float32[np.ndarray, "n
     length = np.sqrt((weighted**2).sum(axis=(1, 2), keepdims=True))
     unit = np.divide(weighted, length, out=np.zeros_like(weighted), where=length > 0)
     return unit.swapaxes(1, 2).astype(np.float32)
-
-
-RING = HandcraftedMethod(
-    "ring",
-    'Lu et al., "RING++: Roto-Translation Invariant Gram for Global Localization on a Sparse Scan Map", T-RO 2023',
-    "points",
-    ring,
-    distance=ring_distance,
-)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32
 
-from sglpr_jax.methods.method import HandcraftedMethod
+from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.pairwise import correlate, in_blocks
 
 RINGS = 20
@@ -17,31 +17,26 @@ BLOCK = 256
 
 
 def scan_context(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "1200"]:
-    """Return the matrix I of 20 rings x 60 sectors, flattened: I[i, j] = max of z + 2 m over the points of a cell, else
-    0.
+    """Return I[i, j] = max of z + 2 m over the points of a cell, else 0, for 20 rings x 60 sectors, flattened.
 
-    Points are in metres: x forward, y left, z up. Points farther than 80 m are ignored. A cell includes its outer and
-    its counter-clockwise border: ring = ceil(20 r / 80 m), sector = ceil(60 theta / 360 degrees), from 1.
+    Points (metres, z up) beyond 80 m are ignored. A cell includes its outer and its counter-clockwise border: ring =
+    ceil(20 r / 80 m), sector = ceil(60 theta / 360 degrees), from 1.
     """
-    x, y, z = points.astype(np.float64).T
-    radius, angle = np.hypot(x, y), np.arctan2(y, x) % (2 * np.pi)
+    radius, angle, z = polar(points)
     inside = radius <= RADIUS_M
     ring = np.clip(np.ceil(radius / RADIUS_M * RINGS), 1, RINGS).astype(np.int64) - 1
-    sector = np.clip(np.ceil(angle / (2 * np.pi) * SECTORS), 1, SECTORS).astype(np.int64) - 1
-    highest = np.full(NUMBERS, -np.inf)
-    np.maximum.at(highest, (ring * SECTORS + sector)[inside], z[inside] + LIDAR_HEIGHT_M)
-    return np.where(np.isfinite(highest), highest, 0).astype(np.float32)
+    sector = np.clip(np.ceil(angle % (2 * np.pi) / (2 * np.pi) * SECTORS), 1, SECTORS).astype(np.int64) - 1
+    cell = (ring * SECTORS + sector)[inside]
+    return extreme(np.maximum, (NUMBERS,), cell, z[inside] + LIDAR_HEIGHT_M).astype(np.float32)
 
 
 def scan_context_distance(
     queries: Float32[np.ndarray, "q 1200"], database: Float32[np.ndarray, "n 1200"]
 ) -> Float32[np.ndarray, "q n"]:
-    """Return the column-wise cosine distance at the best of all 60 rotations (the paper's equations 6 and 7).
+    """Return the column-wise cosine distance at the best of all 60 rotations (equations 6 and 7).
 
-    D = min over shifts s of 1 - (1 / N_s) sum over j of cos(q_j, d_{j + s}). Here q_j are the columns (sectors), and
-    the sum is over the N_s columns that are nonempty in both scans. Without such columns, D is 1. The published search
-    tries only shifts near the best one of a coarse key, and only ten candidates. Here every shift of every scan is
-    tried.
+    D = min over shifts s of 1 - (1 / N_s) sum over j of cos(q_j, d_{j + s}), with columns (sectors) q_j and N_s columns
+    that are nonempty in both scans. Without such columns, D is 1. The published search tries fewer shifts and scans.
     """
 
     def compare(queries, database):
@@ -60,12 +55,3 @@ def _unit_columns(
     lengths = np.linalg.norm(columns, axis=1, keepdims=True)
     unit = np.divide(columns, lengths, out=np.zeros_like(columns), where=lengths > 0)
     return unit, (lengths > 0).astype(np.float32)
-
-
-SCAN_CONTEXT = HandcraftedMethod(
-    "scan-context",
-    'Kim and Kim, "Scan Context", IROS 2018',
-    "points",
-    scan_context,
-    distance=scan_context_distance,
-)

@@ -3,9 +3,8 @@
 import numpy as np
 from jaxtyping import Float32
 
-from sglpr_jax.methods.method import HandcraftedMethod
+from sglpr_jax.methods.cells import voxel_means
 from sglpr_jax.methods.pairwise import unit_length
-from sglpr_jax.methods.voxel_means import voxel_means
 
 RANGES = 40
 ELEVATIONS = 32
@@ -21,11 +20,8 @@ def solid(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "40"]:
 
     R (40 x 32) counts the points in ranges of 2 m, up to 80 m, and in elevations between -24.8 and 2 degrees. Points
     outside these limits count in the nearest bin. w is the sum n of R over the ranges, scaled to 0 to 1: (n - min n) /
-    (max n - min n).
-
-    Points are in metres with z up. Points nearer than 3 m or beyond 80 m are ignored, and the points of each voxel of
-    0.4 m are replaced by their mean. The 60 numbers of the angular part estimate the yaw between two scans. They are
-    not used for retrieval and are left out.
+    (max n - min n). Points (metres, z up) nearer than 3 m or beyond 80 m are ignored, and the mean of each voxel of 0.4
+    m replaces its points. The 60 numbers of the angular part estimate yaw and are left out.
     """
     near = np.linalg.norm(points.astype(np.float64), axis=1)
     x, y, z = voxel_means(points[(near >= NEAREST_M) & (near <= FARTHEST_M)], VOXEL_M).T
@@ -37,11 +33,3 @@ def solid(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "40"]:
     number = counts.sum(axis=0).astype(np.float64)
     weights = (number - number.min()) / max(np.ptp(number), 1)
     return unit_length((counts @ weights)[None])[0]
-
-
-SOLID = HandcraftedMethod(
-    "solid",
-    'Kim et al., "Narrowing your FOV with SOLiD", RA-L 2024',
-    "points",
-    solid,
-)

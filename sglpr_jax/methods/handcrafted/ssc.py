@@ -3,7 +3,6 @@
 import functools
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
 from sglpr_jax.labels import CATEGORIES
-from sglpr_jax.methods.method import HandcraftedMethod
+from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.pairwise import in_blocks
 
 SECTORS = 360
@@ -84,19 +83,21 @@ NEWEST = PolarGrid(24, 5.0)
 def ssc(
     points: Float32[np.ndarray, "n 3"], classes: Int32[np.ndarray, " n"], grid: PolarGrid = PAPER
 ) -> Float32[np.ndarray, " d"]:
-    """Return the strongest class of every stored cell, six to a number, followed by x (360) and y (360) of the
-    landmarks.
+    """Return the strongest class of every stored cell, six to a number, and x (360) and y (360) of the landmarks.
 
-    Points are in metres: x forward, y left, z up. Classes are those of `labels.to_classes`. Sectors are degrees from
-    the back. The landmark of a sector is its last landmark point in the order of the points, at any nonzero range. A
-    sector without a landmark has x = y = 0.
+    Points are in metres, z up; classes are those of `labels.to_classes`. Sectors are degrees from the back. The
+    landmark of a sector is its last landmark point, at any nonzero range, or x = y = 0.
     """
     x, y = points[:, :2].astype(np.float64).T
-    radius, degrees = np.hypot(x, y), 180 + np.degrees(np.arctan2(y, x))
-    ring, sector = np.floor(radius / grid.fine_m).astype(np.int64), np.floor(degrees * FINER).astype(np.int64)
+    radius, angle, _ = polar(points)
+    ring, sector = (
+        np.floor(part).astype(np.int64) for part in (radius / grid.fine_m, (180 + np.degrees(angle)) * FINER)
+    )
     inside = (ring < grid.fine_rings) & (sector < FINE_SECTORS)
-    cells = np.zeros(grid.fine_rings * FINE_SECTORS, np.int64)
-    np.maximum.at(cells, (ring * FINE_SECTORS + sector)[inside], _ranks()[classes[inside]])
+    ranks = np.zeros(len(CATEGORIES))
+    ranks[list(STRONGER)] = 1 + np.arange(len(STRONGER))
+    shape = (grid.fine_rings, FINE_SECTORS)
+    cells = extreme(np.maximum, shape, (ring[inside], sector[inside]), ranks[classes[inside]])
     landmarks = np.flatnonzero(np.isin(classes, LANDMARKS) & (radius > 0) & (sector < FINE_SECTORS))
     outline = np.zeros((2, SECTORS))
     outline[:, sector[landmarks] // FINER] = x[landmarks], y[landmarks]  # in each sector, the last landmark wins
@@ -104,53 +105,27 @@ def ssc(
     return np.concatenate([packed, *outline]).astype(np.float32)
 
 
-@functools.cache
-def _ranks() -> Int[np.ndarray, "20"]:
-    """Return the position of each class in `STRONGER`, from 1, or 0 for ignored classes."""
-    ranks = np.zeros(len(CATEGORIES), np.int64)
-    ranks[list(STRONGER)] = 1 + np.arange(len(STRONGER))
-    return ranks
-
-
-class _Still(NamedTuple):
-    """Prepared data of the n scans that are not moved."""
-
-    outlines: Float32[np.ndarray, "n 2 360"]
-    cells: Int32[np.ndarray, "n rings 360"]
-
-
-class _Moved(NamedTuple):
-    """Prepared data of the n scans that are aligned with the others: the centres of their stored cells."""
-
-    outlines: Float32[np.ndarray, "n 2 360"]
-    centres: Float32[np.ndarray, "n 2 occupied"]
-    ranks: Int32[np.ndarray, "n occupied"]
-
-
 def ssc_distance(
     queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"], grid: PolarGrid = PAPER
 ) -> Float32[np.ndarray, "q n"]:
     """Return 1 - (cells of equal class) / (cells occupied in either scan), after alignment; 1 if no cell is occupied.
 
-    The scan of the database is rotated and moved onto the query (`outline_alignment`). The published method then sorts
-    its points into cells again. Here no points are stored, so the centres of its occupied stored cells are sorted
-    instead.
+    The scan of the database is rotated and moved onto the query (`align`). The published method then sorts its points
+    into cells again. Here no points are stored, so the centres of its occupied stored cells are sorted instead.
     """
+
+    def still(rows):
+        fine, outlines = _unpacked(grid, rows)
+        compared = fine[:, grid.inner : grid.inner + FINER * grid.rings]
+        cells = compared.reshape(-1, grid.rings, FINER, SECTORS, FINER).max(axis=(2, 4))
+        return outlines, cells.astype(np.int32)
+
+    def moved(rows):
+        fine, outlines = _unpacked(grid, rows)
+        return outlines, *_occupied(grid, fine)
+
     compare = functools.partial(_compare, grid)
-    ways = {"prepare": functools.partial(_still, grid), "prepare_database": functools.partial(_moved, grid)}
-    return in_blocks(compare, queries, database, block=BLOCK, threads=None, **ways)
-
-
-def _still(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Still:
-    fine, outlines = _unpacked(grid, rows)
-    compared = fine[:, grid.inner : grid.inner + FINER * grid.rings]
-    cells = compared.reshape(-1, grid.rings, FINER, SECTORS, FINER).max(axis=(2, 4))
-    return _Still(outlines, cells.astype(np.int32))
-
-
-def _moved(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Moved:
-    fine, outlines = _unpacked(grid, rows)
-    return _Moved(outlines, *_occupied(grid, fine))
+    return in_blocks(compare, queries, database, block=BLOCK, threads=None, prepare=still, prepare_database=moved)
 
 
 def _unpacked(
@@ -182,14 +157,16 @@ def _occupied(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _compare(grid: PolarGrid, queries: _Still, database: _Moved) -> Float[Array, "q n"]:
-    """Return the distances of all pairs. One pair at a time stays in the cache and runs only the iterations that it
-    needs."""
+def _compare(grid: PolarGrid, queries: tuple[Array, ...], database: tuple[Array, ...]) -> Float[Array, "q n"]:
+    """Return the distances of outlines and cells to outlines, centres and ranks. One pair at a time stays in the cache
+    and runs only the iterations that it needs."""
 
     def distance(query, other):
-        shift, move = align(query.outlines, other.outlines)
-        moved = turn(other.centres, shift) + move[:, None]
-        return 1 - similarity(query.cells, _cells_of(grid, moved, other.ranks))
+        (outline, cells), (other_outline, centres, ranks) = query, other
+        shift, move = align(outline, other_outline)
+        found = _cells_of(grid, turn(centres, shift) + move[:, None], ranks)
+        either = (cells > 0) | (found > 0)
+        return 1 - jnp.sum(either & (cells == found)) / jnp.maximum(either.sum(), 1)
 
     return jax.lax.map(lambda query: jax.lax.map(lambda other: distance(query, other), database), queries)
 
@@ -205,8 +182,7 @@ def _cells_of(grid: PolarGrid, points: Float[Array, "2 n"], ranks: Int[Array, " 
 
 
 def _angle(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return the angle of (x, y) in radians, with an error of 1e-6. On a CPU it takes a tenth of the time of
-    `jnp.arctan2`."""
+    """Return the angle of (x, y) in radians, with an error of 1e-6, in a tenth of the time of `jnp.arctan2`."""
     low, high = jnp.minimum(jnp.abs(x), jnp.abs(y)), jnp.maximum(jnp.abs(x), jnp.abs(y))
     octant = low / jnp.maximum(high, jnp.finfo(x.dtype).tiny)
     quadrant = octant * jnp.polyval(jnp.asarray(ARCTAN), octant**2)
@@ -215,18 +191,9 @@ def _angle(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.where(y < 0, -turned, turned)
 
 
-def similarity(a: Int[Array, "rings 360"], b: Int[Array, "rings 360"]) -> Float[Array, ""]:
-    """Return the fraction of equal cells among the cells occupied in either scan; 0 without occupied cells."""
-    either = (a > 0) | (b > 0)
-    return jnp.sum(either & (a == b)) / jnp.maximum(either.sum(), 1)
-
-
 def align(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> tuple[Int[Array, ""], Float[Array, "2"]]:
-    """Return the clockwise rotation of the scan `other`, in degrees, and then its translation (x, y), in metres.
-
-    Outlines are x and y of the landmark in each sector, in metres. Both are 0 in sectors without a landmark. A
-    translation of more than 5 m along x or y is replaced by 0.
-    """
+    """Return the clockwise rotation of the outline `other`, in degrees, and then its translation (x, y), in metres. A
+    translation of more than 5 m along x or y is replaced by 0."""
     shift = best_shift(jnp.hypot(*query), jnp.hypot(*other))
     turned = turn(jnp.roll(other, -shift, axis=1), shift)
     move = best_move(query, turned)
@@ -234,8 +201,7 @@ def align(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> tuple[I
 
 
 def best_shift(query: Float[Array, "360"], other: Float[Array, "360"]) -> Int[Array, ""]:
-    """Return the s that minimises the sum over j of |query[j] - other[j + s]|, distances in metres; the first of equal
-    ones."""
+    """Return the first s that minimises the sum over j of |query[j] - other[j + s]|."""
     doubled = jnp.concatenate([other, other])
     costs = jax.lax.map(
         lambda s: jnp.abs(query - jax.lax.dynamic_slice(doubled, (s,), (SECTORS,))).sum(), jnp.arange(SECTORS)
@@ -293,31 +259,3 @@ def _to_nearest(
 
 def _is_landmark(outline: Float[Array, "2 360"]) -> Bool[Array, "360"]:
     return jnp.any(outline != 0, axis=0)
-
-
-def ssc_24(points: Float32[np.ndarray, "n 3"], classes: Int32[np.ndarray, " n"]) -> Float32[np.ndarray, " d"]:
-    """Return `ssc` with the grid `NEWEST`."""
-    return ssc(points, classes, NEWEST)
-
-
-def ssc_24_distance(
-    queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]
-) -> Float32[np.ndarray, "q n"]:
-    """Return `ssc_distance` with the grid `NEWEST`."""
-    return ssc_distance(queries, database, NEWEST)
-
-
-SSC = HandcraftedMethod(
-    "ssc",
-    'Li et al., "SSC: Semantic Scan Context for Large-Scale Place Recognition", IROS 2021',
-    "labelled points",
-    ssc,
-    distance=ssc_distance,
-)
-SSC_24 = HandcraftedMethod(
-    "ssc-24",
-    "SSC with the 24 rings from 5 m of its authors' last version",
-    "labelled points",
-    ssc_24,
-    distance=ssc_24_distance,
-)

@@ -1,17 +1,11 @@
 """BEVPlace++ (Luo et al., 2025) on density images, and its ablation ResNet-34 + NetVLAD, which has no rotations.
 
-Published recipe: Adam with a constant 1e-4, 4 tuples a step, at most 40 epochs of frames 0 to 2999 of KITTI 00. A tuple
-has 1 random positive within 5 m and the 10 hardest negatives beyond 7 m. Mining renews the descriptors once per epoch.
-Images are rotated by random whole degrees. ResNet-34 starts from ImageNet, NetVLAD from k-means of 10,000 local
-features.
-
-Recipe here: the same loss, optimiser and distances, trained from scratch. Half of the positives come from another
-visit, mining describes 256 random places every 25 steps, and images are rotated by any angle. BEVPlace++ has 2 tuples a
-step, because a step of 24 images already needs 6 GB. NetVLAD starts from k-means of local features, too.
+Differences from the published recipe: trained from scratch, half of the positives come from another visit, mining
+describes 256 random places every 25 steps, and images are rotated by any angle. BEVPlace++ has 2 tuples a step, because
+a step of 24 images already needs 6 GB.
 """
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,10 +52,11 @@ class Block(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b _ _ {self.features}"]:
         """Return the sum of the shortcut and the convolved images, after ReLU."""
-        y = batch_norm(train)(Convolution(self.features, stride=self.stride)(x))
+        strides = (self.stride, self.stride)
+        y = batch_norm(train)(Convolution(self.features, strides=strides)(x))
         y = batch_norm(train)(Convolution(self.features)(nn.relu(y)))
         if self.stride > 1:
-            x = batch_norm(train)(Convolution(self.features, size=1, stride=self.stride)(x))
+            x = batch_norm(train)(Convolution(self.features, size=1, strides=strides)(x))
         return nn.relu(x + y)
 
 
@@ -70,11 +65,7 @@ class Encoder(nn.Module):
 
     @nn.compact
     def __call__(self, images: Float[Array, "b h w"], *, train: bool) -> Float[Array, "b _ _ 128"]:
-        """Encode grey images.
-
-        The published network repeats the grey three times as colours. The sum of the kernel over the colours gives the
-        same result from one channel.
-        """
+        """Encode grey images. The kernel is summed over the three equal colours of the published network."""
         kernel = self.param("kernel", HE, (7, 7, 3, 64))
         x = convolve(images[..., None], kernel.sum(2, keepdims=True), (2, 2), False)
         x = max_pool(nn.relu(batch_norm(train)(x)), size=3, border=1)
@@ -89,13 +80,10 @@ class Encoder(nn.Module):
 class REIN(nn.Module):
     """Encoder of eight rotations or one, the maximum of its results, and NetVLAD: 8192 numbers of unit length.
 
-    The image is rotated by multiples of 45 degrees, and the result of each rotation is rotated back. A quarter turn of
-    the image only permutes the rotations, so it does not change the descriptor. For this, the number of pixels minus 1
-    must be a multiple of 8; `__call__` adds zeros at the border. The published network resamples every rotation. Here
-    quarter turns are exact, so that only 45 degrees are resampled.
-
-    The encoder sees all rotations as one batch. Batch normalisation then has common statistics for the eight rotations;
-    the published network computes them for each rotation.
+    The image is rotated by multiples of 45 degrees, and each result is rotated back. A quarter turn of the image only
+    permutes the rotations, so it does not change the descriptor. For this, the number of pixels minus 1 must be a
+    multiple of 8; `bordered` adds zeros. The published network resamples every rotation and normalises each by its own
+    statistics. Here quarter turns are exact, and the eight rotations are one batch.
     """
 
     rotations: int = 8
@@ -112,17 +100,13 @@ class REIN(nn.Module):
             maps = functools.reduce(jnp.maximum, turned_back(encoder(eight_turns(x), train=train)))
         local = l2_normalize(resized(maps, images.shape[1] // DENSER))
         local = local.reshape(len(local), -1, local.shape[-1])
-        if not self.is_initializing():  # the collection does not belong to the variables
-            self.sow(LOCAL, FEATURES, local)
+        self.sow(LOCAL, FEATURES, local)
         return NetVLAD(64)(local)
 
 
 def bordered(images: Float[Array, "b h h"]) -> Float[Array, "b _ _"]:
-    """Add zeros on all sides, so that all resolutions of the encoder have a pixel at the centre.
-
-    Raises:
-      ValueError: If the images have an even number of rows.
-    """
+    """Add zeros on all sides, so that all resolutions of the encoder have a pixel at the centre. Raises ValueError if
+    the number of rows is even."""
     size = images.shape[1]
     if size % 2 == 0:
         raise ValueError(f"expected images with an odd number of rows, found {size}")
@@ -143,36 +127,23 @@ def turned_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
     return jnp.concatenate([*parts[:4], between]).reshape(8, -1, *maps.shape[1:])
 
 
-class Taps(NamedTuple):
-    """The 16 pixels around each point of a resampled image, by row and column, and their weights."""
-
-    pixels: Int32[np.ndarray, "points 16"]
-    """Index in the flattened image. Pixels outside have the weight 0."""
-    weights: Float32[np.ndarray, "points 16"]
+Taps = tuple[Int32[np.ndarray, "points 16"], Float32[np.ndarray, "points 16"]]
+"""Index in the flattened image of the 16 pixels around each point of a resampled image, and their weights."""
 
 
 @functools.cache
 def turned_taps(size: int, degrees: int) -> Taps:
-    """Return the table that rotates an image of `size` x `size` pixels about its centre, with zeros outside.
-
-    Arguments:
-      size: Number of rows and of columns.
-      degrees: Angle of the rotation, counter-clockwise as in `bev.rotate_image`.
-    """
+    """Return the table that rotates a square image about its centre, counter-clockwise, with zeros outside."""
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     down, right = (np.mgrid[:size, :size] - (size - 1) / 2).reshape(2, -1)
-    return _taps(np.stack([cos * down + sin * right, cos * right - sin * down]) + (size - 1) / 2, size)
-
-
-def _taps(at: Float64[np.ndarray, "2 points"], size: int) -> Taps:
-    """Return the table for points at the given rows and columns."""
+    at = np.stack([cos * down + sin * right, cos * right - sin * down]) + (size - 1) / 2
     first = np.floor(at) - 1
     rows, columns = lines = first[..., None] + np.arange(4)
     down, right = cubic(lines - at[..., None]) * ((lines >= 0) & (lines < size))
     rows, columns = (line.clip(0, size - 1).astype(np.int32) for line in (rows, columns))
     pixels = rows[:, :, None] * size + columns[:, None]
     weights = (down[:, :, None] * right[:, None]).astype(np.float32)
-    return Taps(pixels.reshape(-1, 16), weights.reshape(-1, 16))
+    return pixels.reshape(-1, 16), weights.reshape(-1, 16)
 
 
 def cubic(distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
@@ -186,14 +157,15 @@ def cubic(distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
 def resampled(images: Float[Array, "b h h"], taps: Taps) -> Float[Array, "b h h"]:
     """Return images resampled by a table of the same size."""
     flat = images.reshape(len(images), -1)
-    parts = (flat[:, pixels] * weights[None] for pixels, weights in zip(taps.pixels.T, taps.weights.T, strict=True))
+    parts = (flat[:, pixels] * weights[None] for pixels, weights in zip(taps[0].T, taps[1].T, strict=True))
     return functools.reduce(jnp.add, parts).reshape(images.shape)
 
 
 def resampled_maps(maps: Float[Array, "b h h c"], taps: Taps) -> Float[Array, "b h h c"]:
     """Return small maps of many channels resampled by a table, as a product with a dense matrix."""
-    matrix = np.zeros((len(taps.pixels),) * 2, np.float32)
-    np.add.at(matrix, (np.arange(len(matrix))[:, None], taps.pixels), taps.weights)
+    pixels, weights = taps
+    matrix = np.zeros((len(pixels),) * 2, np.float32)
+    np.add.at(matrix, (np.arange(len(matrix))[:, None], pixels), weights)
     return jnp.einsum("pq,bqc->bpc", matrix, maps.reshape(len(maps), -1, maps.shape[-1])).reshape(maps.shape)
 
 
@@ -206,11 +178,8 @@ def resized(maps: Float[Array, "b h h c"], size: int) -> Float[Array, "b {size} 
 
 
 def grey_image(record: Record) -> UInt8[np.ndarray, "151 151"]:
-    """Return the ready-made density image of a record, or the density image of a scan, as grey values.
-
-    Raises:
-      ValueError: If the image has another size or is no density image, or if the scan shows no place.
-    """
+    """Return the ready-made density image of a record, or the density image of a scan, as grey values. Raises
+    ValueError for another image, or for a scan that shows no place."""
     if record.points is not None:
         check_cloud(record.points, name=record.name)
     check_ready_made(record, "density")
@@ -233,18 +202,8 @@ PUBLISHED = (
     "Adam 1e-4, constant; max over negatives of [0.3 + d_positive - d_negative]_+ with d = L2; 4 tuples of 1 positive "
     "and 10 hardest negatives, 40 epochs of KITTI 00; ResNet-34 from ImageNet, NetVLAD from k-means"
 )
-SAMPLING = TupleConfig(
-    positives=1,
-    negatives=10,
-    positive_m=5.0,
-    negative_m=7.0,
-    mining="hardest",
-    hardest=10,
-    refresh_steps=25,
-    mined_places=256,
-)
-"""The hardest negatives are the 10 most similar ones of 256 random places. To describe these takes about an eighth of
-the training time."""
+SAMPLING = TupleConfig(positive_m=5.0, negative_m=7.0, mining="hardest", hardest=10, refresh_steps=25, mined_places=256)
+"""To describe 256 places takes about an eighth of the training time."""
 
 
 def _method(name: str, source: str, *, rotations: int, tuples: int) -> LearnedMethod:

@@ -5,7 +5,6 @@ the beginning of their hash. The distance can be computed as long as this folder
 """
 
 import functools
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from jaxtyping import Float32, Shaped
 
 from sglpr_jax.methods.learned.method import LearnedMethod, Variables
 from sglpr_jax.methods.learned.weights_file import RANDOM, load_variables, variables_hash
-from sglpr_jax.methods.method import DistanceFn
+from sglpr_jax.methods.method import DistanceFn, check_descriptors
 from sglpr_jax.methods.pairwise import in_blocks
 
 BATCH = 16
@@ -36,42 +35,20 @@ def apply_network(variables: Variables, inputs: Shaped[Any, "b ..."], *, method:
 def describe_inputs(
     method: LearnedMethod, variables: Variables, inputs: Shaped[np.ndarray, "n ..."]
 ) -> Float32[np.ndarray, "n d"]:
-    """Return the descriptors of all inputs, which may be a memory-mapped file.
-
-    Raises ValueError if descriptors are invalid (`check_descriptors`).
-    """
+    """Return the descriptors of all inputs, which may be a memory-mapped file. Raises the error of
+    `check_descriptors`."""
     found = []
     for start in range(0, len(inputs), BATCH):
         rows = np.asarray(inputs[start : start + BATCH])
         padded = np.concatenate([rows, np.repeat(rows[-1:], BATCH - len(rows), axis=0)])
-        descriptors = np.asarray(apply_network(variables, padded, method=method))
-        names = [f"input {start + row}" for row in range(len(rows))]
-        found.append(check_descriptors(method.name, descriptors[: len(rows)], names))
-    return np.concatenate(found)
-
-
-def check_descriptors(method: str, descriptors: np.ndarray, names: Sequence[str]) -> Float32[np.ndarray, "n d"]:
-    """Return the descriptors of the scans called `names` as float32.
-
-    Raises ValueError, with the method and the scan, if there is not one vector for each scan, or if one has values that
-    are not finite or only zeros.
-    """
-    if descriptors.ndim != 2 or len(descriptors) != len(names):
-        raise ValueError(f"{method}: expected {len(names)} descriptors ({len(names)}, d), found {descriptors.shape}")
-    broken, empty = ~np.isfinite(descriptors).all(axis=1), ~descriptors.any(axis=1)
-    for bad, what in ((broken, "values that are not finite"), (empty, "only zeros")):
-        if bad.any():
-            raise ValueError(f"{method}: expected a descriptor of {names[int(bad.argmax())]}, found {what}")
-    return descriptors.astype(np.float32)
+        found.append(np.asarray(apply_network(variables, padded, method=method))[: len(rows)])
+    descriptors = np.concatenate(found).astype(np.float32)
+    check_descriptors(method.name, descriptors, [f"input {row}" for row in range(len(inputs))])
+    return descriptors
 
 
 def learned_distance(method: LearnedMethod, variables: Variables) -> DistanceFn:
-    """Return the distance of a trained method: its own one, or L2 if it has none.
-
-    Arguments:
-      method: Method of the descriptors.
-      variables: Weights of its network.
-    """
+    """Return the distance of a trained method: its own one with these weights, or L2 if it has none."""
     own = method.compare
     compare = jax.jit(_l2 if own is None else lambda queries, database: own(variables, queries, database))
 

@@ -1,13 +1,7 @@
 """DiSCO (Xu et al., 2021): the spectrum of a polar map that a U-Net computes from the occupancy of a scan.
 
-Published recipe: Adam with a constant 1e-5, 20 epochs of NCLT. The loss is a lazy quadruplet with margins 0.5 and 0.2
-and the farthest positive. Positives are within 1.5 m, negatives beyond 2 m. From epoch 6 on, 5 negatives are the
-hardest ones. Images are shifted by random sectors. A second head estimates the yaw, with a cross entropy over 120
-sectors.
-
-Recipe here: the same optimiser and loss, 2 tuples of 2 positives and 9 random negatives a step. The distances of
-positives and negatives are those of the other methods. The head for the yaw is left out, because place recognition does
-not use it. Trained from scratch, as published.
+Differences from the published recipe: 2 tuples of 2 positives and 9 random negatives a step, with the distances of the
+other methods. The head for the yaw is left out, because place recognition does not use it.
 """
 
 import functools
@@ -15,9 +9,10 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float, Float32, Shaped, UInt8
+from jaxtyping import Array, Float, Shaped, UInt8
 
 from sglpr_jax.data.recording import Record
+from sglpr_jax.methods.cells import polar
 from sglpr_jax.methods.learned.layers import Convolution, batch_norm, max_pool
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rolled
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
@@ -31,22 +26,18 @@ KEPT = 32
 """Number of lowest frequencies that are kept along the rings and along the sectors."""
 
 
-def occupancy(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "40 120 20"]:
+def occupancy(record: Record) -> UInt8[np.ndarray, "40 120 20"]:
     """Return the occupied cells of a polar grid as 1: rings of 1.75 m, sectors of 3 degrees and layers of 0.5 m.
 
     Sectors are counter-clockwise from x. The layers reach from 0.23 m to 10.23 m above the ground of a sensor at 1.73
-    m. The published layers are 2 m high and begin 2 m above the zero of NCLT's vehicle, so that the lower 11 of 20
-    layers stay empty. A car's scan has few points above 10 m. Here all layers can be filled, and a façade reaches
-    several of them. Points beyond 70 m are dropped; the published grid adds the corners of a square to its last ring.
-
-    Arguments:
-      points: Points in metres: x forward, y left, z up.
+    m, so that all can be filled and a façade reaches several of them. The published layers are 2 m high and begin 2 m
+    above the zero of NCLT's vehicle. Points beyond 70 m are dropped; the published grid adds the corners of a square to
+    its last ring. Raises ValueError if the scan shows no place.
     """
-    x, y, z = points.astype(np.float64).T
-    radius, angle = np.hypot(x, y), np.arctan2(y, x) % (2 * np.pi)
+    radius, angle, z = polar(finite_points(record))
     layer = np.floor((z - LOWEST_M) / LAYER_M)
     inside = (radius >= NEAREST_M) & (radius < FARTHEST_M) & (layer >= 0) & (layer < LAYERS)
-    ring, sector = radius * (RINGS / FARTHEST_M), angle * (SECTORS / (2 * np.pi))
+    ring, sector = radius * (RINGS / FARTHEST_M), angle % (2 * np.pi) * (SECTORS / (2 * np.pi))
     cells = np.zeros((RINGS, SECTORS, LAYERS), np.uint8)
     at = (part[inside].astype(np.int64) for part in (ring, sector % SECTORS, layer))
     cells[tuple(at)] = 1
@@ -93,11 +84,8 @@ class DiSCO(nn.Module):
 
 
 def doubled(x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c"]:
-    """Double the rings and the sectors of maps, bilinearly.
-
-    The corners of the rings coincide. A sector becomes two sectors a quarter to its left and right, and the sectors
-    wrap around.
-    """
+    """Double the rings and the sectors of maps, bilinearly. The corners of the rings coincide. A sector becomes two
+    sectors a quarter to its left and right, and the sectors wrap around."""
     rings = x.shape[1]
     at = np.linspace(0, rings - 1, 2 * rings)
     along = np.maximum(0, 1 - np.abs(at[:, None] - np.arange(rings))).astype(np.float32)
@@ -113,11 +101,6 @@ def spectrum(maps: Float[Array, "b 40 120"]) -> Float[Array, "b 1024"]:
     return lowest.reshape(len(maps), -1)
 
 
-def prepare(record: Record) -> UInt8[np.ndarray, "40 120 20"]:
-    """Return the polar occupancy grid of a scan. Raises ValueError if the scan shows no place."""
-    return occupancy(finite_points(record))
-
-
 PUBLISHED = (
     "Adam 1e-5, constant; lazy quadruplet with margins 0.5 and 0.2 on squared L2, and cross entropy of the yaw; "
     "positives within 1.5 m, negatives beyond 2 m, 20 epochs of NCLT"
@@ -130,8 +113,8 @@ DISCO = LearnedMethod(
     takes="points",
     weights=7_798_337,
     network=DiSCO(),
-    prepare=prepare,
-    turned=functools.partial(rolled, axis=2),
+    prepare=occupancy,
+    turned=rolled,
     loss=functools.partial(quadruplet, closest_positive=False),
     recipe=Recipe(PUBLISHED, TupleConfig(positives=2, negatives=9), tuples=2, learning_rates=(3e-6, 1e-5, 1e-4)),
 )

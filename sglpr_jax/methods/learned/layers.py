@@ -1,5 +1,6 @@
-"""Layers of the learned methods: convolution, normalisation, pooling, and NetVLAD without biases with its clusters."""
+"""Layers of the learned methods: convolution, normalisation, pooling, and NetVLAD with its clusters at the start."""
 
+import functools
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ from jaxtyping import Array, Float, Shaped
 from scipy.cluster.vq import kmeans2
 
 from sglpr_jax.methods.learned.method import Variables
-from sglpr_jax.models.convolution import convolve
+from sglpr_jax.models import convolution
 from sglpr_jax.models.layers import l2_normalize, product
 
 HE = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
@@ -27,29 +28,7 @@ FAR = 0.01
 """Weight of the second-nearest cluster, divided by that of the nearest one, for the average feature."""
 
 
-class Convolution(nn.Module):
-    """Square convolution whose derivative is computed by matrix products (`models.convolution`).
-
-    Rows are padded by kernel // 2 zeros on each side. Columns are padded by as many zeros, or they wrap around.
-    """
-
-    features: int
-    size: int = 3
-    """Edge of the kernel, in pixels."""
-    stride: int = 1
-    """Stride along rows and columns."""
-    circular: bool = False
-    """Whether the columns wrap around."""
-    use_bias: bool = False
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.features}"]:
-        """Convolve images. An odd kernel gives ceil(size / stride) rows and columns."""
-        kernel = self.param("kernel", HE, (self.size, self.size, x.shape[-1], self.features))
-        y = convolve(x, kernel, (self.stride, self.stride), self.circular)
-        if not self.use_bias:
-            return y
-        return y + self.param("bias", nn.initializers.zeros, (self.features,))[None, None, None]
+Convolution = functools.partial(convolution.Convolution, kernel_init=HE, use_bias=False)
 
 
 def batch_norm(train: bool) -> nn.BatchNorm:
@@ -88,15 +67,10 @@ class NetVLAD(nn.Module):
 
 
 def with_clusters(network: nn.Module, variables: Variables, inputs: Shaped[np.ndarray, "n ..."]) -> Variables:
-    """Return the variables with clusters from the local features of some images.
+    """Return the variables with clusters from the local features of some inputs, which the network sows.
 
     The centres are those of k-means (Arandjelović et al., 2016). The assignment is a * x · centre / |centre|, with the
     factor a at which the second-nearest cluster gets 0.01 of the weight of the nearest one.
-
-    Arguments:
-      network: Network that sows its local features as `FEATURES` in the collection `LOCAL`.
-      variables: Random variables of the network.
-      inputs: Inputs of random training places.
     """
     features = _local_features(network, variables, inputs)
     vlad = variables["params"][VLAD]
@@ -126,10 +100,9 @@ def _local_features(
 
 
 def maximum(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
-    """Return the maximum along an axis. Its derivative reaches one of the largest values.
+    """Return the maximum along an axis, whose derivative reaches one of the largest values.
 
-    The derivative of `jnp.max` divides by the number of values that equal the maximum. On a CPU, XLA may compute the
-    values a second time with other rounding. Then this number is 0, and the derivative is NaN.
+    On a CPU, XLA may compute the values a second time with other rounding. Then the derivative of `jnp.max` is NaN.
     """
     place = jnp.argmax(jax.lax.stop_gradient(x), axis, keepdims=True)
     return jnp.take_along_axis(x, place, axis, mode="promise_in_bounds").squeeze(axis)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Shaped
 
+from sglpr_jax.bev import rotate_points
 from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.losses import descriptor_distance, lazy_triplet
 from sglpr_jax.methods.method import Takes
@@ -31,24 +32,12 @@ class Tuples(NamedTuple):
     """Number of positives of each anchor."""
 
 
-@runtime_checkable
-class Compare(Protocol):
-    """Distance of descriptors that needs the weights of the network."""
-
-    def __call__(
-        self, variables: Variables, queries: Float[Array, "q d"], database: Float[Array, "n d"]
-    ) -> Float[Array, "q n"]:
-        """Return the distances. Smaller distances mean more similar places."""
-        ...
-
-
 @dataclass(frozen=True)
 class LearnedMethod:
     """A network of another publication, as declared by its file in `learned/`.
 
-    The network is a linen module. `network.apply(variables, inputs, train=False)` returns one descriptor for each
-    input. With `train=True` and `mutable=["batch_stats"]` it updates the statistics of its batch normalisation. Weights
-    start at random, also where the publication starts from ImageNet.
+    `network.apply(variables, inputs, train=False)` returns one descriptor for each input. With `train=True` and
+    `mutable=["batch_stats"]` it updates the statistics of its batch normalisation.
     """
 
     name: str
@@ -58,7 +47,6 @@ class LearnedMethod:
     licence: str
     """Licence of the authors' code, for example "MIT", or "GPL-3.0, not read"."""
     takes: Takes
-    """Content that `prepare` needs in a record. Methods that take images accept ready-made images and scans."""
     weights: int
     """Number of trained weights."""
     network: nn.Module
@@ -68,11 +56,10 @@ class LearnedMethod:
     """`turned(key, inputs)` rotates each input about the vertical axis by its own random angle, for the training."""
     loss: Callable[[Variables, Tuples], Float[Array, ""]]
     recipe: Recipe
-    compare: Compare | None = None
-    """Distance of descriptors, if it is learned. None: L2."""
+    compare: Callable[[Variables, Float[Array, "q d"], Float[Array, "n d"]], Float[Array, "q n"]] | None = None
+    """Distances between the descriptors of queries and of a database, if they need the weights. None: L2."""
     start: Callable[[Variables, Shaped[np.ndarray, "n ..."]], Variables] | None = None
-    """Changes random weights before the first step, for example to clusters of local features. It receives the inputs
-    of random training places. None: the weights stay as they are."""
+    """Changes random weights before the first step, given the inputs of random training places."""
 
 
 def finite_points(record: Record) -> Float32[np.ndarray, "n 3"]:
@@ -82,16 +69,21 @@ def finite_points(record: Record) -> Float32[np.ndarray, "n 3"]:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def rolled(key: Array, inputs: Shaped[Array, "b ..."], *, axis: int) -> Shaped[Array, "b ..."]:
-    """Roll each input along `axis`, the azimuths, by its own random number of columns."""
-    shifts = jax.random.randint(key, (len(inputs),), 0, inputs.shape[axis])
-    return jax.vmap(lambda one, shift: jnp.roll(one, shift, axis=axis - 1))(inputs, shifts)
+def rolled(key: Array, inputs: Shaped[Array, "b r s *_"]) -> Shaped[Array, "b r s *_"]:
+    """Roll each input along the axis after the first one, the azimuths, by its own random number of columns."""
+    shifts = jax.random.randint(key, (len(inputs),), 0, inputs.shape[2])
+    return jax.vmap(lambda one, shift: jnp.roll(one, shift, axis=1))(inputs, shifts)
+
+
+def rotated_points(key: Array, points: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
+    """Rotate the first three coordinates of the points of each input about z by its own random angle."""
+    angles = jax.random.uniform(key, (len(points),), maxval=2 * jnp.pi)
+    return points.at[..., :3].set(rotate_points(points[..., :3], angles))
 
 
 def triplet(variables: Variables, tuples: Tuples, *, squared: bool = False, **options) -> Float[Array, ""]:
     """Return the mean over the tuples of `losses.lazy_triplet` with these options, with d = L2 or its square."""
-    positive, negative = from_anchors(tuples, squared=squared)
-    return lazy_triplet(positive, negative, **options).mean()
+    return lazy_triplet(*_from_anchors(tuples, squared=squared), **options).mean()
 
 
 def quadruplet(variables: Variables, tuples: Tuples, *, closest_positive: bool) -> Float[Array, ""]:
@@ -99,12 +91,10 @@ def quadruplet(variables: Variables, tuples: Tuples, *, closest_positive: bool) 
 
         max over negatives of [0.5 + d(anchor, p) - d(anchor, n)]_+ + the same of [0.2 + d(anchor, p) - d(o, n)]_+
 
-    The published other negative o is far from all places of the tuple. Here it is the anchor of the next tuple, because
-    tuples have no more places. Its distance from the negatives is not checked. A single tuple has no second term.
-
-    With `closest_positive`, p is the closest positive. Otherwise it is the farthest one.
+    p is the closest or the farthest positive. The published other negative o is far from all places of the tuple. Here
+    it is the anchor of the next tuple, at any distance from the negatives. A single tuple has no second term.
     """
-    positive, negative = from_anchors(tuples, squared=True)
+    positive, negative = _from_anchors(tuples, squared=True)
     total = lazy_triplet(positive, negative, margin=MARGIN, closest_positive=closest_positive)
     if len(tuples.descriptors) > 1:
         others = jnp.roll(tuples.descriptors[:, :1], -1, axis=0)
@@ -114,7 +104,7 @@ def quadruplet(variables: Variables, tuples: Tuples, *, closest_positive: bool) 
     return total.mean()
 
 
-def from_anchors(tuples: Tuples, *, squared: bool) -> list[Float[Array, "t _"]]:
+def _from_anchors(tuples: Tuples, *, squared: bool) -> list[Float[Array, "t _"]]:
     """Return the distances of the anchors to their positives and to their negatives."""
     anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
     distances = descriptor_distance(*jnp.broadcast_arrays(anchors, others), squared=squared)

@@ -1,11 +1,7 @@
 """OverlapTransformer (Ma et al., 2022), rebuilt from the paper: attention between the columns of a range image.
 
-Published recipe: Adam at 5e-6, multiplied by 0.9 every 5 epochs, 100 epochs of KITTI. A step has one anchor, 6
-positives with an overlap above 0.3 and 6 negatives. The loss is the sum over the negatives of a triplet loss with
-margin 0.5, with the farthest positive.
-
-Recipe here: the same optimiser and loss, 2 tuples a step. Distances decide which places are positives, not overlaps.
-Trained from scratch, as published.
+Differences from the published recipe: 2 tuples a step, a constant learning rate, and distances instead of overlaps
+decide which places are positives.
 """
 
 import functools
@@ -16,6 +12,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
 from sglpr_jax.data.recording import Record
+from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.learned.layers import HE, NetVLAD
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, rolled, triplet
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
@@ -33,36 +30,30 @@ CHANNELS, HEADS, HIDDEN, CLUSTERS = 256, 4, 1024, 64
 MARGIN = 0.5
 
 
-def range_image(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "64 900"]:
+def range_image(record: Record) -> Float32[np.ndarray, "64 900"]:
     """Return the distance of the nearest point of each pixel, divided by 80 m. Pixels without points are 0.
 
-    Rows are elevations from 15 degrees down to -25, in steps of 0.625 degrees. They contain the beams of HDL-64E (2 to
-    -24.8 degrees) and VLP-16 (15 to -15), and all but the lowest beams of HDL-32E (10.7 to -30.7). Rows between the
-    beams of a sensor stay empty. Points at other elevations are dropped. Columns are azimuths of 0.4 degrees,
-    counter-clockwise from x.
-
-    Arguments:
-      points: Points in metres: x forward, y left, z up.
+    Rows are elevations from 15 degrees down to -25, in steps of 0.625 degrees. They contain the beams of HDL-64E and
+    VLP-16, and all but the lowest beams of HDL-32E. Points at other elevations are dropped. Columns are azimuths of 0.4
+    degrees, counter-clockwise from x. Raises ValueError if the scan shows no place.
     """
-    x, y, z = points.astype(np.float64).T
-    distance, angle = np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x) % (2 * np.pi)
-    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
-    row = np.floor((HIGHEST_DEG - elevation) * (ROWS / (HIGHEST_DEG - LOWEST_DEG)))
+    points = finite_points(record)
+    radius, angle, z = polar(points)
+    distance = np.sqrt(np.sum(points.astype(np.float64) ** 2, axis=1))
+    row = np.floor((HIGHEST_DEG - np.degrees(np.arctan2(z, radius))) * (ROWS / (HIGHEST_DEG - LOWEST_DEG)))
     inside = (distance > 0) & (distance <= FARTHEST_M) & (row >= 0) & (row < ROWS)
-    column = np.floor(angle * (COLUMNS / (2 * np.pi))) % COLUMNS
-    pixel = (row * COLUMNS + column)[inside].astype(np.int64)
-    image = np.full(ROWS * COLUMNS, np.inf)
-    np.minimum.at(image, pixel, distance[inside] / FARTHEST_M)
-    return np.where(np.isfinite(image), image, 0).astype(np.float32).reshape(ROWS, COLUMNS)
+    column = np.floor(angle % (2 * np.pi) * (COLUMNS / (2 * np.pi))) % COLUMNS
+    at = tuple(part[inside].astype(np.int64) for part in (row, column))
+    return extreme(np.minimum, (ROWS, COLUMNS), at, distance[inside] / FARTHEST_M).astype(np.float32)
 
 
 class OverlapTransformer(nn.Module):
     """Convolutions along the rows, one transformer layer between the columns, and NetVLAD: 256 numbers of unit length.
 
-    No layer knows the position of a column. A rotation by whole columns (0.4 degrees) therefore does not change the
-    descriptor. The paper gives the order of the layers, the sizes of the transformer and the clusters and outputs of
-    NetVLAD. These details are chosen here: the heights of the kernels, convolutions without normalisation, layer norms
-    after each part of the transformer, unit length of the local features, and the context gating.
+    No layer knows the position of a column, so a rotation by whole columns (0.4 degrees) does not change the
+    descriptor. The paper gives the order of the layers, the sizes of the transformer and of NetVLAD. Chosen here: the
+    heights of the kernels, no normalisation of the convolutions, the layer norms, unit length of the local features,
+    and the context gating.
     """
 
     @nn.compact
@@ -99,11 +90,6 @@ def dense(features: int, x: Float[Array, "*b c"]) -> Float[Array, "*b {features}
     return y.reshape(*x.shape[:-1], features)
 
 
-def prepare(record: Record) -> Float32[np.ndarray, "64 900"]:
-    """Return the range image of a scan. Raises ValueError if the scan shows no place."""
-    return range_image(finite_points(record))
-
-
 PUBLISHED = (
     "Adam 5e-6, times 0.9 every 5 epochs; sum over negatives of [0.5 + d_positive - d_negative]_+ with d = L2 squared; "
     "1 tuple of 6 positives (overlap above 0.3) and 6 negatives, 100 epochs of KITTI"
@@ -116,8 +102,8 @@ OVERLAP_TRANSFORMER = LearnedMethod(
     takes="points",
     weights=9_484_848,
     network=OverlapTransformer(),
-    prepare=prepare,
-    turned=functools.partial(rolled, axis=2),
+    prepare=range_image,
+    turned=rolled,
     loss=functools.partial(triplet, squared=True, margin=MARGIN, closest_positive=False, reduction="sum"),
     recipe=Recipe(PUBLISHED, TupleConfig(positives=6, negatives=6), tuples=2, learning_rates=(2e-6, 5e-6, 1e-4)),
 )

@@ -1,32 +1,22 @@
 """PointNetVLAD (Uy and Lee, 2018): features of points, pooled by NetVLAD. The TensorFlow form of its authors.
 
-Published recipe: Adam 5e-5, times 0.9 every 5 epochs and at least 1e-5, for 20 epochs. A step has 2 tuples of 2
-positives within 10 m, 18 negatives beyond 50 m and 1 other negative. Hard negatives come from epoch 6 on. The submaps
-of Oxford are not rotated. The decay of batch normalisation rises from 0.5 to 0.99.
-
-Recipe here: the same loss, optimiser and distances, with a constant learning rate, 8 negatives and no mining. A step of
-22 scans needs 4 GB, one of 44 would need 8 GB. Scans are rotated. The statistics of batch normalisation decay by 0.9
-per step. The input is one scan instead of a submap of 20 m.
-
-The PyTorch port of others differs in batch normalisation, activations, the choice of the positive and the learning
-rate. It is not followed.
+Differences from the published recipe: a constant learning rate, 8 negatives, because a step of 22 scans needs 4 GB, no
+mining, rotated scans, and one scan instead of a submap of 20 m.
 """
 
 import functools
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float, Float32, Int
+from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.bev import rotate_points
 from sglpr_jax.data.recording import Record
+from sglpr_jax.methods.cells import voxel_means
 from sglpr_jax.methods.learned.layers import maximum
-from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet
+from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rotated_points
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
-from sglpr_jax.methods.voxel_means import voxel_means
 from sglpr_jax.models.layers import l2_normalize
 
 POINTS = 4096
@@ -117,10 +107,8 @@ def scaled_points(record: Record) -> Float32[np.ndarray, "4096 3"]:
     """Return 4096 points above the ground, with coordinates between -1 and 1.
 
     The points are the means of the voxels of 0.4 m. They are drawn without replacement with the same seed for every
-    scan. If a scan has fewer voxels, all are used, and some of them are drawn again.
-
-    Raises:
-      ValueError: If the scan shows no place, or has no points above the ground within 40 m.
+    scan. If a scan has fewer voxels, all are used, and some of them are drawn again. Raises ValueError if the scan
+    shows no place, or has no points above the ground within 40 m.
     """
     points = finite_points(record)
     near = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]
@@ -128,21 +116,12 @@ def scaled_points(record: Record) -> Float32[np.ndarray, "4096 3"]:
         raise ValueError(
             f"{record.name}: expected points within {RANGE_M:g} m and above {GROUND_M:g} m, found none of {len(points)}"
         )
-    means = voxel_means(near, VOXEL_M)
-    return (means[_drawn(len(means))] / RANGE_M).astype(np.float32)
-
-
-def _drawn(available: int) -> Int[np.ndarray, "4096"]:
-    """Return 4096 row numbers below `available`."""
-    rng = np.random.default_rng(0)
-    if available >= POINTS:
-        return rng.choice(available, POINTS, replace=False)
-    return np.concatenate([np.arange(available), rng.choice(available, POINTS - available)])
-
-
-def turned(key: Array, points: Float[Array, "b n 3"]) -> Float[Array, "b n 3"]:
-    """Rotate each scan by a random angle."""
-    return rotate_points(points, jax.random.uniform(key, (len(points),), maxval=2 * jnp.pi))
+    means, rng = voxel_means(near, VOXEL_M), np.random.default_rng(0)
+    if len(means) >= POINTS:
+        rows = rng.choice(len(means), POINTS, replace=False)
+    else:
+        rows = np.concatenate([np.arange(len(means)), rng.choice(len(means), POINTS - len(means))])
+    return (means[rows] / RANGE_M).astype(np.float32)
 
 
 POINTNETVLAD = LearnedMethod(
@@ -153,7 +132,7 @@ POINTNETVLAD = LearnedMethod(
     weights=19_784_393,
     network=PointNetVlad(),
     prepare=scaled_points,
-    turned=turned,
+    turned=rotated_points,
     loss=functools.partial(quadruplet, closest_positive=True),
     recipe=Recipe(
         published=(

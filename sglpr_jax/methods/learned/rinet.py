@@ -1,11 +1,7 @@
 """RINet (Li et al., 2022): rings of 360 degrees, one for each of 12 classes, and a learned distance. Variant attention.
 
-Published recipe: Adam at 0.02 with weight decay 1e-6, 1024 pairs a step, 20 epochs, one negative for each positive of a
-soft label above 0.1, scans with themselves included. Half of the pairs lose up to 60 neighbouring columns of each scan.
-
-Recipe here: the same optimiser and loss, and 512 tuples of one positive and one negative a step, that is 1024 pairs.
-Half of the positives come from another visit, and each scan has its own draw of the lost columns. Scans are not paired
-with themselves. Trained from scratch, as published.
+Differences from the published recipe: 512 tuples of one positive and one negative, that is 1024 pairs, and half of the
+positives from another visit. Each scan has its own draw of the lost columns. Scans are not paired with themselves.
 """
 
 import jax
@@ -13,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import linen as nn
-from jaxtyping import Array, Float, Float32, Int32
+from jaxtyping import Array, Float, Float32
 
 from sglpr_jax.data.recording import Record
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.losses import descriptor_distance
+from sglpr_jax.methods.cells import extreme, polar
+from sglpr_jax.methods.learned.layers import batch_norm
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
 
@@ -41,36 +39,26 @@ MARGIN = 0.2
 LOST_COLUMNS = 60
 
 
-def ring_image(points: Float32[np.ndarray, "n 3"], classes: Int32[np.ndarray, " n"]) -> Float32[np.ndarray, "12 360"]:
-    """Return the horizontal range of one point of each class in each degree, divided by 50 m.
+def ring_image(record: Record) -> Float32[np.ndarray, "12 360"]:
+    """Return the horizontal range of one point of each of the `CLASSES` in each degree, divided by 50 m.
 
-    Arguments:
-      points: Points in metres. Points that are not finite or farther than 50 m are ignored.
-      classes: Class of each point, from 0 to 19.
-
-    Returns:
-      Rows of the `CLASSES`, columns from -180 degrees counter-clockwise. 0 where a class has no point.
+    Columns are degrees from -180, counter-clockwise. Cells without points within 50 m are 0. Raises ValueError if the
+    scan has no labels.
     """
+    points, classes = record.upright_points, classes_of(record, 20)
     row_of = np.full(20, -1)
     row_of[list(CLASSES)] = np.arange(len(CLASSES))
-    x, y, _ = np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.inf).astype(np.float64).T
-    reach, row = np.hypot(x, y), row_of[classes]
+    reach, angle, _ = polar(np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.inf))
+    row = row_of[classes]
     kept = (reach <= RANGE_M) & (row >= 0)
-    x, y, reach, row = x[kept], y[kept], reach[kept], row[kept]
     # Exactly 180 degrees would be column 360. The authors drop such points; here they are those of -180 degrees.
-    column = np.floor((np.arctan2(y, x) + np.pi) * (COLUMNS / (2 * np.pi))).astype(np.int64) % COLUMNS
-    nearest = np.full((len(CLASSES), COLUMNS), np.inf)
-    farthest = np.zeros_like(nearest)
-    np.minimum.at(nearest, (row, column), reach)
-    np.maximum.at(farthest, (row, column), reach)
-    image = np.where(np.isfinite(nearest), nearest, 0)
-    image[ROAD] = farthest[ROAD]
-    return (image / RANGE_M).astype(np.float32)
-
-
-def prepare(record: Record) -> Float32[np.ndarray, "12 360"]:
-    """Return the ring image of a scan with labels. Raises ValueError without labels."""
-    return ring_image(record.upright_points, classes_of(record, 20))
+    column = np.floor((angle[kept] + np.pi) * (COLUMNS / (2 * np.pi))).astype(np.int64) % COLUMNS
+    nearest, farthest = (
+        extreme(choose, (len(CLASSES), COLUMNS), (row[kept], column), reach[kept])
+        for choose in (np.minimum, np.maximum)
+    )
+    nearest[ROAD] = farthest[ROAD]
+    return (nearest / RANGE_M).astype(np.float32)
 
 
 def turned(key: Array, inputs: Float[Array, "b 12 360"]) -> Float[Array, "b 12 360"]:
@@ -89,8 +77,8 @@ def turned(key: Array, inputs: Float[Array, "b 12 360"]) -> Float[Array, "b 12 3
 
 
 class RINet(nn.Module):
-    """The network of one scan. It is exactly invariant to rotations by whole degrees: every layer is equivariant, and a
-    reduction keeps the strongest of the possible phases."""
+    """The network of one scan, exactly invariant to rotations by whole degrees: every layer is equivariant, and a
+    reduction keeps the strongest phase."""
 
     @nn.compact
     def __call__(self, inputs: Float[Array, "b 12 360"], *, train: bool) -> Float[Array, "b 288"]:
@@ -118,7 +106,7 @@ class RingConvolution(nn.Module):
         """Apply the layer. Column i of the result depends on the columns i, i + 1 and i + 2."""
         around = jnp.concatenate([x, x[:, :2]], axis=1)
         x = nn.Conv(self.channels, (3,), padding="VALID")(around)
-        return nn.leaky_relu(nn.BatchNorm(use_running_average=not train, momentum=0.9)(x), SLOPE)
+        return nn.leaky_relu(batch_norm(train)(x), SLOPE)
 
 
 class Attention(nn.Module):
@@ -154,8 +142,7 @@ def same_place(apart_m: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the cross entropy of the scores plus the contrastive loss of the descriptors, over all pairs with an
-    anchor."""
+    """Return the cross entropy of the scores plus the contrastive loss of the descriptors, for the pairs of anchors."""
     anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
     label = same_place(tuples.apart_m[:, 1:])
     entropy = optax.sigmoid_binary_cross_entropy(_logits(variables, jnp.abs(anchors - others)), label)
@@ -189,7 +176,7 @@ RINET = LearnedMethod(
     takes="labelled points",
     weights=98_765,
     network=RINet(),
-    prepare=prepare,
+    prepare=ring_image,
     turned=turned,
     loss=loss,
     compare=compare,

@@ -1,14 +1,8 @@
 """SGPR (Kong et al., 2020): a network on the semantic graph of a scan, with a learned comparison of two graphs.
 
-Published recipe: Adam 1e-3 with weight decay 5e-4, for 500 epochs of batches of 128 pairs. A pair within 3 m is
-positive, one beyond 20 m negative. The loss is the binary cross-entropy of both orders of a pair. Graphs are rotated,
-scaled, jittered, shifted and mirrored.
-
-Recipe here: the same loss, optimiser and distances. The pairs are those of an anchor with the places of its tuple.
-Graphs are only rotated.
+Differences from the published recipe: the pairs are those of an anchor with the places of its tuple, and graphs are
+only rotated.
 """
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +13,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from sglpr_jax.bev import rotate_points
 from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.data.views import classes_of
+from sglpr_jax.methods.cells import means, voxels
 from sglpr_jax.methods.learned.layers import batch_norm, maximum
-from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
+from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables, rotated_points
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
-from sglpr_jax.methods.voxel_means import voxels
 
 NEIGHBOURS = 10
 WIDTHS = (64, 64, 32)
@@ -37,30 +30,22 @@ TIE = 1e-4
 NODES = 100
 
 
-class Rule(NamedTuple):
-    """Clustering of a class."""
-
-    gap_m: float
-    """Maximum distance of neighbouring points of a cluster, in metres."""
-    points: int
-    """Minimum number of points of a cluster."""
-
-
 RULES = {
-    1: Rule(0.5, 100),  # car
-    4: Rule(0.5, 100),  # truck
-    5: Rule(0.5, 100),  # other vehicle
-    11: Rule(2.0, 300),  # sidewalk
-    12: Rule(2.0, 300),  # other ground
-    13: Rule(2.0, 300),  # building
-    14: Rule(0.5, 100),  # fence
-    15: Rule(2.0, 200),  # vegetation
-    16: Rule(0.2, 50),  # trunk
-    17: Rule(2.0, 300),  # terrain
-    18: Rule(0.2, 100),  # pole
-    19: Rule(0.2, 50),  # traffic sign
+    1: (0.5, 100),  # car
+    4: (0.5, 100),  # truck
+    5: (0.5, 100),  # other vehicle
+    11: (2.0, 300),  # sidewalk
+    12: (2.0, 300),  # other ground
+    13: (2.0, 300),  # building
+    14: (0.5, 100),  # fence
+    15: (2.0, 200),  # vegetation
+    16: (0.2, 50),  # trunk
+    17: (2.0, 300),  # terrain
+    18: (0.2, 100),  # pole
+    19: (0.2, 50),  # traffic sign
 }
-"""Published rules of the 12 classes of nodes. Other classes are ignored."""
+"""Published rules of the 12 classes of nodes: the maximum distance of neighbouring points of a cluster, in metres, and
+the minimum number of points of a cluster. Other classes are ignored."""
 MOST_POINTS = 50_000
 """Larger clusters are dropped."""
 FINER = 4
@@ -70,17 +55,15 @@ FINER = 4
 def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
     """Return up to 100 nodes: x, y, z of the centre in metres, and the class as 12 numbers, one 1 and eleven 0.
 
-    Missing nodes are zeros. If a scan has more than 100 clusters, those with the most points remain. The published
-    graph has 100 random ones, and takes clusters from the instances of SemanticKITTI where a scan has them.
-
-    Raises:
-      ValueError: If the scan shows no place, or has no labels or no cluster.
+    Missing nodes are zeros. Of more than 100 clusters, those with the most points remain. The published graph has 100
+    random ones, and takes clusters from the instances of SemanticKITTI where a scan has them. Raises ValueError if the
+    scan shows no place, or has no labels or no cluster.
     """
     points, classes = record.upright_points, classes_of(record, 20)
     check_cloud(points, name=record.name)
     finite = np.isfinite(points).all(axis=1)
     points, classes = points[finite], classes[finite]
-    found = [_nodes(points[classes == category], column, rule) for column, (category, rule) in enumerate(RULES.items())]
+    found = [_nodes(points[classes == kind], column, *rule) for column, (kind, rule) in enumerate(RULES.items())]
     counts, nodes = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if len(nodes) == 0:
         raise ValueError(
@@ -91,14 +74,13 @@ def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
 
 
 def _nodes(
-    points: Float32[np.ndarray, "n 3"], column: int, rule: Rule
+    points: Float32[np.ndarray, "n 3"], column: int, gap_m: float, fewest: int
 ) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, "k 15"]]:
     """Return the numbers of points and the nodes of the clusters of one class."""
-    cluster = clusters(points, rule.gap_m)
+    cluster = clusters(points, gap_m)
     counts = np.bincount(cluster)
-    sums = [np.bincount(cluster, weights=axis) for axis in points.T.astype(np.float64)]
-    kept = (counts >= rule.points) & (counts <= MOST_POINTS)
-    centres = np.stack(sums, axis=1)[kept] / counts[kept, None]
+    kept = (counts >= fewest) & (counts <= MOST_POINTS)
+    centres = means(points, cluster, counts)[kept]
     kinds = np.broadcast_to(np.eye(len(RULES))[column], (len(centres), len(RULES)))
     return counts[kept], np.concatenate([centres, kinds], axis=1).astype(np.float32)
 
@@ -111,9 +93,8 @@ def clusters(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, 
     if len(points) == 0:
         return np.zeros(0, np.int64)
     voxel, counts = voxels(points, gap_m / FINER)
-    means = np.stack([np.bincount(voxel, weights=axis) for axis in points.T], axis=1) / counts[:, None]
-    pairs = KDTree(means).query_pairs(gap_m, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(means), len(means)))
+    pairs = KDTree(means(points, voxel, counts)).query_pairs(gap_m, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(counts), len(counts)))
     return connected_components(links, directed=False)[1][voxel].astype(np.int64)
 
 
@@ -179,9 +160,9 @@ class TensorNetwork(nn.Module):
 class Sgpr(nn.Module):
     """Three layers of EdgeConv on positions and on classes, and attention: a vector of 32 numbers.
 
-    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others, as
-    published. Classes have equal distances, so the published neighbours of the first layer depend on the order of the
-    nodes. Here nodes that are nearer in space come first, and the order has no effect.
+    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others. Classes
+    have equal distances, so the published neighbours of the first layer depend on the order of the nodes. Here nodes
+    that are nearer in space come first.
     """
 
     def setup(self):
@@ -228,12 +209,6 @@ def compare(variables: Variables, queries: Float[Array, "q 32"], database: Float
     return jax.lax.map(lambda query: nn.softplus(-_logits(variables, query[None], database)[0]), queries)
 
 
-def turned(key: Array, graphs: Float[Array, "b n 15"]) -> Float[Array, "b n 15"]:
-    """Rotate each graph about z by a random angle."""
-    angles = jax.random.uniform(key, (len(graphs),), maxval=2 * jnp.pi)
-    return graphs.at[..., :3].set(rotate_points(graphs[..., :3], angles))
-
-
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     """Return the mean binary cross-entropy of each anchor with its positives (1) and negatives (0), in both orders."""
 
@@ -254,7 +229,7 @@ SGPR = LearnedMethod(
     weights=47_985,
     network=NETWORK,
     prepare=semantic_graph,
-    turned=turned,
+    turned=rotated_points,
     loss=loss,
     recipe=Recipe(
         published=(
