@@ -65,9 +65,8 @@ class CircularNet(nn.Module):
         maps = [block_means(polar, config.average, config.average)]
         for i, (width, stride, sectors) in enumerate(zip(config.widths, config.strides, config.means, strict=True)):
             if i < len(config.fine):
-                fine = CircularBlock(config.fine[i], config.strides[i - 1] if i else config.average, name=f"fine_{i}")(
-                    fine
-                )
+                stride_of_fine = config.strides[i - 1] if i else config.average
+                fine = CircularBlock(config.fine[i], stride_of_fine, name=f"fine_{i}")(fine)
                 joining = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
                 maps[-1] = jnp.concatenate([maps[-1], joining], axis=-1)
             maps.append(block_means(CircularBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
@@ -91,7 +90,8 @@ class CircularDecoder(nn.Module):
         for i, of_map in enumerate(reversed(finer)):
             seen, width = maps[of_map], self.widths[max(of_map - 1, 0)]
             x = Linear(width, name=f"narrow_{i}")(x)
-            x = jnp.concatenate([_repeated(x, seen.shape[1] // x.shape[1], seen.shape[2] // x.shape[2]), seen], axis=-1)
+            x = x.repeat(seen.shape[1] // x.shape[1], axis=1).repeat(seen.shape[2] // x.shape[2], axis=2)
+            x = jnp.concatenate([x, seen], axis=-1)
             x = CircularBlock(width, name=f"block_{i}")(x)
         return x
 
@@ -109,7 +109,3 @@ def _means_of_parts(x: Float[Array, "b n k"], parts: int) -> Float[Array, "b n _
     if parts == 1:
         return x
     return functools.reduce(jnp.add, jnp.split(x, parts, axis=-1)) * (1 / parts)
-
-
-def _repeated(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
-    return x.repeat(radii, axis=1).repeat(sectors, axis=2)

@@ -16,14 +16,7 @@ import jax.export
 import numpy as np
 from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
 
-from sglpr_jax.data.density_image import (
-    CEILING_M,
-    EDGE_STEP_M,
-    FIRST_EDGE_M,
-    FLOOR_M,
-    MAX_VOXELS,
-    REACH_M,
-)
+from sglpr_jax.data.density_image import CEILING_M, EDGE_STEP_M, FIRST_EDGE_M, FLOOR_M, MAX_VOXELS, REACH_M
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import check_holds_only, replacing, write_json

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from sglpr_jax.sim.objects import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
+from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
 from sglpr_jax.sim.shapes import AnyArray, Vectors
 from sglpr_jax.sim.styles import TOWN, Scenery
 
@@ -91,14 +91,9 @@ def label_at(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Int[np.ndarray, "
     return np.asarray(ground.label[row, column], dtype=np.int32)
 
 
-def is_raised(label: Int[np.ndarray, "*b"]) -> Bool[np.ndarray, "*b"]:
-    """Whether ground with this label is KERB_M above the road."""
-    return np.asarray(~np.isin(label, ROAD_LEVEL))
-
-
 def surface_height(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
-    """Height of the ground at `xy` including kerbs, in metres."""
-    return np.asarray(relief_height(ground.relief, xy) + KERB_M * is_raised(label_at(ground, xy)))
+    """Height of the ground at `xy` in metres. Other ground than ROAD_LEVEL is KERB_M above the road."""
+    return np.asarray(relief_height(ground.relief, xy) + KERB_M * ~np.isin(label_at(ground, xy), ROAD_LEVEL))
 
 
 class GroundView(NamedTuple):
@@ -118,14 +113,9 @@ def ground_view(ground: Ground, sensor: Float[np.ndarray, "3"], *, reach_m: floa
     xy, relief = sensor[:2], ground.relief
     near = ground.around(xy, reach_m)
     local = relief._replace(phase=(relief.wave @ xy + relief.phase) % (2 * np.pi))
-    numbers = (
-        near.origin - xy,
-        local,
-        sensor[2],
-        sensor[2] - relief_height(relief, xy),
-        relief_gradient(relief, xy),
-        relief_curvature(relief, xy),
-    )
+    height = sensor[2] - relief_height(relief, xy)
+    slopes = relief_gradient(relief, xy), relief_curvature(relief, xy)
+    numbers = (near.origin - xy, local, sensor[2], height, *slopes)
     return GroundView(near.label, *jax.tree.map(np.float32, numbers))
 
 
@@ -148,7 +138,7 @@ def meet_ground(
 
     at_kerb, at_road = _crossing(bend, closing, ground.height - KERB_M), _crossing(bend, closing, ground.height)
     kerb_label, road_label = _label(rays, at_kerb, ground), _label(rays, at_road, ground)
-    raised = _is_raised(kerb_label) & jnp.isfinite(at_kerb)
+    raised = jnp.all(jnp.stack([kerb_label != low for low in ROAD_LEVEL]), axis=0) & jnp.isfinite(at_kerb)
     distance = jnp.where(raised, at_kerb, at_road)
     facing = jnp.clip(closing + 2 * bend * jnp.where(jnp.isfinite(distance), distance, 0), 0, 1)
     return distance, jnp.where(raised, kerb_label, road_label), facing
@@ -181,7 +171,3 @@ def _label(rays: Vectors, distance: Array, ground: GroundView) -> Int[Array, "*r
     row = jnp.clip(jnp.floor((distance * rays.y - corner[1]) / CELL_M).astype(jnp.int32), 0, rows - 1)
     column = jnp.clip(jnp.floor((distance * rays.x - corner[0]) / CELL_M).astype(jnp.int32), 0, columns - 1)
     return jnp.asarray(ground.label)[row, column].astype(jnp.int32)
-
-
-def _is_raised(label: Int[Array, "*rays"]) -> Bool[Array, "*rays"]:
-    return jnp.all(jnp.stack([label != low for low in ROAD_LEVEL]), axis=0)

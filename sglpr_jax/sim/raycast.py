@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.sim import objects
+from sglpr_jax.sim import labels
 from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
 
 COLUMNS = 32
@@ -215,14 +215,14 @@ def _nearest_of_kind(
 
 _REFLECTIVITY = np.full(260, 0.35, np.float32)
 for _id, _value in {
-    objects.NO_RETURN: 0.0,
-    objects.ROAD: 0.25,
-    objects.PARKING: 0.25,
-    objects.LANE_MARKING: 0.6,
-    objects.BUILDING: 0.4,
-    objects.CAR: 0.3,
-    objects.MOVING[objects.CAR]: 0.3,
-    objects.TRAFFIC_SIGN: 0.95,
+    labels.NO_RETURN: 0.0,
+    labels.ROAD: 0.25,
+    labels.PARKING: 0.25,
+    labels.LANE_MARKING: 0.6,
+    labels.BUILDING: 0.4,
+    labels.CAR: 0.3,
+    labels.MOVING[labels.CAR]: 0.3,
+    labels.TRAFFIC_SIGN: 0.95,
 }.items():
     _REFLECTIVITY[_id] = _value
 

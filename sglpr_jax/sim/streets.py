@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter1d
 from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief
-from sglpr_jax.sim.objects import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
+from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
 MIDDLE_M = 1.2
@@ -163,8 +163,8 @@ def _draw_stretches(
         stop = min([stop, *changes[changes > start].tolist()])
         name = name if rng.random() < 0.7 else _new_style(rng, scenery)
         here = STYLES["highway" if fast[start] else name]
-        half_width = sum(here.street.road) / 2 + town_width
-        median = rng.random() < here.street.median
+        half_width = sum(here.road) / 2 + town_width
+        median = rng.random() < here.median
         # One stretch in four has another style on its right side.
         other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
         left = draw_side(rng, here, median=median, look_alike=look_alike)
@@ -324,7 +324,7 @@ def _profiles(stretches: tuple[Stretch, ...]) -> Profiles:
     for i, stretch in enumerate(stretches):
         for row, side in ((2 * i, stretch.left), (2 * i + 1, stretch.right)):
             widths = [stretch.half_width, *(strip.width for strip in side.strips), GARDEN_M]
-            labels = [ROAD, *(strip.label for strip in side.strips), side.style.plots.garden]
+            labels = [ROAD, *(strip.label for strip in side.strips), side.style.garden]
             bounds[row, : len(widths)] = np.cumsum(widths)
             names[row, : len(labels)] = labels
     return bounds, names

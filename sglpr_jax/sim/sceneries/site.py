@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.sim.drive import shifted, waves
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief, draw_relief
-from sglpr_jax.sim.objects import BUILDING, OTHER_GROUND, TERRAIN, Part, Thing, block
+from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, TERRAIN
+from sglpr_jax.sim.objects import Part, Thing, block
 from sglpr_jax.sim.placing import HEAD_ROOM_M, Spot, distances, place, to_scene
 from sglpr_jax.sim.routes import Line, Revisit, resampled, travelled
 from sglpr_jax.sim.styles import TOWN
@@ -129,7 +130,7 @@ def closed_box(left: float, right: float, low: float, high: float, height_m: flo
 def build(site: Site, driven: Line, *, clearance_m: float) -> World:
     """Builds the world of a site without standing things closer than `clearance_m` to the driven line."""
     placed = place(site.spots, site.ground)
-    driven = driven if site.levels is None else site.levels.along(driven).xy
+    driven = driven if site.levels is None else site.levels.along(driven)[0]
     low = np.array([part.bottom < HEAD_ROOM_M for part in placed.parts]) & ~placed.shapes.velocity.any(axis=1)
     bad = low & (distances(placed.shapes, driven, reach_m=clearance_m) < clearance_m)
     scene = to_scene(placed, ~np.isin(placed.owner, placed.owner[bad]))
