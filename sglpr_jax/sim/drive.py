@@ -39,10 +39,7 @@ TILT_DEG = 0.6
 """Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
 TILT_S = 0.5
 """Approximate duration of a tilt, in seconds."""
-HAND_HEIGHT_M, HAND_BOB_M = 1.4, 0.04
-"""Mean height of a hand-held sensor above the ground, and amplitude of its vertical motion, in metres."""
-HAND_TILT_DEG = 15.0
-"""Maximum pitch and roll of a hand-held sensor, in degrees."""
+
 STEPS_HZ = 2.0
 """Steps of a walking person per second."""
 SHIFT_S = 3.0
@@ -223,14 +220,6 @@ def _clock(
     return np.concatenate([[0.0], np.cumsum(np.diff(length) / ((speed[1:] + speed[:-1]) / 2))])
 
 
-class Motion(NamedTuple):
-    """Motion of the sensor relative to the ground below the path."""
-
-    tilt: np.ndarray  # (n, 2) pitch and roll, radians
-    height: np.ndarray | float  # (n,) or one value for all, metres above the ground
-    left: np.ndarray | float  # (n,) or one value for all, metres to the left of the path
-
-
 @dataclasses.dataclass(frozen=True)
 class Carrier:
     """Vehicle or person that carries the sensor."""
@@ -259,13 +248,19 @@ class Carrier:
     reverse_m: Range = (5.0, 15.0)
     """Range of the length of a reversal, in metres."""
 
-    def motion(self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float) -> Motion:
-        """Draws the motion of the sensor at `times`. Its mean height is `height_m` if the carrier has no height."""
+    def motion(
+        self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"] | float, Float[np.ndarray, " n"] | float]:
+        """Draws the motion of the sensor at `times`. Its mean height is `height_m` if the carrier has no height.
+
+        Returns:
+          Pitch and roll in radians, height above the ground, and distance to the left of the path, in metres.
+        """
         height_m = height_m if self.height_m is None else self.height_m
         if not self.walks:
-            return Motion(body_tilt(rng, times) * (self.tilt_deg / TILT_DEG), height_m, 0.0)
+            return _body_tilt(rng, times) * (self.tilt_deg / TILT_DEG), height_m, 0.0
         swing, bob = _steps(rng, times)
-        return Motion(np.radians(self.tilt_deg) * swing, height_m + self.bob_m * bob, -self.sway_m * swing[:, 1])
+        return np.radians(self.tilt_deg) * swing, height_m + self.bob_m * bob, -self.sway_m * swing[:, 1]
 
     def halted(self, rng: np.random.Generator, path: PlanarPath, *, poses: int) -> PlanarPath:
         """Inserts the halts into the drive along `path`. The number of poses is a multiple of `poses`."""
@@ -303,22 +298,19 @@ class Carrier:
 
 
 VEHICLE = Carrier()
-HANDHELD = Carrier(
-    speed_mps=(1.2, 1.2), rate_hz=5.0, height_m=HAND_HEIGHT_M, walks=True, tilt_deg=HAND_TILT_DEG, bob_m=HAND_BOB_M
-)
 CARRIERS = {
     "vehicle": VEHICLE,
     "backpack": Carrier(
         speed_mps=(1.0, 1.4), rate_hz=2.0, height_m=1.8, walks=True, tilt_deg=5.0, bob_m=0.03, sway_m=0.04
     ),
-    "handheld": HANDHELD,
+    "handheld": Carrier(speed_mps=(1.2, 1.2), rate_hz=5.0, height_m=1.4, walks=True, tilt_deg=15.0, bob_m=0.04),
     "cart": Carrier(speed_mps=(0.8, 1.2), height_m=0.6, tilt_deg=0.0),
     "stop-and-reverse": Carrier(halt_every_s=(12.0, 35.0)),
 }
 """Carriers by name."""
 
 
-def body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+def _body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
     """Draws pitch and roll of the vehicle's body relative to the ground at `times`, in radians."""
     even = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
     width = TILT_S * PATH_HZ

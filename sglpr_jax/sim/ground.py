@@ -1,10 +1,8 @@
 """Ground: smooth hills, a raster of semantic labels, and the intersection of rays with both.
 
-Along a ray, a parabola approximates the ground, so the intersection is the solution of a quadratic equation. Two
-parabolas are used, both with the height and slope of the ground below the sensor. The first one also has the curvature
-there and gives the approximate distance. The second one passes through the true height at that distance. The error in
-height is at most 0.04 m at distances of 30 to 40 m in towns. In the outskirts, 6 % of the errors exceed 0.2 m there.
-Shapes stand on the true height.
+Along a ray, a parabola with the height and slope below the sensor approximates the ground. A first one with the
+curvature there gives the approximate distance; the second one passes through the true height at that distance. The
+error in height is at most 0.04 m at 30 to 40 m in towns. In the outskirts, 6 % of the errors exceed 0.2 m there.
 """
 
 from typing import NamedTuple
@@ -122,11 +120,10 @@ def ground_view(ground: Ground, sensor: Float[np.ndarray, "3"], *, reach_m: floa
 def meet_ground(
     rays: Vectors, ground: GroundView, *, reach_m: float
 ) -> tuple[Float[Array, "*rays"], Int[Array, "*rays"], Float[Array, "*rays"]]:
-    """Returns distance, label and facing of the ground hit by each ray from the sensor.
+    """Returns distance (inf without a hit), label, and cosine to the normal, of the ground hit by each ray.
 
-    `rays` are unit vectors in the world's axes. Facing is the cosine of the angle between ray and normal. A ray that
-    misses the ground has distance inf. Beyond `reach_m`, distances are rough. A ray that hits the vertical face of a
-    kerb gets the label of the ground behind the kerb, and the distance at which it would hit the road there.
+    `rays` are unit vectors in the world's axes, from the sensor. Beyond `reach_m`, distances are rough. A ray that hits
+    the face of a kerb gets the label behind the kerb, and the distance at which it would hit the road there.
     """
     slope = ground.gradient[0] * rays.x + ground.gradient[1] * rays.y
     curvature, closing = ground.curvature, slope - rays.z

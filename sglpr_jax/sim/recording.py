@@ -18,7 +18,6 @@ from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.drive import (
     VEHICLE,
     Carrier,
-    Motion,
     PlanarPath,
     TimedPoses,
     check_drawing,
@@ -153,7 +152,14 @@ def drive_through(
     """
     clock = path.times[rows]
     ids, times = ids or numbered(len(rows)), clock if times is None else times
-    in_world, of_lidar = _poses(world, path, rows, carrier.motion(rng, clock, height_m=sensor.height_m))
+    tilt, height, left = carrier.motion(rng, clock, height_m=sensor.height_m)
+    yaw = path.yaw[rows]
+    aside = np.reshape(left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    of_lidar = in_world = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
+    if world.levels is not None:  # storeys above one another
+        there, *ground = (values[rows] for values in world.levels.along(path.xy))
+        in_world = poses_on(world.ground.relief, there + aside, yaw, height_m=height, tilt=tilt)
+        of_lidar = poses_on(tuple(ground), path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
     speed = speeds(path)[rows]
     height_m = sensor.height_m if carrier.height_m is None else carrier.height_m
     row_of = {scan_id: i for i, scan_id in enumerate(ids)}
@@ -182,18 +188,3 @@ def drive_through(
         poses=TimedPoses(of_lidar, times),
         render=render,
     )
-
-
-def _poses(
-    world: World, path: PlanarPath, rows: Int[np.ndarray, " n"], motion: Motion
-) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
-    """Poses of the LiDAR in the world that is rendered, and true poses. They differ on storeys above one another."""
-    yaw = path.yaw[rows]
-    aside = np.reshape(motion.left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    sway = {"height_m": motion.height, "tilt": motion.tilt}
-    if world.levels is None:
-        poses = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, **sway)
-        return poses, poses
-    there, ground, slope = (values[rows] for values in world.levels.along(path.xy))
-    in_world = poses_on(world.ground.relief, there + aside, yaw, **sway)
-    return in_world, poses_on((ground, slope), path.xy[rows] + aside, yaw, **sway)

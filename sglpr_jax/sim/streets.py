@@ -118,10 +118,7 @@ def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
 
 
 def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) -> tuple[Street, ...]:
-    """Draws the streets along `path` and their side streets.
-
-    Equal arguments and an equal state of `rng` give equal streets.
-    """
+    """Draws the streets along `path` and their side streets."""
     middle = gaussian_filter1d(path.xy + MIDDLE_M * path.left, 1.5, axis=0, mode="nearest")
     style = _new_style(rng, scenery)
     streets, lines = [], [middle]
@@ -136,14 +133,10 @@ def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) 
             branch = _free_line(start, heading, length, bend, KDTree(np.concatenate(lines)))
             if len(branch) > 20:
                 lines.append(branch)
-                streets.append(_side_street(rng, branch, scenery))
+                ahead, slow = np.gradient(branch, axis=0), np.zeros(len(branch), bool)
+                stretches = tuple(_draw_stretches(rng, slow, _new_style(rng, scenery), scenery))
+                streets.append(Street(branch, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), stretches))
     return tuple(streets)
-
-
-def _side_street(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], scenery: Scenery) -> Street:
-    ahead = np.gradient(line, axis=0)
-    stretches = _draw_stretches(rng, np.zeros(len(line), bool), _new_style(rng, scenery), scenery)
-    return Street(line, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), tuple(stretches))
 
 
 def _new_style(rng: np.random.Generator, scenery: Scenery) -> str:

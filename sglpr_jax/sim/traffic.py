@@ -47,11 +47,8 @@ FLOWS = (
 )
 
 
-class Lane(NamedTuple):
-    """Line beside the vehicle's path, with one point per point of the path."""
-
-    xy: np.ndarray  # (n, 2) metres
-    usable: np.ndarray  # (n,) whether the lane can be used at this point
+Lane = tuple[np.ndarray, np.ndarray]
+"""Position (n, 2) in metres, and whether the lane can be used, for each point of the path."""
 
 
 def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
@@ -73,7 +70,7 @@ def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
     away["oncoming"] = to_middle + beyond, np.ones(len(stretch), bool)
     away["own"] = np.zeros(len(stretch)), np.ones(len(stretch), bool)
     return {
-        name: Lane(path.xy + gaussian_filter1d(left, 5.0, mode="nearest")[:, None] * path.left, usable)
+        name: (path.xy + gaussian_filter1d(left, 5.0, mode="nearest")[:, None] * path.left, usable)
         for name, (left, usable) in away.items()
     }
 
@@ -101,7 +98,7 @@ def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], p
         met, name = block + rng.uniform(0, flow.every_m), flow.lanes[rng.integers(len(flow.lanes))]
         thing, speed = objects.moving(flow.make(rng)), rng.uniform(*flow.speed)
         direction, follows = int(rng.choice((-1, 1))), rng.choice((-1, 1)) * rng.uniform(14, 35)
-        if not 0 <= met < len(path.xy) or not lines[name].usable[int(met)]:
+        if not 0 <= met < len(path.xy) or not lines[name][1][int(met)]:
             continue
         ego = path.speed[int(met)]
         if name == "own":
@@ -116,12 +113,12 @@ def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], p
             step = float(np.clip(_PIECE_M / speed, *_PIECE_S))
             offsets = np.arange(-lasts, lasts, step)
             times, along = path.times[int(met)] + offsets, met + direction * speed * offsets
-        yield _pieces(thing, lines[name], path, times, along, direction)
+        yield _pieces(thing, lines[name][0], path, times, along, direction)
 
 
 def _pieces(
     thing: Thing,
-    lane: Lane,
+    lane: Float[np.ndarray, "n 2"],
     path: Path,
     times: Float[np.ndarray, " k"],
     along: Float[np.ndarray, " k"],
@@ -130,7 +127,7 @@ def _pieces(
     """Motion of a thing that is `along` metres along the path at `times`, without parts beyond the lane's ends."""
     inside = (along[:-1] >= 0) & (along[1:] >= 0) & (np.maximum(along[:-1], along[1:]) <= len(path.xy) - 1)
     index = np.arange(len(path.xy))
-    xy = np.stack([np.interp(along, index, axis) for axis in lane.xy.T], axis=1)
+    xy = np.stack([np.interp(along, index, axis) for axis in lane.T], axis=1)
     middle = (along[:-1] + along[1:]) / 2
     heading = np.interp(middle, index, path.heading) + (np.pi if direction < 0 else 0.0)
     return Pieces(thing, *(leaf[inside] for leaf in (xy[:-1], xy[1:], heading, times[:-1], times[1:])))

@@ -233,9 +233,8 @@ def _tour(floor: Floor, visited: list[Room], closed: bool) -> Line:
 
 def _spots(floor: Floor, room: Room, wing: int) -> list[Spot]:
     """Walls and furniture of a room. Each piece of furniture is left out by itself if the path passes there."""
-    x, y, begin = room.x_m, wing * floor.pitch_m, floor.half_m + WALL_M
-    inside = [(part._replace(y=part.y + begin),) for part in room.furniture]
-    return [Spot(thing, x, y, side=room.side) for thing in (_walls(floor, room), *inside)]
+    inside = [(part._replace(y=part.y + (floor.half_m + WALL_M)),) for part in room.furniture]
+    return [Spot(thing, room.x_m, wing * floor.pitch_m, side=room.side) for thing in (_walls(floor, room), *inside)]
 
 
 def _walls(floor: Floor, room: Room) -> Thing:
