@@ -25,12 +25,10 @@ class CircularBackbone:
     config: CircularConfig
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """Computes the features: the last map. There is no stochastic depth."""
         maps = CircularNet(self.config, name="rings")(image)  # the name in weight files
         return Seen(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """Computes a pixel for each pixel of the averaged image."""
         return CircularDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
 
 
@@ -43,7 +41,6 @@ class CircularBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b r s c"]) -> Float[Array, "b _ s {self.features}"]:
-        """Computes a map with the same number of sectors."""
         convolution = Convolution(self.features, strides=(self.stride, 1), circular=True, name="convolution")
         y = nn.relu(LayerNorm(name="norm")(convolution(x)))
         return x + y if x.shape == y.shape else y

@@ -91,7 +91,7 @@ class WindowAttention(nn.Module):
         return Linear(c, name="projection")(mixed.reshape(n, t, c))
 
     def _position_bias(self, tokens: int) -> Float[Array, "heads t t"]:
-        """Looks up the table by a product with one-hot rows, whose gradient is a product instead of a slow scatter."""
+        """Reads the table by a product with one-hot rows, because the gradient of a lookup is a slow scatter."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
         table = weight(self, "position_bias", initial.normal(0.02), (rows, self.heads))
@@ -140,7 +140,6 @@ class DropPath(nn.Module):
 
     @nn.compact
     def __call__(self, branch: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w c"]:
-        """Returns the branch unchanged if `train` is False or the rate is 0."""
         if not train or self.rate == 0:
             return branch
         keep = 1 - self.rate
@@ -236,7 +235,6 @@ class PatchExpand(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.channels}"]:
-        """Multiplies height and width by `factor`."""
         b, h, w, _ = x.shape
         tokens = Linear(self.factor**2 * self.channels, use_bias=False, name="expand")(x)
         strips = tokens.reshape(b * h, w, self.factor, self.factor * self.channels).transpose(0, 2, 1, 3)

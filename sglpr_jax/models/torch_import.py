@@ -53,16 +53,11 @@ _SWIN_T_ONLY = re.compile(r"head\.(weight|bias)|layers\.\d+\.(blocks\.\d+|downsa
 
 
 class SwinTImport(NamedTuple):
-    """Parameters after an import of Swin-T, and a list of what happened to every weight.
-
-    `copied` and `kept` are names of this project: weights from the checkpoint, and unchanged weights. `unused` are
-    names of the checkpoint.
-    """
+    """Parameters after an import of Swin-T."""
 
     params: Params
-    copied: tuple[str, ...]
-    kept: tuple[str, ...]
-    unused: tuple[str, ...]
+    copied: tuple[str, ...]  # names of this project
+    unused: tuple[str, ...]  # names of the checkpoint
 
 
 def import_swin_unet(params: Params, path: Path | str) -> Params:
@@ -165,8 +160,7 @@ def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
         raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
     if not copied:
         raise ValueError("expected weights that fit the model, found none; Swin-T fits 96 channels and window 7")
-    kept = tuple(sorted(set(weights) - set(copied)))
-    return SwinTImport(dataclasses.replace(params, weights=as_tree(weights)), tuple(copied), kept, tuple(unused))
+    return SwinTImport(dataclasses.replace(params, weights=as_tree(weights)), tuple(copied), tuple(unused))
 
 
 def torch_name(name: str) -> str:
