@@ -11,7 +11,7 @@ import pytest
 
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
-from sglpr_jax.models.input_image import field_of_view, prepare, to_polar
+from sglpr_jax.models.input_image import prepare
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.sglpr import describe, forward, init, segment
@@ -165,23 +165,6 @@ def test_mean_pooling_is_numpys(random_variables):
     expected = np.asarray(seen["head_convolution1"], np.float64).mean((1, 2)) @ layer["kernel"] + layer["bias"]
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
     np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_a_polar_head_for_tokens_reads_patches_of_each_class_s_share(random_params, views):
-    config = with_head(POLAR, input="labels")
-    params, (images, labels) = random_params(config), views
-    planes = np.eye(20, dtype=np.float32)[np.where(field_of_view(config), labels, 0)]
-    polar = np.asarray(to_polar(jnp.asarray(planes), config.grid, *config.polar), np.float64)
-    patches = polar.reshape(4, 4, 4, 8, 4, 20).transpose(0, 1, 3, 2, 4, 5).reshape(4, 4, 8, -1)
-    weights = jax.tree.map(np.asarray, params.weights)
-    layer, norm = (weights["patch_embed"][name] for name in ("projection", "norm"))
-    tokens = patches @ layer["kernel"].reshape(-1, config.backbone.width) + layer["bias"]
-    tokens = (tokens - tokens.mean(-1, keepdims=True)) / np.sqrt(tokens.var(-1, keepdims=True) + 1e-5)
-    tokens = jnp.asarray(tokens * norm["scale"] + norm["bias"], jnp.float32)
-    expected, _ = PlaceHead(config.head, circular=True).apply({"params": weights["place_head"]}, tokens)
-    np.testing.assert_allclose(fast_describe(params, images, labels), expected, atol=1e-5)
-    np.testing.assert_array_equal(fast_describe(params, images + 1, labels), fast_describe(params, images, labels))
 
 
 @pytest.mark.parametrize("call", [describe, forward])

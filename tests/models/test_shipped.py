@@ -88,16 +88,6 @@ def test_a_name_means_the_shipped_weights_and_a_path_a_folder(placeholder, param
     chex.assert_trees_all_equal(load("other"), load(own))
 
 
-def test_what_is_neither_a_name_nor_a_folder_lists_the_names(placeholder, tmp_path, monkeypatch):
-    for unknown in ("simulatd", str(tmp_path / "none"), placeholder / WEIGHTS_FILE):
-        with pytest.raises(FileNotFoundError, match=rf"{unknown}: .* \(placeholder\), found neither"):
-            load(unknown)
-    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "empty")
-    assert shipped_weights() == ()
-    with pytest.raises(FileNotFoundError, match=r"circular: .*\(there are none\), found neither"):
-        load("circular")
-
-
 def images_of(params: Params) -> jax.Array:
     grid = params.config.grid
     return jnp.asarray(np.random.default_rng(1).poisson(0.5, (6, grid.height, grid.width)), jnp.float32)

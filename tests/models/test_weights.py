@@ -46,21 +46,6 @@ def test_every_parameter_is_the_weighted_mean():
     assert found.keys() == names[0].keys() and any(np.ptp(np.asarray(value)) > 0 for value in found.values())
 
 
-def test_whitening_layers_are_left_out():
-    plain = fresh(0)
-    descriptors = np.random.default_rng(0).normal(size=(300, 256)).astype(np.float32)
-    found = average([whitened(plain, descriptors), plain])
-    assert found.config == plain.config
-    for name, value in by_name(found.weights).items():
-        np.testing.assert_allclose(value, by_name(plain.weights)[name], rtol=1e-6)
-
-
-@pytest.mark.parametrize("shares", [[1.0], [1.0, 2.0, 3.0], [2.0, -1.0], [0.0, 0.0]])
-def test_shares_that_weigh_nothing_are_refused(shares):
-    with pytest.raises(ValueError, match="expected 2 shares of 0 or more, not all 0, found"):
-        average([fresh(0), fresh(1)], shares=shares)
-
-
 def test_models_that_differ_are_refused_by_the_name_of_what_does():
     one = fresh(0)
     with pytest.raises(ValueError, match="found categories 20 and 0"):

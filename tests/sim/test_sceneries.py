@@ -5,13 +5,10 @@ import pytest
 
 from sglpr_jax.sim.drive import drive_seed
 from sglpr_jax.sim.ground import relief_height
-from sglpr_jax.sim.labels import BUILDING, FENCE, NO_RETURN, POLE
+from sglpr_jax.sim.labels import BUILDING, FENCE, POLE
 from sglpr_jax.sim.placing import HEAD_ROOM_M, distances, footprint_distance
-from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.repeating import driven_line, plan_drive, simulate_repeating
-from sglpr_jax.sim.routes import Revisit
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.sceneries.parking import HALF_M, WIDE_M
 from sglpr_jax.sim.sceneries.site import STEP_M, build, painted_ground
 from sglpr_jax.sim.sceneries.site import Strip as GroundStrip
 from sglpr_jax.sim.sensor import Sensor
@@ -83,16 +80,6 @@ def test_traffic_on_the_highway_keeps_to_other_lanes():
         assert footprint_distance(away, boxes.yaw[there], boxes.half[there]).min() > scenery.clearance_m
 
 
-def test_rays_beyond_the_deck_of_a_bridge_do_not_return():
-    recording = drive("bridge")
-    for i in (10, 30):
-        points, labels = recording.render(i)
-        assert NO_RETURN not in labels
-        aside = np.abs(points[:, 1])[(np.abs(points[:, 0]) < 15) & (labels != BUILDING)]
-        assert aside.max() < 12
-    assert np.linalg.norm(np.diff(recording.positions, axis=0), axis=1).sum() > 500
-
-
 def test_strips_are_painted_left_of_the_line_and_dashes_with_gaps():
     line = np.stack([np.arange(0, 20, STEP_M), np.zeros(200)], axis=1)
     ground = painted_ground(1, [GroundStrip(line, 0.0, 2.0, POLE), GroundStrip(line, -2.0, -1.0, 7, 4.0)])
@@ -105,25 +92,7 @@ def test_an_unknown_name_is_an_error():
         simulate_repeating("moon")
 
 
-DENSE = Sensor(elevations_deg=(10.0, 2.0, -2.0, -12.0), azimuth_steps=320, min_range_m=0.5, range_noise_m=0.0)
 LEVELS = Levels(rise_m=3.0, pitch_m=50.0, ramp_y_m=10.0, top_m=0.0, foot_m=20.0)
-
-
-def up(revisit: Revisit = "none", scans: int = 150) -> SimulatedRecording:
-    return simulate_repeating("storeys", scans=scans, seed=3, sensor=DENSE, revisit=revisit)
-
-
-def xyz(recording: SimulatedRecording) -> np.ndarray:
-    return recording.poses.world_from_lidar[:, :3, 3]
-
-
-def on_ramp(recording: SimulatedRecording) -> np.ndarray:
-    return xyz(recording)[:, 1] > WIDE_M + HALF_M - 1
-
-
-def heights(recording: SimulatedRecording) -> np.ndarray:
-    """Height of the storey of each scan that is on no ramp, in metres."""
-    return np.round(xyz(recording)[~on_ramp(recording), 2] - DENSE.height_m, 2)
 
 
 def test_a_path_up_and_down_a_ramp():
@@ -136,16 +105,3 @@ def test_a_path_up_and_down_a_ramp():
     np.testing.assert_array_equal(there[:, 0], x)
     measured = np.gradient(ground[12:60], x[12:60])
     np.testing.assert_allclose(slope[13:59, 0], measured[1:-1], atol=0.01)
-
-
-def test_up_through_all_storeys():
-    recording = up()
-    storey = np.unique(heights(recording))
-    rise = np.diff(storey)
-    assert 3 <= len(storey) <= 6 and storey[0] == 0
-    np.testing.assert_allclose(rise, rise[0], atol=0.02)
-    assert 3.0 <= rise[0] <= 3.6
-    assert np.all(np.diff(heights(recording)) >= 0)
-    lowest, highest = (xyz(recording)[~on_ramp(recording)][heights(recording) == z, :2] for z in storey[[0, -1]])
-    apart = np.linalg.norm(lowest[:, None] - highest, axis=2).min(axis=1)
-    assert np.median(apart) < 2  # each storey is driven along the same way

@@ -118,18 +118,3 @@ def test_a_pattern_that_does_not_repeat_fills_its_field_of_view():
     assert np.abs(np.diff(np.sort(np.array(scans)[:, 3, 5]))).max() < 0.4  # of a band of 2.95 degrees
     cells = [np.unique(np.floor(one).astype(int) * 360 + np.arange(1000) * 360 // 1000) for one in (scans[0], scans)]
     assert len(cells[0]) < 0.85 * 59 * 360 and len(cells[1]) > 0.98 * 59 * 360
-
-
-@pytest.mark.slow
-def test_a_sector_sees_what_a_revolution_sees_there():
-    world, where = walled_world(POLE_AHEAD), pose(z=1.73)
-    whole, _ = scan(KEY, world, where, sensor=EXACT)
-    half = dataclasses.replace(EXACT, azimuth_steps=30, azimuths_deg=(-90.0, 90.0))
-    found, _ = scan(KEY, world, where, sensor=half)
-    apart = np.linalg.norm(found[:, None, :3] - whole[None, :, :3], axis=2).min(axis=1)
-    assert len(found) > 100 and np.all(found[:, 0] > -1e-3) and np.quantile(apart, 0.95) < 1e-3
-    other = dataclasses.replace(half, elevations_deg=(-2.0, -6.0, -10.0, -14.0), pattern="scattered")
-    first, second = (scan(KEY, world, where, sensor=other, time=time)[0] for time in (0.0, 0.1))
-    elevations = [np.degrees(np.arcsin(one[:, 2] / np.linalg.norm(one[:, :3], axis=1))) for one in (first, second)]
-    assert all(one.min() >= -16.01 and one.max() <= 0.01 for one in elevations)
-    assert len(np.intersect1d(*(np.round(one, 3) for one in elevations))) < 20

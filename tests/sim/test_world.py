@@ -6,7 +6,7 @@ from town import LOOP, THERE_AND_BACK, drive
 
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim.ground import label_at, surface_height
-from sglpr_jax.sim.labels import BUILDING, CAR, LANE_MARKING, MOVING, POLE, ROAD, TRUNK
+from sglpr_jax.sim.labels import BUILDING, LANE_MARKING, MOVING, POLE, ROAD, TRUNK
 from sglpr_jax.sim.shapes import Shapes
 from sglpr_jax.sim.styles import SCENERIES
 from sglpr_jax.sim.world import World, build_world
@@ -86,20 +86,6 @@ def test_shapes_stand_on_the_ground(scenery):
         built = shapes.label == BUILDING
         assert above[built].max(initial=0) < 12.5 and np.all(above + 2 * shapes.half[:, 2] > 0.2)
         assert np.all(shapes.half > 0) and all(np.isfinite(leaf).all() for leaf in shapes[:8])
-
-
-@pytest.mark.slow
-def test_parked_cars_come_and_go_between_two_visits():
-    corners = ((0, 0), (160, 0), (160, 300), (0, 300), (0, 0), (160, 0))
-    _, times = drive(corners)
-    kept = gone = came = 0
-    for seed in (0, 1):
-        boxes = world_of(corners, seed).scene.boxes
-        near = (np.abs(boxes.centre[:, 1]) < 12) & (boxes.centre[:, 0] > 5) & (boxes.centre[:, 0] < 140)
-        cars = select(boxes, near & (boxes.label == CAR))
-        first, second = ((cars.since <= time) & (time < cars.until) for time in (times[0] + 10, times[-1] - 10))
-        kept, gone, came = kept + (first & second).sum(), gone + (first & ~second).sum(), came + (~first & second).sum()
-    assert min(kept, gone, came) > 2
 
 
 @pytest.mark.parametrize(("length_m", "shapes_at_least"), [(2.5, 0), (12.0, 20)])
