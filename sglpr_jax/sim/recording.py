@@ -157,9 +157,9 @@ def drive_through(
     aside = np.reshape(left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
     of_lidar = in_world = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
     if world.levels is not None:  # storeys above one another
-        there, *ground = (values[rows] for values in world.levels.along(path.xy))
+        there, ground, slope = (values[rows] for values in world.levels.along(path.xy))
         in_world = poses_on(world.ground.relief, there + aside, yaw, height_m=height, tilt=tilt)
-        of_lidar = poses_on(tuple(ground), path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
+        of_lidar = poses_on((ground, slope), path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
     speed = speeds(path)[rows]
     height_m = sensor.height_m if carrier.height_m is None else carrier.height_m
     row_of = {scan_id: i for i, scan_id in enumerate(ids)}
