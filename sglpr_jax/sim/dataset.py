@@ -35,10 +35,7 @@ DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 AZIMUTH_STEPS = 900
 """Firings per revolution in the default datasets."""
 BYTES_PER_RAY = {"scans": 16, "nclt": 5}
-"""Approximate size of a scan with its labels, in bytes per ray, by layout.
-
-Layout "scans" stores 20 bytes per return, and most rays return. NCLT stores 8, but many rays go into the sky.
-"""
+"""Approximate size of a scan with its labels, in bytes per ray, by layout. Most rays return."""
 BYTES_PER_IMAGE = 3500
 """Approximate size of an image with its label image, in bytes."""
 
@@ -216,7 +213,7 @@ def _check_names(
 
 
 def _drives(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[str, Path | None]:
-    """Names of the drives, and the pose files along which they lead."""
+    """Pose files of the drives, by name."""
     unknown = [name for name in routes if name not in ROLES]
     if unknown or scans < 2:
         raise ValueError(f"expected drives among {', '.join(ROLES)} with 2 scans or more, found {unknown}, {scans}")

@@ -90,17 +90,6 @@ def test_the_gradient_of_the_maximum_survives_rounding():
     np.testing.assert_allclose(jax.grad(lambda x: largest(x, (0,)))(tied), [1 / 3, 0, 1 / 3, 1 / 3], rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_a_circular_map_may_be_rolled_along_its_columns_and_no_other(random_variables):
-    image = jnp.asarray(np.random.default_rng(0).normal(size=(2, 8, 12, 6)), jnp.float32)
-    variables = random_variables(CBAM(reduction=3), image)
-    rolled = jnp.roll(image, 5, axis=2)
-    for circular in (True, False):
-        apply = jax.jit(CBAM(reduction=3, circular=circular).apply)
-        difference = apply(variables, rolled) - jnp.roll(apply(variables, image), 5, axis=2)
-        assert (jnp.abs(difference).max() < 1e-5) == circular
-
-
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-8, 1e8])
 def test_l2_normalize_gives_unit_vectors_or_zero_and_finite_gradients(scale):
     x = scale * jnp.asarray([[3.0, 4.0]])

@@ -13,7 +13,6 @@ from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.input_image import prepare
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.sglpr import describe, forward, init, segment
 
 # One stage instead of two, so that a program compiles in a second.
@@ -153,18 +152,6 @@ def test_without_features_there_is_no_backbone(what):
     assert parts(weights_of(with_head(CONFIG, input=what))) == {"place_head"}
     assert parts(weights_of(with_head(POLAR, input=what))) == {"place_head", "patch_embed"}
     assert not with_head(CONFIG, input=what).segments
-
-
-def test_mean_pooling_is_numpys(random_variables):
-    module = PlaceHead(dataclasses.replace(CONFIG.head, cbam=False, pooling="mean"))
-    features = jnp.asarray(np.random.default_rng(0).normal(size=(3, 16, 16, 6)), jnp.float32)
-    variables = random_variables(module, features)
-    found, seen = jax.jit(module.apply, compiler_options=FAST_COMPILE)(variables, features)
-    assert set(seen) == {"head_convolution0", "head_convolution1"}
-    layer = variables["params"]["mean_pooling"]["linear"]
-    expected = np.asarray(seen["head_convolution1"], np.float64).mean((1, 2)) @ layer["kernel"] + layer["bias"]
-    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("call", [describe, forward])

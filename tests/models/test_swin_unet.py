@@ -182,6 +182,13 @@ def test_a_turn_by_windows_of_the_coarsest_map_shifts_the_tokens(random_variable
     assert jnp.abs(straight - jnp.roll(straight, 4, axis=2)).max() > 1e-2
 
 
+def test_quarter_turns_leave_the_descriptor(params):
+    straight = describe(params, BEV)
+    assert jnp.abs(straight[0] - straight[1]).max() > 1e-3
+    for quarters in (1, 2, 3):
+        np.testing.assert_allclose(describe(params, jnp.rot90(BEV, quarters, axes=(1, 2))), straight, atol=2e-5)
+
+
 def test_what_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match="polar"):
         ModelConfig(backbone=BACKBONE)
