@@ -119,7 +119,7 @@ def _pieces(
     xy = np.stack([np.interp(along, index, axis) for axis in lane.T], axis=1)
     middle = (along[:-1] + along[1:]) / 2
     heading = np.interp(middle, index, path.heading) + (np.pi if direction < 0 else 0.0)
-    pieces = [leaf[inside] for leaf in (xy[:-1], xy[1:], heading, times[:-1], times[1:])]
+    pieces = (xy[:-1][inside], xy[1:][inside], heading[inside], times[:-1][inside], times[1:][inside])
     clear = _clear(thing, *pieces, path)
     begin, end, heading, since, until = (leaf[clear] for leaf in pieces)
     velocity = (end - begin) / (until - since)[:, None]
