@@ -14,7 +14,7 @@ from benchmarks.timing import about, median_seconds
 from sglpr_jax.bev import rasterize
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.grid import Grid
-from sglpr_jax.sim.drive import plan_path, poses_on, thinned
+from sglpr_jax.sim.drive import plan_path, poses_on, scan_rows
 from sglpr_jax.sim.sensor import Sensor, cast_turn, first_surface, returned_points, scan, view_of
 from sglpr_jax.sim.world import build_world
 
@@ -27,7 +27,8 @@ class Along:
     """A drive through its town, and the sensor that makes it."""
 
     def __init__(self, seq: str, scans: int, sensor: Sensor):
-        xy, yaw, self.times = thinned(plan_path(np.random.default_rng(0), seq, scans=scans), scans)
+        path = plan_path(np.random.default_rng(0), seq, scans=scans)
+        xy, yaw, self.times = (values[scan_rows(path, scans)] for values in path)
         self.world = build_world(0, xy, self.times)
         self.poses = poses_on(self.world.ground.relief, xy, yaw, height_m=sensor.height_m)
         self.sensor, self.key = sensor, jax.random.key(0)

@@ -47,22 +47,18 @@ def convert(command: ConvertCommand) -> Path:
         raise FileExistsError(f"{command.out}: expected a folder that does not exist yet, found one")
     fresh = init(jax.random.key(command.seed), config=load_preset(command.preset).model)
     if command.network == "swin-t":
-        params, copied, _, unused = import_swin_t(fresh, command.checkpoint)
+        params, copied, unused = import_swin_t(fresh, command.checkpoint)
     else:
         params, unused = import_swin_unet(fresh, command.checkpoint), ()
         copied = tuple(name for name in by_name(params.weights) if not name.startswith("place_head/"))
     save(params, command.out)
-    share = _share({name: leaf.size for name, leaf in by_name(params.weights).items()}, copied)
+    sizes = {name: leaf.size for name, leaf in by_name(params.weights).items()}
+    taken, whole = sum(sizes[name] for name in copied), sum(sizes.values())
+    share = f"{taken / 1e6:.1f} of {whole / 1e6:.1f} million numbers ({taken / whole:.0%})"
     print(f"{command.out}: {share} of {command.checkpoint.name}, the rest random (seed {command.seed})")
     if unused:
         print(f"not used by {command.preset}: {', '.join(unused[:5])}{', ...' if len(unused) > 5 else ''}")
     return command.out
-
-
-def _share(sizes: dict[str, int], copied: tuple[str, ...]) -> str:
-    """Describe the copied fraction of the numbers. `sizes` are those of all weights."""
-    taken, whole = sum(sizes[name] for name in copied), sum(sizes.values())
-    return f"{taken / 1e6:.1f} of {whole / 1e6:.1f} million numbers ({taken / whole:.0%})"
 
 
 def main() -> None:

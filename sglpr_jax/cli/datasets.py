@@ -41,9 +41,9 @@ def dataset_root(data: Path | None, *, write: bool = True) -> Path:
 def cached_sessions() -> Path:
     """Return the folder of the simulated sessions in NCLT's layout. They are created in the user's cache on first
     use."""
-    from sglpr_jax.sim.dataset import default_sessions
+    from sglpr_jax.sim.dataset import default_dataset
 
-    root, options = default_sessions(cache_folder())
+    root, options = default_dataset(cache_folder(), sessions=True)
     print(f"no --nclt: using the simulated sessions in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
     simulate(root, **options)
     return root

@@ -10,12 +10,13 @@ from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
 from sglpr_jax.cli.loops import LoopsCommand, loops_of_recording
 from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import own_names, parse_command, run
-from sglpr_jax.fields import CountOrNone
 from sglpr_jax.methods.names import SHIPPED, UNTRAINED
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 SCANS = 300
 AZIMUTH_STEPS = 450
+STEPS = 20
+"""Training steps."""
 TESTED = "00"
 PRESET = "circular"
 WEIGHTS = DEFAULT_WEIGHTS
@@ -34,15 +35,15 @@ class DemoCommand:
     kept."""
     scans: int = SCANS
     """Scans of each recording."""
-    steps: CountOrNone = 20
-    """Training steps. 0: no training."""
 
 
 def demo(command: DemoCommand) -> Path:
     """Run the command. Returns the output folder."""
-    from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
+    from sglpr_jax.cli.datasets import simulate  # slow imports, not needed for --help
+    from sglpr_jax.cli.train import TrainCommand, train_and_test
     from sglpr_jax.evaluation.evaluation_page import PAGE
     from sglpr_jax.evaluation.loops_page import PAGE as LOOPS_PAGE
+    from sglpr_jax.training.presets import load_preset
 
     out, town = command.out, command.out / "town"
     simulate(town, scans=command.scans, azimuth_steps=AZIMUTH_STEPS, seed=0)
@@ -54,22 +55,14 @@ def demo(command: DemoCommand) -> Path:
     file = out / f"{TESTED}.npz"
     embed_recording(EmbedCommand(data=town, source=source, weights=WEIGHTS, out=str(file)))
     evaluate_file(EvaluateCommand(file, data=town, source=source, weights=WEIGHTS))
-    if command.steps:
-        _title(f"{command.steps} steps of training, to show the command; thousands would be needed: bin/train")
-        _train(town, out / "run", command.steps)
+    _title(f"{STEPS} steps of training, to show the command; thousands would be needed: bin/train")
+    if (out / "run").exists():
+        shutil.rmtree(out / "run")
+    config = dataclasses.replace(load_preset(PRESET), steps=STEPS, score_every=STEPS)
+    train = TrainCommand(seq=TESTED, data=town, preset=PRESET, method=BESIDE, out=out / "run", config=config)
+    train_and_test(train, go_on="the next demo restarts its training")
     print(f"\npages: {out / 'loops' / LOOPS_PAGE}, {out / TESTED / PAGE}")
     return out
-
-
-def _train(town: Path, out: Path, steps: int) -> None:
-    from sglpr_jax.cli.train import TrainCommand, train_and_test
-    from sglpr_jax.training.presets import load_preset
-
-    if out.exists():
-        shutil.rmtree(out)
-    config = dataclasses.replace(load_preset(PRESET), steps=steps, score_every=steps)
-    command = TrainCommand(seq=TESTED, data=town, preset=PRESET, method=BESIDE, out=out, config=config)
-    train_and_test(command, go_on="the next demo restarts its training")
 
 
 def _title(text: str) -> None:

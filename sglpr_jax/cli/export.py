@@ -2,15 +2,12 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.models.config import WHITENING_POWER
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-
-if TYPE_CHECKING:
-    from sglpr_jax.models.params import Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +53,8 @@ def export(command: ExportCommand) -> Path:
     from sglpr_jax.data.readers import open_recording, recording_names
     from sglpr_jax.models.export import save_program
     from sglpr_jax.models.params import Params
-    from sglpr_jax.models.weights_file import save
+    from sglpr_jax.models.weights import average, for_places
+    from sglpr_jax.models.weights_file import load, save
     from sglpr_jax.retrieval.whiten import whiten
 
     if command.out.exists():
@@ -64,7 +62,11 @@ def export(command: ExportCommand) -> Path:
     if command.format != "weights" and (command.half or command.keep_segmentation):
         flag = "half" if command.half else "keep-segmentation"
         raise ValueError(f"expected --{flag} only with --format weights, found it with {command.format}")
-    params = _load(command)
+    if command.shares and not command.average:
+        raise ValueError("expected --shares only with --average, found it without")
+    models = [load(name) for name in (command.weights, *command.average)]
+    models = models if command.keep_segmentation else [for_places(model) for model in models]
+    params = average(models, shares=command.shares or None) if command.average else models[0]
     if command.image is not None:
         params = Params(params.weights, dataclasses.replace(params.config, image=command.image))
     if command.whiten:
@@ -78,18 +80,6 @@ def export(command: ExportCommand) -> Path:
     size = sum(file.stat().st_size for file in command.out.iterdir())
     print(f"{command.out}: {size / 1e6:.1f} MB of {'weights' if command.format == 'weights' else command.format}")
     return command.out
-
-
-def _load(command: ExportCommand) -> "Params":
-    """Load the weights, or the mean of several, with the segmentation head if it is kept."""
-    from sglpr_jax.models.weights import average, for_places
-    from sglpr_jax.models.weights_file import load
-
-    if command.shares and not command.average:
-        raise ValueError("expected --shares only with --average, found it without")
-    models = [load(name) for name in (command.weights, *command.average)]
-    models = models if command.keep_segmentation else [for_places(model) for model in models]
-    return average(models, shares=command.shares or None) if command.average else models[0]
 
 
 def main() -> None:

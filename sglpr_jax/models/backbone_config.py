@@ -5,13 +5,15 @@ import dataclasses
 import math
 from typing import Literal
 
-from sglpr_jax.fields import (
-    Depths,
-    Share,
-    Size,
-    Sizes,
-    check_fields,
-)
+from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
+
+
+def check_lengths(owner: str, **lists: tuple[int, ...]) -> None:
+    """Raise ValueError if the lists, given by name, have different lengths."""
+    if len({len(values) for values in lists.values()}) > 1:
+        *names, last = lists
+        found = ", ".join(f"{name} {values}" for name, values in lists.items())
+        raise ValueError(f"expected equal numbers of {', '.join(names)} and {last} of {owner}, found {found}")
 
 
 class BackboneSizes(abc.ABC):
@@ -127,11 +129,7 @@ class CircularConfig(BackboneSizes):
         check_fields(self)
         if not self.widths:
             raise ValueError("widths: expected at least one block, found ()")
-        if not len(self.widths) == len(self.strides) == len(self.means):
-            raise ValueError(
-                "expected equal numbers of widths, strides and means of the circular CNN, found "
-                f"widths {self.widths}, strides {self.strides}, means {self.means}"
-            )
+        check_lengths("the circular CNN", widths=self.widths, strides=self.strides, means=self.means)
         if len(self.fine) > len(self.widths):
             raise ValueError(
                 f"fine: expected at most one value for each width of the circular CNN, {self.widths}, found {self.fine}"

@@ -25,12 +25,10 @@ class CircularBackbone:
     config: CircularConfig
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """Computes the features: the last map. There is no stochastic depth."""
         maps = CircularNet(self.config, name="rings")(image)  # the name in weight files
         return Seen(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """Computes a pixel for each pixel of the averaged image."""
         return CircularDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
 
 
@@ -43,7 +41,6 @@ class CircularBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b r s c"]) -> Float[Array, "b _ s {self.features}"]:
-        """Computes a map with the same number of sectors."""
         convolution = Convolution(self.features, strides=(self.stride, 1), circular=True, name="convolution")
         y = nn.relu(LayerNorm(name="norm")(convolution(x)))
         return x + y if x.shape == y.shape else y
@@ -65,9 +62,8 @@ class CircularNet(nn.Module):
         maps = [block_means(polar, config.average, config.average)]
         for i, (width, stride, sectors) in enumerate(zip(config.widths, config.strides, config.means, strict=True)):
             if i < len(config.fine):
-                fine = CircularBlock(config.fine[i], config.strides[i - 1] if i else config.average, name=f"fine_{i}")(
-                    fine
-                )
+                stride_of_fine = config.strides[i - 1] if i else config.average
+                fine = CircularBlock(config.fine[i], stride_of_fine, name=f"fine_{i}")(fine)
                 joining = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
                 maps[-1] = jnp.concatenate([maps[-1], joining], axis=-1)
             maps.append(block_means(CircularBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
@@ -91,7 +87,8 @@ class CircularDecoder(nn.Module):
         for i, of_map in enumerate(reversed(finer)):
             seen, width = maps[of_map], self.widths[max(of_map - 1, 0)]
             x = Linear(width, name=f"narrow_{i}")(x)
-            x = jnp.concatenate([_repeated(x, seen.shape[1] // x.shape[1], seen.shape[2] // x.shape[2]), seen], axis=-1)
+            x = x.repeat(seen.shape[1] // x.shape[1], axis=1).repeat(seen.shape[2] // x.shape[2], axis=2)
+            x = jnp.concatenate([x, seen], axis=-1)
             x = CircularBlock(width, name=f"block_{i}")(x)
         return x
 
@@ -109,7 +106,3 @@ def _means_of_parts(x: Float[Array, "b n k"], parts: int) -> Float[Array, "b n _
     if parts == 1:
         return x
     return functools.reduce(jnp.add, jnp.split(x, parts, axis=-1)) * (1 / parts)
-
-
-def _repeated(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
-    return x.repeat(radii, axis=1).repeat(sectors, axis=2)

@@ -22,7 +22,7 @@ from sglpr_jax.fields import (
 )
 from sglpr_jax.files import naming
 from sglpr_jax.grid import Grid, ImageKind, check_density_grid
-from sglpr_jax.models.backbone_config import BackboneConfig, CircularConfig, SglprConfig, SwinConfig
+from sglpr_jax.models.backbone_config import BackboneConfig, CircularConfig, SglprConfig, SwinConfig, check_lengths
 
 WHITENING_POWER = 0.4
 """Default power of whitening: each principal component is divided by its spread raised to this power."""
@@ -67,11 +67,7 @@ class HeadConfig:
 
     def __post_init__(self):
         check_fields(self)
-        if not len(self.channels) == len(self.kernels) == len(self.strides):
-            raise ValueError(
-                "expected equal numbers of channels, kernels and strides of the head, found "
-                f"channels {self.channels}, kernels {self.kernels}, strides {self.strides}"
-            )
+        check_lengths("the head", channels=self.channels, kernels=self.kernels, strides=self.strides)
         if self.means and (len(self.means) != len(self.channels) or set(self.kernels) != {3}):
             raise ValueError(
                 "means: expected one number for each convolution, and 3 x 3 kernels, found "
@@ -214,52 +210,37 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 
 
 def _read(annotation: Any, value: Any, field: str) -> Any:
-    """Converts a value to a field's type, and dictionaries to dataclasses."""
-    value = _of_today(value, f"{field}." if field else "")
-    if is_config(annotation):
-        return _read_dataclass(annotation, value, field)
-    members = typing.get_args(annotation)
-    if any(map(is_config, members)):
-        return _read(_member(members, value, field), value, field)
-    return read_value(value, annotation, field)
+    """Converts a value to a field's type, and dictionaries to dataclasses, of a union by their `kind`."""
+    members = [annotation] if is_config(annotation) else list(filter(is_config, typing.get_args(annotation)))
+    if not members:
+        return read_value(value, annotation, field)
+    require(value, isinstance(value, dict), f"the fields of a {' or '.join(one.__name__ for one in members)}", field)
+    prefix, kind = f"{field}." if field else "", value.get("kind")
+    value = {name: one for name, one in value.items() if (prefix + name, one) not in REMOVED}
+    if isinstance(kind, str) and kind in RENAMED:
+        value["kind"] = kind = RENAMED[kind]
+    if len(members) > 1:
+        configs: dict[str, Any] = {member.kind: member for member in members}
+        require(kind, isinstance(kind, str) and kind in configs, f"a kind, {' or '.join(configs)}", field)
+        members = [configs[kind]]
+    return _read_dataclass(members[0], value, prefix)
 
 
-def _of_today(value: Any, prefix: str) -> Any:
-    """The fields of a file of an earlier version, without removed ones and with the present name of its `kind`."""
-    if not isinstance(value, dict):
-        return value
-    known = {name: one for name, one in value.items() if (prefix + name, one) not in REMOVED}
-    old = known.get("kind")
-    return {**known, "kind": RENAMED[old]} if isinstance(old, str) and old in RENAMED else known
-
-
-def _read_dataclass(expected: Any, value: Any, field: str) -> Any:
-    require(value, isinstance(value, dict), f"the fields of a {expected.__name__}", field)
-    prefix = f"{field}." if field else ""
+def _read_dataclass(expected: Any, value: dict, prefix: str) -> Any:
+    field, begin = prefix.removesuffix("."), f"{prefix.removesuffix('.')}: " if prefix else ""
     annotations = field_types(expected)
-    older = {name: ADDED_LATER[prefix + name] for name in annotations if prefix + name in ADDED_LATER}
-    value = {**older, **value}
+    value = {name: ADDED_LATER[prefix + name] for name in annotations if prefix + name in ADDED_LATER} | value
     unknown = min(map(str, set(value) - set(annotations)), default=None)
     missing = min(set(annotations) - set(value), default=None)
     every = f"the fields of a {expected.__name__} ({', '.join(annotations)})"
     require(unknown, unknown is None, every, field)
     if missing is not None:
-        raise ValueError(f"{field}{': ' if field else ''}expected {every}, found no {missing!r}")
+        raise ValueError(f"{begin}expected {every}, found no {missing!r}")
     read = {name: _read(annotations[name], one, prefix + name) for name, one in value.items()}
     try:
         return expected(**read)
     except ValueError as error:  # the fields are inconsistent
-        raise ValueError(f"{prefix.removesuffix('.')}{': ' if prefix else ''}{error}") from error
-
-
-def _member(members: tuple[Any, ...], value: Any, field: str) -> Any:
-    """The configuration of a union that has the `kind` of the value."""
-    configs: dict[str, Any] = {member.kind: member for member in members}
-    names = " or ".join(member.__name__ for member in members)
-    require(value, isinstance(value, dict), f"the fields of a {names}", field)
-    kind = value.get("kind")
-    require(kind, isinstance(kind, str) and kind in configs, f"a kind, {' or '.join(configs)}", field)
-    return configs[kind]
+        raise ValueError(f"{begin}{error}") from error
 
 
 _PAPER = ModelConfig()

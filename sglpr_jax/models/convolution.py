@@ -91,7 +91,10 @@ def as_product(
         added = jnp.split(_product(columns, kernel.swapaxes(1, 2).reshape(-1, size * f)), size, axis=-1)
         return functools.reduce(jnp.add, [_moved(of_one, border - j, circular) for j, of_one in enumerate(added)])
     columns, at_once = _columns_around(columns, border, circular), AT_ONCE if few else 1
-    wide, stride = _side_by_side_kernels(kernel, at_once, strides[1]), at_once * strides[1]
+    stride = at_once * strides[1]
+    beyond = stride - strides[1]
+    parts = [jnp.pad(kernel, ((0, 0), (j, beyond - j), (0, 0), (0, 0))) for j in range(0, beyond + 1, strides[1])]
+    wide = jnp.concatenate(parts, axis=-1)  # of at_once results, each from its own part of a wider patch
     results = (columns.shape[2] - size) // strides[1] + 1
     lacking = -results % at_once * strides[1]
     patches = _side_by_side(jnp.pad(columns, ((0, 0), (0, 0), (0, lacking), (0, 0))), 2, wide.shape[1], stride)
@@ -101,13 +104,6 @@ def as_product(
 
 def _few_inputs(kernel: Float[Array, "k k c f"]) -> bool:
     return len(kernel) * kernel.shape[2] <= FEW_INPUTS
-
-
-def _side_by_side_kernels(kernel: Float[Array, "k k c f"], n: int, stride: int) -> Float[Array, "k _ c _"]:
-    """Return a kernel that gives the results of n columns. Each result uses its own part of a wider patch."""
-    beyond = (n - 1) * stride
-    parts = [jnp.pad(kernel, ((0, 0), (j, beyond - j), (0, 0), (0, 0))) for j in range(0, beyond + 1, stride)]
-    return jnp.concatenate(parts, axis=-1)
 
 
 def _border(kernel: Float[Array, "k k c f"], strides: tuple[int, int]) -> int:

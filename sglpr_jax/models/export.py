@@ -1,13 +1,11 @@
 """Export of `describe` with its weights as a program for runtimes without this package: StableHLO and ONNX."""
 
-import contextlib
 import dataclasses
 import hashlib
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -16,14 +14,7 @@ import jax.export
 import numpy as np
 from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
 
-from sglpr_jax.data.density_image import (
-    CEILING_M,
-    EDGE_STEP_M,
-    FIRST_EDGE_M,
-    FLOOR_M,
-    MAX_VOXELS,
-    REACH_M,
-)
+from sglpr_jax.data.density_image import CEILING_M, EDGE_STEP_M, FIRST_EDGE_M, FLOOR_M, MAX_VOXELS, REACH_M
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import check_holds_only, replacing, write_json
@@ -87,28 +78,18 @@ def stablehlo(params: Params) -> bytes:
     grid = params.config.grid
     shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
     program = jax.jit(lambda bev: describe(params, bev))
-    with _no_source_locations():
-        exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32))
-        return bytes(exported.serialize())
-
-
-@contextlib.contextmanager
-def _no_source_locations() -> Iterator[None]:
-    """Omit source file locations from programs, so that the same weights give the same bytes on every machine."""
     limit = "jax_traceback_in_locations_limit"
     before = getattr(jax.config, limit)
-    jax.config.update(limit, 0)
+    jax.config.update(limit, 0)  # without source locations, the bytes are the same on every machine
     try:
-        yield
+        exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32))
+        return bytes(exported.serialize())
     finally:
         jax.config.update(limit, before)
 
 
 def onnx(params: Params) -> bytes:
-    """Return `describe` with these weights as an ONNX model.
-
-    The conversion runs in a separate process, because the model cannot be called any more after it.
-    """
+    """Return `describe` with these weights as an ONNX model, converted in a process of its own, which it spoils."""
     with tempfile.TemporaryDirectory() as temporary:
         weights, program = Path(temporary, "weights"), Path(temporary, "describe.onnx")
         save(params, weights)

@@ -4,6 +4,7 @@ The values depend on the key, the name and the shape of a weight. They are equal
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -49,15 +50,15 @@ def draw_all(key: Array, initial: Any, shapes: Any) -> Any:
       KeyError: If a weight has no initial values.
     """
     leaves, tree = jax.tree_util.tree_flatten_with_path(shapes)
-    draws = [(jax.tree_util.keystr(path, simple=True, separator="/"), _at(initial, path).draw) for path, _ in leaves]
+
+    def draw(seed: list[int], path: tuple[Any, ...], leaf: Any) -> np.ndarray:
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        one = functools.reduce(lambda tree, step: tree[step.key], path, initial)
+        return one.draw(np.random.default_rng([*seed, *name.encode()]), leaf.shape).astype(leaf.dtype)
 
     def drawn(words: Any) -> list[np.ndarray]:
         seed = [int(word) for word in np.asarray(words).reshape(-1)]
-        pairs = zip(draws, leaves, strict=True)
-        return [
-            draw(np.random.default_rng([*seed, *name.encode()]), leaf.shape).astype(leaf.dtype)
-            for (name, draw), (_, leaf) in pairs
-        ]
+        return [draw(seed, path, leaf) for path, leaf in leaves]
 
     words = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
     if isinstance(words, jax.core.Tracer):
@@ -65,12 +66,6 @@ def draw_all(key: Array, initial: Any, shapes: Any) -> Any:
     else:  # a callback would be compiled
         found = jax.device_put(drawn(words))
     return jax.tree_util.tree_unflatten(tree, found)
-
-
-def _at(initial: Any, path: tuple[Any, ...]) -> Initial:
-    for step in path:
-        initial = initial[step.key]
-    return initial
 
 
 def constant(value: float) -> Initial:
@@ -89,9 +84,11 @@ def scaled_normal(scale: float, *, truncated: bool = False) -> Initial:
     The variance is that of the truncated distribution. Scale 2 is He's initialisation, 1 is LeCun's.
     """
     low = ndtr(-TRUNCATED_AT) if truncated else 0.0
+    density = math.exp(-(TRUNCATED_AT**2) / 2) / math.sqrt(2 * math.pi)
+    after_truncation = math.sqrt(1 - 2 * TRUNCATED_AT * density / (1 - 2 * low)) if truncated else 1.0
 
     def draw(rng: np.random.Generator, shape: tuple[int, ...]) -> Float32[np.ndarray, "*shape"]:
-        deviation = math.sqrt(scale / _inputs(shape)) / (_truncated_deviation() if truncated else 1.0)
+        deviation = math.sqrt(scale / _inputs(shape)) / after_truncation
         values = ndtri(rng.uniform(low, 1 - low, shape)) if truncated else rng.standard_normal(shape)
         return np.float32(deviation) * values.astype(np.float32)
 
@@ -101,12 +98,6 @@ def scaled_normal(scale: float, *, truncated: bool = False) -> Initial:
 def uniform(bound: float) -> Initial:
     """U(-bound, bound)."""
     return Initial(lambda rng, shape: rng.uniform(-bound, bound, shape).astype(np.float32))
-
-
-def _truncated_deviation() -> float:
-    """Standard deviation of the standard normal distribution after truncation."""
-    density = math.exp(-(TRUNCATED_AT**2) / 2) / math.sqrt(2 * math.pi)
-    return math.sqrt(1 - 2 * TRUNCATED_AT * density / (1 - 2 * ndtr(-TRUNCATED_AT)))
 
 
 def _inputs(shape: tuple[int, ...]) -> int:

@@ -31,9 +31,7 @@ class Seen(NamedTuple):
 
 
 def weight(module: nn.Module, name: str, init: Initializer, shape: tuple[int, ...]) -> Any:
-    """Return a weight of the calling module, and create it at initialisation.
-
-    At initialisation, the collection `initial` also gets the distribution `init`, for `draw_all`, if it is mutable.
+    """Return a weight of the calling module. At initialisation, create it and store its distribution for `draw_all`.
 
     Flax's `param` traces `init` in every call to find the shape. This takes half of the time of tracing a network.
 
@@ -62,7 +60,6 @@ class Linear(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b {self.features}"]:
-        """Apply the same linear map to every vector of `c` channels."""
         c = x.shape[-1]
         kernel = weight(self, "kernel", self.kernel_init, (c, self.features)).astype(x.dtype)
         y = product(x.reshape(-1, c), jnp.asarray(kernel))
@@ -108,7 +105,6 @@ class LayerNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
-        """The output has the data type of the input."""
         scale = jnp.asarray(weight(self, "scale", initial.ones, x.shape[-1:]))
         bias = jnp.asarray(weight(self, "bias", initial.zeros, x.shape[-1:]))
         rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])

@@ -47,7 +47,6 @@ class ChannelGate(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
-        """The hidden layer of the MLP has max(1, c // reduction) units."""
         c = x.shape[-1]
         pooled = jnp.stack([x.mean((1, 2)), largest(x, (1, 2))], axis=1)
         hidden = nn.relu(Linear(max(1, c // self.reduction), name="mlp_in")(pooled))
@@ -66,7 +65,6 @@ class SpatialGate(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
-        """Applies one weight per pixel."""
         pooled = jnp.stack([largest(x, (-1,)), x.mean(-1)], axis=-1)
         convolution = Convolution(1, 7, circular=self.circular, kernel_init=torch_uniform, name="convolution")
         return x * nn.sigmoid(convolution(pooled))
@@ -81,7 +79,6 @@ class CBAM(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
-        """Returns the weighted map. There is no residual connection."""
         return SpatialGate(self.circular, name="spatial")(ChannelGate(self.reduction, name="channel")(x))
 
 
@@ -92,7 +89,6 @@ class MeanPooling(nn.Module):
 
     @nn.compact
     def __call__(self, features: Float[Array, "b n d"]) -> Float[Array, "b {self.output}"]:
-        """Returns the vector before its L2 normalisation."""
         weights_init = initial.normal(features.shape[-1] ** -0.5)
         return Linear(self.output, kernel_init=weights_init, name="linear")(features.astype(jnp.float32).mean(1))
 
@@ -115,10 +111,7 @@ class NetVLAD(nn.Module):
 
     @nn.compact
     def __call__(self, features: Float[Array, "b n d"]) -> Float[Array, "b {self.output}"]:
-        """Returns the vector before its final L2 normalisation.
-
-        The sums over the features and all later steps are float32.
-        """
+        """The sums over the features and all later steps are float32."""
         d = features.shape[-1]
         weights_init = initial.normal(d**-0.5)
         logits = Linear(self.clusters, kernel_init=weights_init, name="assignment")(features)
@@ -145,10 +138,7 @@ class Spectrum(nn.Module):
 
     @nn.compact
     def __call__(self, features: Float[Array, "b r s c"]) -> Float[Array, "b {self.output}"]:
-        """Return the vector before its L2 normalisation.
-
-        The transform and all later steps are float32. Frequency 0 is the mean.
-        """
+        """The transform and all later steps are float32. Frequency 0 is the mean."""
         b, radii, sectors, c = features.shape
         columns = features.swapaxes(1, 2).reshape(b, sectors, radii * c)
         columns = Linear(self.channels, kernel_init=initial.he_normal, name="narrow")(columns)
@@ -174,7 +164,6 @@ class Whitening(nn.Module):
 
     @nn.compact
     def __call__(self, descriptor: Float[Array, "b d"]) -> Float[Array, "b d"]:
-        """Returns descriptors of length 1."""
         d = descriptor.shape[-1]
         kernel = weight(self, "kernel", initial.identity, (d, d))
         bias = weight(self, "bias", initial.zeros, (d,))
@@ -186,9 +175,7 @@ def raw_input(
 ) -> Float[Array, "b p q _"]:
     """Return planes of point counts, of labels (one plane for each class), or of both, in place of features.
 
-    For a polar model the planes are resampled bilinearly, so a polar pixel holds the fraction of each class. A head
-    with the tap `tokens` reads the planes through a patch embedding, a layer of the calling module. With the tap
-    `pixels` it reads them directly.
+    With the tap `tokens`, the head reads them through a patch embedding, a layer of the calling module.
     """
     planes = [image] if config.head.reads_counts else []
     if config.head.reads_labels:
@@ -220,7 +207,6 @@ class PlaceHead(nn.Module):
         return Whitening(name="whiten")(descriptor) if self.config.whiten else descriptor, seen
 
     def _convolve(self, x: Float[Array, "b h w c"], i: int) -> Float[Array, "b _ _ _"]:
-        """Applies the i-th convolution, its layer norm and ReLU."""
         config = self.config
         channels, kernel, stride = config.channels[i], config.kernels[i], config.strides[i]
         if config.means:

@@ -19,15 +19,12 @@ from sglpr_jax.models.place_head import PlaceHead, raw_input
 from sglpr_jax.models.segmentation_head import segmentation_head
 from sglpr_jax.models.swin_unet import SglprBackbone, SwinBackbone
 
-Backbone = SwinBackbone | CircularBackbone | SglprBackbone
-"""Layers of a backbone, with two calls: from images to `Seen`, and from `Seen` to pixels (`decode`, at most once).
 
-They belong to the Flax module that calls them, and get their names there.
-"""
+def _backbone(config: BackboneConfig, *, circular: bool) -> SwinBackbone | CircularBackbone | SglprBackbone:
+    """Return the layers of a backbone, which belong to the calling Flax module.
 
-
-def build(config: BackboneConfig, *, circular: bool) -> Backbone:
-    """Return the layers of a backbone. With `circular=True` the first and last columns of the image are neighbours."""
+    They have two calls: from images to `Seen`, and from `Seen` to pixels (`decode`, at most once).
+    """
     match config:
         case SwinConfig():
             return SwinBackbone(config, circular)
@@ -73,22 +70,19 @@ class SGLPR(nn.Module):
             features = raw_input(image, labels, config)
             descriptor, maps = place_head(features)
             return Outputs(descriptor, None, {"raw_input": features, **maps})
-        backbone = build(config.backbone, circular=config.polar is not None)
+        backbone = _backbone(config.backbone, circular=config.polar is not None)
         seen = backbone(backbone_view(image, config), train=train)
         pixels = backbone.decode(seen) if config.head.tap == "pixels" else None
         descriptor, maps = place_head(seen.features if pixels is None else pixels)
         maps = {**seen.named, **maps}
         if not (segment and config.segments):
             return Outputs(descriptor, None, maps)
-        pixels = _decode_every(segment, backbone, seen) if pixels is None else pixels[::segment]
+        if pixels is None:
+            pixels = backbone.decode(Seen(seen.features[::segment], [one[::segment] for one in seen.finer], {}))
+        else:
+            pixels = pixels[::segment]
         logits = segmentation_head(pixels, image[::segment], config)
         return Outputs(descriptor, logits, {**maps, "pixels": pixels})
-
-
-def _decode_every(n: int, backbone: Backbone, seen: Seen) -> Float[Array, "b p q c"]:
-    """Pixels of every n-th image."""
-    finer = [one[::n] for one in seen.finer]
-    return backbone.decode(Seen(seen.features[::n], finer, named={}))
 
 
 @jax.jit
@@ -97,16 +91,15 @@ def describe(
     bev: Num[Array, "*b h w"],
     labels: Int[Array, "... h w"] | None = None,
 ) -> Float[Array, "*b d"]:
-    """Compute the descriptor of each bird's-eye-view image.
+    """Compute the descriptor of each bird's-eye-view image. It works under jit, vmap and grad.
 
-    The distance between two descriptors is the dissimilarity of their places (equation 2). The function works under
-    jit, vmap and grad. It does not compute the segmentation head. An empty image has a descriptor, too: see
-    `is_describable`.
+    The distance between two descriptors is the dissimilarity of their places (equation 2). An empty image has a
+    descriptor, too: see `is_describable`.
 
     Arguments:
       params: Model. The shipped weights require density images (`params.config.image`).
-      bev: Images with any leading axes, from `scan_image`. For models of point counts, `rasterize` also computes them.
-        A density image has float counts from 0 to 10, or the uint8 grey values from 0 to 255 of its file.
+      bev: Images with any leading axes, from `scan_image`. A density image has float counts from 0 to 10, or the uint8
+        grey values from 0 to 255 of its file.
       labels: Class maps, if the head reads labels (`head.input`).
 
     Returns:

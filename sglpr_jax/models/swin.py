@@ -36,25 +36,21 @@ def relative_position_index(window: int) -> Int[np.ndarray, "t t"]:
 
 @cache
 def shift_mask(
-    height: int, width: int, window: int, shift: int | tuple[int, int], *, circular: bool = False
+    height: int, width: int, window: int, shift: tuple[int, int], *, circular: bool
 ) -> Bool[np.ndarray, "n t t"]:
     """Mask of the token pairs that must not see each other in an image rolled by `-shift` (rows, columns).
 
     The roll brings opposite borders together in the last windows; n = (height / window) * (width / window). In a
     `circular` image the left and right borders are neighbours, so the mask blocks nothing across them.
     """
-    down, right = (shift, shift) if isinstance(shift, int) else shift
-    columns = np.zeros(width, np.int64) if circular else _strip(width, window, right)
-    regions = 3 * _strip(height, window, down)[:, None] + columns[None, :]
+    row, column = np.arange(height), np.arange(width)
+    # Rows and columns are labelled 0 in other windows, 1 in the last window's own part, 2 in its rolled-in part.
+    row = 1 * (row >= height - window) + (row >= height - shift[0])
+    column = 0 * column if circular else 1 * (column >= width - window) + (column >= width - shift[1])
+    regions = 3 * row[:, None] + column[None, :]
     blocks = regions.reshape(height // window, window, width // window, window)
     tokens = blocks.transpose(0, 2, 1, 3).reshape(-1, window**2)
     return tokens[:, :, None] != tokens[:, None, :]
-
-
-def _strip(size: int, window: int, shift: int) -> Int[np.ndarray, " size"]:
-    """Label of each row or column: 0 in other windows, 1 in the last window's own part, 2 in its rolled-in part."""
-    place = np.arange(size)
-    return (place >= size - window).astype(np.int64) + (place >= size - shift)
 
 
 def split_windows(image: Float[Array, "b h w c"], window: int) -> Float[Array, "n t c"]:
@@ -95,7 +91,7 @@ class WindowAttention(nn.Module):
         return Linear(c, name="projection")(mixed.reshape(n, t, c))
 
     def _position_bias(self, tokens: int) -> Float[Array, "heads t t"]:
-        """Looks up the table by a product with one-hot rows, whose gradient is a product instead of a slow scatter."""
+        """Reads the table by a product with one-hot rows, because the gradient of a lookup is a slow scatter."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
         table = weight(self, "position_bias", initial.normal(0.02), (rows, self.heads))
@@ -108,26 +104,24 @@ class PatchEmbed(nn.Module):
     """One token for each patch of the image: a convolution with stride equal to its kernel, then layer norm."""
 
     channels: int
-    patch: tuple[int, int] = (4, 4)
+    patch: tuple[int, int]
     """Rows and columns of a patch."""
 
     @nn.compact
     def __call__(
         self, image: Float[Array, "b h w c"]
     ) -> Float[Array, "b h//{self.patch[0]} w//{self.patch[1]} {self.channels}"]:
-        """Maps `c` input channels to `channels` and divides height and width by those of the patch."""
         return LayerNorm(name="norm")(PatchProjection(self.channels, self.patch, name="projection")(image))
 
 
 class PatchProjection(nn.Module):
-    """Linear map of each patch: a convolution with stride equal to its kernel, initialised as in PyTorch."""
+    """Convolution of `PatchEmbed`, initialised as in PyTorch."""
 
     channels: int
     patch: tuple[int, int]
 
     @nn.compact
     def __call__(self, image: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.channels}"]:
-        """Maps `c` input channels to `channels` and divides height and width by those of the patch."""
         shape = (*self.patch, image.shape[-1], self.channels)
         kernel = jnp.asarray(weight(self, "kernel", torch_uniform, shape), image.dtype)
         bias = weight(self, "bias", uniform(math.prod(shape[:-1]) ** -0.5), (self.channels,)).astype(image.dtype)
@@ -146,7 +140,6 @@ class DropPath(nn.Module):
 
     @nn.compact
     def __call__(self, branch: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w c"]:
-        """Returns the branch unchanged if `train` is False or the rate is 0."""
         if not train or self.rate == 0:
             return branch
         keep = 1 - self.rate
@@ -187,19 +180,14 @@ class SwinBlock(nn.Module):
         window = min(self.window, h, w)
         if h % window or w % window:
             raise ValueError(f"windows of {window} x {window} tokens must tile the map, found {h} x {w} tokens")
-        down, right = self._shift(h, w, window)
+        shifted = self.shifted and (min(h, w) > self.window or self.shift_each_way)
+        down, right = (shifted * window // 2 if size > window else 0 for size in (h, w))
         attention = WindowAttention(self.heads, name="attention")
         if not (down or right):
             return join_windows(attention(split_windows(x, window)), h, w)
         windows = split_windows(jnp.roll(x, (-down, -right), (1, 2)), window)
         mixed = attention(windows, shift_mask(h, w, window, (down, right), circular=self.circular))
         return jnp.roll(join_windows(mixed, h, w), (down, right), (1, 2))
-
-    def _shift(self, h: int, w: int, window: int) -> tuple[int, int]:
-        """Numbers of rows and columns by which the image is rolled."""
-        if not self.shifted or (min(h, w) <= self.window and not self.shift_each_way):
-            return 0, 0
-        return (window // 2 if h > window else 0), (window // 2 if w > window else 0)
 
 
 class SwinStage(nn.Module):
@@ -247,7 +235,6 @@ class PatchExpand(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.channels}"]:
-        """Multiplies height and width by `factor`."""
         b, h, w, _ = x.shape
         tokens = Linear(self.factor**2 * self.channels, use_bias=False, name="expand")(x)
         strips = tokens.reshape(b * h, w, self.factor, self.factor * self.channels).transpose(0, 2, 1, 3)

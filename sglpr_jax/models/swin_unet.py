@@ -1,9 +1,7 @@
 """Swin-Unet: an encoder and a decoder of Swin blocks with skip connections, on patches or on circular convolutions.
 
-A patch of eight sectors changes under rotations smaller than the patch. The result of a convolution shifts with such
-rotations. Therefore the stem of the backbone `sglpr` reduces the polar image like the circular CNN, and the attention
-windows use the resulting tokens. A rotation by a whole number of windows of the coarsest map is a shift of the tokens.
-Other rotations must be learnt.
+The stem of the backbone `sglpr` reduces the polar image like the circular CNN, whose result shifts with rotations. A
+rotation by a whole number of windows of the coarsest map is a shift of the tokens. Others must be learnt.
 """
 
 import dataclasses
@@ -103,13 +101,11 @@ class SwinBackbone:
     circular: bool
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """Computes the tokens."""
         swin_unet = SwinUnet(self.config, self.config.patch, circular=self.circular, name="backbone")
         tokens, named = swin_unet(image, train=train)
         return Seen(tokens, [], named)
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """Computes a pixel for each pixel of the image by a linear layer."""
         return PatchExpand(self.config.patch, seen.features.shape[-1], name="expand")(seen.features)
 
 
@@ -120,11 +116,9 @@ class SglprBackbone:
     config: SglprConfig
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """Computes the tokens and the maps of the stem. The tokens replace the last map."""
         return CircularSwin(self.config, name="backbone")(image, train=train)
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """Computes a pixel for each pixel of the averaged image."""
         return CircularDecoder(self.config.stem.widths, name="decoder")([*seen.finer, seen.features])
 
 

@@ -44,8 +44,6 @@ _RULES = (
 _BUFFERS = ("relative_position_index", "attn_mask")
 """Tables that PyTorch stores with the weights. Here they follow from the configuration."""
 
-_PREFIXES = ("module.", "swin_unet.")
-"""Name prefixes of data-parallel models and of Swin-Unet's outer class."""
 
 PICKLES = (".pth", ".pt", ".bin", ".ckpt")
 """File name extensions of PyTorch's own checkpoints."""
@@ -55,16 +53,11 @@ _SWIN_T_ONLY = re.compile(r"head\.(weight|bias)|layers\.\d+\.(blocks\.\d+|downsa
 
 
 class SwinTImport(NamedTuple):
-    """Parameters after an import of Swin-T, and a list of what happened to every weight.
-
-    `copied` and `kept` are names of this project: weights from the checkpoint, and unchanged weights. `unused` are
-    names of the checkpoint.
-    """
+    """Parameters after an import of Swin-T."""
 
     params: Params
-    copied: tuple[str, ...]
-    kept: tuple[str, ...]
-    unused: tuple[str, ...]
+    copied: tuple[str, ...]  # names of this project
+    unused: tuple[str, ...]  # names of the checkpoint
 
 
 def import_swin_unet(params: Params, path: Path | str) -> Params:
@@ -112,8 +105,11 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
         raise ValueError(
             f"expected a .safetensors file, found {found}; to convert it see docs/guides/weights.md"
         ) from error
-    named = {_without_prefixes(name): value for name, value in content.items() if not name.endswith(_BUFFERS)}
-    return {name: value.astype(np.float32) for name, value in named.items()}
+    return {
+        name.removeprefix("module.").removeprefix("swin_unet."): value.astype(np.float32)
+        for name, value in content.items()
+        if not name.endswith(_BUFFERS)
+    }
 
 
 def from_torch_names(
@@ -159,9 +155,12 @@ def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
         copied.append(name)
         used.add(source)
     unused = sorted(set(state) - used)
-    _check_swin_t(copied, [name for name in unused if name not in misshapen and not _SWIN_T_ONLY.fullmatch(name)])
-    kept = tuple(sorted(set(weights) - set(copied)))
-    return SwinTImport(dataclasses.replace(params, weights=as_tree(weights)), tuple(copied), kept, tuple(unused))
+    unknown = [name for name in unused if name not in misshapen and not _SWIN_T_ONLY.fullmatch(name)]
+    if unknown:
+        raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
+    if not copied:
+        raise ValueError("expected weights that fit the model, found none; Swin-T fits 96 channels and window 7")
+    return SwinTImport(dataclasses.replace(params, weights=as_tree(weights)), tuple(copied), tuple(unused))
 
 
 def torch_name(name: str) -> str:
@@ -200,16 +199,3 @@ def _flax_layout(name: str, weight: np.ndarray, input_channels: int) -> np.ndarr
     if not name.endswith("kernel"):
         return weight
     return weight.transpose(*range(2, weight.ndim), 1, 0)
-
-
-def _without_prefixes(name: str) -> str:
-    for prefix in _PREFIXES:
-        name = name.removeprefix(prefix)
-    return name
-
-
-def _check_swin_t(copied: list[str], unknown: list[str]) -> None:
-    if unknown:
-        raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
-    if not copied:
-        raise ValueError("expected weights that fit the model, found none; Swin-T fits 96 channels and window 7")

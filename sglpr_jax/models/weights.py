@@ -1,9 +1,4 @@
-"""Weights of models: names, parts, partial restore, checksums, averages, and the fit of the whitening layer.
-
-Descriptors vary mostly along a few directions. The whitening layer divides principal components by a power of their
-spread. The spread is measured about the origin, because descriptors of length 1 are compared by their angles there. The
-layer is fitted to descriptors of any places, without labels or poses.
-"""
+"""Weights of models: names, parts, partial restore, checksums, averages, and the fit of the whitening layer."""
 
 import dataclasses
 import functools
@@ -55,27 +50,21 @@ def graft(given: Params, fresh: Params) -> Params:
       ValueError: If `given` has another weight that `fresh` lacks, or one of another shape.
     """
     given = given if fresh.config.segments else for_places(given)
-    all_of_them, values = by_name(fresh.weights), by_name(given.weights)
-    for name, value in values.items():
-        wanted = all_of_them[name].shape if name in all_of_them else None
+    weights = by_name(fresh.weights)
+    for name, value in by_name(given.weights).items():
+        wanted = weights[name].shape if name in weights else None
         if wanted is None or not _may_become(wanted, value.shape):
             expected = "no such weight" if wanted is None else wanted
             raise ValueError(f"cannot start from these weights: {name} has shape {value.shape}, expected {expected}")
-    values = {name: _with_zeros(value, all_of_them[name].shape) for name, value in values.items()}
-    return dataclasses.replace(fresh, weights=as_tree(all_of_them | values))
+        missing = np.subtract(wanted, value.shape)
+        weights[name] = np.pad(np.asarray(value), [(0, more) for more in missing]) if missing.any() else value
+    return dataclasses.replace(fresh, weights=as_tree(weights))
 
 
 def _may_become(wanted: tuple[int, ...], found: tuple[int, ...]) -> bool:
     """Whether the shapes are equal, or of kernels where `wanted` has more input channels (last axis but one)."""
-    if wanted == found:
-        return True
     same = wanted[:-2] + wanted[-1:] == found[:-2] + found[-1:]
-    return same and len(wanted) == len(found) in (2, 4) and wanted[-2] > found[-2]
-
-
-def _with_zeros(value: Any, shape: tuple[int, ...]) -> Any:
-    missing = [(0, wanted - found) for wanted, found in zip(shape, value.shape, strict=True)]
-    return np.pad(np.asarray(value), missing) if np.any(missing) else value
+    return wanted == found or (same and len(wanted) == len(found) in (2, 4) and wanted[-2] > found[-2])
 
 
 def describing(params: Params) -> Any:
@@ -115,11 +104,9 @@ def hash_of(named: Mapping[str, Any]) -> str:
 
 
 def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) -> Params:
-    """Average the weights of models with equal configurations.
+    """Average the weights of models with equal configurations, without their whitening layers.
 
-    The average is useful only if one training started from the weights of another. In independent trainings the same
-    channel has different meanings. Whitening layers are removed, because each was fitted to the descriptors of its own
-    model. Fit a new one to the average.
+    The average is useful only if one training started from the weights of another.
 
     Arguments:
       models: Models whose configurations are equal except for the whitening layer.
@@ -127,38 +114,30 @@ def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) 
 
     Raises:
       ValueError: If the configurations differ, or if the shares are invalid.
-
-    Example:
-      average([load("runs/before"), load("runs/after")], shares=[0.3, 0.7])
     """
     shares = [1.0] * len(models) if shares is None else list(shares)
     if len(shares) != len(models) or min(shares, default=0) < 0 or sum(shares) == 0:
         raise ValueError(f"expected {len(models)} shares of 0 or more, not all 0, found {shares}")
     parts = [unwhitened(model) for model in models]
     for part in parts[1:]:
-        _require_same_model(parts[0], part)
-    weighted = [_times(part.weights, share / sum(shares)) for share, part in zip(shares, parts, strict=True)]
-    return Params(jax.tree.map(lambda *values: sum(values), *weighted), parts[0].config)
+        a, b = (by_name(dataclasses.asdict(params.config)) for params in (parts[0], part))
+        if name := min((name for name in a.keys() | b.keys() if a.get(name) != b.get(name)), default=None):
+            found = f"{name.replace('/', '.')} {a.get(name)} and {b.get(name)}"
+            raise ValueError(f"expected models with equal configurations, found {found}")
 
+    factors = [share / sum(shares) for share in shares]
 
-def _times(weights: Any, factor: float) -> Any:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32) * factor, weights)
+    def mean(*values: Any) -> Any:
+        return sum(jnp.asarray(one, jnp.float32) * factor for one, factor in zip(values, factors, strict=True))
 
-
-def _require_same_model(one: Params, other: Params) -> None:
-    a, b = (by_name(dataclasses.asdict(params.config)) for params in (one, other))
-    different = sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))
-    if different:
-        name = different[0]
-        found = f"{name.replace('/', '.')} {a.get(name)} and {b.get(name)}"
-        raise ValueError(f"expected models with equal configurations, found {found}")
+    return Params(jax.tree.map(mean, *(part.weights for part in parts)), parts[0].config)
 
 
 def fit_whitening(descriptors: Float[np.ndarray, "n d"], *, power: float = WHITENING_POWER) -> Float[np.ndarray, "d d"]:
-    """Fit the kernel of the whitening layer.
+    """Fit the kernel of the whitening layer to descriptors of any places, without labels or poses.
 
-    A principal component with spread s gets a spread proportional to s**(1 - power), both about the origin. Power 1
-    whitens fully. Fewer than d descriptors leave some directions undetermined.
+    A principal component with spread s gets a spread proportional to s**(1 - power), both about the origin, where
+    descriptors of length 1 are compared by their angles. Power 1 whitens fully.
 
     Raises:
       ValueError: If all descriptors are equal.
@@ -172,9 +151,7 @@ def fit_whitening(descriptors: Float[np.ndarray, "n d"], *, power: float = WHITE
 
 
 def whitened(params: Params, descriptors: Float[np.ndarray, "n d"], *, power: float = WHITENING_POWER) -> Params:
-    """Return `params` with a whitening layer that is fitted to descriptors.
-
-    The descriptors must come from `params` without a whitening layer (see `unwhitened`).
+    """Return `params`, which has no whitening layer, with one that is fitted to its descriptors.
 
     Raises:
       ValueError: If `params` already has a whitening layer.

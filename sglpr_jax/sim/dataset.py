@@ -1,7 +1,6 @@
 """Simulated datasets: `simulate` plans the recordings and writes them. An interrupted run can be resumed."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import math
@@ -11,9 +10,9 @@ from pathlib import Path
 
 from sglpr_jax.files import read_json, replacing
 from sglpr_jax.sim import RATE_HZ, SCANS
-from sglpr_jax.sim.drive import CARRIERS, check_drawing, name_of_path, read_path, thinned
+from sglpr_jax.sim.drive import CARRIERS, check_drawing, name_of_path, read_path, scan_rows
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
-from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, simulate_recording, with_submaps
+from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, numbered, simulate_recording, with_submaps
 from sglpr_jax.sim.repeating import default_rate, simulate_repeating
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sceneries import REPEATING
@@ -36,10 +35,7 @@ DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 AZIMUTH_STEPS = 900
 """Firings per revolution in the default datasets."""
 BYTES_PER_RAY = {"scans": 16, "nclt": 5}
-"""Approximate size of a scan with its labels, in bytes per ray, by layout.
-
-Layout "scans" stores 20 bytes per return, and most rays return. NCLT stores 8, but many rays go into the sky.
-"""
+"""Approximate size of a scan with its labels, in bytes per ray, by layout. Most rays return."""
 BYTES_PER_IMAGE = 3500
 """Approximate size of an image with its label image, in bytes."""
 
@@ -94,9 +90,8 @@ def simulate(
 ) -> Simulated:
     """Drives a simulated LiDAR through simulated towns and writes scans, labels and poses.
 
-    Existing files are kept. The same call completes an interrupted dataset and gives the same bytes. Files are written
-    atomically. Recordings can be added to a dataset, but not sessions, because their streets depend on the number of
-    days.
+    Existing files are kept: the same call completes an interrupted dataset. Recordings can be added to a dataset, but
+    not sessions, because their streets depend on the number of days.
 
     Arguments:
       out: Output folder.
@@ -151,8 +146,10 @@ def simulate(
     else:
         check_drawing(rate_hz, seed)
         drives = _drives(routes, along, scans)
-        record = functools.partial(_recording, scenery=scenery, carrier=carrier, sensor=lidar, submap_m=submap_m)
-        plans = [_plan(name, file, functools.partial(record, **options), scans) for name, file in drives.items()]
+        plans = [
+            _plan(name, file, scenery, submap_m, **options, sensor=lidar, carrier=CARRIERS[carrier])
+            for name, file in drives.items()
+        ]
         settings |= {"submap_m": submap_m} if submap_m else {}
     out = Path(out)
     _claim(out, settings, {f"drive {name}": _fingerprint(file) for name, file in drives.items()})
@@ -164,18 +161,11 @@ def simulate(
     return dataset
 
 
-def default_dataset(cache: Path) -> tuple[Path, dict]:
-    """Folder below `cache`, and options of `simulate`, for the dataset that is used by default."""
-    return _below(cache, "simulated"), {"scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
-
-
-def default_sessions(cache: Path) -> tuple[Path, dict]:
-    """Like `default_dataset`, for one town on three days."""
-    return _below(cache, "sessions"), {"sessions": DAYS, "scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
-
-
-def _below(cache: Path, kind: str) -> Path:
-    return cache / f"{kind}-v{VERSION}-{SCANS}x{AZIMUTH_STEPS}-seed0"
+def default_dataset(cache: Path, *, sessions: bool = False) -> tuple[Path, dict]:
+    """Folder below `cache`, and options of `simulate`, of the default towns or of one town on three days."""
+    folder = f"{'sessions' if sessions else 'simulated'}-v{VERSION}-{SCANS}x{AZIMUTH_STEPS}-seed0"
+    options = {"scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
+    return cache / folder, options | ({"sessions": DAYS} if sessions else {})
 
 
 def _lidar(sensor: str | Sensor, azimuth_steps: int | None) -> Sensor:
@@ -223,7 +213,7 @@ def _check_names(
 
 
 def _drives(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[str, Path | None]:
-    """Names of the drives, and the pose files along which they lead."""
+    """Pose files of the drives, by name."""
     unknown = [name for name in routes if name not in ROLES]
     if unknown or scans < 2:
         raise ValueError(f"expected drives among {', '.join(ROLES)} with 2 scans or more, found {unknown}, {scans}")
@@ -233,22 +223,17 @@ def _drives(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[st
     return dict(zip(names, [*[None] * len(routes), *along], strict=True))
 
 
-def _plan(name: str, file: Path | None, record: Callable[..., SimulatedRecording], scans: int) -> PlannedRecording:
-    count = scans if file is None else len(thinned(read_path(file), scans).times)
-    ids = tuple(f"{i:06d}" for i in range(count))
-    return PlannedRecording(name, ids, functools.partial(record, name, along=file))
-
-
-def _recording(
-    name: str, *, along: Path | None, scenery: str, carrier: str, submap_m: float, **options
-) -> SimulatedRecording:
+def _plan(name: str, file: Path | None, scenery: str, submap_m: float, *, scans: int, **options) -> PlannedRecording:
     """Drive of a route or along a pose file, with submaps of `submap_m`."""
-    options |= {"carrier": CARRIERS[carrier]}
-    if scenery in REPEATING:
-        recording = simulate_repeating(scenery, revisit=ROLES[name].revisit, **options)
-    else:
-        recording = simulate_recording(name, along=along, scenery=SCENERIES[scenery], **options)
-    return with_submaps(recording, submap_m)
+
+    def simulate() -> SimulatedRecording:
+        if scenery in REPEATING:
+            recording = simulate_repeating(scenery, revisit=ROLES[name].revisit, scans=scans, **options)
+        else:
+            recording = simulate_recording(name, along=file, scenery=SCENERIES[scenery], scans=scans, **options)
+        return with_submaps(recording, submap_m)
+
+    return PlannedRecording(name, numbered(scans if file is None else len(scan_rows(read_path(file), scans))), simulate)
 
 
 def _fingerprint(file: Path | None) -> str:

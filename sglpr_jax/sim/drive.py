@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -39,10 +39,7 @@ TILT_DEG = 0.6
 """Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
 TILT_S = 0.5
 """Approximate duration of a tilt, in seconds."""
-HAND_HEIGHT_M, HAND_BOB_M = 1.4, 0.04
-"""Mean height of a hand-held sensor above the ground, and amplitude of its vertical motion, in metres."""
-HAND_TILT_DEG = 15.0
-"""Maximum pitch and roll of a hand-held sensor, in degrees."""
+
 STEPS_HZ = 2.0
 """Steps of a walking person per second."""
 SHIFT_S = 3.0
@@ -60,6 +57,11 @@ class PlanarPath(NamedTuple):
     yaw: np.ndarray  # (n,) heading of the vehicle, radians
     times: np.ndarray  # (n,) seconds, from 0
 
+    def at(self, progress: Float[np.ndarray, " m"], times: Float[np.ndarray, " m"]) -> "PlanarPath":
+        """Returns the path that is at `times` where this path is at the times `progress`."""
+        x, y, yaw = (np.interp(progress, self.times, values) for values in (*self.xy.T, self.yaw))
+        return PlanarPath(np.stack([x, y], axis=1), yaw, times)
+
 
 class TimedPoses(NamedTuple):
     """Poses of the LiDAR and their times."""
@@ -74,14 +76,16 @@ def plan_path(
     """Returns the path of a drive along route `name`, with a pose about every 0.1 s.
 
     The drive lasts `scans / rate_hz` seconds, but at least SHORTEST_S. The vehicle keeps right with a small sway that
-    differs between visits. It slows down in corners. The number of poses is a multiple of `scans * days`. If `days` is
-    above 1, the path has one part for each day. The parts are equally long and use the same streets.
+    differs between visits. The path has `days` equally long parts along the same streets, each with a multiple of
+    `scans` poses.
     """
     if name not in ROLES:
         raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
     role = ROLES[name]
     seconds = max(scans / rate_hz, SHORTEST_S)
-    path = _in_lane(rng, plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m), days=days))
+    middle = plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m), days=days)
+    right_m = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * waves(rng, travelled(middle), SWAY_WAVELENGTH_M)
+    path = gaussian_filter1d(shifted(middle, -right_m), STEERING_M / STEP_M, axis=0, mode="nearest")
     return timed(rng, path, free_mps=FREE_SPEED * role.speed_mps, poses=scans * days)
 
 
@@ -92,20 +96,21 @@ def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps:
     """
     heading = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
     clock = _clock(rng, line, heading, free_mps)
-    times = np.linspace(0, clock[-1], poses * max(1, round(clock[-1] * PATH_HZ / poses)))
-    x, y, yaw = (np.interp(times, clock, values) for values in (*line.T, heading))
-    return PlanarPath(np.stack([x, y], axis=1), yaw, times)
+    times = _even_times(clock[-1], poses)
+    return PlanarPath(line, heading, clock).at(times, times)
+
+
+def _even_times(end_s: float, poses: int) -> Float[np.ndarray, " n"]:
+    """Times about 0.1 s apart up to `end_s`. Their number is a multiple of `poses`."""
+    return np.linspace(0, end_s, poses * max(1, round(end_s * PATH_HZ / poses)))
 
 
 def read_path(file: Path) -> PlanarPath:
-    """Reads the path of a KITTI pose file, with the camera's pose as 12 numbers per line.
-
-    Times come from a `times.txt` in the same folder. Without it, the lines are 0.1 s apart. Distances in x and y are
-    those of the file. Height, pitch and roll are dropped.
+    """Reads x, y and yaw of a KITTI pose file. Times come from a `times.txt` beside it, or the lines are 0.1 s apart.
 
     Raises:
       FileNotFoundError: The file does not exist.
-      ValueError: A file is malformed. The message names file and line, and what was expected and found.
+      ValueError: A file is malformed. The message names file and line.
     """
     poses = read_poses(file)
     if len(poses) < 2:
@@ -127,14 +132,9 @@ def name_of_path(file: Path) -> str:
     return file.resolve().parent.name if file.name == "poses.txt" else file.stem
 
 
-def thinned(path: PlanarPath, scans: int) -> PlanarPath:
-    """Returns every k-th pose, with the smallest k that gives at most `scans` poses."""
-    return PlanarPath(*(values[every_kth(path, scans)] for values in path))
-
-
-def every_kth(path: PlanarPath, scans: int) -> slice:
-    """Indices of the poses that `thinned` keeps."""
-    return slice(None, None, -(-len(path.times) // scans))
+def scan_rows(path: PlanarPath, scans: int) -> Int[np.ndarray, " n"]:
+    """Returns every k-th row of a path, with the smallest k that gives at most `scans` rows."""
+    return np.arange(0, len(path.times), -(-len(path.times) // scans))
 
 
 def speeds(path: PlanarPath) -> Float[np.ndarray, " n"]:
@@ -158,21 +158,7 @@ def drive_seed(seed: int, name: str) -> tuple[int, int]:
 
 
 def poses_on(
-    relief: Relief,
-    xy: Float[np.ndarray, "n 2"],
-    yaw: Float[np.ndarray, " n"],
-    *,
-    height_m: float | Float[np.ndarray, " n"],
-    tilt: Float[np.ndarray, "n 2"] | None = None,
-) -> Float[np.ndarray, "n 4 4"]:
-    """Returns the poses of `poses_over` for a vehicle on hills."""
-    ground, slope = relief_height(relief, xy), relief_gradient(relief, xy)
-    return poses_over(ground, slope, xy, yaw, height_m=height_m, tilt=tilt)
-
-
-def poses_over(
-    ground: Float[np.ndarray, " n"],
-    slope: Float[np.ndarray, "n 2"],
+    ground: Relief | tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]],
     xy: Float[np.ndarray, "n 2"],
     yaw: Float[np.ndarray, " n"],
     *,
@@ -182,13 +168,15 @@ def poses_over(
     """Returns world_from_lidar of a vehicle on the ground: x points forward, z along the normal of the ground.
 
     Arguments:
-      ground: Height of the ground, in metres.
-      slope: Slope of the ground along x and y.
+      ground: Hills, or height (metres) and slope along x and y of the ground at each pose.
       xy: Position of the LiDAR, in metres.
       yaw: Heading of the vehicle, in radians.
       height_m: Height of the LiDAR above the ground along the normal, one value or one for each pose.
       tilt: Pitch and roll relative to the ground, in radians, see `Carrier.motion`.
     """
+    if isinstance(ground, Relief):
+        ground = relief_height(ground, xy), relief_gradient(ground, xy)
+    height, slope = ground
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     x_axis = np.concatenate([forward, (forward * slope).sum(axis=1, keepdims=True)], axis=1)
     z_axis = np.concatenate([-slope, np.ones((len(yaw), 1))], axis=1)
@@ -198,7 +186,7 @@ def poses_over(
     poses = np.tile(np.eye(4), (len(yaw), 1, 1))
     poses[:, :3, :3] = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=2)
     poses[:, :2, 3] = xy
-    poses[:, 2, 3] = ground + height_m * steepness  # `height_m` along the normal
+    poses[:, 2, 3] = height + height_m * steepness  # `height_m` along the normal
     if tilt is not None:
         poses[:, :3, :3] @= Rotation.from_euler("yx", tilt).as_matrix()
     return poses
@@ -217,34 +205,19 @@ def shifted(line: Line, left_m: Float[np.ndarray, " n"] | float) -> Line:
     return line + np.reshape(left_m, (-1, 1)) * np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
 
 
-def _in_lane(rng: np.random.Generator, middle: Line) -> Line:
-    """`middle` shifted to the right, with a slow sway."""
-    offset = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * waves(rng, travelled(middle), SWAY_WAVELENGTH_M)
-    return gaussian_filter1d(shifted(middle, -offset), STEERING_M / STEP_M, axis=0, mode="nearest")
-
-
 def _clock(
     rng: np.random.Generator, path: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, " n"], free_mps: float
 ) -> Float[np.ndarray, " n"]:
     """Time of each point of `path`, for the highest speed that streets, corners and a car's acceleration allow."""
     length = travelled(path)
     curvature = np.abs(np.gradient(heading, length)).clip(min=1e-6)
-    limit = np.minimum(
-        (free_mps * (1 + 0.2 * waves(rng, length, SWAY_WAVELENGTH_M))) ** 2, LATERAL_ACCELERATION / curvature
-    )
+    free = free_mps * (1 + 0.2 * waves(rng, length, SWAY_WAVELENGTH_M))
+    limit = np.minimum(free**2, LATERAL_ACCELERATION / curvature)
     gain = 2 * ACCELERATION * length  # v^2 grows by at most 2 a s
     limit = np.minimum.accumulate(limit - gain) + gain
     limit = np.minimum.accumulate((limit + gain)[::-1])[::-1] - gain
     speed = np.sqrt(limit)
     return np.concatenate([[0.0], np.cumsum(np.diff(length) / ((speed[1:] + speed[:-1]) / 2))])
-
-
-class Motion(NamedTuple):
-    """Motion of the sensor relative to the ground below the path."""
-
-    tilt: np.ndarray  # (n, 2) pitch and roll, radians
-    height: np.ndarray | float  # (n,) or one value for all, metres above the ground
-    left: np.ndarray | float  # (n,) or one value for all, metres to the left of the path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,28 +248,29 @@ class Carrier:
     reverse_m: Range = (5.0, 15.0)
     """Range of the length of a reversal, in metres."""
 
-    def motion(self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float) -> Motion:
-        """Draws the motion of the sensor at `times`. Its mean height is `height_m` if the carrier has no height."""
+    def motion(
+        self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"] | float, Float[np.ndarray, " n"] | float]:
+        """Draws the motion of the sensor at `times`. Its mean height is `height_m` if the carrier has no height.
+
+        Returns:
+          Pitch and roll in radians, height above the ground, and distance to the left of the path, in metres.
+        """
         height_m = height_m if self.height_m is None else self.height_m
         if not self.walks:
-            return Motion(body_tilt(rng, times) * (self.tilt_deg / TILT_DEG), height_m, 0.0)
-        swing, bob = steps(rng, times)
-        return Motion(np.radians(self.tilt_deg) * swing, height_m + self.bob_m * bob, -self.sway_m * swing[:, 1])
+            return _body_tilt(rng, times) * (self.tilt_deg / TILT_DEG), height_m, 0.0
+        swing, bob = _steps(rng, times)
+        return np.radians(self.tilt_deg) * swing, height_m + self.bob_m * bob, -self.sway_m * swing[:, 1]
 
     def halted(self, rng: np.random.Generator, path: PlanarPath, *, poses: int) -> PlanarPath:
-        """Inserts the halts into the drive along `path`, which must not stand.
-
-        The number of poses is a multiple of `poses`. The heading stays that of the path where the carrier reverses.
-        """
+        """Inserts the halts into the drive along `path`. The number of poses is a multiple of `poses`."""
         if self.halt_every_s is None:
             return path
         clock, progress = self._halts(rng, path)
         even = np.arange(0, clock[-1], 1 / PATH_HZ)
         smooth = gaussian_filter1d(np.interp(even, clock, progress), BRAKING_S * PATH_HZ, mode="nearest")
-        times = np.linspace(0, even[-1], poses * max(1, round(even[-1] * PATH_HZ / poses)))
-        at = np.interp(times, even, smooth)
-        x, y, yaw = (np.interp(at, path.times, values) for values in (*path.xy.T, path.yaw))
-        return PlanarPath(np.stack([x, y], axis=1), yaw, times)
+        times = _even_times(even[-1], poses)
+        return path.at(np.interp(times, even, smooth), times)
 
     def _halts(self, rng: np.random.Generator, path: PlanarPath) -> tuple[list[float], list[float]]:
         """Knots of the drive with halts: times, and the times at which `path` is at the same places."""
@@ -324,40 +298,31 @@ class Carrier:
 
 
 VEHICLE = Carrier()
-HANDHELD = Carrier(
-    speed_mps=(1.2, 1.2), rate_hz=5.0, height_m=HAND_HEIGHT_M, walks=True, tilt_deg=HAND_TILT_DEG, bob_m=HAND_BOB_M
-)
 CARRIERS = {
     "vehicle": VEHICLE,
     "backpack": Carrier(
         speed_mps=(1.0, 1.4), rate_hz=2.0, height_m=1.8, walks=True, tilt_deg=5.0, bob_m=0.03, sway_m=0.04
     ),
-    "handheld": HANDHELD,
+    "handheld": Carrier(speed_mps=(1.2, 1.2), rate_hz=5.0, height_m=1.4, walks=True, tilt_deg=15.0, bob_m=0.04),
     "cart": Carrier(speed_mps=(0.8, 1.2), height_m=0.6, tilt_deg=0.0),
     "stop-and-reverse": Carrier(halt_every_s=(12.0, 35.0)),
 }
 """Carriers by name."""
 
 
-def body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+def _body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
     """Draws pitch and roll of the vehicle's body relative to the ground at `times`, in radians."""
-    steps = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
+    even = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
     width = TILT_S * PATH_HZ
-    noise = gaussian_filter1d(rng.normal(size=(len(steps), 2)), width, axis=0, mode="wrap")
+    noise = gaussian_filter1d(rng.normal(size=(len(even), 2)), width, axis=0, mode="wrap")
     noise *= np.sqrt(2 * width * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # undoes the loss of variance in the filter
-    return np.stack([np.interp(times, steps, axis) for axis in noise.T], axis=1)
+    return np.stack([np.interp(times, even, axis) for axis in noise.T], axis=1)
 
 
-def steps(
+def _steps(
     rng: np.random.Generator, times: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Draws the motion of a walking person at `times`, as fractions of its amplitudes, between -1 and 1.
-
-    Pitch and roll oscillate with the steps, around directions that change over some seconds.
-
-    Returns:
-      Pitch and roll, and height.
-    """
+    """Draws pitch and roll, and height, of a walking person at `times`, as fractions of their amplitudes."""
     phase = np.pi * STEPS_HZ * times[:, None] * rng.uniform(0.97, 1.03, 2)  # the body sways once every two steps
     sway = np.sin(phase * [2, 1] + rng.uniform(0, 2 * np.pi, 2))
     seconds = rng.uniform(3, 8, 2)

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sglpr_jax.sim import objects
-from sglpr_jax.sim.objects import FENCE, OTHER_OBJECT, POLE, TERRAIN, TRAFFIC_SIGN, Beside, Part, Range, Thing, Zone
+from sglpr_jax.sim.labels import FENCE, OTHER_OBJECT, POLE, TERRAIN, TRAFFIC_SIGN
+from sglpr_jax.sim.objects import Beside, Part, Range, Thing, Zone
 from sglpr_jax.sim.styles import Side, draw_house
 
 Clock = tuple[float, float]
@@ -29,7 +30,10 @@ def frontage(
     `bystanders` yields functions that draw people, bicycles and similar things, in the order of their use.
     """
     if side.bays:
-        yield from _parked_cars(rng, side, start, stop, clock)
+        d = side.strips[0].width / 2 + 0.1
+        for s in _steps(rng, start + 4, stop - 4, (5.4, 6.4)):
+            yaw = rng.choice((0.0, np.pi))
+            yield from _changing(rng, objects.parked, s, d, yaw, "bay", clock, side.occupied)
     yield from _street_furniture(rng, side, start, stop)
     yield from _tree_row(rng, side, start, stop)
     for s in _poisson(rng, side.style.bystanders, start, stop):
@@ -91,27 +95,20 @@ def _changing(
         yield Beside(make(rng), s + shift[0], d + shift[1] / 2, yaw + turn, zone, since, until)
 
 
-def _parked_cars(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
-    d = side.strips[0].width / 2 + 0.1
-    for s in _steps(rng, start + 4, stop - 4, (5.4, 6.4)):
-        yaw = rng.choice((0.0, np.pi))
-        yield from _changing(rng, objects.parked, s, d, yaw, "bay", clock, side.occupied)
-
-
 def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
     """Lamp posts, bins, benches, posts and signs at the edge of the sidewalk nearest to the road."""
     d = side.verge - side.strips[-1].width + 0.35 if side.strips else 0.7
     zone: Zone = "verge" if side.strips else "plot"
-    if side.style.street.lamps:
+    if side.style.lamps:
         spacing = rng.uniform(20, 40)
         for s in _steps(rng, start, stop, (spacing, spacing + 3)):
             yield Beside((objects.post(POLE, 0.18, rng.uniform(5, 8)),), s, d, zone=zone)
         for s in _steps(rng, start, stop, (40.0, 120.0)):
-            yield Beside(bin_or_bench(rng), s, d + 0.3, zone=zone)
+            yield Beside(_bin_or_bench(rng), s, d + 0.3, zone=zone)
     if side.post_spacing:
         for s in _steps(rng, start, stop, (side.post_spacing, side.post_spacing + 0.2)):
             yield Beside((objects.post(POLE, 0.15, 1.4),), s, d, zone=zone)
-    for s in _poisson(rng, side.style.street.signs, start, stop):
+    for s in _poisson(rng, side.style.signs, start, stop):
         size, low = rng.uniform(0.5, 0.9), rng.uniform(1.3, 2.1)
         plate = objects.block(TRAFFIC_SIGN, 0.06, size, size, x=0.06, bottom=low)
         yield Beside((objects.post(POLE, 0.08, low + size), plate), s, d, rng.normal(0, 0.2), zone)
@@ -134,7 +131,7 @@ def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -
 
 
 def _tree(rng: np.random.Generator, side: Side, spread: Range) -> Thing:
-    return objects.limbed_tree(rng, spread) if side.style.plants.old_trees else objects.tree(rng, spread)
+    return objects.limbed_tree(rng, spread) if side.style.old_trees else objects.tree(rng, spread)
 
 
 class Border(NamedTuple):
@@ -143,15 +140,20 @@ class Border(NamedTuple):
     thickness: float
     height: Range
     closed: float  # fraction of the line that is closed
-    make: Callable[[np.random.Generator, float, float, float], Thing]
-    """Function of a random generator, length, thickness and height."""
+    make: Callable[..., Thing]  # of a random generator, length, thickness and height
 
 
-def _fence(porosity: float) -> Callable[..., Thing]:
-    """Function that makes a piece of a fence, or of a wall with porosity 0."""
-    return lambda rng, length, thickness, height: (
-        objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=porosity),
-    )
+def _wall(_: np.random.Generator, length: float, thickness: float, height: float, porosity: float = 0.0) -> Thing:
+    return (objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=porosity),)
+
+
+def _fence(rng: np.random.Generator, *size: float) -> Thing:
+    return _wall(rng, *size, porosity=0.45)
+
+
+def _trimmed(rng: np.random.Generator, *size: float) -> Thing:
+    """Hedge that is straight and dense like a wall."""
+    return objects.hedge(*size, roughness=rng.uniform(0.05, 0.2), porosity=rng.uniform(0.05, 0.25))
 
 
 def _rail(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
@@ -161,8 +163,8 @@ def _rail(rng: np.random.Generator, length: float, thickness: float, height: flo
 
 def _lattice(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
     """Low see-through fence on posts, with a bush behind some pieces."""
-    mesh = objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=rng.uniform(0.4, 0.8))
-    parts = [mesh, objects.block(FENCE, 0.15, 0.15, height + 0.1)]
+    mesh = _wall(rng, length, thickness, height, rng.uniform(0.4, 0.8))
+    parts = [*mesh, objects.block(FENCE, 0.15, 0.15, height + 0.1)]
     if rng.random() < 0.3:
         x, y = rng.uniform(-0.4, 0.4) * length, rng.uniform(0.7, 1.5)
         parts += [part._replace(x=part.x + x, y=part.y + y) for part in objects.bush(rng, 0.6)]
@@ -171,12 +173,12 @@ def _lattice(rng: np.random.Generator, length: float, thickness: float, height: 
 
 _BORDERS = {
     "hedge": Border(1.0, (0.9, 2.6), 0.9, lambda rng, *size: objects.hedge(*size)),
-    "trimmed": Border(0.8, (0.9, 2.2), 0.9, objects.trimmed_hedge),
+    "trimmed": Border(0.8, (0.9, 2.2), 0.9, _trimmed),
     "hedgerow": Border(0.3, (1.2, 3.0), 0.95, objects.hedgerow),
-    "fence": Border(0.06, (0.9, 1.8), 0.85, _fence(0.45)),
+    "fence": Border(0.06, (0.9, 1.8), 0.85, _fence),
     "lattice": Border(0.08, (0.8, 1.5), 0.9, _lattice),
-    "wall": Border(0.25, (0.7, 2.2), 0.9, _fence(0.0)),
-    "screen": Border(0.2, (1.6, 3.5), 1.0, _fence(0.0)),
+    "wall": Border(0.25, (0.7, 2.2), 0.9, _wall),
+    "screen": Border(0.2, (1.6, 3.5), 1.0, _wall),
     "rail": Border(0.15, (0.75, 0.8), 1.0, _rail),
 }
 
@@ -201,7 +203,7 @@ def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> 
     d = side.verge + 0.45 + border.thickness / 2
     s = start
     while s < stop - 1:
-        end = stop if side.border == "rail" else min(s + rng.uniform(*side.style.plots.closed), stop)
+        end = stop if side.border == "rail" else min(s + rng.uniform(*side.style.closed), stop)
         if rng.random() < border.closed:
             yield from _in_pieces(rng, side.border, s, end, d, "plot")
         s = end + rng.uniform(2, 4.5)
@@ -210,13 +212,13 @@ def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> 
 def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
     """Row of houses. Gaps between houses may hold cars, a garage, a wall or a hedge."""
     style = side.style
-    s = start + max(rng.uniform(*style.plots.gap), 0) / 2
+    s = start + max(rng.uniform(*style.gap), 0) / 2
     while s < stop - 3.5:
         plan = side.row or draw_house(rng, style)
-        width, gap = min(plan.width, stop - s), rng.uniform(*style.plots.gap)
-        if rng.random() < style.plots.houses:
+        width, gap = min(plan.width, stop - s), rng.uniform(*style.gap)
+        if rng.random() < style.houses:
             near = rng.random() < (1.0 if side.row else 0.75)
-            set_back = side.set_back if near else rng.uniform(*style.plots.set_back)
+            set_back = side.set_back if near else rng.uniform(*style.set_back)
             plan = objects.House(width, plan.depth, plan.height, plan.glass)
             thing = objects.house(rng, plan, porch=set_back > 2)
             yield Beside(thing, s + width / 2, side.verge + 0.1 + set_back, rng.normal(0, 0.008))
@@ -236,12 +238,12 @@ def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, 
     elif what == "hedge":
         yield Beside(objects.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
     elif what == "wall":
-        yield Beside(_BORDERS["wall"].make(rng, 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
+        yield Beside(_wall(rng, 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
 
 
 def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
     """Trees and bushes on the plots, most of them near the street."""
-    for s in _poisson(rng, side.style.plants.trees, start, stop):
+    for s in _poisson(rng, side.style.trees, start, stop):
         d, kind = side.verge + 1.0 + 14 * rng.random() ** 2, rng.random()
         if kind < 0.28:
             yield Beside(_tree(rng, side, (3.0, 7.0)), s, d)
@@ -282,8 +284,7 @@ def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> I
         yield Beside((Part("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2)
 
 
-def bin_or_bench(rng: np.random.Generator) -> Thing:
-    """Bin or bench, as a box of the class other-object."""
+def _bin_or_bench(rng: np.random.Generator) -> Thing:
     return (objects.block(OTHER_OBJECT, *rng.uniform((0.5, 0.5, 0.8), (1.8, 0.8, 1.3)).tolist()),)
 
 
@@ -292,9 +293,8 @@ def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generat
 
     Each block of ten contains three people, three bicycles and one of each other kind.
     """
-    person, bicycle = objects.person, objects.bicycle
-    kinds = [person, person, person, bicycle, bicycle, bicycle]
-    kinds += [objects.bicyclist, objects.motorcycle, objects.motorcyclist, bin_or_bench]
+    kinds = [*3 * [objects.person], *3 * [objects.bicycle]]
+    kinds += [objects.bicyclist, objects.motorcycle, objects.motorcyclist, _bin_or_bench]
     while True:
         for i in rng.permutation(len(kinds)).tolist():
             yield kinds[i]

@@ -1,10 +1,8 @@
 """Ground: smooth hills, a raster of semantic labels, and the intersection of rays with both.
 
-Along a ray, a parabola approximates the ground, so the intersection is the solution of a quadratic equation. Two
-parabolas are used, both with the height and slope of the ground below the sensor. The first one also has the curvature
-there and gives the approximate distance. The second one passes through the true height at that distance. The error in
-height is at most 0.04 m at distances of 30 to 40 m in towns. In the outskirts, 6 % of the errors exceed 0.2 m there.
-Shapes stand on the true height.
+Along a ray, a parabola with the height and slope below the sensor approximates the ground. A first one with the
+curvature there gives the approximate distance; the second one passes through the true height at that distance. The
+error in height is at most 0.04 m at 30 to 40 m in towns. In the outskirts, 6 % of the errors exceed 0.2 m there.
 """
 
 from typing import NamedTuple
@@ -12,9 +10,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from sglpr_jax.sim.objects import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
+from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
 from sglpr_jax.sim.shapes import AnyArray, Vectors
 from sglpr_jax.sim.styles import TOWN, Scenery
 
@@ -91,14 +89,9 @@ def label_at(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Int[np.ndarray, "
     return np.asarray(ground.label[row, column], dtype=np.int32)
 
 
-def is_raised(label: Int[np.ndarray, "*b"]) -> Bool[np.ndarray, "*b"]:
-    """Whether ground with this label is KERB_M above the road."""
-    return np.asarray(~np.isin(label, ROAD_LEVEL))
-
-
 def surface_height(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
-    """Height of the ground at `xy` including kerbs, in metres."""
-    return np.asarray(relief_height(ground.relief, xy) + KERB_M * is_raised(label_at(ground, xy)))
+    """Height of the ground at `xy` in metres. Other ground than ROAD_LEVEL is KERB_M above the road."""
+    return np.asarray(relief_height(ground.relief, xy) + KERB_M * ~np.isin(label_at(ground, xy), ROAD_LEVEL))
 
 
 class GroundView(NamedTuple):
@@ -118,25 +111,19 @@ def ground_view(ground: Ground, sensor: Float[np.ndarray, "3"], *, reach_m: floa
     xy, relief = sensor[:2], ground.relief
     near = ground.around(xy, reach_m)
     local = relief._replace(phase=(relief.wave @ xy + relief.phase) % (2 * np.pi))
-    numbers = (
-        near.origin - xy,
-        local,
-        sensor[2],
-        sensor[2] - relief_height(relief, xy),
-        relief_gradient(relief, xy),
-        relief_curvature(relief, xy),
-    )
+    height = sensor[2] - relief_height(relief, xy)
+    slopes = relief_gradient(relief, xy), relief_curvature(relief, xy)
+    numbers = (near.origin - xy, local, sensor[2], height, *slopes)
     return GroundView(near.label, *jax.tree.map(np.float32, numbers))
 
 
 def meet_ground(
     rays: Vectors, ground: GroundView, *, reach_m: float
 ) -> tuple[Float[Array, "*rays"], Int[Array, "*rays"], Float[Array, "*rays"]]:
-    """Returns distance, label and facing of the ground hit by each ray from the sensor.
+    """Returns distance (inf without a hit), label, and cosine to the normal, of the ground hit by each ray.
 
-    `rays` are unit vectors in the world's axes. Facing is the cosine of the angle between ray and normal. A ray that
-    misses the ground has distance inf. Beyond `reach_m`, distances are rough. A ray that hits the vertical face of a
-    kerb gets the label of the ground behind the kerb, and the distance at which it would hit the road there.
+    `rays` are unit vectors in the world's axes, from the sensor. Beyond `reach_m`, distances are rough. A ray that hits
+    the face of a kerb gets the label behind the kerb, and the distance at which it would hit the road there.
     """
     slope = ground.gradient[0] * rays.x + ground.gradient[1] * rays.y
     curvature, closing = ground.curvature, slope - rays.z
@@ -148,7 +135,7 @@ def meet_ground(
 
     at_kerb, at_road = _crossing(bend, closing, ground.height - KERB_M), _crossing(bend, closing, ground.height)
     kerb_label, road_label = _label(rays, at_kerb, ground), _label(rays, at_road, ground)
-    raised = _is_raised(kerb_label) & jnp.isfinite(at_kerb)
+    raised = jnp.all(jnp.stack([kerb_label != low for low in ROAD_LEVEL]), axis=0) & jnp.isfinite(at_kerb)
     distance = jnp.where(raised, at_kerb, at_road)
     facing = jnp.clip(closing + 2 * bend * jnp.where(jnp.isfinite(distance), distance, 0), 0, 1)
     return distance, jnp.where(raised, kerb_label, road_label), facing
@@ -181,7 +168,3 @@ def _label(rays: Vectors, distance: Array, ground: GroundView) -> Int[Array, "*r
     row = jnp.clip(jnp.floor((distance * rays.y - corner[1]) / CELL_M).astype(jnp.int32), 0, rows - 1)
     column = jnp.clip(jnp.floor((distance * rays.x - corner[0]) / CELL_M).astype(jnp.int32), 0, columns - 1)
     return jnp.asarray(ground.label)[row, column].astype(jnp.int32)
-
-
-def _is_raised(label: Int[Array, "*rays"]) -> Bool[Array, "*rays"]:
-    return jnp.all(jnp.stack([label != low for low in ROAD_LEVEL]), axis=0)

@@ -3,6 +3,7 @@
 Images may show varied scans, for training: rotated about z, some with lost points, as with other sensors and weather.
 """
 
+import functools
 import io
 import zlib
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt
+from jaxtyping import Float, Float32, Int, UInt
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -49,7 +50,6 @@ class Layout(NamedTuple):
     """Last of the files of the whole drive. If it exists, the drive is complete."""
 
     def files_of_scan(self, root: Path, name: str, id: str) -> tuple[Path, ...]:
-        """Paths of the files of scan `id` of drive `name`."""
         return tuple(root / self.folder.format(name=name) / file.format(id=id) for file in self.scan_files)
 
     def file_of_drive(self, root: Path, name: str, file: str) -> Path:
@@ -68,24 +68,14 @@ def _points_and_labels(
 
 
 def _image_and_labels(
-    points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None
+    points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None, *, varied: bool = False
 ) -> tuple[bytes, ...]:
-    """Density image, and image of the raw ids of its pixels. Empty pixels have the id 0.
-
-    The scan is first levelled to the height that the models expect, as in images made from the drive's scans.
-    """
+    """Density image of a levelled scan, and image of the raw ids of its pixels. Empty pixels have the id 0."""
     xyz = points[:, :3].astype(np.float32)
-    return _pngs(xyz if mounting is None else mounting.level(xyz), labels)
-
-
-def _varied_image_and_labels(
-    points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None
-) -> tuple[bytes, ...]:
-    """Density image and label image of a scan after `vary`."""
-    return _pngs(*vary(points[:, :3].astype(np.float32), labels, mounting))
-
-
-def _pngs(xyz: Float32[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"]) -> tuple[bytes, ...]:
+    if varied:
+        xyz, labels = vary(xyz, labels, mounting)
+    elif mounting is not None:
+        xyz = mounting.level(xyz)
     image = density_image(xyz)
     shown = np.where(image > 0, density_label_image(xyz, labels), 0)
     return _png(image), _png(shown.astype(np.uint16))
@@ -115,15 +105,10 @@ def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
     }
 
 
-def _bevplace_files(poses: TimedPoses) -> dict[str, bytes]:
-    return {"pose.txt": "".join(_row(pose) for pose in poses.world_from_lidar).encode()}
-
-
-def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting | None) -> tuple[bytes, ...]:
+def _nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting | None) -> tuple[bytes, ...]:
     """Returns the bytes of a scan in NCLT's body frame: x forward, y right, z down, origin on the ground.
 
-    `points` are x, y, z in metres from the sensor, with z up, and reflectivities from 0 to 1. All points have laser 0.
-    NCLT's coordinates range from -100 to 227 m in steps of 5 mm.
+    `points` are x, y, z in metres from the sensor, with z up, and reflectivities from 0 to 1.
     """
     above_ground = np.add(points[:, :3].astype(np.float64), [0, 0, NCLT_HEIGHT_M])
     body = above_ground * Z_UP_FROM_Z_DOWN
@@ -134,9 +119,7 @@ def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: 
 
 
 def _nclt_files(poses: TimedPoses) -> dict[str, bytes]:
-    """Ground truth in the axes north, east, down. The file has one row per scan. NCLT's own files have 100 rows per
-    second.
-    """
+    """Ground truth in the axes north, east, down, with one row per scan."""
     lidar_from_body = np.eye(4)
     lidar_from_body[2, 3] = -NCLT_HEIGHT_M
     world_from_body = poses.world_from_lidar @ lidar_from_body
@@ -157,7 +140,7 @@ _IMAGES = Layout(
     folder="{name}",
     scan_files=("imgs/{id}.png", "labels/{id}.png"),
     scan_contents=_image_and_labels,
-    drive_contents=_bevplace_files,
+    drive_contents=lambda poses: {"pose.txt": "".join(map(_row, poses.world_from_lidar)).encode()},
     last_file="pose.txt",
 )
 LAYOUTS = {
@@ -169,11 +152,11 @@ LAYOUTS = {
         last_file="poses.txt",
     ),
     "images": _IMAGES,
-    "varied": _IMAGES._replace(scan_contents=_varied_image_and_labels),
+    "varied": _IMAGES._replace(scan_contents=functools.partial(_image_and_labels, varied=True)),
     "nclt": Layout(
         folder="{name}",
         scan_files=("velodyne_sync/{id}.bin",),
-        scan_contents=nclt_scan,
+        scan_contents=_nclt_scan,
         drive_contents=_nclt_files,
         last_file="groundtruth_{name}.csv",
     ),
@@ -190,25 +173,10 @@ def vary(
 ) -> tuple[Float32[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
     """Removes points of some scans, levels the scan, and rotates it about z by a random angle.
 
-    The random seed is a hash of the points. The points are rotated because a rotation of the image would blur its
-    cells.
-
-    Arguments:
-      points: Points in the LiDAR frame, in metres.
-      labels: Labels of the points.
-      mounting: Mounting of the LiDAR. None is the mounting that the models expect.
-
-    Returns:
-      Remaining points and their labels.
+    The random seed is a hash of `points`, which are in the LiDAR frame. Returns the remaining points and labels.
     """
     seed = zlib.crc32(points.tobytes())
-    left = _left(points, np.random.default_rng(seed))
-    points, labels = points[left], labels[left]
-    points = points if mounting is None else mounting.level(points)
-    return rotated(points, 2 * np.pi * seed / 2**32), labels
-
-
-def _left(points: Float32[np.ndarray, "n 3"], rng: np.random.Generator) -> Bool[np.ndarray, " n"]:
+    rng = np.random.default_rng(seed)
     kind, strength = rng.random(), rng.random()
     if kind < THINNED:
         corruption = Corruption("dropout", MOST_LOST * strength)
@@ -216,7 +184,10 @@ def _left(points: Float32[np.ndarray, "n 3"], rng: np.random.Generator) -> Bool[
         corruption = Corruption("beams", BEAMS[int(len(BEAMS) * strength)])
     else:
         corruption = Corruption("clean")
-    return corrupt(points, corruption, rng=rng)[1]
+    left = corrupt(points, corruption, rng=rng)[1]
+    points, labels = points[left], labels[left]
+    points = points if mounting is None else mounting.level(points)
+    return rotated(points, 2 * np.pi * seed / 2**32), labels
 
 
 def _has_rings(points: Float32[np.ndarray, "n 3"]) -> bool:

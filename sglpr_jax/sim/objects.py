@@ -1,28 +1,16 @@
 """Objects of a town, made of boxes, cylinders and ellipsoids: plants, vehicles, people and buildings."""
 
-import dataclasses
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-# Raw label ids of SemanticKITTI for the classes in the simulator.
-NO_RETURN = 0
-"""Ground that returns no rays, such as water. No point has this label."""
-CAR, BICYCLE, BUS, MOTORCYCLE, TRUCK, OTHER_VEHICLE = 10, 11, 13, 15, 18, 20
-PERSON, BICYCLIST, MOTORCYCLIST = 30, 31, 32
-ROAD, PARKING, SIDEWALK, OTHER_GROUND, LANE_MARKING, TERRAIN = 40, 44, 48, 49, 60, 72
-BUILDING, FENCE, VEGETATION, TRUNK, POLE, TRAFFIC_SIGN, OTHER_OBJECT = 50, 51, 70, 71, 80, 81, 99
-
-MOVING = {CAR: 252, BICYCLIST: 253, PERSON: 254, MOTORCYCLIST: 255, BUS: 257, TRUCK: 258, OTHER_VEHICLE: 259}
-"""Id of the moving class for each static class."""
+from sglpr_jax.sim import labels
 
 Range = tuple[float, float]
 """Minimum and maximum of a uniform distribution."""
 Kind = Literal["box", "cylinder", "ellipsoid"]
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")
 """Kinds in the order of `shapes.Scene`."""
-
-
 Zone = Literal["bay", "verge", "plot"]
 """Place of a thing: parked along its street, on the strips beside the road, or behind the strips."""
 _BELOW_M = 1.0
@@ -81,7 +69,7 @@ def tree(rng: np.random.Generator, spread: Range) -> Thing:
     """Tree whose crown has a diameter in the range `spread`, in metres. A large crown has several ellipsoids."""
     crown, below = rng.uniform(*spread), rng.uniform(0.9, 2.6)
     thick = 0.12 + 0.05 * crown * rng.uniform(0.6, 1.4)
-    parts = [post(TRUNK, thick, below + 0.35 * crown)]
+    parts = [post(labels.TRUNK, thick, below + 0.35 * crown)]
     lobes = 1 if crown < 3.5 else int(rng.integers(2, 5))
     for _ in range(lobes):
         size = crown * (1.0 if lobes == 1 else rng.uniform(0.6, 0.85))
@@ -89,7 +77,7 @@ def tree(rng: np.random.Generator, spread: Range) -> Thing:
         low = below + rng.uniform(0, 0.25) * crown * (lobes > 1)
         high = size * rng.uniform(0.8, 1.3)
         porosity = rng.uniform(0.45, 0.75)
-        parts.append(ball(VEGETATION, size, high, x, y, bottom=low, roughness=0.7, porosity=porosity))
+        parts.append(ball(labels.VEGETATION, size, high, x, y, bottom=low, roughness=0.7, porosity=porosity))
     return tuple(parts)
 
 
@@ -97,21 +85,21 @@ def limbed_tree(rng: np.random.Generator, spread: Range) -> Thing:
     """Old street tree: a thick trunk and bare limbs under a crown that begins above most lasers."""
     crown, fork = rng.uniform(*spread), rng.uniform(1.2, 2.2)
     thick = rng.uniform(0.25, 0.7)
-    parts = [post(TRUNK, thick, fork + 1.5, roughness=0.05)]
+    parts = [post(labels.TRUNK, thick, fork + 1.5, roughness=0.05)]
     for _ in range(int(rng.integers(1, 4))):
         wide, high = rng.uniform((0.6, 0.7), (2.2, 1.8)).tolist()
         x, y = rng.uniform(-0.4, 0.4, 2).tolist()
-        parts.append(ball(TRUNK, wide, high, x, y, bottom=fork - 0.2, roughness=0.4, porosity=0.8))
+        parts.append(ball(labels.TRUNK, wide, high, x, y, bottom=fork - 0.2, roughness=0.4, porosity=0.8))
     low, porosity = fork + rng.uniform(-0.3, 1.6), rng.uniform(0.55, 0.85)
-    parts.append(ball(VEGETATION, crown, crown, bottom=low, roughness=0.9, porosity=porosity))
+    parts.append(ball(labels.VEGETATION, crown, crown, bottom=low, roughness=0.9, porosity=porosity))
     return tuple(parts)
 
 
 def conifer(rng: np.random.Generator) -> Thing:
     """Conifer with a crown that reaches the ground."""
     spread = rng.uniform(1.5, 4)
-    leaves = ball(VEGETATION, spread, 3 * spread, bottom=-0.8 * spread, roughness=0.5, porosity=0.45)
-    return post(TRUNK, 0.3, 1.5), leaves
+    leaves = ball(labels.VEGETATION, spread, 3 * spread, bottom=-0.8 * spread, roughness=0.5, porosity=0.45)
+    return post(labels.TRUNK, 0.3, 1.5), leaves
 
 
 def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
@@ -122,19 +110,14 @@ def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
         length, width, height = large * rng.uniform((0.8, 0.8, 0.7), (3.0, 2.0, 2.4))
         x, y = i * rng.uniform(-0.5, 0.5, 2) * (length, width)
         size, yaw = (length, width, 1.4 * height), rng.uniform(0, np.pi)
-        parts.append(Part("ellipsoid", VEGETATION, size, float(x), float(y), -0.4 * height, yaw, 0.45, 0.45))
+        parts.append(Part("ellipsoid", labels.VEGETATION, size, float(x), float(y), -0.4 * height, yaw, 0.45, 0.45))
     return tuple(parts)
 
 
 def hedge(length: float, thickness: float, height: float, *, roughness: float = 0.3, porosity: float = 0.25) -> Thing:
     """Trimmed hedge along x."""
     size = length, thickness, height + 0.3
-    return (block(VEGETATION, *size, bottom=-0.3, roughness=roughness, porosity=porosity),)
-
-
-def trimmed_hedge(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
-    """Hedge along x that is straight and dense like a wall."""
-    return hedge(length, thickness, height, roughness=rng.uniform(0.05, 0.2), porosity=rng.uniform(0.05, 0.25))
+    return (block(labels.VEGETATION, *size, bottom=-0.3, roughness=roughness, porosity=porosity),)
 
 
 def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
@@ -155,11 +138,11 @@ def thicket(rng: np.random.Generator) -> Thing:
     for _ in range(int(rng.integers(1, 4))):
         x, y = rng.uniform(-2.5, 2.5, 2).tolist()
         thick = rng.uniform(0.15, 0.45)
-        parts.append(post(TRUNK, thick, rng.uniform(4, 8), x, y))
+        parts.append(post(labels.TRUNK, thick, rng.uniform(4, 8), x, y))
         size = rng.uniform(2.5, 5)
         low = rng.uniform(1.0, 3.5)
         porosity = rng.uniform(0.5, 0.75)
-        parts.append(ball(VEGETATION, size, 1.5 * size, x, y, bottom=low, roughness=0.9, porosity=porosity))
+        parts.append(ball(labels.VEGETATION, size, 1.5 * size, x, y, bottom=low, roughness=0.9, porosity=porosity))
     return tuple(parts)
 
 
@@ -168,16 +151,16 @@ def car(rng: np.random.Generator) -> Thing:
     length, width, height = rng.uniform(3.7, 4.8), rng.uniform(1.65, 1.85), rng.uniform(1.4, 1.65)
     cabin, estate = rng.uniform(0.45, 0.7) * length, rng.uniform(0, 0.12) * length
     return (
-        block(CAR, length, width, 0.4 * height, bottom=0.22),
-        block(CAR, cabin, 0.88 * width, 0.4 * height, x=-estate, bottom=0.6 * height),
+        block(labels.CAR, length, width, 0.4 * height, bottom=0.22),
+        block(labels.CAR, cabin, 0.88 * width, 0.4 * height, x=-estate, bottom=0.6 * height),
     )
 
 
 def van(rng: np.random.Generator) -> Thing:
     length, height = rng.uniform(4.8, 5.8), rng.uniform(1.8, 2.5)
     return (
-        block(OTHER_VEHICLE, length, 1.95, 0.45 * height, bottom=0.25),
-        block(OTHER_VEHICLE, 0.8 * length, 1.85, height - 0.3, x=-0.1 * length, bottom=0.3),
+        block(labels.OTHER_VEHICLE, length, 1.95, 0.45 * height, bottom=0.25),
+        block(labels.OTHER_VEHICLE, 0.8 * length, 1.85, height - 0.3, x=-0.1 * length, bottom=0.3),
     )
 
 
@@ -185,38 +168,38 @@ def truck(rng: np.random.Generator) -> Thing:
     """Truck: a cab and, behind a gap, the load."""
     length, height = rng.uniform(6, 9), rng.uniform(2.7, 3.6)
     return (
-        block(TRUCK, 1.9, 2.2, 2.3, x=length / 2 - 0.95, bottom=0.45),
-        block(TRUCK, length - 2.3, 2.35, height - 0.9, x=-1.15, bottom=0.9),
+        block(labels.TRUCK, 1.9, 2.2, 2.3, x=length / 2 - 0.95, bottom=0.45),
+        block(labels.TRUCK, length - 2.3, 2.35, height - 0.9, x=-1.15, bottom=0.9),
     )
 
 
 def bus(rng: np.random.Generator) -> Thing:
-    return (block(BUS, rng.uniform(10, 12.5), 2.5, 2.8, bottom=0.3),)
+    return (block(labels.BUS, rng.uniform(10, 12.5), 2.5, 2.8, bottom=0.3),)
 
 
 def bicycle(rng: np.random.Generator) -> Thing:
-    return (block(BICYCLE, rng.uniform(1.6, 1.8), 0.15, 1.0, porosity=0.5),)
+    return (block(labels.BICYCLE, rng.uniform(1.6, 1.8), 0.15, 1.0, porosity=0.5),)
 
 
 def motorcycle(rng: np.random.Generator) -> Thing:
-    return (block(MOTORCYCLE, rng.uniform(1.9, 2.2), 0.45, 1.1, bottom=0.05),)
+    return (block(labels.MOTORCYCLE, rng.uniform(1.9, 2.2), 0.45, 1.1, bottom=0.05),)
 
 
 def _rider(rng: np.random.Generator, label: int, vehicle: Part) -> Thing:
-    top = rng.uniform(1.6, 1.85)
-    return vehicle._replace(label=label), Part("cylinder", label, (0.4, 0.45, top - 0.7), bottom=0.7)
+    body = Part("cylinder", label, (0.4, 0.45, rng.uniform(1.6, 1.85) - 0.7), bottom=0.7)
+    return vehicle._replace(label=label), body
 
 
 def bicyclist(rng: np.random.Generator) -> Thing:
-    return _rider(rng, BICYCLIST, *bicycle(rng))
+    return _rider(rng, labels.BICYCLIST, *bicycle(rng))
 
 
 def motorcyclist(rng: np.random.Generator) -> Thing:
-    return _rider(rng, MOTORCYCLIST, *motorcycle(rng))
+    return _rider(rng, labels.MOTORCYCLIST, *motorcycle(rng))
 
 
 def person(rng: np.random.Generator) -> Thing:
-    return (Part("cylinder", PERSON, (rng.uniform(0.3, 0.5), rng.uniform(0.4, 0.6), rng.uniform(1.5, 1.9))),)
+    return (Part("cylinder", labels.PERSON, (rng.uniform(0.3, 0.5), rng.uniform(0.4, 0.6), rng.uniform(1.5, 1.9))),)
 
 
 def people(rng: np.random.Generator) -> Thing:
@@ -225,23 +208,21 @@ def people(rng: np.random.Generator) -> Thing:
     for place in range(int(rng.integers(1, 4))):
         deep, wide, height = rng.uniform((0.35, 0.5, 1.5), (0.6, 0.8, 1.9)).tolist()
         x, y = rng.uniform(-0.15, 0.15, 2).tolist()
-        parts.append(Part("cylinder", PERSON, (deep, wide, height), x, y + 0.75 * place, roughness=0.12))
+        parts.append(Part("cylinder", labels.PERSON, (deep, wide, height), x, y + 0.75 * place, roughness=0.12))
     return tuple(parts)
 
 
 def moving(thing: Thing) -> Thing:
     """`thing` with the labels of the moving classes."""
-    return tuple(part._replace(label=MOVING[part.label]) for part in thing)
+    return tuple(part._replace(label=labels.MOVING[part.label]) for part in thing)
 
 
 def parked(rng: np.random.Generator) -> Thing:
     """Parked vehicle, mostly a car."""
-    make = (car, van, truck)[rng.choice(3, p=[0.955, 0.03, 0.015])]
-    return make(rng)
+    return (car, van, truck)[rng.choice(3, p=[0.955, 0.03, 0.015])](rng)
 
 
-@dataclasses.dataclass(frozen=True)
-class House:
+class House(NamedTuple):
     """Size of a house in metres, and the fraction of its facade that is window."""
 
     width: float
@@ -253,7 +234,7 @@ class House:
 def _block(width: float, depth: float, height: float, x: float, front: float, glass: float) -> Part:
     """Box with its front at y = `front`. It extends below the ground."""
     size = width, depth, height + _BELOW_M
-    return Part("box", BUILDING, size, x, front + depth / 2, -_BELOW_M, roughness=_FACADE_M, glass=glass)
+    return Part("box", labels.BUILDING, size, x, front + depth / 2, -_BELOW_M, roughness=_FACADE_M, glass=glass)
 
 
 def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
@@ -276,7 +257,7 @@ def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
     if height > 6 and rng.random() < 0.35:
         length, x = rng.uniform(2, 0.4 * width + 2), rng.uniform(-0.2, 0.2) * width
         for storey in range(1, int(height / 3)):
-            parts.append(block(BUILDING, length, 1.3, 1.1, x, -0.6, bottom=3.0 * storey - 0.2))
+            parts.append(block(labels.BUILDING, length, 1.3, 1.1, x, -0.6, bottom=3.0 * storey - 0.2))
     return tuple(parts)
 
 

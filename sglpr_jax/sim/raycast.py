@@ -1,8 +1,7 @@
 """First hit of each ray with a shape, and whether it returns: surfaces, windows, weak echoes and mixed edges.
 
-The columns of a revolution are divided into sectors. The host lists the shapes that overlap each sector, nearest first.
-The device processes all sectors in parallel, one shape per sector at a time. It stops when the remaining shapes are
-farther than all hits.
+The host lists the shapes that overlap each sector of columns, nearest first. The device processes all sectors in
+parallel, one shape per sector at a time, until the remaining shapes are farther than all hits.
 """
 
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.sim import objects
+from sglpr_jax.sim import labels
 from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
 
 COLUMNS = 32
@@ -21,8 +20,7 @@ COLUMNS = 32
 SLOTS = 64, 48, 128
 """Maximum numbers of boxes, cylinders and ellipsoids in a sector. If there are more, the nearest are kept.
 
-In the towns of routes 00 and 02, sectors have up to 50 cylinders and 160 ellipsoids. About one sector in a hundred has
-too many ellipsoids. The omitted shapes are at least 47 m away.
+In the towns of routes 00 and 02, one sector in a hundred has too many ellipsoids. The omitted ones are 47 m away.
 """
 UNROLL = 2
 """Number of shapes tested between two checks of the stop condition. It must divide all numbers of slots."""
@@ -67,8 +65,7 @@ class Chance(NamedTuple):
 
 
 def sector_count(azimuth_steps: int) -> int:
-    """Number of sectors in a scan. The last one may extend beyond the last azimuth. In a revolution it may overlap the
-    first one."""
+    """Number of sectors in a scan. The last one may extend beyond the last azimuth."""
     return -(-azimuth_steps // COLUMNS)
 
 
@@ -167,9 +164,9 @@ def nearest_hit(
 ) -> tuple[Float[Array, "lasers azimuths"], Int[Array, "lasers azimuths"]]:
     """Returns the distance to the first shape that each ray from the sensor hits, and its slot.
 
-    `rays` are unit vectors for the azimuths of all sectors. Slots count boxes, then cylinders, then ellipsoids. A ray
-    without a hit nearer than `limit` has the distance `limit` and slot -1. Shapes around the sensor are not hit. A
-    rough shape returns a ray from a random depth. If the shape is thinner than this depth, the ray passes.
+    Slots count boxes, then cylinders, then ellipsoids. A ray without a hit nearer than `limit` has the distance `limit`
+    and slot -1. Shapes around the sensor are not hit. A rough shape returns a ray from a random depth, if it is not
+    thinner than that.
     """
     sectors = (limit.shape[0], -1, COLUMNS)
     rays, limit, chance = jax.tree.map(
@@ -215,14 +212,14 @@ def _nearest_of_kind(
 
 _REFLECTIVITY = np.full(260, 0.35, np.float32)
 for _id, _value in {
-    objects.NO_RETURN: 0.0,
-    objects.ROAD: 0.25,
-    objects.PARKING: 0.25,
-    objects.LANE_MARKING: 0.6,
-    objects.BUILDING: 0.4,
-    objects.CAR: 0.3,
-    objects.MOVING[objects.CAR]: 0.3,
-    objects.TRAFFIC_SIGN: 0.95,
+    labels.NO_RETURN: 0.0,
+    labels.ROAD: 0.25,
+    labels.PARKING: 0.25,
+    labels.LANE_MARKING: 0.6,
+    labels.BUILDING: 0.4,
+    labels.CAR: 0.3,
+    labels.MOVING[labels.CAR]: 0.3,
+    labels.TRAFFIC_SIGN: 0.95,
 }.items():
     _REFLECTIVITY[_id] = _value
 
@@ -292,9 +289,8 @@ def echo_returns(
 ) -> Bool[Array, "lasers azimuths"]:
     """Whether the echo of each ray is detected. `chance` is uniform in [0, 1).
 
-    The strength of an echo is e = reflectivity x facing / distance^2. It is detected with probability
-    1 - exp(-(e / faintest_echo)^2), reduced by `dropout` and by windows. A flat road vanishes between 35 and 55 m, as
-    in KITTI's scans. A wall vanishes at a much larger distance.
+    An echo of strength e = reflectivity x facing / distance^2 is detected with probability
+    1 - exp(-(e / faintest_echo)^2), reduced by `dropout` and by windows. A flat road vanishes between 35 and 55 m.
     """
     echo = reflectivity(surface.label) * surface.facing / jnp.maximum(surface.distance, 1) ** 2
     seen = (1 - dropout) * -jnp.expm1(-((echo / faintest_echo) ** 2))

@@ -5,7 +5,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -18,17 +18,15 @@ from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.drive import (
     VEHICLE,
     Carrier,
-    Motion,
     PlanarPath,
     TimedPoses,
     check_drawing,
     drive_seed,
-    every_kth,
     name_of_path,
     plan_path,
     poses_on,
-    poses_over,
     read_path,
+    scan_rows,
     speeds,
 )
 from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
@@ -53,8 +51,7 @@ class SimulatedRecording(Recording):
 
 
 class PlannedRecording(NamedTuple):
-    """Recording of a dataset before it is simulated: its name, the names of its scans, and the function that simulates
-    it."""
+    """Recording before it is simulated."""
 
     name: str
     ids: tuple[str, ...]
@@ -72,10 +69,7 @@ def simulate_recording(
     scenery: Scenery = TOWN,
     carrier: Carrier = VEHICLE,
 ) -> SimulatedRecording:
-    """Builds the town around a drive and returns the recording of the drive.
-
-    Building takes some seconds, and rendering a scan takes some hundredths of a second. `simulate` writes the same
-    scans for the same arguments.
+    """Builds the town around a drive and returns the recording. `simulate` writes the same scans for equal arguments.
 
     Arguments:
       name: Route, from `ROLES`.
@@ -93,27 +87,15 @@ def simulate_recording(
       FileNotFoundError: The pose file does not exist.
     """
     check_drawing(rate_hz, seed)
-    if along is not None:
-        name = name_of_path(along)
-        path = read_path(along)
-    else:
-        rng = np.random.default_rng((*drive_seed(seed, name), 1))
-        path = plan_path(rng, name, scans=scans, rate_hz=rate_hz)
+    name = name if along is None else name_of_path(along)
     seeds = drive_seed(seed, name)
+    if along is None:
+        path = plan_path(np.random.default_rng((*seeds, 1)), name, scans=scans, rate_hz=rate_hz)
+    else:
+        path = read_path(along)
     world = build_world(seeds, path.xy, path.times, scenery=scenery)
-    rows = np.arange(len(path.times))[every_kth(path, scans)]
-    return drive_through(
-        world,
-        path,
-        rows,
-        name=name,
-        ids=tuple(f"{i:06d}" for i in range(len(rows))),
-        times=path.times[rows],
-        sensor=sensor,
-        key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
-        rng=np.random.default_rng((*seeds, 2)),
-        carrier=carrier,
-    )
+    rows = scan_rows(path, scans)
+    return drive_through(world, path, rows, name=name, sensor=sensor, carrier=carrier, **random_of(seeds))
 
 
 def with_submaps(recording: SimulatedRecording, length_m: float) -> SimulatedRecording:
@@ -130,14 +112,25 @@ def with_submaps(recording: SimulatedRecording, length_m: float) -> SimulatedRec
     return dataclasses.replace(recording, read=view.read, render=render, found=view.found)
 
 
+def numbered(scans: int) -> tuple[str, ...]:
+    """Names of scans that are numbered from 0."""
+    return tuple(f"{i:06d}" for i in range(scans))
+
+
+def random_of(seeds: tuple[int, ...]) -> dict[str, Any]:
+    """`key` and `rng` of `drive_through`."""
+    key = functools.reduce(jax.random.fold_in, seeds[1:], jax.random.key(seeds[0]))
+    return {"key": key, "rng": np.random.default_rng((*seeds, 2))}
+
+
 def drive_through(
     world: World,
     path: PlanarPath,
     rows: Int[np.ndarray, " n"],
     *,
     name: str,
-    ids: tuple[str, ...],
-    times: Float[np.ndarray, " n"],
+    ids: tuple[str, ...] | None = None,
+    times: Float[np.ndarray, " n"] | None = None,
     sensor: Sensor,
     key: PRNGKeyArray,
     rng: np.random.Generator,
@@ -150,17 +143,23 @@ def drive_through(
       path: Path of the vehicle. Its times are those of the town.
       rows: Rows of `path` at which scans are taken.
       name: Name of the recording.
-      ids: Names of the scans.
-      times: Times of the scans in the recording, in seconds. They may differ from the times of the town.
+      ids: Names of the scans. None numbers them.
+      times: Times of the scans in the recording, in seconds. None: the times of the town.
       sensor: LiDAR.
       key: Random key of the measurements.
       rng: Random generator of the sway of the carrier.
       carrier: Carrier of the sensor, which follows `path`. Its height and sway are used.
     """
     clock = path.times[rows]
-    motion = carrier.motion(rng, clock, height_m=sensor.height_m)
-    in_world, of_lidar = _poses(world, path, rows, motion)
-    poses = TimedPoses(of_lidar, times)
+    ids, times = ids or numbered(len(rows)), clock if times is None else times
+    tilt, height, left = carrier.motion(rng, clock, height_m=sensor.height_m)
+    yaw = path.yaw[rows]
+    aside = np.reshape(left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    of_lidar = in_world = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
+    if world.levels is not None:  # storeys above one another
+        there, ground, slope = (values[rows] for values in world.levels.along(path.xy))
+        in_world = poses_on(world.ground.relief, there + aside, yaw, height_m=height, tilt=tilt)
+        of_lidar = poses_on((ground, slope), path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
     speed = speeds(path)[rows]
     height_m = sensor.height_m if carrier.height_m is None else carrier.height_m
     row_of = {scan_id: i for i, scan_id in enumerate(ids)}
@@ -178,7 +177,7 @@ def drive_through(
     return SimulatedRecording(
         name=name,
         ids=ids,
-        positions=poses.world_from_lidar[:, :3, 3],
+        positions=of_lidar[:, :3, 3],
         times=times,
         pose_source="simulation",
         paths=names,
@@ -186,21 +185,6 @@ def drive_through(
         read=read,
         mounting=None if height_m == MODEL_HEIGHT_M else Mounting(height_m),
         on_disk=False,
-        poses=poses,
+        poses=TimedPoses(of_lidar, times),
         render=render,
     )
-
-
-def _poses(
-    world: World, path: PlanarPath, rows: Int[np.ndarray, " n"], motion: Motion
-) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
-    """Poses of the LiDAR in the world that is rendered, and true poses. They differ on storeys above one another."""
-    yaw = path.yaw[rows]
-    aside = np.reshape(motion.left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    sway = {"height_m": motion.height, "tilt": motion.tilt}
-    if world.levels is None:
-        poses = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, **sway)
-        return poses, poses
-    there, ground, slope = (values[rows] for values in world.levels.along(path.xy))
-    in_world = poses_on(world.ground.relief, there + aside, yaw, **sway)
-    return in_world, poses_over(ground, slope, path.xy[rows] + aside, yaw, **sway)

@@ -2,11 +2,10 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 
-from sglpr_jax.sim.drive import VEHICLE, Carrier, PlanarPath, check_drawing, drive_seed, timed
-from sglpr_jax.sim.recording import SimulatedRecording, drive_through
+from sglpr_jax.sim.drive import VEHICLE, Carrier, PlanarPath, check_drawing, drive_seed, scan_rows, timed
+from sglpr_jax.sim.recording import SimulatedRecording, drive_through, random_of
 from sglpr_jax.sim.routes import REVISITS, Line, Revisit
 from sglpr_jax.sim.sceneries import REPEATING, Repeating
 from sglpr_jax.sim.sceneries.site import LAPS, Site, build, way
@@ -57,19 +56,9 @@ def simulate_repeating(
     check_drawing(rate_hz := default_rate(scenery, carrier) if rate_hz is None else rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
     world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
-    rows = np.arange(scans) * (len(path.times) // scans)
-    return drive_through(
-        world,
-        path,
-        rows,
-        name=f"{name}-{revisit}",
-        ids=tuple(f"{i:06d}" for i in range(scans)),
-        times=path.times[rows],
-        sensor=mounted(sensor, scenery, carrier),
-        key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
-        rng=np.random.default_rng((*seeds, 2)),
-        carrier=carrier,
-    )
+    rows = scan_rows(path, scans)
+    options = {"name": f"{name}-{revisit}", "sensor": _mounted(sensor, scenery, carrier), "carrier": carrier}
+    return drive_through(world, path, rows, **options, **random_of(seeds))
 
 
 def plan_drive(
@@ -89,8 +78,8 @@ def plan_drive(
         length = max(length, SHORTEST_S * scenery.speed_mps[0] / LAPS)
     site = scenery.site(rng, length, scenery.is_closed(revisit))
     line = driven_line(rng, site, scenery, revisit)
-    world = build(site, line, clearance_m=scenery.clearance_m)
-    return world, carrier.halted(rng, timed(rng, line, free_mps=speed, poses=scans), poses=scans)
+    path = carrier.halted(rng, timed(rng, line, free_mps=speed, poses=scans), poses=scans)
+    return build(site, line, clearance_m=scenery.clearance_m), path
 
 
 def driven_line(rng: np.random.Generator, site: Site, scenery: Repeating, revisit: Revisit) -> Line:
@@ -104,7 +93,7 @@ def default_rate(scenery: Repeating, carrier: Carrier) -> float:
     return scenery.rate_hz if carrier.rate_hz is None else carrier.rate_hz
 
 
-def mounted(sensor: Sensor, scenery: Repeating, carrier: Carrier = VEHICLE) -> Sensor:
+def _mounted(sensor: Sensor, scenery: Repeating, carrier: Carrier) -> Sensor:
     """`sensor` with the height and minimum range for the carrier, or for the scenery's vehicle."""
     height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
     if height_m is None:

@@ -1,8 +1,7 @@
 """Eleven routes through a lattice of streets, with revisits as in the KITTI sequences of the same names.
 
-A route is first a walk over the crossings of the lattice. The walk is then converted to a line: crossings are moved at
-random, streets are bent, some crossings become roundabouts, and corners are rounded. A street that is driven twice has
-the same line both times.
+A route is a walk over the crossings of the lattice. It becomes a line: crossings are moved at random, streets are bent,
+and corners are rounded. A street that is driven twice has the same line both times.
 """
 
 import dataclasses
@@ -85,11 +84,8 @@ have more.
 
 
 def plan_route(rng: np.random.Generator, role: Role, *, blocks: int, days: int = 1) -> Float[np.ndarray, "n 2"]:
-    """Returns the middle line of the streets of a drive of about `blocks` blocks, with a point every STEP_M metres.
-
-    If `days` is above 1, each further day adds the same number of blocks along the same streets, see `plan_days`.
-    """
-    walk = plan_walk(rng, role, blocks=blocks) if days == 1 else plan_days(rng, role, blocks=blocks, days=days)
+    """Returns the middle line of the streets of a drive of about `blocks` blocks a day, with a point every STEP_M."""
+    walk = plan_days(rng, role, blocks=blocks, days=days)
     corners = resampled(_Streets(rng, role, np.array(walk)).line(), STEP_M)
     return resampled(gaussian_filter1d(corners, role.corner_m / STEP_M, axis=0, mode="nearest"), STEP_M)
 
@@ -112,8 +108,13 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
     Raises:
       ValueError: `blocks` is too small for a loop.
     """
-    if role.again == 0:
-        return _walk_onward(rng, role, blocks)
+    if role.again == 0:  # a walk that never goes west and therefore never meets itself
+        walk, heading = [(0, 0)], (1, 0)
+        for _ in range(blocks):
+            if rng.random() >= role.straight:
+                heading = (1, 0) if heading[0] == 0 else (0, int(rng.choice([-1, 1])))
+            walk.append(_moved(walk[-1], heading))
+        return walk
     loops = min(role.loops, max(1, blocks // BLOCKS_PER_LOOP))
     shares = np.diff(np.linspace(0, blocks, loops + 1).round().astype(int)).tolist()
     for _ in range(TRIES):
@@ -123,11 +124,10 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
 
 
 def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -> list[Node]:
-    """Returns a walk that is `days` times as long as one of `plan_walk`.
+    """Returns a walk that is `days` times as long as one of `plan_walk`, along the same streets.
 
-    The later days use the streets of the first day. Each later day begins with a U-turn at a roundabout. At a crossing,
-    the walk takes the street ahead that was driven least often in that direction. The later days therefore partly drive
-    in the opposite direction.
+    Each later day begins with a U-turn at a roundabout. At a crossing, the walk takes the street ahead that was driven
+    least often in that direction. The later days therefore partly drive in the opposite direction.
     """
     walk = plan_walk(rng, role, blocks=blocks)
     ahead = defaultdict(set)
@@ -154,16 +154,6 @@ def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> l
         if not walk:
             break
     return walk
-
-
-def _walk_onward(rng: np.random.Generator, role: Role, blocks: int) -> list[Node]:
-    """Walk that never goes west and therefore never meets itself."""
-    nodes, heading = [(0, 0)], (1, 0)
-    for _ in range(blocks):
-        if rng.random() >= role.straight:
-            heading = (1, 0) if heading[0] == 0 else (0, int(rng.choice([-1, 1])))
-        nodes.append(_moved(nodes[-1], heading))
-    return nodes
 
 
 def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: int, again: int) -> list[Node]:

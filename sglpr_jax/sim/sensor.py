@@ -32,14 +32,12 @@ from sglpr_jax.sim.world import World
 
 HDL64E_DEG = (*np.linspace(2.0, -8.33, 32).tolist(), *np.linspace(-8.83, -24.8, 32).tolist())
 """Elevations of the HDL-64E in degrees: two blocks of 32 lasers, with a smaller spacing in the upper block."""
-HDL32E_DEG = tuple(np.linspace(10.67, -30.67, 32).tolist())
-NCLT_DEG = tuple(-elevation for elevation in HDL32E_DEG)
 NCLT_HEIGHT_M = 1.03
-VLP16_DEG = tuple(np.linspace(15.0, -15.0, 16).tolist())
-XT32_DEG = tuple(np.linspace(15.0, -16.0, 32).tolist())
-OS1_64_DEG = tuple(np.linspace(22.5, -22.5, 64).tolist())
-OS0_32_DEG = tuple(np.linspace(45.0, -45.0, 32).tolist())
-M1_DEG = tuple(np.linspace(12.5, -12.5, 125).tolist())
+
+
+def _even(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
+    """Equally spaced elevations from the top, in degrees."""
+    return tuple(np.linspace(first_deg, last_deg, count).tolist())
 
 
 def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
@@ -113,15 +111,20 @@ KITTI_SHADOWS_DEG = (
 HDL64E = Sensor(shadows_deg=KITTI_SHADOWS_DEG)
 SENSORS = {
     "hdl64e": HDL64E,
-    "hdl32e": Sensor(HDL32E_DEG, azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
+    "hdl32e": Sensor(_even(10.67, -30.67, 32), azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
     # Mounted upside down on a Segway. Elevations and height fit a real scan of NCLT.
-    "hdl32e-nclt": Sensor(NCLT_DEG, azimuth_steps=2160, min_range_m=1.9, height_m=NCLT_HEIGHT_M),
-    "vlp16": Sensor(VLP16_DEG, min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
-    "xt32": Sensor(XT32_DEG, azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
-    "os1-64": Sensor(OS1_64_DEG, azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
-    "os0-32": Sensor(OS0_32_DEG, azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
+    "hdl32e-nclt": Sensor(
+        tuple(-elevation for elevation in _even(10.67, -30.67, 32)),
+        azimuth_steps=2160,
+        min_range_m=1.9,
+        height_m=NCLT_HEIGHT_M,
+    ),
+    "vlp16": Sensor(_even(15.0, -15.0, 16), min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
+    "xt32": Sensor(_even(15.0, -16.0, 32), azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
+    "os1-64": Sensor(_even(22.5, -22.5, 64), azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
+    "os0-32": Sensor(_even(45.0, -45.0, 32), azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
     # RoboSense M1: 120 x 25 degrees in steps of .2 degrees.
-    "m1": Sensor(M1_DEG, azimuth_steps=600, azimuths_deg=(-60.0, 60.0), min_range_m=0.5),
+    "m1": Sensor(_even(12.5, -12.5, 125), azimuth_steps=600, azimuths_deg=(-60.0, 60.0), min_range_m=0.5),
     # 200,000 points a second over 360 x 59 degrees, 20,000 in a scan.
     "mid360": Sensor(
         _bands(-7.0, 52.0, 20), azimuth_steps=1000, pattern="scattered", min_range_m=0.1, max_range_m=70.0, height_m=1.2
@@ -170,8 +173,7 @@ def scan(
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
     """Simulates one scan of a world.
 
-    The order of the points is that of KITTI's files: laser by laser in the order of `elevations_deg`, each laser
-    counter-clockwise from straight ahead.
+    Points are in the order of KITTI's files: laser by laser, each counter-clockwise from the first azimuth.
 
     Arguments:
       key: Random key of the measurements.
@@ -276,23 +278,14 @@ def _rays_of(view: View, sensor: Sensor) -> Vectors:
 def _rays(sensor: Sensor, *, time: float = 0.0) -> Vectors:
     """Unit vectors of the rays in the LiDAR frame, as arrays (lasers, azimuths). The azimuths fill whole sectors."""
     columns = sector_count(sensor.azimuth_steps) * COLUMNS
-    azimuth = _azimuths(sensor, columns)[None, :]
+    first, last = np.radians(sensor.azimuths_deg)
+    azimuth = (first + np.arange(columns) * ((last - first) / sensor.azimuth_steps))[None, :]
     repeats = sensor.pattern == "rings"
     degrees = np.array(sensor.elevations_deg)[:, None]
     elevation = np.radians(degrees if repeats else scattered(sensor.elevations_deg, columns, time=time))
-    level = np.cos(elevation)
-    axes = (
-        level * np.cos(azimuth),
-        level * np.sin(azimuth),
-        np.broadcast_to(np.sin(elevation), (len(elevation), columns)),
-    )
+    level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(elevation), columns))
+    axes = (level * np.cos(azimuth), level * np.sin(azimuth), up)
     return Vectors(*(jnp.asarray(axis, jnp.float32) for axis in axes))
-
-
-def _azimuths(sensor: Sensor, columns: int) -> Float[np.ndarray, " {columns}"]:
-    """The first azimuths of a scan, in radians."""
-    first, last = np.radians(sensor.azimuths_deg)
-    return first + np.arange(columns) * ((last - first) / sensor.azimuth_steps)
 
 
 def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]:
@@ -315,7 +308,8 @@ def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
     elevation = np.array(sensor.elevations_deg)[:, None]
     hidden = np.zeros((len(elevation), len(azimuth)), bool)
     if sensor.pattern == "scattered-round":
-        hidden |= outside_round(sensor.elevations_deg, azimuth)
+        up, side = ((one - (one.max() + one.min()) / 2) / (np.ptp(one) / 2) for one in (elevation, azimuth))
+        hidden |= up**2 + side**2 > 1
     for first, last, below in sensor.shadows_deg:
         hidden |= ((azimuth - first) % 360 <= last - first) & (elevation < below)
     return hidden
@@ -324,26 +318,11 @@ def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
 def scattered(elevations_deg: Sequence[float], azimuths: int, *, time: float) -> Float[np.ndarray, "lasers {azimuths}"]:
     """Elevation of each ray of a scan that does not repeat its pattern, as those of Livox, in degrees.
 
-    Elevations follow a low-discrepancy sequence, which fills the field of view evenly in space and, scan after scan, in
-    time. They are not the curves of the prisms of a real sensor.
-
-    Arguments:
-      elevations_deg: Middle of the band of elevations of each laser. The bands have equal heights and do not overlap.
-      azimuths: Number of azimuths.
-      time: Time of the scan, in seconds.
+    A low-discrepancy sequence fills the bands of elevations around `elevations_deg` evenly in space and, scan after
+    scan, in time. It does not follow the curves of the prisms of a real sensor.
     """
     middle = np.array(elevations_deg)
     height = abs(middle[1] - middle[0])
     azimuth, laser, scan = np.arange(azimuths), np.arange(len(middle))[:, None], time / TURN_S
     part = (azimuth * STEPS[0] + laser * STEPS[1] + scan * STEPS[2]) % 1
     return middle[:, None] + height * (part - 0.5)
-
-
-def outside_round(
-    elevations_deg: Sequence[float], azimuths_deg: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, "lasers n"]:
-    """Whether each ray is outside the ellipse of a round field of view."""
-    elevation = np.array(elevations_deg)[:, None]
-    middle = [(values.max() + values.min()) / 2 for values in (elevation, azimuths_deg)]
-    half = [(values.max() - values.min()) / 2 for values in (elevation, azimuths_deg)]
-    return ((elevation - middle[0]) / half[0]) ** 2 + ((azimuths_deg - middle[1]) / half[1]) ** 2 > 1

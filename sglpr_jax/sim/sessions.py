@@ -1,23 +1,21 @@
 """One town on several days: the same streets, houses and trees, with different parked cars, traffic and paths.
 
-The days are equal parts of one long drive, with a pause between consecutive days. Places are therefore the same on all
-days, while temporary things have changed.
+The days are equal parts of one long drive, with a pause between consecutive days.
 """
 
 import datetime
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-import jax
 import numpy as np
 
 from sglpr_jax.sim import RATE_HZ
-from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, plan_path
+from sglpr_jax.sim.drive import check_drawing, drive_seed, plan_path
 from sglpr_jax.sim.layouts import to_utime
-from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, drive_through
+from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, drive_through, random_of
 from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.styles import TOWN, Scenery
-from sglpr_jax.sim.world import World, build_world
+from sglpr_jax.sim.world import build_world
 
 PAUSE_S = 1800.0
 """Pause between two days in the town's time, in seconds. It is three times the mean stay of a parked car."""
@@ -57,42 +55,23 @@ def plan_sessions(
     starts = [_start_of(date) for date in dates]
     if len(set(dates)) < max(len(dates), 1) or scans < 2:
         raise ValueError(f"expected different dates and 2 scans or more, found {', '.join(dates) or 'none'}; {scans}")
-    seeds = drive_seed(seed, f"sessions {route}")
-    path = _with_pauses(
-        plan_path(np.random.default_rng((*seeds, 1)), route, scans=scans, rate_hz=rate_hz, days=len(dates)), len(dates)
-    )
-    days = np.split(np.arange(0, len(path.times), len(path.times) // (scans * len(dates))), len(dates))
+    seeds, days = drive_seed(seed, f"sessions {route}"), len(dates)
+    path = plan_path(np.random.default_rng((*seeds, 1)), route, scans=scans, rate_hz=rate_hz, days=days)
+    path = path._replace(times=path.times + PAUSE_S * (np.arange(len(path.times)) * days // len(path.times)))
     town = functools.cache(lambda: build_world(seeds, path.xy, path.times, scenery=scenery))
-    return tuple(
-        _session(date, start, path, rows, town, sensor, (*seeds, day))
-        for day, (date, start, rows) in enumerate(zip(dates, starts, days, strict=True))
-    )
 
+    def plan(day: int, rows: np.ndarray) -> PlannedRecording:
+        times = starts[day] + path.times[rows] - path.times[rows[0]]
+        ids = tuple(str(to_utime(time)) for time in times.tolist())
 
-def _session(
-    date: str,
-    start_s: float,
-    path: PlanarPath,
-    rows: np.ndarray,
-    town: Callable[[], World],
-    sensor: Sensor,
-    seeds: tuple[int, int, int],
-) -> PlannedRecording:
-    times = start_s + path.times[rows] - path.times[rows[0]]
-    ids = tuple(str(to_utime(time)) for time in times.tolist())
+        def simulate() -> SimulatedRecording:
+            options = {"name": dates[day], "ids": ids, "times": times, "sensor": sensor}
+            return drive_through(town(), path, rows, **options, **random_of((*seeds, day)))
 
-    def simulate() -> SimulatedRecording:
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seeds[0]), seeds[1]), seeds[2])
-        rng = np.random.default_rng((*seeds, 2))
-        return drive_through(town(), path, rows, name=date, ids=ids, times=times, sensor=sensor, key=key, rng=rng)
+        return PlannedRecording(dates[day], ids, simulate)
 
-    return PlannedRecording(date, ids, simulate)
-
-
-def _with_pauses(path: PlanarPath, days: int) -> PlanarPath:
-    """`path` with a pause of PAUSE_S between each two of its `days` equal parts."""
-    day = np.arange(len(path.times)) * days // len(path.times)
-    return path._replace(times=path.times + PAUSE_S * day)
+    rows = np.arange(0, len(path.times), len(path.times) // (scans * days))
+    return tuple(plan(day, rows_of_day) for day, rows_of_day in enumerate(np.split(rows, days)))
 
 
 def _start_of(date: str) -> float:

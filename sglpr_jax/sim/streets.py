@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter1d
 from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief
-from sglpr_jax.sim.objects import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
+from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
 MIDDLE_M = 1.2
@@ -118,10 +118,7 @@ def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
 
 
 def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) -> tuple[Street, ...]:
-    """Draws the streets along `path` and their side streets.
-
-    Equal arguments and an equal state of `rng` give equal streets.
-    """
+    """Draws the streets along `path` and their side streets."""
     middle = gaussian_filter1d(path.xy + MIDDLE_M * path.left, 1.5, axis=0, mode="nearest")
     style = _new_style(rng, scenery)
     streets, lines = [], [middle]
@@ -136,14 +133,10 @@ def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) 
             branch = _free_line(start, heading, length, bend, KDTree(np.concatenate(lines)))
             if len(branch) > 20:
                 lines.append(branch)
-                streets.append(_side_street(rng, branch, scenery))
+                ahead, slow = np.gradient(branch, axis=0), np.zeros(len(branch), bool)
+                stretches = tuple(_draw_stretches(rng, slow, _new_style(rng, scenery), scenery))
+                streets.append(Street(branch, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), stretches))
     return tuple(streets)
-
-
-def _side_street(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], scenery: Scenery) -> Street:
-    ahead = np.gradient(line, axis=0)
-    stretches = _draw_stretches(rng, np.zeros(len(line), bool), _new_style(rng, scenery), scenery)
-    return Street(line, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), tuple(stretches))
 
 
 def _new_style(rng: np.random.Generator, scenery: Scenery) -> str:
@@ -163,8 +156,8 @@ def _draw_stretches(
         stop = min([stop, *changes[changes > start].tolist()])
         name = name if rng.random() < 0.7 else _new_style(rng, scenery)
         here = STYLES["highway" if fast[start] else name]
-        half_width = sum(here.street.road) / 2 + town_width
-        median = rng.random() < here.street.median
+        half_width = sum(here.road) / 2 + town_width
+        median = rng.random() < here.median
         # One stretch in four has another style on its right side.
         other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
         left = draw_side(rng, here, median=median, look_alike=look_alike)
@@ -324,7 +317,7 @@ def _profiles(stretches: tuple[Stretch, ...]) -> Profiles:
     for i, stretch in enumerate(stretches):
         for row, side in ((2 * i, stretch.left), (2 * i + 1, stretch.right)):
             widths = [stretch.half_width, *(strip.width for strip in side.strips), GARDEN_M]
-            labels = [ROAD, *(strip.label for strip in side.strips), side.style.plots.garden]
+            labels = [ROAD, *(strip.label for strip in side.strips), side.style.garden]
             bounds[row, : len(widths)] = np.cumsum(widths)
             names[row, : len(labels)] = labels
     return bounds, names

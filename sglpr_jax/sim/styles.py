@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sglpr_jax.sim.objects import OTHER_GROUND, PARKING, ROAD, SIDEWALK, TERRAIN, House, Range
+from sglpr_jax.sim.labels import OTHER_GROUND, PARKING, ROAD, SIDEWALK, TERRAIN
+from sglpr_jax.sim.objects import House, Range
 
 BAY_M = 2.3
 """Depth of a row of parked cars, in metres."""
@@ -14,175 +15,100 @@ CARRIAGEWAY_M = 7.0
 """Width of the second carriageway of a street with a median, in metres."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Carriageway:
-    """Road and the strips beside it. Pairs are ranges in metres. Fractions are probabilities."""
+class Style(NamedTuple):
+    """Style of a neighbourhood. Pairs are ranges in metres. Fractions are probabilities."""
 
     road: Range  # half width of the carriageway
     walk: Range  # width of the sidewalk; 0 without a sidewalk
-    bays: float = 0.0  # fraction of the sides with parked cars along the road
-    verge: float = 0.0  # fraction of the sides with a strip between road and sidewalk
-    median: float = 0.0  # fraction of the streets with a planted median and a second carriageway
-    posts: float = 0.0  # fraction of the sides with a row of posts along the road
-    signs: float = 0.02  # traffic signs per metre of side
-    lamps: bool = True
+    bays: float  # fraction of the sides with parked cars along the road
+    verge: float  # fraction of the sides with a strip between road and sidewalk
+    median: float  # fraction of the streets with a planted median and a second carriageway
+    posts: float  # fraction of the sides with a row of posts along the road
+    signs: float  # traffic signs per metre of side
+    lamps: bool
+    houses: float  # fraction of the plots with a house
+    gap: Range  # between two houses
+    set_back: Range  # of the houses
+    closed: Range  # length of the border between two entrances
+    borders: str  # possible borders of the plots; one is drawn per side
+    garden: int  # label of the ground around the houses
+    width: Range  # of a house
+    depth: Range
+    height: Range
+    glass: Range  # fraction of a facade that is window
+    street_trees: float  # fraction of the sides with a row of trees
+    trees: float  # trees and bushes on the plots, per metre of side
+    wood: float  # fraction of the sides with a wood along the road
+    banks: float  # fraction of the sides with banks beside the road
+    slopes: float  # fraction of the sides at the foot of a hill
+    old_trees: bool  # whether trees have thick trunks and bare limbs under their crowns
+    bystanders: float  # people, bicycles, bins and similar things, per metre of side
+    groups: bool  # whether people stand in groups
 
 
-@dataclasses.dataclass(frozen=True)
-class Plots:
-    """Plots behind the strips. Pairs are ranges in metres."""
-
-    houses: float = 0.95  # fraction of the plots with a house
-    gap: Range = (3.0, 11.0)
-    set_back: Range = (3.0, 8.0)
-    border: tuple[str, ...] = ("none",)  # possible borders of the plots; one is drawn per side
-    closed: Range = (6.0, 30.0)  # length of the border between two entrances
-    garden: int = TERRAIN  # label of the ground around the houses
-
-
-@dataclasses.dataclass(frozen=True)
-class Sizes:
-    """Sizes of houses. Pairs are ranges in metres, except for `glass`."""
-
-    width: Range = (8.0, 14.0)
-    depth: Range = (7.0, 11.0)
-    height: Range = (4.0, 8.0)
-    glass: Range = (0.1, 0.35)  # fraction of a facade that is window
-
-
-@dataclasses.dataclass(frozen=True)
-class Plants:
-    """Trees and the like. Fractions are probabilities."""
-
-    street_trees: float = 0.0  # fraction of the sides with a row of trees
-    trees: float = 0.0  # trees and bushes on the plots, per metre of side
-    wood: float = 0.0  # fraction of the sides with a wood along the road
-    banks: float = 0.0  # fraction of the sides with banks beside the road
-    slopes: float = 0.0  # fraction of the sides at the foot of a hill
-    old_trees: bool = False  # whether trees have thick trunks and bare limbs under their crowns
-
-
-@dataclasses.dataclass(frozen=True)
-class Style:
-    """Style of a neighbourhood."""
-
-    street: Carriageway
-    plots: Plots = Plots()
-    size: Sizes = Sizes()
-    plants: Plants = Plants()
-    bystanders: float = 0.0  # people, bicycles, bins and similar things, per metre of side
-    groups: bool = False  # whether people stand in groups
-
-
-STYLES = {
-    "centre": Style(
-        street=Carriageway((3.1, 3.8), (1.4, 3.0), bays=0.75, verge=0.12, signs=0.035),
-        plots=Plots(gap=(-3.0, 1.0), set_back=(0.0, 1.0), garden=SIDEWALK),
-        size=Sizes(width=(7.0, 18.0), depth=(8.0, 13.0), height=(7.0, 16.0), glass=(0.15, 0.4)),
-        plants=Plants(street_trees=0.15, trees=0.16),
-        bystanders=0.05,
-    ),
-    "suburb": Style(
-        street=Carriageway((3.0, 3.7), (1.3, 2.4), bays=0.4, verge=0.25),
-        plots=Plots(gap=(2.0, 8.0), set_back=(1.5, 6.0), border=("hedge", "hedge", "hedge", "fence", "wall", "none")),
-        plants=Plants(street_trees=0.2, trees=0.9, wood=0.15, banks=0.1),
-        bystanders=0.025,
-    ),
-    "estate": Style(
-        street=Carriageway((3.3, 4.2), (1.6, 2.8), bays=0.65, verge=0.5, median=0.15),
-        plots=Plots(gap=(6.0, 20.0), set_back=(4.0, 10.0), border=("none", "none", "hedge", "fence")),
-        size=Sizes(width=(18.0, 38.0), depth=(10.0, 13.0), height=(8.0, 13.0)),
-        plants=Plants(street_trees=0.4, trees=0.6),
-        bystanders=0.03,
-    ),
-    "works": Style(
-        street=Carriageway((3.6, 4.6), (1.4, 2.5), bays=0.25, verge=0.5, median=0.25),
-        plots=Plots(
-            houses=0.9,
-            gap=(6.0, 18.0),
-            set_back=(3.0, 12.0),
-            border=("fence", "fence", "wall", "hedge", "none"),
-            garden=PARKING,
-        ),
-        size=Sizes(width=(16.0, 40.0), depth=(12.0, 20.0), height=(5.0, 9.0), glass=(0.0, 0.2)),
-        plants=Plants(street_trees=0.25, trees=0.3, banks=0.15),
-        bystanders=0.015,
-    ),
-    "park": Style(
-        street=Carriageway((3.1, 4.0), (1.5, 3.0), bays=0.25, verge=0.3, median=0.2),
-        plots=Plots(houses=0.25, gap=(20.0, 40.0), set_back=(8.0, 15.0), border=("none", "none", "hedge", "fence")),
-        size=Sizes(width=(6.0, 9.0), depth=(4.0, 6.0), height=(3.0, 4.0)),
-        plants=Plants(street_trees=0.4, trees=1.1, wood=0.35, banks=0.35),
-        bystanders=0.03,
-    ),
-    "square": Style(
-        street=Carriageway((3.4, 4.2), (3.0, 5.0), bays=0.4),
-        plots=Plots(houses=0.9, gap=(-3.0, 2.0), set_back=(11.0, 20.0), garden=OTHER_GROUND),
-        size=Sizes(width=(10.0, 22.0), depth=(8.0, 14.0), height=(9.0, 16.0), glass=(0.15, 0.4)),
-        plants=Plants(street_trees=0.6, trees=0.08),
-        bystanders=0.06,
-    ),
-    "country": Style(
-        street=Carriageway((2.9, 3.5), (0.0, 0.0), verge=0.2, signs=0.012, lamps=False),
-        plots=Plots(houses=0.04, gap=(25.0, 60.0), set_back=(6.0, 15.0), border=("none", "none", "hedge")),
-        size=Sizes(width=(10.0, 20.0)),
-        plants=Plants(street_trees=0.15, trees=0.5, wood=0.6, banks=0.3),
-    ),
-    "walled": Style(
-        street=Carriageway((3.2, 4.6), (1.4, 3.5), bays=0.1, verge=0.4),
-        plots=Plots(
-            houses=0.6,
-            gap=(6.0, 30.0),
-            set_back=(6.0, 16.0),
-            border=("screen", "screen", "hedge", "wall"),
-            closed=(60.0, 400.0),
-        ),
-        plants=Plants(trees=0.7),
-        bystanders=0.01,
-    ),
-    "hillside": Style(
-        street=Carriageway((2.9, 4.0), (0.0, 2.0), bays=0.1, verge=0.4),
-        plots=Plots(
-            houses=0.4,
-            gap=(8.0, 40.0),
-            set_back=(3.0, 10.0),
-            border=("none", "hedge", "wall", "fence"),
-            closed=(20.0, 120.0),
-        ),
-        plants=Plants(trees=0.5, wood=0.15, slopes=0.6),
-        bystanders=0.01,
-    ),
-    "hedged": Style(
-        street=Carriageway((3.0, 4.6), (0.0, 2.5), bays=0.1, verge=0.5, posts=0.3),
-        plots=Plots(
-            houses=0.4,
-            gap=(8.0, 40.0),
-            set_back=(6.0, 16.0),
-            border=("hedgerow", "hedgerow", "hedgerow", "screen"),
-            closed=(40.0, 400.0),
-        ),
-        plants=Plants(trees=0.6, banks=0.1),
-        bystanders=0.01,
-    ),
-    "gardens": Style(
-        street=Carriageway((2.9, 3.8), (1.2, 2.4), bays=0.55, verge=0.3, signs=0.03),
-        plots=Plots(
-            gap=(1.0, 8.0),
-            set_back=(1.5, 6.0),
-            border=("trimmed", "lattice", "lattice", "hedge", "hedge", "wall", "none"),
-            closed=(4.0, 16.0),
-        ),
-        size=Sizes(width=(8.0, 16.0), height=(5.0, 9.0)),
-        plants=Plants(street_trees=0.4, trees=1.5, old_trees=True),
-        bystanders=0.02,
-        groups=True,
-    ),
-    "highway": Style(
-        street=Carriageway((6.0, 7.5), (0.0, 0.0), verge=1.0, median=1.0, lamps=False),
-        plots=Plots(houses=0.0, border=("rail",)),
-        plants=Plants(trees=0.2, wood=0.25, banks=0.6),
-    ),
+# fmt: off
+_STREETS = {
+    # road, walk, bays, verge, median, posts, signs, lamps
+    "centre":   ((3.1, 3.8), (1.4, 3.0), 0.75, 0.12, 0.0,  0.0, 0.035, True),
+    "suburb":   ((3.0, 3.7), (1.3, 2.4), 0.4,  0.25, 0.0,  0.0, 0.02,  True),
+    "estate":   ((3.3, 4.2), (1.6, 2.8), 0.65, 0.5,  0.15, 0.0, 0.02,  True),
+    "works":    ((3.6, 4.6), (1.4, 2.5), 0.25, 0.5,  0.25, 0.0, 0.02,  True),
+    "park":     ((3.1, 4.0), (1.5, 3.0), 0.25, 0.3,  0.2,  0.0, 0.02,  True),
+    "square":   ((3.4, 4.2), (3.0, 5.0), 0.4,  0.0,  0.0,  0.0, 0.02,  True),
+    "country":  ((2.9, 3.5), (0.0, 0.0), 0.0,  0.2,  0.0,  0.0, 0.012, False),
+    "walled":   ((3.2, 4.6), (1.4, 3.5), 0.1,  0.4,  0.0,  0.0, 0.02,  True),
+    "hillside": ((2.9, 4.0), (0.0, 2.0), 0.1,  0.4,  0.0,  0.0, 0.02,  True),
+    "hedged":   ((3.0, 4.6), (0.0, 2.5), 0.1,  0.5,  0.0,  0.3, 0.02,  True),
+    "gardens":  ((2.9, 3.8), (1.2, 2.4), 0.55, 0.3,  0.0,  0.0, 0.03,  True),
+    "highway":  ((6.0, 7.5), (0.0, 0.0), 0.0,  1.0,  1.0,  0.0, 0.02,  False),
 }
+_PLOTS = {
+    # houses, gap, set_back, closed, borders
+    "centre":   (0.95, (-3.0, 1.0),  (0.0, 1.0),   (6.0, 30.0),   "none"),
+    "suburb":   (0.95, (2.0, 8.0),   (1.5, 6.0),   (6.0, 30.0),   "hedge hedge hedge fence wall none"),
+    "estate":   (0.95, (6.0, 20.0),  (4.0, 10.0),  (6.0, 30.0),   "none none hedge fence"),
+    "works":    (0.9,  (6.0, 18.0),  (3.0, 12.0),  (6.0, 30.0),   "fence fence wall hedge none"),
+    "park":     (0.25, (20.0, 40.0), (8.0, 15.0),  (6.0, 30.0),   "none none hedge fence"),
+    "square":   (0.9,  (-3.0, 2.0),  (11.0, 20.0), (6.0, 30.0),   "none"),
+    "country":  (0.04, (25.0, 60.0), (6.0, 15.0),  (6.0, 30.0),   "none none hedge"),
+    "walled":   (0.6,  (6.0, 30.0),  (6.0, 16.0),  (60.0, 400.0), "screen screen hedge wall"),
+    "hillside": (0.4,  (8.0, 40.0),  (3.0, 10.0),  (20.0, 120.0), "none hedge wall fence"),
+    "hedged":   (0.4,  (8.0, 40.0),  (6.0, 16.0),  (40.0, 400.0), "hedgerow hedgerow hedgerow screen"),
+    "gardens":  (0.95, (1.0, 8.0),   (1.5, 6.0),   (4.0, 16.0),   "trimmed lattice lattice hedge hedge wall none"),
+    "highway":  (0.0,  (3.0, 11.0),  (3.0, 8.0),   (6.0, 30.0),   "rail"),
+}
+_SIZES = {
+    # garden, width, depth, height, glass
+    "centre":   (SIDEWALK,     (7.0, 18.0),  (8.0, 13.0),  (7.0, 16.0), (0.15, 0.4)),
+    "suburb":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
+    "estate":   (TERRAIN,      (18.0, 38.0), (10.0, 13.0), (8.0, 13.0), (0.1, 0.35)),
+    "works":    (PARKING,      (16.0, 40.0), (12.0, 20.0), (5.0, 9.0),  (0.0, 0.2)),
+    "park":     (TERRAIN,      (6.0, 9.0),   (4.0, 6.0),   (3.0, 4.0),  (0.1, 0.35)),
+    "square":   (OTHER_GROUND, (10.0, 22.0), (8.0, 14.0),  (9.0, 16.0), (0.15, 0.4)),
+    "country":  (TERRAIN,      (10.0, 20.0), (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
+    "walled":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
+    "hillside": (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
+    "hedged":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
+    "gardens":  (TERRAIN,      (8.0, 16.0),  (7.0, 11.0),  (5.0, 9.0),  (0.1, 0.35)),
+    "highway":  (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
+}
+_PLANTS = {
+    # street_trees, trees, wood, banks, slopes, old_trees, bystanders, groups
+    "centre":   (0.15, 0.16, 0.0,  0.0,  0.0, False, 0.05,  False),
+    "suburb":   (0.2,  0.9,  0.15, 0.1,  0.0, False, 0.025, False),
+    "estate":   (0.4,  0.6,  0.0,  0.0,  0.0, False, 0.03,  False),
+    "works":    (0.25, 0.3,  0.0,  0.15, 0.0, False, 0.015, False),
+    "park":     (0.4,  1.1,  0.35, 0.35, 0.0, False, 0.03,  False),
+    "square":   (0.6,  0.08, 0.0,  0.0,  0.0, False, 0.06,  False),
+    "country":  (0.15, 0.5,  0.6,  0.3,  0.0, False, 0.0,   False),
+    "walled":   (0.0,  0.7,  0.0,  0.0,  0.0, False, 0.01,  False),
+    "hillside": (0.0,  0.5,  0.15, 0.0,  0.6, False, 0.01,  False),
+    "hedged":   (0.0,  0.6,  0.0,  0.1,  0.0, False, 0.01,  False),
+    "gardens":  (0.4,  1.5,  0.0,  0.0,  0.0, True,  0.02,  True),
+    "highway":  (0.0,  0.2,  0.25, 0.6,  0.0, False, 0.0,   False),
+}
+# fmt: on
+STYLES = {name: Style(*_STREETS[name], *_PLOTS[name], *_SIZES[name], *_PLANTS[name]) for name in _STREETS}
 
 
 class Strip(NamedTuple):
@@ -219,30 +145,30 @@ class Side:
 def draw_side(rng: np.random.Generator, style: Style, *, median: bool, look_alike: bool) -> Side:
     """Draws one side of a stretch in the given style."""
     width = rng.uniform(2.5, 9.0) if median else 0.0
-    bays = not median and rng.random() < style.street.bays
+    bays = not median and rng.random() < style.bays
     strips = []
     if median:
         strips = [Strip(width, _planted(rng)), Strip(CARRIAGEWAY_M, ROAD)]
     if bays:
         strips.append(Strip(BAY_M, int(rng.choice((PARKING, ROAD)))))
-    if rng.random() < style.street.verge:
+    if rng.random() < style.verge:
         strips.append(Strip(rng.uniform(0.8, 2.2), _planted(rng)))
-    if style.street.walk[1]:
-        strips.append(Strip(rng.uniform(*style.street.walk), SIDEWALK))
+    if style.walk[1]:
+        strips.append(Strip(rng.uniform(*style.walk), SIDEWALK))
     return Side(
         style=style,
         strips=tuple(strips),
         median=width,
         bays=bays,
         occupied=rng.uniform(0.25, 0.95),
-        set_back=rng.uniform(*style.plots.set_back),
-        border=str(rng.choice(style.plots.border)),
-        wood=rng.random() < style.plants.wood,
-        bank=rng.random() < style.plants.banks,
-        slope=style.plants.slopes > 0 and rng.random() < style.plants.slopes,
-        tree_spacing=rng.uniform(7, 16) if median or rng.random() < style.plants.street_trees else 0.0,
+        set_back=rng.uniform(*style.set_back),
+        border=str(rng.choice(style.borders.split())),
+        wood=rng.random() < style.wood,
+        bank=rng.random() < style.banks,
+        slope=style.slopes > 0 and rng.random() < style.slopes,
+        tree_spacing=rng.uniform(7, 16) if median or rng.random() < style.street_trees else 0.0,
         row=draw_house(rng, style) if look_alike else None,
-        post_spacing=rng.uniform(6, 14) if style.street.posts and rng.random() < style.street.posts else 0.0,
+        post_spacing=rng.uniform(6, 14) if style.posts and rng.random() < style.posts else 0.0,
     )
 
 
@@ -252,9 +178,7 @@ def _planted(rng: np.random.Generator) -> int:
 
 def draw_house(rng: np.random.Generator, style: Style) -> House:
     """Draws the size of a house of this style."""
-    return House(
-        *(rng.uniform(*span) for span in (style.size.width, style.size.depth, style.size.height, style.size.glass))
-    )
+    return House(*(rng.uniform(*span) for span in (style.width, style.depth, style.height, style.glass)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -47,11 +47,8 @@ FLOWS = (
 )
 
 
-class Lane(NamedTuple):
-    """Line beside the vehicle's path, with one point per point of the path."""
-
-    xy: np.ndarray  # (n, 2) metres
-    usable: np.ndarray  # (n,) whether the lane can be used at this point
+Lane = tuple[np.ndarray, np.ndarray]
+"""Position (n, 2) in metres, and whether the lane can be used, for each point of the path."""
 
 
 def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
@@ -73,35 +70,24 @@ def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
     away["oncoming"] = to_middle + beyond, np.ones(len(stretch), bool)
     away["own"] = np.zeros(len(stretch)), np.ones(len(stretch), bool)
     return {
-        name: Lane(path.xy + gaussian_filter1d(left, 5.0, mode="nearest")[:, None] * path.left, usable)
+        name: (path.xy + gaussian_filter1d(left, 5.0, mode="nearest")[:, None] * path.left, usable)
         for name, (left, usable) in away.items()
     }
-
-
-class Pieces(NamedTuple):
-    """Straight motions of one thing, from position `begin` at time `since` to `end` at `until`."""
-
-    thing: Thing
-    begin: np.ndarray  # (k, 2) metres
-    end: np.ndarray  # (k, 2)
-    heading: np.ndarray  # (k,) radians
-    since: np.ndarray  # (k,) seconds
-    until: np.ndarray  # (k,)
 
 
 def traffic(rng: np.random.Generator, network: Network, path: Path) -> list[Spot]:
     """Draws the traffic around the vehicle, clear of it."""
     lines = lanes(network, path)
-    return [spot for flow in FLOWS for pieces in _movers(rng, flow, lines, path) for spot in _spots(pieces, path)]
+    return [spot for flow in FLOWS for spot in _movers(rng, flow, lines, path)]
 
 
-def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], path: Path) -> Iterator[Pieces]:
-    """Yields the movers of one flow. The vehicle meets each at another point of the path."""
+def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], path: Path) -> Iterator[Spot]:
+    """Yields the pieces of all movers of one flow. The vehicle meets each mover at another point of the path."""
     for block in np.arange(rng.uniform(-0.5, 0) * flow.every_m, len(path.xy), flow.every_m):
         met, name = block + rng.uniform(0, flow.every_m), flow.lanes[rng.integers(len(flow.lanes))]
         thing, speed = objects.moving(flow.make(rng)), rng.uniform(*flow.speed)
         direction, follows = int(rng.choice((-1, 1))), rng.choice((-1, 1)) * rng.uniform(14, 35)
-        if not 0 <= met < len(path.xy) or not lines[name].usable[int(met)]:
+        if not 0 <= met < len(path.xy) or not lines[name][1][int(met)]:
             continue
         ego = path.speed[int(met)]
         if name == "own":
@@ -116,45 +102,50 @@ def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], p
             step = float(np.clip(_PIECE_M / speed, *_PIECE_S))
             offsets = np.arange(-lasts, lasts, step)
             times, along = path.times[int(met)] + offsets, met + direction * speed * offsets
-        yield _pieces(thing, lines[name], path, times, along, direction)
+        yield from _pieces(thing, lines[name][0], path, times, along, direction)
 
 
 def _pieces(
     thing: Thing,
-    lane: Lane,
+    lane: Float[np.ndarray, "n 2"],
     path: Path,
     times: Float[np.ndarray, " k"],
     along: Float[np.ndarray, " k"],
     direction: int,
-) -> Pieces:
-    """Motion of a thing that is `along` metres along the path at `times`, without parts beyond the lane's ends."""
+) -> list[Spot]:
+    """Straight motions of a thing `along` metres along the path at `times`, on the lane and clear of the vehicle."""
     inside = (along[:-1] >= 0) & (along[1:] >= 0) & (np.maximum(along[:-1], along[1:]) <= len(path.xy) - 1)
     index = np.arange(len(path.xy))
-    xy = np.stack([np.interp(along, index, axis) for axis in lane.xy.T], axis=1)
+    xy = np.stack([np.interp(along, index, axis) for axis in lane.T], axis=1)
     middle = (along[:-1] + along[1:]) / 2
     heading = np.interp(middle, index, path.heading) + (np.pi if direction < 0 else 0.0)
-    return Pieces(thing, *(leaf[inside] for leaf in (xy[:-1], xy[1:], heading, times[:-1], times[1:])))
-
-
-def _spots(pieces: Pieces, path: Path) -> list[Spot]:
-    """Pieces that stay clear of the vehicle."""
-    begin, end, heading, since, until = (leaf[_clear(pieces, path)] for leaf in pieces[1:])
+    pieces = (xy[:-1][inside], xy[1:][inside], heading[inside], times[:-1][inside], times[1:][inside])
+    clear = _clear(thing, *pieces, path)
+    begin, end, heading, since, until = (leaf[clear] for leaf in pieces)
     velocity = (end - begin) / (until - since)[:, None]
     rows = np.column_stack([(begin + end) / 2, heading, velocity, since, until, (since + until) / 2]).tolist()
-    return [Spot(pieces.thing, x, y, turn, 1, (vx, vy), *when) for x, y, turn, vx, vy, *when in rows]
+    return [Spot(thing, x, y, turn, 1, (vx, vy), *when) for x, y, turn, vx, vy, *when in rows]
 
 
-def _clear(pieces: Pieces, path: Path) -> Bool[np.ndarray, " k"]:
+def _clear(
+    thing: Thing,
+    begin: np.ndarray,
+    end: np.ndarray,
+    heading: np.ndarray,
+    since: np.ndarray,
+    until: np.ndarray,
+    path: Path,
+) -> Bool[np.ndarray, " k"]:
     """Whether each piece stays clear of the vehicle: CLEARANCE_M beside it, KEPT_M ahead of it and behind."""
-    half = np.max([(abs(part.x) + part.size[0] / 2, part.size[1] / 2, 0.0) for part in pieces.thing], axis=0)
-    half = np.tile(half, (len(pieces.heading), 1))
-    clear = np.ones(len(pieces.heading), bool)
+    half = np.max([(abs(part.x) + part.size[0] / 2, part.size[1] / 2, 0.0) for part in thing], axis=0)
+    half = np.tile(half, (len(heading), 1))
+    clear = np.ones(len(heading), bool)
     for share in np.linspace(0, 1, 21):
-        time = pieces.since + share * (pieces.until - pieces.since)
+        time = since + share * (until - since)
         vehicle = np.stack([np.interp(time, path.times, axis) for axis in path.xy.T], axis=1)
         facing = np.interp(time, path.times, path.heading)
-        away = vehicle - (pieces.begin + share * (pieces.end - pieces.begin))
+        away = vehicle - (begin + share * (end - begin))
         beside = np.abs(np.cos(facing) * away[:, 1] - np.sin(facing) * away[:, 0]) > half[:, 1] + 1.0
-        distance = footprint_distance(away, pieces.heading, half)
+        distance = footprint_distance(away, heading, half)
         clear &= distance > np.where(beside, CLEARANCE_M, KEPT_M)
     return clear

@@ -12,8 +12,8 @@ from sglpr_jax.sim.ground import Ground, draw_relief
 from sglpr_jax.sim.objects import Beside, bush
 from sglpr_jax.sim.placing import CLEARANCE_M, HEAD_ROOM_M, Placed, Spot, distances, place, to_scene
 from sglpr_jax.sim.routes import Line
-from sglpr_jax.sim.shapes import Scene, Shapes
-from sglpr_jax.sim.streets import Island, Network, Path, draw_streets, paint_ground, resample, roundabouts, runs
+from sglpr_jax.sim.shapes import Scene
+from sglpr_jax.sim.streets import Island, Network, draw_streets, paint_ground, resample, roundabouts, runs
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.traffic import traffic
 
@@ -23,38 +23,26 @@ _TOLERANCE_M = 0.3
 """Depth to which things may overlap the strips of a street, in metres."""
 
 
-class Unfolded(NamedTuple):
-    """Path through storeys."""
-
-    xy: np.ndarray  # (n, 2) positions in the world that holds the storeys side by side, metres
-    ground: np.ndarray  # (n,) true height of the ground, metres
-    slope: np.ndarray  # (n, 2) true slope of the ground along x and y
-
-
 @dataclasses.dataclass(frozen=True)
 class Levels:
-    """Equal storeys above one another, joined by ramps above one another that descend along x.
+    """Equal storeys above one another, joined by ramps above one another that descend along x. All are in metres.
 
-    In the world, storey k is shifted by k * `pitch_m` along y. The world of each storey has a level copy of the ramp.
-    In the middle of the ramp, a path changes from one storey to the next. A scan on a ramp therefore shows a level ramp
-    that is parallel to the sensor. Its true pose follows the slope, whose change over 1 m is at most about 1.5 degrees.
+    In the world, storey k is shifted by k * `pitch_m` along y, with a level copy of the ramp. In the middle of the
+    ramp, a path changes to the next storey. A scan on a ramp therefore shows a level ramp that is parallel to the
+    sensor. Its true pose follows the slope, whose change over 1 m is at most about 1.5 degrees.
     """
 
-    rise_m: float
-    """Height of a storey, in metres."""
-    pitch_m: float
-    """Distance of two storeys along y in the world, in metres."""
-    ramp_y_m: float
-    """Minimum y of paths on the ramps, in metres. Paths with smaller y are on a storey."""
-    top_m: float
-    """x of the top of the ramps, in metres."""
-    foot_m: float
-    """x of the foot of the ramps, in metres, above `top_m`."""
+    rise_m: float  # height of a storey
+    pitch_m: float  # distance of two storeys along y in the world
+    ramp_y_m: float  # minimum y of paths on the ramps; paths with smaller y are on a storey
+    top_m: float  # x of the top of the ramps
+    foot_m: float  # x of the foot of the ramps, above `top_m`
 
-    def along(self, path: Line) -> Unfolded:
-        """Returns the unfolded path of a path that begins on the lowest storey.
+    def along(self, path: Line) -> tuple[Line, Float[np.ndarray, " n"], Line]:
+        """Unfolds a path that begins on the lowest storey. Its points must be close to each other.
 
-        The points of the path must be close enough to find each crossing of the middle of a ramp.
+        Returns:
+          Positions in the world, and true height (metres) and slope along x and y of the ground there.
         """
         on, beyond = path[:, 1] > self.ramp_y_m, path[:, 0] < (self.top_m + self.foot_m) / 2
         storey = np.concatenate([[0], np.cumsum(np.diff(beyond.astype(int)) * on[1:])])
@@ -64,7 +52,7 @@ class Levels:
         steepness = np.where(on, 6 * share * (1 - share), 0) * self.rise_m / run
         slope = np.stack([-steepness, np.zeros(len(path))], axis=1)
         there = path + self.pitch_m * np.stack([np.zeros(len(path)), storey], axis=1)
-        return Unfolded(there, self.rise_m * (storey + climbed), slope)
+        return there, self.rise_m * (storey + climbed), slope
 
 
 class World(NamedTuple):
@@ -83,10 +71,7 @@ def build_world(
     *,
     scenery: Scenery = TOWN,
 ) -> World:
-    """Builds a town around a drive.
-
-    The town exists only along the path of the vehicle. Nothing is closer to the trajectory than 1.6 m. Equal arguments
-    give equal towns.
+    """Builds a town along a drive. Nothing is closer to the trajectory than 1.6 m.
 
     Arguments:
       seed: Seed of the town.
@@ -103,22 +88,18 @@ def build_world(
     network, islands = Network(draw_streets(rng, path, scenery)), roundabouts(path)
     ground = paint_ground(network, islands, relief, path.xy)
     clock = (float(times[0]), float(times[-1]))
-    standing = furnish(rng, network, islands, ground, path.xy, clock)
+    standing = _furnish(rng, network, islands, ground, path.xy, clock)
     bushes = [Spot(bush(rng), *island.centre.tolist()) for island in islands]
     placed = place([*standing, *bushes, *traffic(rng, network, path)], ground)
-    return World(to_scene(placed, _in_view(placed.shapes, path)), ground)
-
-
-def _in_view(shapes: Shapes, path: Path) -> Bool[np.ndarray, " n"]:
-    """Whether each shape moves, or is within VIEW_M of the vehicle while it is present."""
+    shapes = placed.shapes
     keep = np.any(shapes.velocity != 0, axis=1)
     for i in range(0, len(path.xy), 10):
         near = np.sum((shapes.centre[:, :2] - path.xy[i]) ** 2, axis=1) < VIEW_M**2
         keep |= near & (shapes.since <= path.times[i] + 2) & (shapes.until > path.times[i] - 2)
-    return keep
+    return World(to_scene(placed, keep), ground)
 
 
-def furnish(
+def _furnish(
     rng: np.random.Generator,
     network: Network,
     islands: tuple[Island, ...],
@@ -140,7 +121,11 @@ def furnish(
     placed = place(spots, ground)
     street, zone = network.street[along.astype(int)], np.array([item.zone for item in items])
     bad = _on_a_street(network, placed, street[placed.owner], zone[placed.owner])
-    bad |= _in_the_way(placed.shapes, path) | _on_an_island(placed.shapes, islands)
+    dense = np.concatenate([path, (path[1:] + path[:-1]) / 2])
+    bad |= distances(placed.shapes, dense, reach_m=CLEARANCE_M) < CLEARANCE_M + 0.05
+    for island in islands:
+        away = np.linalg.norm(placed.shapes.centre[:, :2] - island.centre, axis=1)
+        bad |= away < island.radius + 2 + np.hypot(placed.shapes.half[:, 0], placed.shapes.half[:, 1])
     gone = set(placed.owner[bad].tolist())
     return [spot for i, spot in enumerate(spots) if i not in gone]
 
@@ -205,18 +190,3 @@ def _on_a_street(network: Network, placed: Placed, street: np.ndarray, zone: np.
             bad |= _margin(network, xy, zone == "plot") < -_TOLERANCE_M
             bad |= (zone == "bay") & (network.street[network.nearest(xy)] != street)
     return bad & np.array([part.bottom < HEAD_ROOM_M for part in placed.parts], bool)
-
-
-def _in_the_way(shapes: Shapes, path: Float[np.ndarray, "p 2"]) -> Bool[np.ndarray, " n"]:
-    """Whether each shape is closer to the vehicle's path than CLEARANCE_M."""
-    dense = np.concatenate([path, (path[1:] + path[:-1]) / 2])
-    return distances(shapes, dense, reach_m=CLEARANCE_M) < CLEARANCE_M + 0.05
-
-
-def _on_an_island(shapes: Shapes, islands: tuple[Island, ...]) -> Bool[np.ndarray, " n"]:
-    """Whether each shape is inside a roundabout."""
-    bad = np.zeros(len(shapes.label), bool)
-    for island in islands:
-        away = np.linalg.norm(shapes.centre[:, :2] - island.centre, axis=1)
-        bad |= away < island.radius + 2 + np.hypot(shapes.half[:, 0], shapes.half[:, 1])
-    return bad

@@ -16,7 +16,7 @@ from .conftest import assert_one_line_error, run_command
 
 LINES = {
     "convert": ("swin.safetensors", "--out", "start", "--network", "swin-unet", "--seed", "3"),
-    "demo": ("--scans", "40", "--steps", "0"),
+    "demo": ("--scans", "40"),
     "embed": ("--data", "scans", "--out", "07.npz", "--seq", "07", "--sensor-height", "2", "--rotate"),
     "evaluate": ("a.npz", "b.npz", "--database", "c.npz", "--protocol", "all", "--seq", "no"),
     "export": ("--out", "mine", "--average", "1e3", "--shares", "1", "1e-4", "--image", "density"),

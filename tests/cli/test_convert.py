@@ -61,17 +61,6 @@ def written(path, weights):
     return path
 
 
-def test_a_whole_swin_unet(command, preset, state, tmp_path):
-    file = written(tmp_path / "unet.safetensors", state)
-    ended = command("convert", file, "--network", "swin-unet", "--preset", preset, "--out", tmp_path / "start")
-    assert ended.status == 0, ended.error
-    assert "million numbers" in ended.out and "of unet.safetensors, the rest random (seed 0)" in ended.out
-    values = by_name(sglpr_jax.load(tmp_path / "start").weights)
-    for name, value in values.items():
-        if not name.startswith("place_head/"):
-            assert (value == state[torch_name(name)].reshape(-1)[0]).all(), name
-
-
 def test_swin_t_fills_what_it_fits_and_says_what_it_does_not(command, preset, state, tmp_path):
     encoder = {name: value for name, value in state.items() if name.startswith(("patch_embed.", "layers.", "norm."))}
     file = written(tmp_path / "t.safetensors", {**encoder, "head.weight": np.zeros((10, 16), np.float32)})

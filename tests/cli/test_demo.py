@@ -21,13 +21,14 @@ def tiny_demo(monkeypatch, town, preset):
     monkeypatch.setattr(datasets, "simulate", simulate)
     monkeypatch.setattr(demo, "WEIGHTS", "circular")
     monkeypatch.setattr(demo, "PRESET", str(preset))
+    monkeypatch.setattr(demo, "STEPS", 2)
     return asked
 
 
 @pytest.mark.slow
 def test_the_demo_finds_loops_scores_descriptors_and_trains(command, tiny_demo, tmp_path):
     out = tmp_path / "demo"
-    ended = command("demo", "--out", out, "--scans", 40, "--steps", 2)
+    ended = command("demo", "--out", out, "--scans", 40)
     assert ended.status == 0, ended.error
     assert tiny_demo["scans"] == 40
     for words in ("frames of 00", "top-1 F1max", "untrained", "shipped", "rotated", "sequence 00, 40 scans"):
@@ -46,6 +47,6 @@ def test_a_demo_that_is_stopped_says_what_it_does_next(command, tiny_demo, rando
     monkeypatch.setattr(recipe, "train", train)
     for part in ("loops_of_recording", "embed_recording", "evaluate_file"):
         monkeypatch.setattr(demo, part, lambda command: None)
-    ended = command("demo", "--out", tmp_path / "demo", "--steps", 2)
+    ended = command("demo", "--out", tmp_path / "demo")
     assert "stopped at step 1 of 2; the next demo restarts its training" in ended.error
     assert "--resume" not in ended.error

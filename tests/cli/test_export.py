@@ -61,33 +61,12 @@ def test_a_folder_that_is_there_is_left_alone(command, exported, weights):
     assert (exported / "README.md").read_text() == "a card"
 
 
-def test_an_image_that_does_not_fit_the_grid_is_refused(command, weights, tmp_path):
-    ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--image", "density")
-    assert_one_line_error(ended, "151 x 151 cells of 0.4 m", "found 16 x 16 cells of 3.2 m")
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("tool", ["embed", "segment", "evaluate", "export"])
 def test_an_unknown_name_lists_those_there_are(command, exported, town, tmp_path, tool):
     file = (tmp_path / "08.npy",) if tool == "evaluate" else ()
     data = () if tool == "export" else ("--data", town, "--seq", "08")
     ended = command(tool, *file, "--weights", "circularr", *data, "--out", tmp_path / "out.npz")
     assert_one_line_error(ended, "circularr: expected a folder", "(circular), found neither")
-
-
-@pytest.mark.slow
-def test_whitened_weights_describe_with_the_layer_fitted_to_a_dataset(command, weights, town, tmp_path):
-    ended = command("export", "--weights", weights, "--whiten", town, "--out", tmp_path / "out")
-    assert ended.status == 0, ended.error
-    assert "expected more than 256 scans for whitening" in ended.error
-    params = sglpr_jax.load(tmp_path / "out")
-    assert params.config.head.whiten
-    options = ("--weights", tmp_path / "out", "--data", town, "--seq", "08", "--out", tmp_path / "08.npz")
-    assert command("embed", *options).status == 0
-    descriptors = load(tmp_path / "08.npz").descriptors
-    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-4)
-    again = command("export", "--weights", tmp_path / "out", "--whiten", town, "--out", tmp_path / "again")
-    assert again.status == 0, again.error  # in place of the layer that is there
 
 
 @pytest.mark.slow

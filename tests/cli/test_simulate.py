@@ -1,8 +1,6 @@
-import numpy as np
 import pytest
 
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.sim.sensor import SENSORS
 
 from .conftest import assert_one_line_error
 
@@ -30,23 +28,6 @@ def test_drives_are_written_completed_and_kept(command, tmp_path):
 
     other = command("simulate", "--out", out, "--scans", 4, "--azimuth-steps", 40, "--seed", 5, "--seq", "08")
     assert_one_line_error(other, "simulation.json", "scans 4", "found 3")
-
-
-@pytest.mark.slow
-def test_a_pose_file_and_another_sensor(command, tmp_path):
-    rows = np.tile(np.eye(3, 4), (150, 1, 1))
-    rows[:, 2, 3] = 0.5 * np.arange(150)
-    np.savetxt(tmp_path / "campus.txt", rows.reshape(150, 12))
-    options = ("--along", tmp_path / "campus.txt", *THIN, "--sensor", "vlp16")
-    ended = command("simulate", "--out", tmp_path / "town", *options)
-    assert ended.status == 0 and ended.out == f"{tmp_path / 'town'}: recordings campus\n"
-    drive = open_recording(tmp_path / "town", "campus")
-    np.testing.assert_allclose(drive.positions[:, 0], [0, 25, 50], atol=1e-6)  # every 50th of 150 lines
-    assert len(drive.points(0)) <= len(SENSORS["vlp16"].elevations_deg) * 40
-
-    images = command("simulate", "--out", tmp_path / "images", *options, "--images")
-    assert images.status == 0 and "3 images, about 0 MB" in images.error
-    assert open_recording(tmp_path / "images", "campus").image(0).shape == (151, 151)
 
 
 def test_wrong_input_is_refused_before_anything_is_written(command, tmp_path):

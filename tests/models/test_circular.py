@@ -9,7 +9,7 @@ import pytest
 
 from sglpr_jax.models import sglpr
 from sglpr_jax.models.backbone_config import CircularConfig
-from sglpr_jax.models.circular import CircularNet, block_means
+from sglpr_jax.models.circular import CircularNet
 from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.place_head import amplitudes
 
@@ -43,16 +43,6 @@ def test_maps_shrink_as_configured_and_turn_with_the_image(fine, random_variable
     np.testing.assert_allclose(maps[0][..., :2], image.reshape(2, 8, 2, 16, 2, 2).mean((2, 4)), atol=1e-6)
     turned = net.apply(variables, jnp.roll(image, 8, axis=2))  # two sectors of the last map
     np.testing.assert_allclose(turned[-1], jnp.roll(maps[-1], 2, axis=2), atol=1e-5)
-
-
-@pytest.mark.parametrize(("radii", "sectors"), [(1, 1), (2, 1), (1, 3), (4, 2)])
-def test_means_of_blocks_are_numpys(radii, sectors):
-    image = np.random.default_rng(0).normal(size=(2, 8, 12, 3)).astype(np.float32)
-    expected = image.reshape(2, 8 // radii, radii, 12 // sectors, sectors, 3).mean((2, 4))
-    found = jax.jit(block_means, static_argnums=(1, 2))(image, radii, sectors)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    each = jax.vmap(lambda one: block_means(one[None], radii, sectors)[0])(jnp.asarray(image))
-    np.testing.assert_allclose(each, expected, atol=1e-6)
 
 
 def test_quarter_turns_leave_the_descriptor(params):

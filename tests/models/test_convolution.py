@@ -10,15 +10,12 @@ from sglpr_jax.models.convolution import FEW_INPUTS, as_product, convolve
 CASES = [
     pytest.param(3, (1, 1), True, id="around"),
     pytest.param(3, (2, 1), True, id="around, stride along rows"),
-    pytest.param(3, (2, 2), True, id="around, stride"),
     pytest.param(3, (1, 1), False, id="flat"),
-    pytest.param(3, (2, 2), False, id="flat, stride"),
     pytest.param(4, (4, 4), False, id="side by side"),
     pytest.param(4, (1, 1), False, id="even"),
     pytest.param(5, (1, 1), True, id="five"),
-    pytest.param(7, (3, 2), False, id="seven"),
 ]
-SHAPES = [(2, 9, 8, 3), (1, 8, 7, 1), (2, 9, 8, 6)]
+SHAPES = [(2, 8, 8, 1), (2, 8, 8, 6)]
 """Few channels and many: these go other ways."""
 
 
@@ -48,7 +45,7 @@ def test_both_forms_are_xlas(size, strides, circular, shape):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [SHAPES[0], SHAPES[2]], ids=str)
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("size, strides, circular", CASES)
 def test_the_gradient_is_xlas(size, strides, circular, shape):
     x, kernel = image_and_kernel(shape, size)
@@ -65,6 +62,6 @@ def test_no_convolution_runs_backward(size, strides, circular):
     def loss(x, kernel):
         return convolve(x, kernel, strides, circular).sum()
 
-    few, _, many = (str(jax.make_jaxpr(jax.grad(loss, (0, 1)))(*image_and_kernel(shape, size))) for shape in SHAPES)
+    few, many = (str(jax.make_jaxpr(jax.grad(loss, (0, 1)))(*image_and_kernel(shape, size))) for shape in SHAPES)
     assert many.count("conv_general_dilated") == 1  # the one forward
     assert few.count("conv_general_dilated") == (size * SHAPES[0][-1] > FEW_INPUTS)

@@ -63,17 +63,6 @@ def test_onnx_gives_the_same_descriptors_for_any_number_of_images(params, tmp_pa
     assert said == input_description(params.config) | {"sha256": checksum}
 
 
-def test_the_input_of_counts_is_made_as_it_is_said():
-    config = dataclasses.replace(TINY, image="points")
-    assert "u = floor(x / 1.6) + 16, v = 15 - floor(y / 1.6)" in input_description(config)["cells"]
-    points, bev = scan(), np.zeros((32, 32))
-    cell = np.floor(points[:, :2] * np.float32(1 / 1.6)).astype(int)
-    u, v = 16 + cell[:, 0], 15 - cell[:, 1]
-    inside = (u >= 0) & (u < 32) & (v >= 0) & (v < 32)
-    np.add.at(bev, (v[inside], u[inside]), 1)
-    np.testing.assert_array_equal(bev, sglpr_jax.scan_image(points, config))
-
-
 def test_the_input_of_densities_is_made_as_it_is_said():
     config = model_preset("circular")
     config = dataclasses.replace(config, image="density")

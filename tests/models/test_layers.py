@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.layers import LayerNorm, layer_norm, product
+from sglpr_jax.models.layers import layer_norm, product
 
 EPSILON = 1e-5
 RNG = np.random.default_rng(0)
@@ -34,23 +34,6 @@ def test_values_and_gradients_are_those_of_the_plain_formula(wrap):
     assert_close(wrap(ours)(ROWS[0], SCALE, BIAS), plain(ROWS[0], SCALE, BIAS))
     found, expected = (wrap(jax.grad(functools.partial(loss, norm), (0, 1, 2))) for norm in (ours, plain))
     assert_close(found(ROWS[0], SCALE, BIAS), expected(ROWS[0], SCALE, BIAS))
-
-
-def test_equal_channels_have_finite_gradients():
-    flat = jnp.full((3, 6), 2.0)
-    found = jax.grad(lambda x: jnp.sum(ours(x, SCALE, BIAS) * WEIGHTS[0, :3]))(flat)
-    assert np.isfinite(found).all()
-
-
-def test_the_layer_keeps_type_and_shape():
-    norm = LayerNorm()
-    for type_ in (jnp.float32, jnp.bfloat16):
-        x = ROWS.astype(type_)
-        variables = {"params": {"scale": SCALE, "bias": BIAS}}
-        found = norm.apply(variables, x)
-        assert found.dtype == type_ and found.shape == x.shape
-        expected = plain(x.astype(jnp.float32).reshape(-1, 6), SCALE, BIAS).reshape(x.shape)
-        np.testing.assert_allclose(found.astype(jnp.float32), expected, atol=2e-5 if type_ == jnp.float32 else 0.03)
 
 
 SIZES = [pytest.param(20, 7, 3, id="tall"), pytest.param(20, 3, 7, id="wide"), pytest.param(4, 7, 3, id="few rows")]

@@ -90,27 +90,6 @@ def test_the_gradient_of_the_maximum_survives_rounding():
     np.testing.assert_allclose(jax.grad(lambda x: largest(x, (0,)))(tied), [1 / 3, 0, 1 / 3, 1 / 3], rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_a_circular_map_may_be_rolled_along_its_columns_and_no_other(random_variables):
-    image = jnp.asarray(np.random.default_rng(0).normal(size=(2, 8, 12, 6)), jnp.float32)
-    variables = random_variables(CBAM(reduction=3), image)
-    rolled = jnp.roll(image, 5, axis=2)
-    for circular in (True, False):
-        apply = jax.jit(CBAM(reduction=3, circular=circular).apply)
-        difference = apply(variables, rolled) - jnp.roll(apply(variables, image), 5, axis=2)
-        assert (jnp.abs(difference).max() < 1e-5) == circular
-
-
-def test_vmap_and_order_of_local_features_change_nothing(random_variables):
-    module, rng = NetVLAD(clusters=4, output=8), np.random.default_rng(0)
-    features = jnp.asarray(rng.normal(size=(3, 20, 6)), jnp.float32)
-    variables = random_variables(module, features)
-    expected = module.apply(variables, features)
-    one_by_one = jax.vmap(module.apply, (None, 0))(variables, features[:, None])[:, 0]
-    np.testing.assert_allclose(one_by_one, expected, atol=1e-6)
-    np.testing.assert_allclose(module.apply(variables, features[:, rng.permutation(20)]), expected, atol=1e-6)
-
-
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-8, 1e8])
 def test_l2_normalize_gives_unit_vectors_or_zero_and_finite_gradients(scale):
     x = scale * jnp.asarray([[3.0, 4.0]])
@@ -121,17 +100,6 @@ def test_l2_normalize_gives_unit_vectors_or_zero_and_finite_gradients(scale):
 
 def head(kernels, strides):
     return PlaceHead(HeadConfig(channels=(8, 12, 16), kernels=kernels, strides=strides, clusters=4, descriptor_size=32))
-
-
-@pytest.mark.parametrize(
-    ("kernels", "strides", "sizes"),
-    [((3, 3, 3), (2, 2, 2), [16, 8, 4]), ((4, 3, 3), (4, 2, 2), [8, 4, 2]), ((2, 2, 2), (2, 2, 2), [16, 8, 4])],
-)
-def test_the_map_shrinks_by_each_stride(kernels, strides, sizes):
-    run = head(kernels, strides).init_with_output
-    (descriptors, seen), _ = jax.eval_shape(run, jax.random.key(0), jnp.zeros((3, 32, 32, 6)))
-    assert descriptors.shape == (3, 32)
-    assert [seen[f"head_convolution{i}"].shape[1] for i in range(3)] == sizes
 
 
 def test_a_stride_two_convolution_is_centred_on_every_second_pixel(random_variables):

@@ -88,32 +88,9 @@ def test_a_name_means_the_shipped_weights_and_a_path_a_folder(placeholder, param
     chex.assert_trees_all_equal(load("other"), load(own))
 
 
-def test_what_is_neither_a_name_nor_a_folder_lists_the_names(placeholder, tmp_path, monkeypatch):
-    for unknown in ("simulatd", str(tmp_path / "none"), placeholder / WEIGHTS_FILE):
-        with pytest.raises(FileNotFoundError, match=rf"{unknown}: .* \(placeholder\), found neither"):
-            load(unknown)
-    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "empty")
-    assert shipped_weights() == ()
-    with pytest.raises(FileNotFoundError, match=r"circular: .*\(there are none\), found neither"):
-        load("circular")
-
-
 def images_of(params: Params) -> jax.Array:
     grid = params.config.grid
     return jnp.asarray(np.random.default_rng(1).poisson(0.5, (6, grid.height, grid.width)), jnp.float32)
-
-
-def test_half_precision_is_half_as_large_and_describes_places_all_but_the_same(params, tmp_path):
-    whole, half = (save(params, tmp_path / str(half), half=half) for half in (False, True))
-    size, half_size = ((folder / WEIGHTS_FILE).stat().st_size for folder in (whole, half))
-    assert 0.45 < half_size / size < 0.6  # names and shapes take their room
-    loaded = load(half)
-    assert {leaf.dtype for leaf in jax.tree.leaves(loaded.weights)} == {np.dtype(np.float32)}
-    expected = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16).astype(np.float32), params)
-    chex.assert_trees_all_equal(loaded, expected)
-    images = images_of(params)
-    difference = np.abs(describe(loaded, images) - describe(params, images)).max()
-    assert 0 < difference < 1e-2
 
 
 @pytest.mark.parametrize(("tap", "also_dropped"), [("pixels", set()), ("tokens", {"expand"})])

@@ -13,7 +13,6 @@ import sglpr_jax
 from sglpr_jax.models.backbone_config import CircularConfig
 from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.place_head import Whitening
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.weights import (
     as_tree,
@@ -47,21 +46,6 @@ def test_every_parameter_is_the_weighted_mean():
     assert found.keys() == names[0].keys() and any(np.ptp(np.asarray(value)) > 0 for value in found.values())
 
 
-def test_whitening_layers_are_left_out():
-    plain = fresh(0)
-    descriptors = np.random.default_rng(0).normal(size=(300, 256)).astype(np.float32)
-    found = average([whitened(plain, descriptors), plain])
-    assert found.config == plain.config
-    for name, value in by_name(found.weights).items():
-        np.testing.assert_allclose(value, by_name(plain.weights)[name], rtol=1e-6)
-
-
-@pytest.mark.parametrize("shares", [[1.0], [1.0, 2.0, 3.0], [2.0, -1.0], [0.0, 0.0]])
-def test_shares_that_weigh_nothing_are_refused(shares):
-    with pytest.raises(ValueError, match="expected 2 shares of 0 or more, not all 0, found"):
-        average([fresh(0), fresh(1)], shares=shares)
-
-
 def test_models_that_differ_are_refused_by_the_name_of_what_does():
     one = fresh(0)
     with pytest.raises(ValueError, match="found categories 20 and 0"):
@@ -82,14 +66,6 @@ def test_the_spread_along_every_component_is_its_own_to_the_power_left(power):
     expected = spread * (spread / spread.max()) ** -power
     mapped = CLOUD @ fit_whitening(CLOUD, power=power)
     np.testing.assert_allclose(mapped.T @ mapped / len(CLOUD), np.diag(expected**2), atol=1e-3)
-
-
-def test_distances_are_those_of_numpy():
-    kernel, bias = fit_whitening(CLOUD, power=0.5), RNG.normal(size=6).astype(np.float32)
-    vectors = CLOUD / np.linalg.norm(CLOUD, axis=1, keepdims=True)
-    found = Whitening().apply({"params": {"kernel": kernel, "bias": bias}}, jnp.asarray(vectors, jnp.float32))
-    expected = vectors @ kernel.astype(np.float64) + bias
-    np.testing.assert_allclose(found, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-5)
 
 
 @pytest.mark.parametrize("n", [1, 20])

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data.density_image import density_bev, density_image, density_label_image
-from sglpr_jax.data.mounting import MODEL_HEIGHT_M
+from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.submap import submaps
 from sglpr_jax.se3 import positions_from_camera
@@ -144,23 +143,12 @@ def test_images_are_those_of_the_scans(tmp_path, drive):
     assert expected.max() > 0 and 0.8 < (images.labels(2)[expected > 0] > 0).mean() <= 1
 
 
-@pytest.mark.slow
-def test_images_are_as_of_a_sensor_at_the_height_that_models_know(tmp_path):
-    low = dataclasses.replace(TINY, height_m=0.8)
-    image = open_recording(write(tmp_path, routes=("08",), sensor=low, images=True), "08").image(0)
-    drive = simulate_recording("08", scans=SCANS, sensor=low, seed=1)
-    np.testing.assert_array_equal(image, density_bev(drive.points(0) + np.float32([0, 0, 0.8 - MODEL_HEIGHT_M])))
-
-
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
         ({"seed": 2}, r"seed 2 \(found 1\)"),
-        ({"sensor": SENSORS["vlp16"]}, "sensor"),
         ({"images": True}, r"layout images \(found scans\)"),
         ({"scenery": "outskirts"}, "scenery .*walled"),
-        ({"carrier": "cart"}, "carrier"),
-        ({"submap_m": 5.0}, r"submap_m 5.0 \(found None\)"),
     ],
 )
 def test_other_settings_are_refused(dataset, changes, found):
@@ -216,18 +204,12 @@ def test_submaps_of_a_carrier_in_a_scenery_where_places_repeat(tmp_path):
     ("changes", "error"),
     [
         ({"routes": ["99"]}, "expected drives among 00, .* found \\['99'\\]"),
-        ({"routes": ["00", "00"]}, "expected different names"),
-        ({"routes": ["99"], "sessions": ["2012-01-15"]}, "found '99'"),
         ({"seed": -1}, "seed: expected a whole number, 0 or more, found -1"),
         ({"rate_hz": float("nan")}, "rate_hz: expected scans per second, more than 0, found nan"),
-        ({"scans": 1}, "2 scans or more"),
-        ({"submap_m": -1.0}, "submap_m: expected"),
         ({"vary": True}, "vary: expected images, found scans"),
         ({"sensor": "vlp17"}, "expected a sensor among hdl64e, .* found 'vlp17'"),
         ({"sessions": ["2012-01-15"], "submap_m": 5.0, "routes": None}, "expected no submaps"),
-        ({"sessions": ["2012-01-15"], "images": True, "routes": None}, "at most one route"),
         ({"scenery": "forest", "routes": ["00", "05"]}, "different revisits"),
-        ({"scenery": "wood"}, "found 'wood'"),
         ({"carrier": "horse"}, "expected a carrier among vehicle, .* found 'horse'"),
         ({"sessions": ["2012-01-15"], "carrier": "cart", "routes": None}, "expected the carrier vehicle"),
     ],

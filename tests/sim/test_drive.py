@@ -8,24 +8,20 @@ from hypothesis import strategies as st
 from sglpr_jax.se3 import distances
 from sglpr_jax.sim.drive import (
     CARRIERS,
-    TILT_DEG,
     PlanarPath,
-    body_tilt,
     plan_path,
     poses_on,
     read_path,
+    scan_rows,
     speeds,
-    thinned,
 )
-from sglpr_jax.sim.ground import Relief, draw_relief, relief_height
-from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
+from sglpr_jax.sim.ground import draw_relief, relief_height
+from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.routes import ROLES, plan_walk
 from sglpr_jax.sim.sensor import Sensor
 
-SAME, OPPOSITE = ("00", "02", "05", "06", "07", "09"), ("08",)
 LEAST = {"00": 0.12, "02": 0.08, "05": 0.12, "06": 0.1, "07": 0.05, "08": 0.1, "09": 0.03}
-CASES = [(name, scans, seed) for name in ROLES for scans, seed in ((200, 0), (1500, 2))]
 
 
 def revisits(trajectory) -> tuple[float, float, np.ndarray]:
@@ -37,23 +33,16 @@ def revisits(trajectory) -> tuple[float, float, np.ndarray]:
     return np.mean(again & (heading > 0.7)), np.mean(again & (heading < -0.7)), trajectory.times[again]
 
 
-@pytest.mark.parametrize(("name", "scans", "seed"), CASES)
-def test_a_route_has_the_revisits_of_its_namesake(name, scans, seed):
-    trajectory = thinned(plan_path(np.random.default_rng(seed), name, scans=scans), scans)
-    same, opposite, when = revisits(trajectory)
-    if name in SAME:
-        assert LEAST[name] <= same <= 0.3 and opposite < 0.02
-    elif name in OPPOSITE:
-        assert LEAST[name] <= opposite <= 0.3 and same < 0.02
-    else:
-        assert same == opposite == 0
+@pytest.mark.parametrize("name", ROLES)
+def test_a_car_could_drive_a_route_which_has_the_revisits_of_its_namesake(name):
+    scans = 200
+    path = plan_path(np.random.default_rng(0), name, scans=scans)
+    same, opposite, when = revisits(PlanarPath(*(values[scan_rows(path, scans)] for values in path)))
+    least = LEAST.get(name, 0)
+    assert (least <= opposite <= 0.3 and same < 0.02) if name == "08" else (least <= same <= 0.3 and opposite < 0.02)
+    assert least or same == 0
     if name in ("06", "07", "09"):
-        assert when.min() > 0.6 * trajectory.times[-1]  # they come back at the end
-
-
-@pytest.mark.parametrize(("name", "scans", "seed"), CASES)
-def test_a_car_could_drive_it(name, scans, seed):
-    path = plan_path(np.random.default_rng(seed), name, scans=scans)
+        assert when.min() > 0.6 * path.times[-1]  # they come back at the end
     assert len(path.times) % scans == 0 and path.times[0] == 0
     np.testing.assert_allclose(np.diff(path.times), path.times[1])  # evenly
     assert 0.05 < path.times[1] < 0.25
@@ -104,9 +93,6 @@ def test_poses_stand_on_the_hills():
     assert np.abs(rotation[:, 2, 0]).max() > 1e-3
 
 
-PLAIN = Relief(np.zeros(1), np.ones((1, 2)), np.zeros(1))
-
-
 def pose_file(path, xy, yaw):
     """A KITTI pose file: the camera looks along z, x points right."""
     cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw)), np.ones(len(yaw))
@@ -117,7 +103,8 @@ def pose_file(path, xy, yaw):
 
 
 def test_a_pose_file_becomes_a_trajectory(tmp_path):
-    planned = thinned(plan_path(np.random.default_rng(0), "03", scans=300), 60)
+    path = plan_path(np.random.default_rng(0), "03", scans=300)
+    planned = PlanarPath(*(values[scan_rows(path, 60)] for values in path))
     path = read_path(pose_file(tmp_path / "campus.txt", planned.xy, planned.yaw))
     np.testing.assert_allclose(path.xy, planned.xy, atol=1e-9)
     np.testing.assert_allclose(np.cos(path.yaw - planned.yaw), 1)
@@ -130,8 +117,6 @@ def test_a_pose_file_becomes_a_trajectory(tmp_path):
     ("content", "times", "said"),
     [
         ("", None, "campus.txt: expected 2 poses or more, 12 numbers a line, found 0"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2 + "1 0 0 0 0 1 0 nan 0 0 1 0\n", None, "campus.txt, line 3: .*finite.*nan"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 2 3\n", None, "campus.txt, line 2: expected 12 numbers, found 3"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "0\n1\n", "times.txt: expected 3 times, one per pose of campus.txt, found 2"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "0\n1\n1\n", "times.txt, line 3: expected a time > 1.0, found 1.0"),
     ],
@@ -144,22 +129,8 @@ def test_a_malformed_pose_file_is_refused(tmp_path, content, times, said):
         read_path(tmp_path / "campus.txt")
 
 
-PLAIN = Relief(np.zeros(1), np.ones((1, 2)), np.zeros(1))
 NARROW = Sensor(elevations_deg=(10.0, -10.0, -20.0), azimuth_steps=64, azimuths_deg=(-60.0, 60.0), min_range_m=0.5)
 straight = PlanarPath(np.stack([np.arange(0, 800, 0.5), np.zeros(1600)], axis=1), np.zeros(1600), np.arange(1600) / 10)
-
-
-def test_the_body_tilts_on_the_spot():
-    times = np.linspace(0, 400, 2000)
-    tilt = body_tilt(np.random.default_rng(0), times)
-    np.testing.assert_allclose(np.degrees(tilt.std(axis=0)), TILT_DEG, rtol=0.2)
-    assert np.abs(np.diff(tilt, axis=0)).max() < np.abs(tilt).max() / 4  # it takes about a second
-    xy, yaw = np.zeros((2000, 2)), np.full(2000, 0.7)
-    level, tilted = (poses_on(PLAIN, xy, yaw, height_m=2.0, tilt=t) for t in (None, tilt))
-    np.testing.assert_array_equal(level[:, :3, 3], tilted[:, :3, 3])
-    turn = level[:, :3, :3].transpose(0, 2, 1) @ tilted[:, :3, :3]
-    np.testing.assert_allclose(turn[:, 0, 2], tilt[:, 0], atol=1e-3)  # nose down lifts what lies ahead
-    np.testing.assert_allclose(turn[:, 2, 1], tilt[:, 1], atol=1e-3)
 
 
 def carried(name: str, scans: int = 40, **more):
@@ -186,13 +157,6 @@ def test_a_carrier_has_its_height_and_tilt(name, height_m, bob_m, tilt_deg):
     assert recording.mounting is not None and recording.mounting.height_m == height_m
 
 
-@pytest.mark.parametrize(("name", "rate_hz"), [("backpack", 2.0), ("handheld", 5.0)])
-def test_a_carrier_has_its_rate(name, rate_hz):
-    step = np.median(np.diff(carried(name, scans=400).poses.times))
-    assert np.isclose(1 / step, rate_hz, rtol=0.3)
-    assert np.diff(carried(name, scans=400, rate_hz=10.0).poses.times).max() < step
-
-
 def test_a_car_stands_and_reverses():
     path = CARRIERS["stop-and-reverse"].halted(np.random.default_rng(1), straight, poses=7)
     speed = speeds(path)
@@ -213,11 +177,3 @@ def runs_of(mask: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Duration of each run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
     return np.array([times[stop - 1] - times[start] for start, stop in zip(edges[::2], edges[1::2], strict=True)])
-
-
-def test_a_carrier_in_a_town_has_its_height():
-    options = {"scans": 12, "sensor": NARROW}
-    backpack = simulate_recording("03", carrier=CARRIERS["backpack"], **options)
-    hand = simulate_recording("03", carrier=CARRIERS["handheld"], **options)
-    np.testing.assert_allclose(xyz(backpack)[:, :2], xyz(hand)[:, :2], atol=0.1)
-    assert 0.3 < np.median(xyz(backpack)[:, 2] - xyz(hand)[:, 2]) < 0.5

@@ -14,7 +14,6 @@ from sglpr_jax.sim.ground import (
     Relief,
     draw_relief,
     ground_view,
-    is_raised,
     label_at,
     meet_ground,
     relief_curvature,
@@ -22,7 +21,7 @@ from sglpr_jax.sim.ground import (
     relief_height,
     surface_height,
 )
-from sglpr_jax.sim.objects import LANE_MARKING, OTHER_GROUND, PARKING, ROAD, SIDEWALK, TERRAIN
+from sglpr_jax.sim.labels import ROAD, SIDEWALK, TERRAIN
 from sglpr_jax.sim.shapes import Vectors
 
 STEP = 1e-3
@@ -53,25 +52,6 @@ def test_rows_are_y_and_columns_are_x(ground):
     where = ground.origin + (np.array([[7, 31]]) + 0.5) * CELL_M
     assert label_at(ground, where) == ground.label[31, 7]
     assert label_at(ground, np.array([[-500.0, 500.0]])) == ground.label[-1, 0]
-
-
-def test_a_window_shows_the_same_ground_and_its_edge_goes_on(ground):
-    centre = ground.origin + 4.0
-    window = ground.around(centre, 2.0)
-    xy = centre + np.random.default_rng(2).uniform(-1.9, 1.9, (100, 2))
-    np.testing.assert_array_equal(label_at(window, xy), label_at(ground, xy))
-    far = ground.around(np.array([-900.0, -900.0]), 2.0)
-    assert far.label.shape == window.label.shape
-    assert np.all(far.label == ground.label[0, 0])
-
-
-def test_kerbs_rise_between_the_road_and_the_sidewalk(ground):
-    labels = np.array([ROAD, PARKING, OTHER_GROUND, LANE_MARKING, SIDEWALK, TERRAIN])
-    np.testing.assert_array_equal(is_raised(labels), [False, False, False, False, True, True])
-    for label, kerb in ((ROAD, 0), (TERRAIN, KERB_M)):
-        flat = ground._replace(label=np.full((60, 80), label, np.uint8))
-        xy = places(3)
-        np.testing.assert_allclose(surface_height(flat, xy), relief_height(ground.relief, xy) + kerb)
 
 
 REACH_M = 70.0
@@ -108,12 +88,6 @@ def test_points_lie_on_the_ground_and_bear_its_label(x, y, relief):
         # A flat ray along the kerb into its face may be given metres behind it, that is below the surface.
         assert np.mean(error < tolerance) > 0.98 and error.max() < KERB_M + tolerance
         np.testing.assert_array_equal(label[near], np.where(points[near][:, 1] > 0, ROAD, TERRAIN))
-
-
-def test_rays_above_the_horizon_of_flat_ground_meet_nothing():
-    directions = rays(highest=0.3)
-    distance, _, _, _ = cast(striped_ground(FLAT, ROAD, TERRAIN), np.array([0, 0, 1.73]), directions)
-    np.testing.assert_array_equal(np.isinf(distance), directions[..., 2] >= 0)
 
 
 def test_a_kerb_hides_nothing_and_its_face_is_the_sidewalk():

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import NOTHING, pose, random_scene, reference, shapes
 
-from sglpr_jax.sim.objects import BUILDING, ROAD, TERRAIN
+from sglpr_jax.sim.labels import BUILDING, ROAD, TERRAIN
 from sglpr_jax.sim.raycast import (
     COLUMNS,
     Chance,

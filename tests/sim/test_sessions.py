@@ -4,18 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 from scipy.spatial import KDTree
 
-from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.drive import plan_path
-from sglpr_jax.sim.layouts import nclt_scan
 from sglpr_jax.sim.sensor import NCLT_HEIGHT_M, Sensor
 from sglpr_jax.sim.sessions import plan_sessions
 
@@ -92,37 +86,6 @@ def test_the_ground_truth_turns_forward_right_down_to_north_east_down(dataset, d
     forward = days[1].poses.world_from_lidar[:, :3, 0]
     np.testing.assert_allclose(east_of_north * [1, -1, -1], forward, atol=1e-6)
     assert np.abs(roll).max() < 0.2  # upright, not upside down
-
-
-@settings(max_examples=30, deadline=None)
-@given(points=arrays.arrays(np.float32, (20, 3), elements=st.floats(-95, 95, width=32)))
-def test_a_scan_comes_back_as_its_rounded_self(tmp_path_factory, points):
-    path = tmp_path_factory.mktemp("scan") / "velodyne_sync" / "1.bin"
-    path.parent.mkdir()
-    intensities = np.full((20, 1), 0.5)
-    (content,) = nclt_scan(np.hstack([points, intensities]), np.zeros(20, int), Mounting(NCLT_HEIGHT_M))
-    path.write_bytes(content)
-    body = np.add(points.astype(np.float64), [0, 0, NCLT_HEIGHT_M]) * [1, -1, -1]
-    rounded = np.round((body + 100) / 0.005) * 0.005 - 100
-    np.testing.assert_allclose(read_scan(path), rounded * [1, -1, -1], atol=1e-5)
-    np.testing.assert_allclose(read_scan(path) - [0, 0, NCLT_HEIGHT_M], points, atol=0.00251)
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_an_interrupted_run_goes_on(dataset, tmp_path):
-    def interrupt(done: int) -> None:
-        if done == SCANS + 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        simulate(tmp_path / "again", sessions=DAYS, **OPTIONS, on_progress=interrupt)
-    assert not (tmp_path / "again" / DAYS[1] / f"groundtruth_{DAYS[1]}.csv").exists()
-    simulate(tmp_path / "again", sessions=DAYS, **OPTIONS)
-    files = [path.relative_to(dataset) for path in dataset.rglob("*") if path.is_file()]
-    assert len(files) == 3 * (SCANS + 1) + 1
-    assert all((tmp_path / "again" / file).read_bytes() == (dataset / file).read_bytes() for file in files)
-    with pytest.raises(ValueError, match="belongs to another simulated dataset"):
-        simulate(tmp_path / "again", sessions=DAYS[:2], **OPTIONS)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from sglpr_jax.sim.streets import (
     revisits,
     roundabouts,
 )
-from sglpr_jax.sim.styles import STYLES, Scenery
+from sglpr_jax.sim.styles import STYLES
 
 
 def streets_of(corners, seed: int = 0, **how):
@@ -94,11 +94,6 @@ def test_a_fast_drive_is_on_a_highway_and_a_slow_one_is_not():
         styles = [part.right.style for part in streets[0].stretches]
         assert [style is STYLES["highway"] for style in styles] == [expected] * len(styles)
         assert expected == (len(streets) == 1)  # nothing branches off a highway
-
-
-def test_what_a_scenery_asks_for_must_be_there():
-    with pytest.raises(ValueError, match=r"styles: expected shares of centre, .*, found \{'harbour': 1.0\}"):
-        Scenery({"harbour": 1.0})
 
 
 def test_going_around_a_roundabout_makes_an_island():

@@ -6,29 +6,8 @@ import numpy as np
 
 from sglpr_jax.sim.drive import shifted
 from sglpr_jax.sim.ground import Ground, Relief
-from sglpr_jax.sim.objects import (
-    BUILDING,
-    FENCE,
-    OTHER_OBJECT,
-    POLE,
-    ROAD,
-    SIDEWALK,
-    TERRAIN,
-    TRUNK,
-    VEGETATION,
-    House,
-    Part,
-    Thing,
-    ball,
-    bicycle,
-    block,
-    bush,
-    hedge,
-    house,
-    parked,
-    post,
-    tree,
-)
+from sglpr_jax.sim.labels import BUILDING, FENCE, OTHER_OBJECT, POLE, ROAD, SIDEWALK, TERRAIN, TRUNK, VEGETATION
+from sglpr_jax.sim.objects import House, Thing, ball, bicycle, block, bush, hedge, house, parked, post, tree
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import (
@@ -92,24 +71,16 @@ def _module(rng: np.random.Generator, wide: float) -> Thing:
     porch = block(BUILDING, 1.4, 1.2, 2.6, rng.uniform(-0.25, 0.25) * wide, front - 0.6)
     shed = block(BUILDING, 2.4, 2.0, 2.3, 0.3 * wide, front + deep + rng.uniform(3, 5))
     gate = rng.uniform(1.0, 2.5)
-    border = _border(rng, wide - gate)._replace(x=-gate / 2, y=HOUSES_WALK_M + 0.4)
-    between = block(FENCE, 0.1, garden - 0.6, 1.0, wide / 2, HOUSES_WALK_M + garden / 2, porosity=0.3)
-    plant = _small_tree(rng, rng.uniform(-0.3, 0.3) * wide, front - garden / 2)
-    return body, wing, porch, shed, border, between, *plant
-
-
-def _border(rng: np.random.Generator, length: float) -> Part:
-    """Hedge or fence of this length."""
     if rng.random() < 0.5:
-        return hedge(length, rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.6))[0]
-    return block(FENCE, length, 0.1, rng.uniform(0.8, 1.2), porosity=0.4)
-
-
-def _small_tree(rng: np.random.Generator, x: float, y: float) -> Thing:
-    """Tree in a front garden."""
+        (border,) = hedge(wide - gate, rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.6))
+    else:
+        border = block(FENCE, wide - gate, 0.1, rng.uniform(0.8, 1.2), porosity=0.4)
+    border = border._replace(x=-gate / 2, y=HOUSES_WALK_M + 0.4)
+    between = block(FENCE, 0.1, garden - 0.6, 1.0, wide / 2, HOUSES_WALK_M + garden / 2, porosity=0.3)
+    x, y = rng.uniform(-0.3, 0.3) * wide, front - garden / 2
     crown = rng.uniform(1.5, 2.5)
     leaves = ball(VEGETATION, crown, crown, x, y, bottom=1.3, roughness=0.6, porosity=0.5)
-    return post(TRUNK, 0.15, 2.0, x, y), leaves
+    return body, wing, porch, shed, border, between, post(TRUNK, 0.15, 2.0, x, y), leaves
 
 
 def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -123,19 +94,11 @@ def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     bays = grid(xs, np.concatenate([streets - aside, streets + aside]), lambda: parked(rng))
     lamps = grid(xs[::5], streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 7.0),))
     spots = [*buildings, *jittered(rng, bays, 0.2, keep=rng.uniform(0.3, 0.6)), *lamps]
-    spots += _street_trees(rng, plan.run_m, streets, (pitch - deep) / 2)
+    low, high = (0, SLABS_WALK_M + 1.0), (plan.run_m, (pitch - deep) / 2 - 2.0)  # between sidewalks and slabs
+    for street, side, _ in itertools.product(streets.tolist(), (-1, 1), range(round(plan.run_m / TREE_M))):
+        x, away = rng.uniform(low, high).tolist()
+        spots.append(Spot(_plant(rng, 5.0), x, street + side * away, rng.uniform(0, 2 * np.pi)))
     return Site(plan.line, spots, _street(plan.line, SLABS_WALK_M, rolling(rng)))
-
-
-def _street_trees(rng: np.random.Generator, run: float, streets: np.ndarray, edge: float) -> list[Spot]:
-    """Trees and bushes at random between the sidewalks and the slabs, `edge` metres from the middle of the street."""
-    spots = []
-    for street, side in itertools.product(streets.tolist(), (-1, 1)):
-        for _ in range(round(run / TREE_M)):
-            x, away = rng.uniform((0, SLABS_WALK_M + 1.0), (run, edge - 2.0)).tolist()
-            plant = _plant(rng, 5.0)
-            spots.append(Spot(plant, x, street + side * away, rng.uniform(0, 2 * np.pi)))
-    return spots
 
 
 def _plant(rng: np.random.Generator, widest: float) -> Thing:
@@ -169,22 +132,20 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     for column, row in itertools.product(columns.tolist(), lines.tolist()):
         building = twin if (column, row) in TWINS else _building(rng, pitch)
         x, y = (column + 0.5) * pitch, (row + 0.5) * pitch
-        spots += [Spot(building, x, y), *_trees_around(rng, x, y, pitch)]
+        spots.append(Spot(building, x, y))
+        for _ in range(int(rng.integers(4, 11))):
+            beside = rng.uniform(-0.5, 0.5) * pitch
+            away = rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
+            dx, dy = ((beside, away), (away, beside))[rng.integers(2)]
+            spots.append(Spot(_plant(rng, 6.0), x + dx, y + dy, rng.uniform(0, 2 * np.pi)))
     spots += along(shifted(line, 2.5), lambda: (post(POLE, 0.15, 4.5),), rng.uniform(18, 26))
     spots += along(shifted(line, -2.6), lambda: (block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40))
-    ends = pitch * np.array([columns[0], columns[-1] + 1, lines[0], lines[-1] + 1])
-    paths = [Strip(each, -1.8, 1.8, SIDEWALK) for each in _paths(pitch, ends)]
-    return Site(line, spots, painted_ground(TERRAIN, paths, rolling(rng)))
-
-
-def _paths(pitch: float, ends: np.ndarray) -> list[Line]:
-    """Middles of all paths between the buildings, along x and along y."""
-    left, right, low, high = ends.tolist()
+    left, right, low, high = (pitch * np.array([columns[0], columns[-1] + 1, lines[0], lines[-1] + 1])).tolist()
     along_x, along_y = np.arange(left, right, STEP_M), np.arange(low, high, STEP_M)
-    return [
-        *(np.stack([along_x, np.full(len(along_x), y)], axis=1) for y in np.arange(low, high + 1, pitch)),
-        *(np.stack([np.full(len(along_y), x), along_y], axis=1) for x in np.arange(left, right + 1, pitch)),
-    ]
+    middles = [np.stack([along_x, np.full(len(along_x), y)], axis=1) for y in np.arange(low, high + 1, pitch)]
+    middles += [np.stack([np.full(len(along_y), x), along_y], axis=1) for x in np.arange(left, right + 1, pitch)]
+    paths = [Strip(middle, -1.8, 1.8, SIDEWALK) for middle in middles]
+    return Site(line, spots, painted_ground(TERRAIN, paths, rolling(rng)))
 
 
 def _building(rng: np.random.Generator, pitch: float) -> Thing:
@@ -197,21 +158,6 @@ def _building(rng: np.random.Generator, pitch: float) -> Thing:
         long, thick = rng.uniform(0.6, 0.95) * (room / 2 - front - deep), rng.uniform(0.2, 0.35) * room
         x, y = rng.choice((-1, 1)) * (wide - thick) / 2, front + deep + long / 2
         parts.append(block(BUILDING, thick, long, high, float(x), y, roughness=0.06, glass=glass))
-    return *parts, *_bicycles(rng, rng.uniform(-0.3, 0.3) * wide, front - 2.6)
-
-
-def _bicycles(rng: np.random.Generator, x: float, y: float) -> list[Part]:
-    """Row of 6 to 16 bicycles along x."""
-    count, every = int(rng.integers(6, 17)), rng.uniform(0.5, 0.8)
-    places = x + every * (np.arange(count) - count / 2)
-    return [bicycle(rng)[0]._replace(x=float(place), y=y, yaw=np.pi / 2) for place in places]
-
-
-def _trees_around(rng: np.random.Generator, x: float, y: float, pitch: float) -> list[Spot]:
-    """Four to ten trees and bushes on the lawn around a building."""
-    spots = []
-    for _ in range(int(rng.integers(4, 11))):
-        along_path, away = rng.uniform(-0.5, 0.5) * pitch, rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
-        dx, dy = ((along_path, away), (away, along_path))[rng.integers(2)]
-        spots.append(Spot(_plant(rng, 6.0), x + dx, y + dy, rng.uniform(0, 2 * np.pi)))
-    return spots
+    x, count, every = rng.uniform(-0.3, 0.3) * wide, int(rng.integers(6, 17)), rng.uniform(0.5, 0.8)
+    stand = (x + every * (np.arange(count) - count / 2)).tolist()
+    return *parts, *(bicycle(rng)[0]._replace(x=place, y=front - 2.6, yaw=np.pi / 2) for place in stand)

@@ -1,12 +1,12 @@
 """Inside of buildings: a corridor with doors, equal rooms along a corridor, and a floor of an office or a hospital."""
 
-import dataclasses
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.sim.objects import BUILDING, OTHER_GROUND, OTHER_OBJECT, Part, Thing, block
+from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT
+from sglpr_jax.sim.objects import Part, Thing, block
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded
@@ -44,7 +44,15 @@ Place = Float[np.ndarray, "2"]
 def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """One straight corridor, or four corridors at right angles around a core, with a door every 5 to 7 m."""
     half, height, pitch, recess = rng.uniform(1.0, 1.4), rng.uniform(2.4, 3.0), rng.uniform(5, 7), rng.uniform(0.1, 0.3)
-    line, corners = _around(rng, length_m) if closed else _straight(length_m)
+    if closed:
+        long = (0.5 + rng.uniform(0, 0.15)) * length_m / 2
+        wide = length_m / 2 - long
+        corners = np.array([(0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide)])
+        line = rounded(corners, corner_m=0.5, closed=True)
+    else:
+        corners = np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
+        x = np.arange(0, length_m, STEP_M)
+        line = np.stack([x, np.zeros(len(x))], axis=1)
     starts = corners if closed else corners[:1]
     spots = []
     for start, stop in zip(starts, np.roll(corners, -1, axis=0), strict=False):
@@ -53,20 +61,6 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     (long, wide), (x, y) = (high - low + 4).tolist(), ((low + high) / 2).tolist()
     ceiling = Spot((block(BUILDING, long, wide, 0.3, bottom=height),), x, y)
     return Site(line, [*spots, ceiling], painted_ground(OTHER_GROUND))
-
-
-def _straight(length_m: float) -> tuple[Line, Line]:
-    """Straight path, and the ends of its corridor."""
-    x = np.arange(0, length_m, STEP_M)
-    return np.stack([x, np.zeros(len(x))], axis=1), np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
-
-
-def _around(rng: np.random.Generator, length_m: float) -> tuple[Line, Line]:
-    """Closed path around a rectangular core, and the corners of its corridors."""
-    long = (0.5 + rng.uniform(0, 0.15)) * length_m / 2
-    wide = length_m / 2 - long
-    corners = np.array([(0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide)])
-    return rounded(corners, corner_m=0.5, closed=True), corners
 
 
 def _corridor_walls(
@@ -80,21 +74,16 @@ def _corridor_walls(
         first = (half if side > 0 else -half) if closed else 0.0
         pieces = max(1, round((length - 2 * first) / pitch))
         each = (length - 2 * first) / pieces
-        thing = _with_door(each, half, height, recess, side)
+        away, part = half + CORRIDOR_WALL_M / 2, (each - DOOR_M) / 2
+        thing = (
+            block(BUILDING, part, CORRIDOR_WALL_M, height, part / 2, side * away),
+            block(BUILDING, DOOR_M, CORRIDOR_WALL_M, height, each / 2, side * (away + recess)),  # door in the middle
+            block(BUILDING, part, CORRIDOR_WALL_M, height, each - part / 2, side * away),
+        )
         for k in range(pieces):
             x, y = (start + (first + k * each) * ahead).tolist()
             spots.append(Spot(thing, x, y, heading))
     return spots
-
-
-def _with_door(each: float, half: float, height: float, recess: float, side: int) -> Thing:
-    """Piece of wall of length `each`, with a door in its middle."""
-    away, part = half + CORRIDOR_WALL_M / 2, (each - DOOR_M) / 2
-    return (
-        block(BUILDING, part, CORRIDOR_WALL_M, height, part / 2, side * away),
-        block(BUILDING, DOOR_M, CORRIDOR_WALL_M, height, each / 2, side * (away + recess)),
-        block(BUILDING, part, CORRIDOR_WALL_M, height, each - part / 2, side * away),
-    )
 
 
 def _visit(x: float, side_m: float, deep_m: float, ahead: int = 1) -> list[tuple[float, float]]:
@@ -151,15 +140,12 @@ def _room_furniture(rng: np.random.Generator, size: float, deep: float) -> Thing
     return tuple(parts)
 
 
-@dataclasses.dataclass(frozen=True)
-class Floor:
+class Floor(NamedTuple):
     """Sizes of a floor, in metres. Wings run along x, from a cross corridor at x = 0 to one at x = `run_m`."""
 
     run_m: float
-    half_m: float
-    """Half width of all corridors."""
-    deep_m: float
-    """Depth of the rooms."""
+    half_m: float  # half width of all corridors
+    deep_m: float  # depth of the rooms
     height_m: float
 
     @property
@@ -168,8 +154,7 @@ class Floor:
         return 2 * (self.half_m + WALL_M + self.deep_m + WALL_M)
 
 
-@dataclasses.dataclass(frozen=True)
-class Room:
+class Room(NamedTuple):
     """Room on the left side of a wing, or on its right side (`side` -1). Positions are in the frame of the wing."""
 
     x_m: float
@@ -188,7 +173,7 @@ def indoor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     floor = Floor(*rng.uniform((22, 1.0, 4.2, 2.5), (30, 1.4, 6.0, 3.2)).tolist())
     count = 2 if closed else int(np.ceil(length_m / (floor.run_m + floor.pitch_m))) + 1
     first, more = _wing(rng, floor), range(count + 2 * WINGS_MORE)
-    wings = [_like(rng, first, floor) if rng.random() < ALIKE else _wing(rng, floor) for _ in more]
+    wings = [[_like(rng, room, floor) for room in first] if rng.random() < ALIKE else _wing(rng, floor) for _ in more]
     line = _tour(floor, [wing[VISITED] for wing in wings[WINGS_MORE : WINGS_MORE + count]], closed)
     spots = [spot for k, wing in enumerate(wings, -WINGS_MORE) for room in wing for spot in _spots(floor, room, k)]
     spots += _shell(floor, count)
@@ -206,18 +191,13 @@ def _wing(rng: np.random.Generator, floor: Floor) -> list[Room]:
             for x, wide in zip(start + np.cumsum(widths) - widths / 2, widths.tolist(), strict=True):
                 front = list(FRONTS)[rng.choice(len(FRONTS), p=list(FRONTS.values()))]
                 wing.append(Room(float(x), wide, side, front, _furniture(rng, wide, floor.deep_m)))
-    wing[VISITED] = dataclasses.replace(wing[VISITED], front="open")
+    wing[VISITED] = wing[VISITED]._replace(front="open")
     return wing
 
 
-def _like(rng: np.random.Generator, wing: list[Room], floor: Floor) -> list[Room]:
-    """The same rooms, partly with other furniture."""
-    return [
-        room
-        if rng.random() < ALIKE
-        else dataclasses.replace(room, furniture=_furniture(rng, room.wide_m, floor.deep_m))
-        for room in wing
-    ]
+def _like(rng: np.random.Generator, room: Room, floor: Floor) -> Room:
+    """The same room, perhaps with other furniture."""
+    return room if rng.random() < ALIKE else room._replace(furniture=_furniture(rng, room.wide_m, floor.deep_m))
 
 
 def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Part]:
@@ -253,9 +233,8 @@ def _tour(floor: Floor, visited: list[Room], closed: bool) -> Line:
 
 def _spots(floor: Floor, room: Room, wing: int) -> list[Spot]:
     """Walls and furniture of a room. Each piece of furniture is left out by itself if the path passes there."""
-    x, y, begin = room.x_m, wing * floor.pitch_m, floor.half_m + WALL_M
-    inside = [(part._replace(y=part.y + begin),) for part in room.furniture]
-    return [Spot(thing, x, y, side=room.side) for thing in (_walls(floor, room), *inside)]
+    inside = [(part._replace(y=part.y + (floor.half_m + WALL_M)),) for part in room.furniture]
+    return [Spot(thing, room.x_m, wing * floor.pitch_m, side=room.side) for thing in (_walls(floor, room), *inside)]
 
 
 def _walls(floor: Floor, room: Room) -> Thing:

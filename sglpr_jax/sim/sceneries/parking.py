@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.sim.objects import BUILDING, PARKING, POLE, Thing, block, car, parked, post
+from sglpr_jax.sim.labels import BUILDING, PARKING, POLE
+from sglpr_jax.sim.objects import Thing, block, car, parked, post
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.sceneries.site import Site, closed_box, grid, jittered, painted_ground, rounded, rows, wall
 from sglpr_jax.sim.world import Levels

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sglpr_jax.sim.drive import shifted
-from sglpr_jax.sim.objects import (
+from sglpr_jax.sim.labels import (
     BUILDING,
     FENCE,
     LANE_MARKING,
@@ -13,15 +13,8 @@ from sglpr_jax.sim.objects import (
     ROAD,
     TERRAIN,
     TRAFFIC_SIGN,
-    Part,
-    Thing,
-    block,
-    car,
-    moving,
-    post,
-    truck,
-    van,
 )
+from sglpr_jax.sim.objects import Part, Thing, block, car, moving, post, truck, van
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, Strip, along, painted_ground, road, rolling

@@ -3,19 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.sim.objects import (
-    BUILDING,
-    OTHER_GROUND,
-    OTHER_OBJECT,
-    PARKING,
-    POLE,
-    TRUNK,
-    VEGETATION,
-    Thing,
-    ball,
-    block,
-    post,
-)
+from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT, PARKING, POLE, TRUNK, VEGETATION
+from sglpr_jax.sim.objects import Thing, ball, block, post
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.sceneries.site import Rows, Site, grid, jittered, painted_ground, rolling, rows, track
 
@@ -48,51 +37,43 @@ def orchard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Rows of trees of one kind and age, 5 to 6.5 m apart, with a tree every 3 to 4.5 m."""
     pitch, spacing, crown = rng.uniform(5, 6.5), rng.uniform(3, 4.5), rng.uniform(2.0, 2.7)
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
-    trees = grid(np.arange(FREE_M, plan.run_m - FREE_M, spacing), across, lambda: _fruit_tree(rng, crown))
+
+    def fruit_tree() -> Thing:
+        wide, high = crown * rng.uniform(0.9, 1.1), crown * rng.uniform(1.0, 1.3)
+        leaves = ball(VEGETATION, wide, high, bottom=0.8, roughness=0.5, porosity=0.5)
+        return post(TRUNK, rng.uniform(0.12, 0.2), 1.8), leaves
+
+    trees = grid(np.arange(FREE_M, plan.run_m - FREE_M, spacing), across, fruit_tree)
     ground = track(plan.line, 1.5, rolling(rng))
     return Site(plan.line, jittered(rng, trees, 0.12, keep=0.97), ground)
-
-
-def _fruit_tree(rng: np.random.Generator, crown: float) -> Thing:
-    """Trunk, and a crown whose width differs by up to 10 % from `crown`."""
-    wide, high = crown * rng.uniform(0.9, 1.1), crown * rng.uniform(1.0, 1.3)
-    leaves = ball(VEGETATION, wide, high, bottom=0.8, roughness=0.5, porosity=0.5)
-    return post(TRUNK, rng.uniform(0.12, 0.2), 1.8), leaves
 
 
 def vineyard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Rows of vines 2.8 to 3.4 m apart, with a post every 4 to 6 m."""
     pitch, every, high, thick = rng.uniform((2.8, 4, 1.6, 0.35), (3.4, 6, 2.2, 0.6)).tolist()
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
+
+    def vines() -> Thing:  # leaves between two posts, and the first post
+        top, wide = high * rng.uniform(0.9, 1.05), thick * rng.uniform(0.8, 1.2)
+        leaves = block(VEGETATION, every, wide, top - 0.6, bottom=0.6, roughness=0.2, porosity=rng.uniform(0.3, 0.6))
+        return leaves, post(POLE, 0.1, high + 0.15, -every / 2)
+
     middles = np.arange(FREE_M, plan.run_m - FREE_M - every, every) + every / 2
-    vines = grid(middles, across, lambda: _vines(rng, every, high, thick))
-    return Site(plan.line, vines, track(plan.line, 1.2, rolling(rng)))
-
-
-def _vines(rng: np.random.Generator, every: float, high: float, thick: float) -> Thing:
-    """Leaves between two posts, with random size and density, and the first post."""
-    top, wide = high * rng.uniform(0.9, 1.05), thick * rng.uniform(0.8, 1.2)
-    leaves = block(VEGETATION, every, wide, top - 0.6, bottom=0.6, roughness=0.2, porosity=rng.uniform(0.3, 0.6))
-    return leaves, post(POLE, 0.1, high + 0.15, -every / 2)
+    return Site(plan.line, grid(middles, across, vines), track(plan.line, 1.2, rolling(rng)))
 
 
 def solar(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Rows of equal panels 7 to 10 m apart. The panels are 8 to 16 m long and tilted by 15 to 30 degrees."""
     pitch, long, deep, tilt, low = rng.uniform((7, 8, 2.2, 15, 0.6), (10, 16, 3.8, 30, 1.0)).tolist()
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(80, 130))
-    panel = _panel(long, deep, np.radians(tilt), low)
-    panels = grid(np.arange(FREE_M + long / 2, plan.run_m - FREE_M - long / 2, long + 0.4), across, lambda: panel)
-    return Site(plan.line, panels, track(plan.line, 1.5, rolling(rng)))
-
-
-def _panel(long: float, deep: float, tilt: float, low: float) -> Thing:
-    """Table of panels along x that rises along y from `low` metres, on two rows of posts."""
+    tilt = np.radians(tilt)
     wide, step = np.cos(tilt) * deep / SLATS, np.sin(tilt) * deep / SLATS
     places = ((np.arange(SLATS) - (SLATS - 1) / 2) * wide).tolist()
     slats = [block(OTHER_OBJECT, long, wide, step + 0.02, y=y, bottom=low + k * step) for k, y in enumerate(places)]
     xs = np.linspace(-long / 2 + 1, long / 2 - 1, 4).tolist()
-    posts = [post(POLE, 0.12, low + k * step, x, places[k]) for k in (1, SLATS - 2) for x in xs]
-    return *slats, *posts
+    panel = *slats, *(post(POLE, 0.12, low + k * step, x, places[k]) for k in (1, SLATS - 2) for x in xs)
+    panels = grid(np.arange(FREE_M + long / 2, plan.run_m - FREE_M - long / 2, long + 0.4), across, lambda: panel)
+    return Site(plan.line, panels, track(plan.line, 1.5, rolling(rng)))
 
 
 def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:

@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.sim.drive import shifted, waves
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief, draw_relief
-from sglpr_jax.sim.objects import BUILDING, OTHER_GROUND, TERRAIN, Part, Thing, block
+from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, TERRAIN
+from sglpr_jax.sim.objects import Part, Thing, block
 from sglpr_jax.sim.placing import HEAD_ROOM_M, Spot, distances, place, to_scene
 from sglpr_jax.sim.routes import Line, Revisit, resampled, travelled
 from sglpr_jax.sim.styles import TOWN
@@ -43,21 +44,18 @@ class Site(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Strip of ground between two distances to the left of a line, in metres.
-
-    With `dash_m`, the strip is dashed. Dashes and gaps have this length, in metres.
-    """
+    """Strip of ground between two distances to the left of a line, in metres."""
 
     line: Line
     low_m: float
     high_m: float
     label: int
-    dash_m: float | None = None
+    dash_m: float | None = None  # length of dashes and gaps
 
 
-def along(line: Line, make: Callable[[], Thing], every_m: float, *, first_m: float = 0.0) -> list[Spot]:
+def along(line: Line, make: Callable[[], Thing], every_m: float) -> list[Spot]:
     """Places things every `every_m` metres along a line, with their x axes along the line."""
-    rows = np.arange(first_m / STEP_M, len(line) - 1, every_m / STEP_M).astype(int)
+    rows = np.arange(0, len(line) - 1, every_m / STEP_M).astype(int)
     ahead = np.gradient(line, axis=0)[rows]
     places = zip(*line[rows].T.tolist(), np.arctan2(ahead[:, 1], ahead[:, 0]).tolist(), strict=True)
     return [Spot(make(), x, y, heading) for x, y, heading in places]
@@ -129,7 +127,7 @@ def closed_box(left: float, right: float, low: float, high: float, height_m: flo
 def build(site: Site, driven: Line, *, clearance_m: float) -> World:
     """Builds the world of a site without standing things closer than `clearance_m` to the driven line."""
     placed = place(site.spots, site.ground)
-    driven = driven if site.levels is None else site.levels.along(driven).xy
+    driven = driven if site.levels is None else site.levels.along(driven)[0]
     low = np.array([part.bottom < HEAD_ROOM_M for part in placed.parts]) & ~placed.shapes.velocity.any(axis=1)
     bad = low & (distances(placed.shapes, driven, reach_m=clearance_m) < clearance_m)
     scene = to_scene(placed, ~np.isin(placed.owner, placed.owner[bad]))
@@ -145,24 +143,16 @@ class Rows(NamedTuple):
 
 
 def road(rng: np.random.Generator, length_m: float, closed: bool) -> tuple[Line, Line]:
-    """Road and its driven part: a straight line or an arc with MARGIN_M at both ends, or a closed ring."""
+    """Road and its driven part: a line or an arc with MARGIN_M at both ends, or two lines and two half circles."""
     if closed:
-        line = ring(length_m, straight=rng.uniform(0, 0.5))
+        straight = rng.uniform(0, 0.5)
+        count = round(length_m * straight / 2 / STEP_M), round(length_m * (1 - straight) / 2 / STEP_M)
+        line = _integrated(np.tile(np.repeat([0.0, np.pi / (count[1] * STEP_M)], count), 2))
         return line, line
     turn = rng.choice((0.0, rng.uniform(-2.5, 2.5)))
     line = _integrated(np.full(round((length_m + 2 * MARGIN_M) / STEP_M), turn / length_m))
     margin = round(MARGIN_M / STEP_M)
     return line, line[margin:-margin]
-
-
-def ring(length_m: float, *, straight: float) -> Line:
-    """Closed line of two straight parts and two half circles.
-
-    The straight parts together are the fraction `straight` of the length.
-    """
-    count = round(length_m * straight / 2 / STEP_M), round(length_m * (1 - straight) / 2 / STEP_M)
-    half = np.repeat([0.0, np.pi / (count[1] * STEP_M)], count)
-    return _integrated(np.tile(half, 2))
 
 
 def _integrated(curvature: Float[np.ndarray, " n"]) -> Line:
@@ -205,14 +195,10 @@ def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: floa
     if revisit == "same":
         line = np.concatenate([line, line[: round((LAPS - 1) * len(line))]])
     out = shifted(line, -right_m)
-    if revisit == "opposite":
-        out = np.concatenate([out, _turn(line, right_m), shifted(line[::-1], -right_m)])
+    if revisit == "opposite":  # a half circle to the left around the end of the line, and back
+        ahead = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+        angle = np.linspace(-np.pi / 2, np.pi / 2, 2 + round(np.pi * right_m / STEP_M))[1:-1, None]
+        turn = line[-1] + right_m * (np.cos(angle) * ahead + np.sin(angle) * np.array([-ahead[1], ahead[0]]))
+        out = np.concatenate([out, turn, shifted(line[::-1], -right_m)])
     out = resampled(out, STEP_M)
     return resampled(shifted(out, sway_m * waves(rng, travelled(out), SWAY_WAVELENGTH_M)), STEP_M)
-
-
-def _turn(line: Line, radius_m: float) -> Line:
-    """Half circle to the left around the end of `line`."""
-    ahead = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
-    angle = np.linspace(-np.pi / 2, np.pi / 2, 2 + round(np.pi * radius_m / STEP_M))[1:-1, None]
-    return line[-1] + radius_m * (np.cos(angle) * ahead + np.sin(angle) * np.array([-ahead[1], ahead[0]]))

@@ -6,22 +6,9 @@ The path leads from one place to the next, or criss-cross through a single one.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from sglpr_jax.sim.objects import (
-    BUILDING,
-    OTHER_GROUND,
-    OTHER_OBJECT,
-    PARKING,
-    POLE,
-    Thing,
-    bicycle,
-    block,
-    bush,
-    car,
-    post,
-    tree,
-)
+from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT, PARKING, POLE
+from sglpr_jax.sim.objects import Thing, bicycle, block, bush, car, post, tree
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded, wall
@@ -95,16 +82,11 @@ def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_
     """Closed path between random corners, each at least half the width of the place from the corner before."""
     low, high = np.array((MARGIN_M, MARGIN_M - wide_m / 2)), np.array((long_m - MARGIN_M, wide_m / 2 - MARGIN_M))
     corners = [rng.uniform(low, high)]
-    while len(corners) < 3 or _around(np.array(corners)) < length_m:
+    while len(corners) < 3 or np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum() < length_m:
         corner = rng.uniform(low, high)
         if np.linalg.norm(corner - corners[-1]) > min(long_m, wide_m) / 2:
             corners.append(corner)
     return rounded(np.array(corners), corner_m=CORNER_M, closed=True)
-
-
-def _around(corners: Float[np.ndarray, "n 2"]) -> float:
-    """Length of a closed polygon, in metres."""
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum())
 
 
 def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -114,7 +96,11 @@ def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     spots = [Spot(plan.walls, 0.0, 0.0)]
     for k in range(plan.count):
         spots += [Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in plan.anywhere(rng, YARD_M2)]
-        spots += _annexes(rng, k * long, long, wide)
+        for side in (-1, 1):  # sheds, stairs and ducts at the two walls along x
+            for place in rng.uniform(2.0, long - 2.0, int(rng.integers(1, 4))).tolist():
+                length, deep, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
+                annex = (block(OTHER_OBJECT, length, deep, high),)
+                spots.append(Spot(annex, k * long + place, side * (wide - deep - 0.3) / 2))
     return Site(plan.line, spots, painted_ground(PARKING))
 
 
@@ -134,16 +120,6 @@ def _lumber(rng: np.random.Generator) -> Thing:
             return car(rng)
         case _:
             return bicycle(rng)
-
-
-def _annexes(rng: np.random.Generator, x: float, long: float, wide: float) -> list[Spot]:
-    """Sheds, stairs and ducts at the two walls along x."""
-    spots = []
-    for side in (-1, 1):
-        for place in rng.uniform(2.0, long - 2.0, int(rng.integers(1, 4))).tolist():
-            length, deep, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
-            spots.append(Spot((block(OTHER_OBJECT, length, deep, high),), x + place, side * (wide - deep - 0.3) / 2))
-    return spots
 
 
 def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
