@@ -80,20 +80,32 @@ def check_holds_only(folder: Path, names: Collection[str]) -> None:
 
 
 @contextlib.contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Lock an existing folder against other processes of this computer that also lock it.
+def exclusive_lock(folder: Path) -> Iterator[None]:
+    """Create a folder and lock it against other processes of this computer. At the end, remove it if it is empty.
 
     The lock is a file in the system's temporary folder. It ends with the process.
 
     Raises:
       BlockingIOError: If another process holds the lock.
+      NotADirectoryError: If the path leads through a file.
     """
     import filelock  # slow import
 
+    there = next(one for one in (folder, *folder.parents) if one.exists())
+    if not there.is_dir():
+        raise NotADirectoryError(f"{there}: expected a folder to write into, found a file")
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    with writing(folder, *folder.parents):
+        folder.mkdir(parents=True, exist_ok=True)
     name = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
     try:
         with filelock.FileLock(Path(tempfile.gettempdir()) / f"sglpr-jax-{name}.lock", timeout=0):
-            yield
+            try:
+                yield
+            finally:
+                with contextlib.suppress(OSError):  # not empty
+                    for one in made or [folder]:
+                        one.rmdir()
     except filelock.Timeout as error:
         raise BlockingIOError(f"{folder}: expected exclusive use, found another process at work") from error
 

@@ -4,14 +4,17 @@ Each record has a number, its length and a checksum. A damaged record is skipped
 The end of an unfinished record is removed when the file is read.
 """
 
+import json
 import mmap
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
-from sglpr_jax.files import writing
+from sglpr_jax.data.warning import warn
+from sglpr_jax.files import parse_json, writing
 
 HEAD = struct.Struct("<4sIII")
 """Bytes before a record: `MARK`, number, length, and CRC-32 of the record that begins with the CRC of its number."""
@@ -54,7 +57,7 @@ class FrameLog:
         if not ours and not end:
             raise ValueError(f"{self.path}: expected a log of frames, found another file")
         self.cut = self._size - end
-        self._truncate(end)
+        self.truncate(end)
 
     def append(self, number: int, record: bytes) -> None:
         """Add a record. It survives a kill of the process, and with `sync` a loss of power.
@@ -69,7 +72,7 @@ class FrameLog:
                 while done < len(content):
                     done += os.write(self._file, content[done:])
             except OSError:
-                self._truncate(self._size)
+                self.truncate(self._size)
                 raise
         self._size += len(content)
 
@@ -85,10 +88,69 @@ class FrameLog:
         finally:
             os.close(self._file)
 
-    def _truncate(self, size: int) -> None:
+    def truncate(self, size: int) -> None:
+        """Remove everything after the first `size` bytes."""
         with writing(self.path):
             os.ftruncate(self._file, size)
         self._size = size
+
+
+class RunLog:
+    """Log of a run. A run that was killed resumes after its last whole step, if its settings are the same.
+
+    Example:
+      with RunLog(path, settings) as log:
+          done = log.records            # steps of an earlier process
+          log.append(len(done), record)
+    """
+
+    def __init__(self, path: Path | None, settings: Mapping[str, Any]):
+        """Open or create a log. With other settings, warn and delete its steps.
+
+        Arguments:
+          path: File of the log, or None to keep nothing.
+          settings: JSON values that determine the steps.
+
+        Raises:
+          ValueError: If the file is no log of a run.
+          WriteError: If it cannot be written.
+        """
+        self.records: list[bytes] = []
+        """Steps of an earlier process."""
+        self.path, self._log = path, None
+        if path is None:
+            return
+        with writing(path, *path.parents):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        self._log, found = FrameLog(path), list[bytes]()
+        for number, record in self._log.records():
+            if number <= len(found):  # later records follow a damaged one
+                found[number:] = [record]
+        wanted = json.loads(json.dumps(settings))
+        known = parse_json(found[0], source=path) if found else None
+        if known != wanted:
+            if found:
+                other = ", ".join(name for name in wanted if known.get(name) != wanted[name])
+                warn(f"{path}: expected a checkpoint with the same settings, found another {other}; restarting")
+            self._log.truncate(0)
+            self._log.append(0, json.dumps(wanted).encode())
+        else:
+            self.records = found[1:]
+
+    def __enter__(self) -> "RunLog":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._log is not None:
+            self._log.close()
+
+    def append(self, step: int, record: bytes) -> None:
+        """Add a step, counted from 0. It replaces that step of an earlier process and all after it.
+
+        Raises WriteError if it cannot be written.
+        """
+        if self._log is not None:
+            self._log.append(step + 1, record)
 
 
 def _record(content: mmap.mmap, at: int) -> tuple[int, bytes] | None:

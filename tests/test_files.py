@@ -11,8 +11,8 @@ from sglpr_jax.files import (
     MOST_BYTES,
     MOST_SHOWN,
     WriteError,
-    alone_in,
     check_writable,
+    exclusive_lock,
     file_name,
     half_written,
     json_in_short,
@@ -88,14 +88,16 @@ def test_several_that_replace_one_folder_at_once_all_end_well(tmp_path, monkeypa
 
 
 def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path):
+    folder = tmp_path / "new" / "folder"
     with (
-        alone_in(tmp_path),
-        pytest.raises(BlockingIOError, match=rf"^{tmp_path}: expected .* found another process"),
-        alone_in(tmp_path),
+        exclusive_lock(folder),
+        pytest.raises(BlockingIOError, match=rf"^{folder}: expected .* found another process"),
+        exclusive_lock(folder),
     ):
         pass
-    with alone_in(tmp_path):
-        assert names(tmp_path) == []
+    with exclusive_lock(folder):
+        assert names(folder) == []
+    assert names(tmp_path) == []
 
 
 def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files):

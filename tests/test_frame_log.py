@@ -1,9 +1,12 @@
 """A log returns the records that were appended, but for a damaged one or the end of an unfinished one."""
 
+import json
+
 import pytest
 
+from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
-from sglpr_jax.frame_log import HEAD, FrameLog
+from sglpr_jax.frame_log import HEAD, FrameLog, RunLog
 
 RECORDS = [(0, b"first"), (1, b"second" * 9), (2, b"\0third")]
 ENDS = [HEAD.size + 5, 2 * HEAD.size + 59, 3 * HEAD.size + 65]
@@ -56,3 +59,25 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(WriteError, match="file"):
         FrameLog(tmp_path / "file" / "frames.log")
+
+
+def test_a_run_resumes_after_its_last_whole_step_with_the_same_settings_alone(tmp_path):
+    path, settings = tmp_path / "new" / "run.log", {"weights": "a", "sizes": (1, 2)}
+    with RunLog(path, settings) as log:
+        for step in range(4):
+            log.append(step, b"step %d" % step)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"step 2")] ^= 1
+    path.write_bytes(content)
+    with RunLog(path, settings) as log:
+        assert log.records == [b"step 0", b"step 1"]
+        log.append(2, b"again")
+    with RunLog(path, settings) as log:
+        assert log.records == [b"step 0", b"step 1", b"again"]
+        log.append(1, b"other")
+    assert RunLog(path, settings).records == [b"step 0", b"other"]
+    with pytest.warns(DataWarning, match=rf"{path}: expected .* the same settings, found another weights; restarting"):
+        assert RunLog(path, {**settings, "weights": "b"}).records == []
+    assert json.loads(path.read_bytes()[HEAD.size :]) == {"weights": "b", "sizes": [1, 2]}
+    with RunLog(None, {}) as log:
+        log.append(0, b"is not kept")

@@ -32,9 +32,10 @@ from benchmarks.quality.scoring import REPEATING_M, STOREY_M, WAY_M, pose_errors
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.files import replacing
+from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.loops.acceptance import accepted
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.checkpoint import columns, compared_of
+from sglpr_jax.loops.checkpoint import frame_bytes, read_frame
 from sglpr_jax.loops.config import MIN_CELLS
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
@@ -175,22 +176,18 @@ def compared(
     With `breaks`, the motion is unknown in the middle of the drive.
     """
     finder = finder_of(params)
-    name = f"{path.stem}-{_settings(finder, odometry)}{'-broken' * breaks}.npz"
+    name = f"{path.stem}-{_settings(finder, odometry)}{'-broken' * breaks}.log"
     path = path.parent / "compared" / name
-    if path.exists():
-        with np.load(path) as file:
-            return compared_of(dict(file))
-    poses = drive.odometry(odometry)
-    found = []
-    for i, (seen, stamp) in enumerate(zip(drive.seen, drive.times.tolist(), strict=True)):
-        pose = None if poses is None else poses[i]
-        finder.add_seen(seen, time=stamp, odometry=pose, continues=not (breaks and i == len(drive.seen) // 2))
-        found.append(finder.compared)
-    kept = columns(found)
-    path.parent.mkdir(exist_ok=True, parents=True)
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **kept)
-    return compared_of(kept)
+    if not path.exists():
+        poses = drive.odometry(odometry)
+        with replacing(path) as temporary:
+            log = FrameLog(temporary)
+            for i, (seen, stamp) in enumerate(zip(drive.seen, drive.times.tolist(), strict=True)):
+                pose = None if poses is None else poses[i]
+                finder.add_seen(seen, time=stamp, odometry=pose, continues=not (breaks and i == len(drive.seen) // 2))
+                log.append(i, frame_bytes(None, finder.compared))
+            log.close()
+    return [read_frame(content, i, {}, source=path)[1] for i, content in FrameLog(path).records()]
 
 
 def _settings(finder: CandidateFinder, odometry: Odometry) -> str:

@@ -12,6 +12,7 @@ import tyro
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import DetectorFlags
 from sglpr_jax.cli.runtime import parse_command, print_error, run, stop_on_signal
+from sglpr_jax.files import exclusive_lock
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -90,9 +91,8 @@ def run_node(
     """
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.results import corrected_trajectory, write_results
-    from sglpr_jax.loops.checkpoint import alone
 
-    with alone(command.out), contextlib.ExitStack() as opened:
+    with exclusive_lock(command.out), contextlib.ExitStack() as opened:
         found = _map(command, report)
         opened.callback(found.close)
         missed = found.recall()

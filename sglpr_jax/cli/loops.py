@@ -12,6 +12,7 @@ from sglpr_jax.cli.detector_config import DetectorFlags
 from sglpr_jax.cli.recording import AUTO, PosedRecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
+from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
@@ -96,10 +97,8 @@ class LoopsCommand(DetectorFlags):
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.checkpoint import alone  # slow import, not needed for --help
-
     _check(command)
-    with alone(command.out / UNFINISHED):
+    with exclusive_lock(command.out / UNFINISHED):
         return _search(command)
 
 

@@ -11,6 +11,7 @@ from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
+from sglpr_jax.files import exclusive_lock, naming
 from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
@@ -76,7 +77,6 @@ class MapCommand:
 
 def write_map(command: MapCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.checkpoint import alone
     from sglpr_jax.models.weights_file import load
 
     if command.out.suffix != ".safetensors":
@@ -84,12 +84,11 @@ def write_map(command: MapCommand) -> int:
     if command.out.is_dir():
         raise IsADirectoryError(f"{command.out}: expected a file to write, found a folder")
     params = load(command.weights)
-    with alone(command.out.with_suffix(UNFINISHED)):  # locked from reading the old map until the new one is written
+    with exclusive_lock(command.out.with_suffix(UNFINISHED)):  # until the new map replaces the one that is read
         return _add_places(command, params)
 
 
 def _add_places(command: MapCommand, params: "Params") -> int:
-    from sglpr_jax.files import naming
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id

@@ -5,32 +5,26 @@ import dataclasses
 import json
 import os
 import time
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import safetensors.numpy
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
-from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.files import in_short, parse_json, read_json, write_json, writing
+from sglpr_jax.files import parse_json, read_json, write_json, writing
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.messages import LiveFrame, LoopEdge, Report
 from sglpr_jax.live.odometry_input import Clock, Continuity, FirstScans
 from sglpr_jax.loops.arguments import given_pose
 from sglpr_jax.loops.candidates import Compared
-from sglpr_jax.loops.checkpoint import COLUMNS, columns, compared_of
+from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
-from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT = "sglpr-jax live 4"
 SETTINGS, FRAMES, LOOPS = "settings.json", "frames.log", "loops.jsonl"
 OLD = "journal.bin"
 """File of the scans in maps of earlier versions, which are not read."""
@@ -38,15 +32,8 @@ SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""
 MOST_WALL_S = 1e8
 """Maximum time between two processes that is believed, in seconds."""
-ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int, "mounting": dict | None}
+ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int}
 """JSON values of each scan in the log."""
-ARRAYS = {
-    "descriptor": Column("float32", ("d",)),
-    "image": Column("uint8", ("h", "h")),
-    "pose": Column("float64", (4, 4), optional=True),
-    **{name: COLUMNS[name] for name in ("counts", "fitted", "fits", "links")},
-}
-"""Arrays of each scan in the log."""
 
 
 class LiveScan(NamedTuple):
@@ -111,7 +98,7 @@ class LiveMap:
         self._clock = Clock(report)
         self._continuity = Continuity(report, expected=expects_odometry)
         self._mounting = FirstScans(sensor_height)
-        about = {"format": FORMAT, "weights": detector.finder.index.weights_hash, "sensor_height": sensor_height}
+        about = {"format": FRAME_FORMAT, "weights": detector.finder.index.weights_hash, "sensor_height": sensor_height}
         _check_settings(folder, {**about, **dataclasses.asdict(detector.config)})
         self._log: FrameLog | None = FrameLog(folder / FRAMES)
         self._loops_path, self._loops_file = folder / LOOPS, -1
@@ -139,7 +126,8 @@ class LiveMap:
         assert self._log is not None
         scan, lost, known = None, 0, True
         for frame, content in self._log.records():
-            scan = from_bytes(content, frame, source=self._log.path)
+            seen, compared, pose, about = read_frame(content, frame, ABOUT, source=self._log.path)
+            scan = LiveScan(seen, compared, pose, **about)
             known = scan.part == self._part
             for _ in range(len(self), frame):
                 self._extend(scan._replace(seen=None, compared=None, name=""))
@@ -225,7 +213,9 @@ class LiveMap:
         if self._log is None:
             return
         try:
-            self._log.append(len(self) - 1, to_bytes(scan))
+            assert scan.compared is not None
+            about = {name: getattr(scan, name) for name in ABOUT}
+            self._log.append(len(self) - 1, frame_bytes(scan.seen, scan.compared, pose=scan.pose, **about))
             with writing(self._loops_path):
                 os.write(self._loops_file, loop_lines(loops).encode())
             if time.monotonic() - self._synced > SYNC_S:
@@ -248,44 +238,6 @@ class LiveMap:
         return LoopEdge(loop.query, loop.match, *times, *found, query, match, time.monotonic() - received)
 
 
-def to_bytes(scan: LiveScan) -> bytes:
-    """Return the compressed bytes of a scan."""
-    assert scan.seen is not None and scan.compared is not None
-    arrays = {"descriptor": scan.seen.descriptor, "image": scan.seen.image, **columns([scan.compared])}
-    if scan.pose is not None:
-        arrays["pose"] = np.asarray(scan.pose, np.float64)
-    mounting = None if scan.seen.mounting is None else scan.seen.mounting.fields
-    about = {**{name: getattr(scan, name) for name in ABOUT if name != "mounting"}, "mounting": mounting}
-    contiguous = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-    text = json.dumps({"format": FORMAT, **about})
-    return zlib.compress(tensors_as_bytes(contiguous, {"scan": text}), 1)
-
-
-def from_bytes(content: bytes, frame: int, *, source: Path) -> LiveScan:
-    """Return the scan of `to_bytes`, which has this frame number.
-
-    Raises ValueError, which names `source`, if the content is invalid.
-    """
-    try:
-        plain = zlib.decompress(content)
-        arrays = safetensors.numpy.load(plain)
-        size = int.from_bytes(plain[:8], "little")
-        about = json.loads(json.loads(plain[8 : 8 + size])["__metadata__"]["scan"])
-        check_about(about, ABOUT, format=FORMAT)
-        check_columns(arrays, ARRAYS, n=1)
-        fitted = arrays["fitted"]
-        if arrays["counts"][0] != len(fitted) or ((fitted < 0) | (fitted >= frame)).any():
-            raise ValueError(f"expected comparisons of frame {frame}, found others")
-        mounting = about.pop("mounting")
-        mounting = None if mounting is None else Mounting(**{**mounting, "up": tuple(mounting["up"])})
-    except Exception as error:  # another program may have written it
-        raise ValueError(f"{source}: expected scan {frame} of a live map, found others ({in_short(error)})") from error
-    (compared,) = compared_of(arrays)
-    seen = Seen(arrays["descriptor"], arrays["image"], mounting)
-    known = {name: about[name] for name in ABOUT if name != "mounting"}
-    return LiveScan(seen, compared, arrays.get("pose"), **known)
-
-
 def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
     """Write the settings of a new map, or raise ValueError if those in the folder are others."""
     wanted, path = json.loads(json.dumps(wanted)), folder / SETTINGS
@@ -294,8 +246,8 @@ def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
     if not (folder / FRAMES).exists():
         return write_json(path, wanted)
     found = read_json(path)
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise ValueError(f"{path}: expected the settings of a live map ({FORMAT}), found others; use another --out")
+    if not isinstance(found, dict) or found.get("format") != FRAME_FORMAT:
+        raise ValueError(f"{path}: expected the settings of a live map ({FRAME_FORMAT}), found others; use another --out")
     other = [name for name, value in wanted.items() if not _holds(found.get(name), value)]
     if other:
         raise ValueError(

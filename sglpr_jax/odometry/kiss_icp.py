@@ -1,5 +1,6 @@
 """Odometry from the scans alone, by kiss-icp (extra `odometry`): one pose of the LiDAR for each scan."""
 
+import dataclasses
 import importlib
 from collections import deque
 from collections.abc import Callable
@@ -17,8 +18,9 @@ from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.warning import warn
+from sglpr_jax.frame_log import RunLog
 from sglpr_jax.odometry.config import OdometryConfig
-from sglpr_jax.odometry.kept_poses import KeptPoses, settings_hash
+from sglpr_jax.retrieval.reuse import fingerprint
 from sglpr_jax.se3 import inverse, transformed
 
 MIN_POINTS = 100
@@ -68,7 +70,7 @@ def scan_odometry(
       recording: The scans, about 10 a second.
       config: Settings of kiss-icp.
       scale: Factor for all lengths, as in `find_loops`. With 4, the default range is 25 m and the voxels .25 m.
-      kept_in: Checkpoint file (.npz) of this recording and these settings, from which a stopped call resumes. It stays.
+      kept_in: Checkpoint file of this recording and these settings, from which a stopped call resumes. It stays.
       on_bad_scan: Called with id and error of an unreadable scan.
       should_stop: If it returns True, the poses of the scans so far are returned.
       on_progress: Called with the number of processed scans.
@@ -84,32 +86,45 @@ def scan_odometry(
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans for odometry, found ready-made images")
     check_installed()
-    made_from = settings_hash(recording, config, scale=scale, version=version("kiss-icp"))
-    kept = KeptPoses(None if kept_in is None else Path(kept_in), made_from, scans=len(recording))
-    if len(kept) < len(recording):
-        options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-        _register(recording, kept, _FrontEnd(config), scale, **options)
-    poses = scaled_poses(np.array(kept.poses).reshape(-1, 4, 4), 1 / scale)
-    return _at_times_of_scans(poses, recording, np.array(kept.ends))
+    path, known = None if kept_in is None else Path(kept_in), np.zeros((0, 17))
+    with RunLog(path, {} if path is None else _settings(recording, config, scale)) as log:
+        if log.records:
+            known = np.frombuffer(b"".join(log.records)).reshape(-1, 17)
+        if len(known) < len(recording):
+            options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
+            known = _register(recording, log, known, _FrontEnd(config), scale, **options)
+    poses = scaled_poses(known[:, :16].reshape(-1, 4, 4), 1 / scale)
+    return _at_times_of_scans(poses, recording, known[:, 16])
 
 
-def _register(recording: Recording, kept: KeptPoses, front_end: "_FrontEnd", scale: Scale, **options: Any) -> None:
-    """Add the poses of all further scans to `kept`, and warn of doubtful ones."""
+def _settings(recording: Recording, config: OdometryConfig, scale: Scale) -> dict[str, Any]:
+    """All that determines the poses."""
+    scans = [recording.name, fingerprint(recording, contents="some")]
+    return {"scans": scans, "kiss-icp": version("kiss-icp"), "scale": scale, **dataclasses.asdict(config)}
+
+
+def _register(
+    recording: Recording,
+    log: RunLog,
+    known: Float[np.ndarray, "k 17"],
+    front_end: "_FrontEnd",
+    scale: Scale,
+    **options: Any,
+) -> Float[np.ndarray, "n 17"]:
+    """Pose of each scan and time of its last point. Adds new ones to the log, and warns of doubtful ones."""
     timed = has_point_times(recording)
-    known, registered = list(kept.poses), dict[int, _Registered]()
-    try:
-        for row, given in scan_stream(scaled(recording, scale), lambda _, record: _input(record, timed), **options):
-            pose = known[row] if row < len(known) else None
-            found = front_end.add(given, known=pose)
-            if given is not None:
-                registered[row] = found
-            if pose is None:
-                kept.add(found.pose, 0.0 if given is None else float(given.times.max(initial=0)))
-    finally:
-        kept.write()
-    if len(kept) == len(recording):
+    rows, registered = list(known), dict[int, _Registered]()
+    for row, given in scan_stream(scaled(recording, scale), lambda _, record: _input(record, timed), **options):
+        found = front_end.add(given, known=known[row, :16].reshape(4, 4) if row < len(known) else None)
+        if given is not None:
+            registered[row] = found
+        if row >= len(known):
+            rows.append(np.append(found.pose, 0.0 if given is None else given.times.max(initial=0)))
+            log.append(row, rows[row].tobytes())
+    if len(rows) == len(recording):
         check_readable(recording, len(registered))
         _warn_of_doubtful(recording, registered)
+    return np.array(rows).reshape(-1, 17)
 
 
 class _FrontEnd:

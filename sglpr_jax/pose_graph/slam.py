@@ -75,7 +75,7 @@ def slam(
         opened,
         config=odometry,
         scale=scale,
-        kept_in=None if folder is None else folder / "odometry.npz",
+        kept_in=None if folder is None else folder / "odometry.log",
         on_bad_scan=on_bad_scan,
     )
     found = find_loops(

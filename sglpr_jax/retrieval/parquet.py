@@ -169,7 +169,7 @@ def embed_to_store(
     method = network(method) if isinstance(method, Params) else method
     made = [method.weights_hash, method.about, options.get("rotation_seed"), scale_of(recording)]
     hashed = hashlib.sha256(json.dumps(made).encode()).hexdigest()[:12]
-    name = file_name(f"{recording.name}-{fingerprint(recording, contents=True)}")
+    name = file_name(f"{recording.name}-{fingerprint(recording, contents='all')}")
     folder = f"{store.rstrip('/')}/{file_name(method.about['method'])}-{hashed}"
     address = f"{folder}/{name}.parquet"
     with usable(address):

@@ -5,10 +5,9 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from sglpr_jax.data.corruption import CLEAN, ROTATION, Corruption, corrupted
 from sglpr_jax.data.recording import Recording
@@ -60,44 +59,51 @@ def embed_or_reuse(
     return file
 
 
-def fingerprint(recording: Recording, *, contents: bool = False) -> str:
-    """Hash a recording, by default without reading its scans.
+def fingerprint(recording: Recording, *, contents: Literal["none", "some", "all"] = "none") -> str:
+    """Hash a recording: ids, files, read options, mounting, positions and times.
 
-    The hash covers ids, files, read options, mounting, positions and times. Files of scans and labels, or those of a
-    bag, count by their size and modification time, or with `contents` by their bytes. Copies then have equal hashes.
+    Files of scans and labels, or those of a bag, count by their size and modification time. Sizes and times may agree
+    by chance, so with `contents="some"` the bytes of the first, the middle and the last scan count, too. With "all" the
+    bytes of all files count instead. Copies then have equal hashes.
     """
-    state = _content if contents else _state
+    state = _content if contents == "all" else _state
     files = (recording.containers or recording.paths, recording.label_paths)
-    scans, labels = ([state(path) for path in paths] for paths in files)
+    scans, labels = ([None if path is None or not path.is_file() else state(path) for path in paths] for paths in files)
     mounting = None if recording.mounting is None else recording.mounting.fields
     digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
-    for values in (recording.positions, recording.times, each_mounting(recording)):
+    each = None
+    if recording.mountings is not None:
+        each = np.array([(one.height_m, *one.up) for one in recording.mountings])
+    for values in (recording.positions, recording.times, each):
         if values is not None:
             digest.update(values.tobytes())
+    if contents == "some" and len(recording):
+        for row in sorted({0, len(recording) // 2, len(recording) - 1}):
+            digest.update(_scan_bytes(recording, row))
     return digest.hexdigest()[:16]
 
 
-def each_mounting(recording: Recording) -> Float[np.ndarray, "n 4"] | None:
-    """Height and up of the sensor at each scan, or None if one mounting holds for all."""
-    if recording.mountings is None:
-        return None
-    return np.array([(one.height_m, *one.up) for one in recording.mountings])
-
-
-def _state(path: Path | None) -> tuple[int, int] | None:
-    """Size and modification time of a file, or None if it does not exist."""
-    if path is None or not path.is_file():
-        return None
+def _state(path: Path) -> tuple[int, int]:
+    """Size and modification time of a file."""
     found = path.stat()
     return found.st_size, found.st_mtime_ns
 
 
-def _content(path: Path | None) -> str | None:
-    """Hash of the bytes of a file, or None if it does not exist."""
-    if path is None or not path.is_file():
-        return None
+def _content(path: Path) -> str:
+    """Hash of the bytes of a file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _scan_bytes(recording: Recording, row: int) -> bytes:
+    """Bytes of a scan's file, or its points in a bag. Empty if the scan cannot be read, which the caller reports."""
+    path = recording.paths[row]
+    if path.is_file():
+        return path.read_bytes()
+    if recording.containers:
+        with contextlib.suppress(ValueError, OSError):
+            return recording.points(row).tobytes()
+    return b""
 
 
 def _settings(method: Method, recording: Recording, corruption: Corruption, seed: int) -> dict[str, Any]:
@@ -123,25 +129,3 @@ def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
                 f"{json_in_short(found.get(name))}; choose another --out, or delete the file"
             )
     return file
-
-
-def scans_sample(recording: Recording) -> str:
-    """Hash the bytes of the first, the middle and the last scan file, or the points of these scans of a bag.
-
-    Sizes and times of files may agree by chance.
-    """
-    digest = hashlib.sha256()
-    for row in sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ()):
-        path = recording.paths[row]
-        if path.is_file():
-            digest.update(path.read_bytes())
-        elif recording.containers:
-            digest.update(_points(recording, row))
-    return digest.hexdigest()[:16]
-
-
-def _points(recording: Recording, row: int) -> bytes:
-    """Points of a scan as bytes. Empty if the scan cannot be read, which the search reports."""
-    with contextlib.suppress(ValueError, OSError):
-        return recording.points(row).tobytes()
-    return b""

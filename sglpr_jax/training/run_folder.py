@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 
-from sglpr_jax.files import alone_in, read_json, remove_half_written, write_json
+from sglpr_jax.files import exclusive_lock, read_json, remove_half_written, write_json
 
 CONFIG_FILE = "config.json"
 ENVIRONMENT_FILE = "environment.json"
@@ -47,8 +47,7 @@ def claimed(
     path = folder / CONFIG_FILE
     if resume:
         require_same_settings(folder, settings, limits=limits)
-    folder.mkdir(parents=True, exist_ok=True)
-    with alone_in(folder):
+    with exclusive_lock(folder):
         if path.exists() and not resume:
             raise FileExistsError(
                 f"{folder}: there is a run already; resume it (--resume) or choose another folder (--out)"

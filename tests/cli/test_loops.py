@@ -9,8 +9,8 @@ from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.readers import open_recording
+from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops import search
-from sglpr_jax.loops.checkpoint import alone
 from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.models.weights_file import load
@@ -189,7 +189,7 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
 @pytest.mark.slow
 def test_two_processes_do_not_search_into_one_folder(command, town, tmp_path):
     out = tmp_path / "found"
-    with alone(out / "unfinished"):
+    with exclusive_lock(out / "unfinished"):
         ended = command("loops", town, "--seq", "08", "--out", out)
     assert_one_line_error(ended, "unfinished: expected exclusive use, found another process at work")
     assert not out.exists()

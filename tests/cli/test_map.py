@@ -10,7 +10,7 @@ from rich.console import Console
 import sglpr_jax
 from sglpr_jax.cli.relocalize import _table
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.loops.checkpoint import alone
+from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.maps import build as recorded
 from sglpr_jax.maps.build import map_recording
@@ -164,7 +164,7 @@ def test_a_map_of_another_frame_is_aligned_or_rejected(command, town, poses, tmp
 
 def test_two_processes_do_not_make_one_map(command, town, poses, tmp_path):
     out = tmp_path / "town.safetensors"
-    with alone(out.with_suffix(".unfinished")):
+    with exclusive_lock(out.with_suffix(".unfinished")):
         ended = command("map", town, "--seq", "08", "--poses", poses, "--out", out)
     assert_one_line_error(ended, "town.unfinished: expected exclusive use, found another process at work")
     assert [path.name for path in tmp_path.iterdir()] == ["poses.tum"]

@@ -4,8 +4,6 @@ import dataclasses
 import itertools
 import os
 import shutil
-import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +11,12 @@ import pytest
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.frame_log import FrameLog
-from sglpr_jax.live.live_map import FRAMES, LOOPS, OLD, SETTINGS, LiveMap, LiveScan, from_bytes, to_bytes
+from sglpr_jax.live.live_map import FRAMES, LOOPS, OLD, SETTINGS, LiveMap
 from sglpr_jax.live.results import CorrectedTrajectory, write_results
-from sglpr_jax.loops.candidates import Compared
-from sglpr_jax.loops.comparison import NO_FITS, Fits
+from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
-from sglpr_jax.odometry.bev_odometry import Link
 from sglpr_jax.pose_graph.files import read_loops_jsonl
 from sglpr_jax.registration.bev_search import Peak
 from sglpr_jax.se3 import inverse
@@ -169,26 +165,3 @@ def test_a_full_disk_is_reported_and_the_map_lives_on(drive, params, tmp_path, s
             assert live.add(live_frame(drive, i)) == []
     assert len(live) == 2 and said.kinds == ["disk"] and "No space left" in said[0][1]
     live.close()
-
-
-def live_scan(fits: Fits, **more) -> LiveScan:
-    given = {"pose": np.eye(4), "part": 2, "name": "a", "stamp": 1.0, "time": 2.0, "wall": 3.0}
-    return LiveScan(SEEN, Compared(fits, Link(*DRAW.normal(size=6))), **given | more)
-
-
-@pytest.mark.parametrize("scan", [live_scan(FITS), live_scan(NO_FITS, pose=None)])
-def test_a_scan_comes_back_from_its_bytes(scan):
-    found = from_bytes(to_bytes(scan), 5, source=Path("frames.log"))
-    assert found.seen.mounting == scan.seen.mounting and found[3:] == scan[3:]
-    np.testing.assert_array_equal(found.seen.image, scan.seen.image)
-    np.testing.assert_array_equal(found.compared.fits.frames, scan.compared.fits.frames)
-    np.testing.assert_array_equal(np.stack(found.compared.fits.peaks), np.stack(scan.compared.fits.peaks))
-    np.testing.assert_array_equal(found.compared.link, scan.compared.link)
-    assert (found.pose is None) == (scan.pose is None)
-
-
-def test_fits_with_later_scans_and_damaged_bytes_are_refused():
-    content = to_bytes(live_scan(FITS))
-    for wrong, frame in ((content, 4), (content[:-9], 5), (zlib.compress(b"no scan"), 5)):
-        with pytest.raises(ValueError, match=rf"frames\.log: expected scan {frame} of a live map, found others"):
-            from_bytes(wrong, frame, source=Path("frames.log"))

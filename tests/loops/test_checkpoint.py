@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import os
 from pathlib import Path
 
@@ -13,13 +14,15 @@ import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import acceptance, checkpoint, search
+from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
+from sglpr_jax.odometry.bev_odometry import Link
 from sglpr_jax.pose_graph.folder import write_found
+from sglpr_jax.registration.bev_search import Peak
 from sglpr_jax.registration.gicp import Registration
-from sglpr_jax.retrieval.index import Index
-
-from .kept import WANTED, fake_frames, keep, recalled
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
@@ -27,7 +30,10 @@ ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 10.0), "e
 find_loops = functools.partial(search.find_loops, model=ALWAYS)
 """Every candidate is probable, so that the loops depend on nothing but what is kept."""
 CONFIG = DetectorConfig(candidates=CandidateConfig(recent_m=20.0))
-EMPTY = Index.empty(4, weights_hash="w")
+DRAW = np.random.default_rng(0)
+FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(5, 2))))
+SEEN = Seen(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))
+ABOUT = {"name": str, "wall": float}
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +45,6 @@ def twice(drive):
     )
     clouds = {path: drive.points(drive.paths.index(path)) for path in parts["paths"]}
     return with_points(recording, clouds.__getitem__), drive.poses.world_from_lidar[list(ROWS)]
-
-
-@pytest.fixture(autouse=True)
-def _small_files(monkeypatch):
-    monkeypatch.setattr(checkpoint, "FRAMES", 5)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,6 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
         assert done[0] == (reached[-2] if len(reached) > 1 else 1)
     assert reached == [3, 7, 16, 24]
     assert contents(found, tmp_path / "found") == files
-    (tmp_path / "kept" / f".000024.safetensors.{32 * 'a'}.tmp").write_bytes(b"half")
     checkpoint.remove(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
 
@@ -102,29 +102,23 @@ def test_a_run_that_forgets_scans_goes_on_too_and_other_limits_are_other_setting
 
 
 @pytest.mark.slow
-def test_what_is_damaged_is_seen_again_and_what_others_made_is_thrown_away(twice, params, whole, tmp_path):
+def test_after_a_damaged_frame_scans_are_described_again_and_other_settings_restart(twice, params, whole, tmp_path):
     recording, odometry = twice
-    kept = tmp_path / "kept"
-    options = {"config": CONFIG, "kept_in": kept}
+    options, log = {"config": CONFIG, "kept_in": tmp_path / "kept"}, tmp_path / "kept" / checkpoint.LOG
     find_loops(recording, params, odometry=odometry, **options, should_stop=stopping_after(16, []))
-    files = sorted(path.name for path in kept.iterdir())
-    assert files == [f"{first:06d}.safetensors" for first in (0, 5, 10, 15)] + ["settings.json"]
-    content = (kept / "000010.safetensors").read_bytes()
-    (kept / "000010.safetensors").write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    done = []
-    found = find_loops(recording, params, odometry=odometry, **options, on_progress=done.append)
-    assert done[0] == 10 and contents(found, tmp_path / "found") == whole[1]
-
-    (kept / "mine.txt").write_text("not to be removed")
-    for change in ({"odometry": odometry + 0.0, "words": ""}, {"odometry": None, "words": "odometry"}):
-        done, words = [], change.pop("words")
-        if words:
-            with pytest.warns(DataWarning, match=f"the same settings, found another {words}"):
-                find_loops(recording, params, **change, **options, on_progress=done.append)
-        else:
-            find_loops(recording, params, **change, **options, on_progress=done.append)
-        assert done[0] == (1 if words else 24)
-    assert (kept / "mine.txt").exists()
+    content = bytearray(log.read_bytes())
+    content[len(content) // 2] ^= 1
+    log.write_bytes(content)
+    for first in (range(2, 15), [24]):  # the frames after the damaged one are those of the second run
+        done = []
+        found = find_loops(recording, params, odometry=odometry, **options, on_progress=done.append)
+        assert done[0] in first and contents(found, tmp_path / "found") == whole[1]
+    with pytest.warns(DataWarning, match="the same settings, found another odometry; restarting"):
+        find_loops(recording, params, odometry=None, **options, on_progress=done.append)
+    assert done[1] == 1
+    (tmp_path / "kept" / checkpoint.OLD).touch()
+    with pytest.raises(ValueError, match="kept: expected a checkpoint of this version, found that of an earlier one"):
+        find_loops(recording, params, **options)
 
 
 @pytest.mark.slow
@@ -166,32 +160,6 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
             find_loops(with_points(recording, lambda path, cloud=cloud: cloud), params, config=CONFIG)
 
 
-@pytest.mark.parametrize("name", ["mine.txt", "2024.safetensors", ".mine.tmp", "settings.json", "000001.safetensors/a"])
-def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path, name):
-    folder = tmp_path / "kept"
-    for path in (folder / "000000.safetensors", folder / name):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{}")
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(FileExistsError, match=rf"kept: expected a new folder.* found {Path(name).parts[0]}$"):
-        checkpoint.Unfinished.opened(folder, {"format": checkpoint.FORMAT})
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_of_a_run_with_other_settings_its_own_files_are_removed_and_no_others(tmp_path):
-    wanted = {"format": checkpoint.FORMAT, "weights": "a"}
-    checkpoint.Unfinished.opened(tmp_path, wanted)
-    own = ("000050.safetensors", "1000000.safetensors", f".settings.json.{32 * '0'}.tmp")
-    others = ("2024.safetensors", "000050.safetensors.bak", ".mine.tmp")
-    for name in (*own, *others):
-        (tmp_path / name).write_text("")
-    with pytest.warns(DataWarning, match="found another weights"):
-        checkpoint.Unfinished.opened(tmp_path, {**wanted, "weights": "b"})
-    assert {path.name for path in tmp_path.iterdir()} == {*others, "settings.json"}
-    checkpoint.remove(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == set(others)
-
-
 @pytest.mark.slow
 def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, monkeypatch):
     recording, odometry = twice
@@ -215,76 +183,47 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
     assert len(asked) == 2 * len(found.loops)  # for their registration: no scan was looked at again
 
 
-def test_frames_come_back_as_they_were_kept(tmp_path):
-    keep(tmp_path, WANTED)
-    found, kept = recalled(tmp_path, WANTED), fake_frames()
-    assert [seen is None for seen, _ in found] == [False, True, False, False, False]
-    for one, other in zip(found[4][0], kept[4][0] or (), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert found[0][1].link is None
-    np.testing.assert_allclose(np.array(found[3][1].link), np.array(kept[3][1].link))
-    for (_, one), (_, other) in zip(found, kept, strict=True):
-        np.testing.assert_array_equal(one.fits.frames, other.fits.frames)
-        np.testing.assert_array_equal(np.stack(one.fits.peaks), np.stack(other.fits.peaks))
+@pytest.mark.parametrize(("fits", "pose"), [(FITS, np.eye(4)), (NO_FITS, None)])
+def test_a_frame_comes_back_from_its_bytes(fits, pose):
+    link = Link(*DRAW.normal(size=6)) if pose is None else None
+    content = checkpoint.frame_bytes(SEEN, Compared(fits, link), pose=pose, name="a", wall=3.5)
+    seen, compared, found, about = checkpoint.read_frame(content, 5, ABOUT, source=Path("log"))
+    assert seen.mounting == SEEN.mounting and about == {"name": "a", "wall": 3.5}
+    np.testing.assert_array_equal(seen.image, SEEN.image)
+    np.testing.assert_array_equal(compared.fits.frames, fits.frames)
+    np.testing.assert_array_equal(np.stack(compared.fits.peaks), np.stack(fits.peaks))
+    assert (compared.link is None) == (link is None) and (found is None) == (pose is None)
+    assert link is None or compared.link == link
 
 
-def test_a_file_of_another_recording_or_of_other_frames_is_not_believed(tmp_path):
-    path = keep(tmp_path / "ours", WANTED)
-    other = keep(tmp_path / "theirs", {**WANTED, "recording": "b"}, seed=1)
-    ours = path.read_bytes()
-    path.write_bytes(other.read_bytes())
-    assert recalled(tmp_path / "ours", WANTED) == []
-    path.write_bytes(ours)
-    path.with_name("000005.safetensors").write_bytes(ours)
-    assert len(recalled(tmp_path / "ours", WANTED)) == 5, "the second file has the frames of the first"
+@pytest.mark.parametrize(("cut", "number", "about"), [(0, 4, {}), (9, 5, {}), (0, 5, ABOUT)])
+def test_another_content_is_refused(cut, number, about):
+    content, bad_scan = (checkpoint.frame_bytes(seen, Compared(FITS, None)) for seen in (SEEN, None))
+    assert checkpoint.read_frame(bad_scan, 5, {}, source=Path("log"))[0] is None
+    with pytest.raises(ValueError, match=rf"log: expected frame {number}, found another content"):
+        checkpoint.read_frame(content[: len(content) - cut], number, about, source=Path("log"))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"shown": np.array([0, 2, 3, 9])},
-        {"images": np.zeros((3, 6, 6), np.uint8)},
-        {"counts": np.array([0, 0, 0, 0, 1])},
-        {"counts": np.array([0, 0, 0, 3, -1])},
-        {"fitted": np.array([1, 4])},
-        {"fits": np.full((2, 5), np.nan)},
-        {"links": np.array([[np.nan, 0, 0, 0, 0, 0]] * 5)},
-        {"made_from": np.zeros(31, np.uint8)},
-        {"links": None},
-    ],
-)
-def test_content_that_cannot_be_is_not_believed_though_the_checksum_is_right(tmp_path, change):
-    path = keep(tmp_path, WANTED)
-    frames, more = Index.load_with(path)
-    changed = {name: values for name, values in (more | change).items() if values is not None}
-    path.write_bytes(frames.to_bytes(changed))
-    assert recalled(tmp_path, WANTED) == []
-
-
-def test_scans_of_another_drive_have_other_settings_though_sizes_and_times_agree(twice, params, tmp_path):
-    finder, paths = sglpr_jax.LoopDetector(params).finder, tuple(tmp_path / f"{name}.bin" for name in twice[0].ids)
-    recording = dataclasses.replace(twice[0], paths=paths)
+def test_settings_tell_all_that_changes_what_is_seen(twice, params, tmp_path):
+    recording, odometry = twice
+    finder = sglpr_jax.LoopDetector(params, config=CONFIG).finder
+    paths = tuple(tmp_path / f"{name}.bin" for name in recording.ids)
+    files = dataclasses.replace(recording, paths=paths)
     found = []
     for content in (b"aaaa", b"bbbb"):
         for path in paths:
             path.write_bytes(content)
-            os.utime(path, (1e9, 1e9))
-        found.append(checkpoint.settings(recording, finder))
-    assert found[0]["recording"] == found[1]["recording"] and found[0] != found[1]
-    assert checkpoint.settings(dataclasses.replace(recording, name="other"), finder) != found[1]
-
-
-def test_settings_tell_all_that_changes_what_is_seen(twice, params):
-    recording, odometry = twice
-    finder = sglpr_jax.LoopDetector(params, config=CONFIG).finder
+            os.utime(path, (1e9, 1e9))  # sizes and times agree
+        found.append(checkpoint.settings(files, finder))
     base = checkpoint.settings(recording, finder, odometry=odometry)
-    tilted = dataclasses.replace(recording, mounting=Mounting(2.0))
-    others = (
-        checkpoint.settings(tilted, finder, odometry=odometry),
+    assert base == checkpoint.settings(recording, finder, odometry=odometry.copy())
+    found += [
+        base,
+        checkpoint.settings(dataclasses.replace(recording, mounting=Mounting(2.0)), finder, odometry=odometry),
         checkpoint.settings(recording, finder, odometry=odometry + 1e-9),
         checkpoint.settings(recording, finder, odometry=None),
         checkpoint.settings(recording, sglpr_jax.LoopDetector(params).finder, odometry=odometry),
         checkpoint.settings(dataclasses.replace(recording, times=recording.times + 1), finder, odometry=odometry),
-    )
-    assert base == checkpoint.settings(recording, finder, odometry=odometry.copy())
-    assert all(other != base for other in others)
+        checkpoint.settings(dataclasses.replace(recording, name="other"), finder, odometry=odometry),
+    ]
+    assert all(one != other for one, other in itertools.combinations(found, 2))

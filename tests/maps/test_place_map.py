@@ -14,7 +14,6 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record
 from sglpr_jax.data.views import rotated
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops import checkpoint
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.retrieval.index import Index
@@ -133,8 +132,7 @@ def test_places_of_a_drive_are_called_the_same_wherever_it_was_stopped(here, own
 
 
 @pytest.mark.slow
-def test_a_map_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(first, places, params, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "FRAMES", 5)
+def test_a_map_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(first, places, params, tmp_path):
     recording, poses = first
     reached, seen = [], []
     read = with_points(recording, lambda path: seen.append(path) or recording.read(path, None, False).points)
