@@ -67,54 +67,51 @@ def has_bounds(annotation: Any) -> bool:
 
 def check_value(value: Any, annotation: Any, field: str) -> None:
     """Raise ValueError, whose message begins with `field`, if a field with this annotation rejects the value."""
-    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is Annotated:
-        check_value(value, parts[0], field)
-        require(value, value in parts[1], str(parts[1]), field)
-    elif origin in (typing.Union, types.UnionType):
-        _check_union(value, parts, field)
-    elif origin is Literal:
-        fits = any(type(value) is type(choice) and value == choice for choice in parts)
-        require(value, fits, f"one of {', '.join(map(repr, parts))}", field)
-    elif origin is tuple:
-        _check_tuple(value, parts, field)
-    elif annotation is float:
-        require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
-        require(value, abs(value) <= sys.float_info.max, "a finite number", field)  # works for integers of any size
-    elif is_config(annotation):
-        require(value, isinstance(value, annotation), f"the fields of a {annotation.__name__}", field)
-    else:
-        expected = "null" if annotation is types.NoneType else f"a value of type {annotation.__name__}"
-        require(value, type(value) is annotation, expected, field)
+    read_value(value, annotation, field, json=False)
 
 
-def read_value(value: Any, annotation: Any, field: str) -> Any:
+def read_value(value: Any, annotation: Any, field: str, *, json: bool = True) -> Any:
     """Convert a JSON value to the type of a field: lists to tuples, strings to paths, integers to floats.
 
     Arguments:
       value: JSON value, or the value of a field.
-      annotation: Type annotation of the field. It may not be a nested configuration.
+      annotation: Type annotation of the field.
       field: Name of the field, for error messages.
+      json: If False, the value must have the type of the field already, and numbers without bounds must be finite.
 
     Raises:
-      ValueError: If the value does not fit the annotation. Infinity fits a `float` without bounds.
+      ValueError: If the value does not fit the annotation.
     """
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
-        read = read_value(value, parts[0], field)
-        if has_bounds(annotation):
-            check_value(read, annotation, field)
+        read = read_value(value, parts[0], field, json=json)
+        for bounds in parts[1:]:
+            if isinstance(bounds, Bounds):
+                require(value, abs(read) <= sys.float_info.max, "a finite number", field)
+                require(value, read in bounds, str(bounds), field)
         return read
     if origin in (typing.Union, types.UnionType):
-        return _read_union(value, parts, field)
-    if origin is tuple and isinstance(value, list | tuple):
+        return _read_union(value, parts, field, json=json)
+    if origin is tuple:
+        require(value, isinstance(value, list | tuple if json else tuple), "a list", field)
         items = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
         require(value, len(value) == len(items), f"a list of {len(items)}", field)
-        return tuple(read_value(one, item, field) for one, item in zip(value, items, strict=True))
-    if annotation is float and isinstance(value, float):
-        return value
-    check_value(value, str if annotation is Path else annotation, field)
-    return annotation(value) if annotation in (Path, float) else value
+        return tuple(read_value(one, item, field, json=json) for one, item in zip(value, items, strict=True))
+    if annotation is float:
+        require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
+        finite = abs(value) <= sys.float_info.max  # works for integers of any size
+        require(value, finite or (json and isinstance(value, float)), "a finite number", field)
+        return float(value) if json else value
+    if origin is Literal:
+        fits = any(type(value) is type(choice) and value == choice for choice in parts)
+        require(value, fits, f"one of {', '.join(map(repr, parts))}", field)
+    elif is_config(annotation):
+        require(value, isinstance(value, annotation), f"the fields of a {annotation.__name__}", field)
+    else:
+        kind = str if annotation is Path else annotation
+        expected = "null" if kind is types.NoneType else f"a value of type {kind.__name__}"
+        require(value, type(value) is kind, expected, field)
+    return Path(value) if annotation is Path else value
 
 
 def require(value: Any, fits: bool, expected: str, field: str) -> None:
@@ -125,38 +122,17 @@ def require(value: Any, fits: bool, expected: str, field: str) -> None:
         raise ValueError(f"{field}{': ' if field else ''}expected {expected}, found {shown}")
 
 
-def _check_union(value: Any, members: tuple[Any, ...], field: str) -> None:
-    """Check that a member accepts the value. The message names the first member, or all configurations."""
-    if value is None and types.NoneType in members:
-        return
-    configs = [member for member in members if is_config(member)]
-    if configs:
-        names = " or ".join(member.__name__ for member in configs)
-        require(value, isinstance(value, tuple(configs)), f"the fields of a {names}", field)
-    else:
-        check_value(value, next(member for member in members if member is not types.NoneType), field)
-
-
-def _read_union(value: Any, members: tuple[Any, ...], field: str) -> Any:
+def _read_union(value: Any, members: tuple[Any, ...], field: str, *, json: bool) -> Any:
     """Convert a value by the first member that accepts it. The message has what each member but None expects."""
     if value is None and types.NoneType in members:
         return None
-    *others, last = (member for member in members if member is not types.NoneType)
-    expected = ""
-    for member in others:
+    expected, before, found = [], "", ""
+    for member in (one for one in members if one is not types.NoneType):
         try:
-            return read_value(value, member, field)
+            return read_value(value, member, field, json=json)
         except ValueError as error:
-            expected += str(error).partition("expected ")[2].rpartition(", found")[0] + " or "
-    try:
-        return read_value(value, last, field)
-    except ValueError as error:
-        raise ValueError(str(error).replace("expected ", f"expected {expected}", 1)) from error
-
-
-def _check_tuple(value: Any, items: tuple[Any, ...], field: str) -> None:
-    require(value, isinstance(value, tuple), "a list", field)
-    if items[-1] is not Ellipsis:
-        require(value, len(value) == len(items), f"a list of {len(items)}", field)
-    for i, one in enumerate(value):
-        check_value(one, items[0] if items[-1] is Ellipsis else items[i], field)
+            before, _, after = str(error).partition("expected ")
+            kind, _, found = after.rpartition(", found ")
+            expected.append(kind)
+    what = " or ".join(expected).replace("or the fields of a ", "or ")
+    raise ValueError(f"{before}expected {what}, found {found}")

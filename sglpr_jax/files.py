@@ -28,10 +28,7 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
 
     The block writes to the path that it receives, a hidden path beside `path`. At the end of the block, it replaces
     `path`. After an error it is removed, and the earlier content of `path` stays. Missing parent folders are created.
-
-    Arguments:
-      path: File or folder to write.
-      keep: If True, a folder that another process has put at `path` meanwhile stays, too.
+    With `keep`, a folder that another process has put at `path` meanwhile stays, too.
 
     Raises:
       WriteError: If `path` cannot be written.
@@ -51,14 +48,11 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
 
 
 def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> list[Path]:
-    """Write several files of a folder. Every file is complete before the first one replaces its earlier version.
+    """Write several files of a folder, and return their paths. All are complete before the first one is replaced.
 
     Arguments:
       folder: Folder of the files. It is created if needed.
       files: For each file name, a function that writes the content to the path that it receives.
-
-    Returns:
-      The paths of the files.
 
     Raises:
       WriteError: If a file cannot be written. All files in the folder then stay as they were.
@@ -219,7 +213,7 @@ def half_written(folder: Path) -> list[Path]:
 
 
 def remove_half_written(folder: Path) -> None:
-    """Remove the unfinished files and folders of `replacing` in `folder` and below, left by killed processes."""
+    """Remove the files and folders of `half_written`."""
     for left in half_written(folder):
         _remove(left)
 

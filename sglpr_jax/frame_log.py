@@ -127,7 +127,7 @@ class RunLog:
             if number <= len(found):  # later records follow a damaged one
                 found[number:] = [record]
         wanted = json.loads(json.dumps(settings))
-        known = parse_json(found[0], source=path) if found else None
+        known = parse_json(found[0], source=path) if found else {}
         if known != wanted:
             if found:
                 other = ", ".join(name for name in wanted if known.get(name) != wanted[name])

@@ -2,7 +2,6 @@
 
 import math
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,29 +9,21 @@ import numpy as np
 
 from sglpr_jax.files import in_short
 
-INFLATION = 32
-"""Maximum size of the arrays of an archive, as a multiple of the size of its file. Descriptors compress less."""
-SMALL_BYTES = 2**26
-"""Arrays up to this total size are read from archives of any size: 64 MiB."""
-
 
 def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
     """Read every array of an .npz file, without pickle.
 
     Raises:
       FileNotFoundError: If the file does not exist.
-      ValueError: If it is another kind of file, or damaged, or if its arrays are larger than `SMALL_BYTES` and
-        `INFLATION` times its size. All messages name the file and what was `expected`.
+      ValueError: If it is another kind of file, or damaged. All messages name the file and what was `expected`.
     """
     expected = f"{path}: expected {expected}"
     if not path.is_file():
         raise FileNotFoundError(f"{expected}, found no file")
-    size = path.stat().st_size
     if not zipfile.is_zipfile(path):
-        raise ValueError(f"{expected}, found {size} bytes that are not a complete .npz archive")
+        raise ValueError(f"{expected}, found {path.stat().st_size} bytes that are not a complete .npz archive")
     try:
         with zipfile.ZipFile(path) as archive:
-            _check_inflated(archive.infolist(), size)
             return {member.filename.removesuffix(".npy"): _member(archive, member) for member in archive.infolist()}
     except Exception as error:  # zip, zlib and numpy raise many types of errors
         raise ValueError(f"{expected}, found a broken one: {in_short(error)}") from error
@@ -58,13 +49,6 @@ def read_array(stream: Any, *, size: int) -> np.ndarray:
         raise ValueError(f"expected values of at least one byte, found {dtype} {shape}")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
-
-
-def _check_inflated(members: Sequence[zipfile.ZipInfo], size: int) -> None:
-    """Raise ValueError if the directory of an archive of `size` bytes declares too many bytes."""
-    declared, most = sum(member.file_size for member in members), max(SMALL_BYTES, INFLATION * size)
-    if declared > most:
-        raise ValueError(f"expected arrays of at most {most} bytes in {size} bytes, found {declared}")
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:

@@ -55,7 +55,7 @@ def export(command: ExportCommand) -> Path:
     from sglpr_jax.models.params import Params
     from sglpr_jax.models.weights import average, for_places
     from sglpr_jax.models.weights_file import load, save
-    from sglpr_jax.retrieval.whiten import whiten
+    from sglpr_jax.retrieval.embed import whiten
 
     if command.out.exists():
         raise FileExistsError(f"{command.out}: expected a folder that does not exist yet, found one")

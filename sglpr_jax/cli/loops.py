@@ -191,7 +191,7 @@ def _search(command: LoopsCommand) -> int:
 
 def _odometry_kept_in(out: Path, number: int) -> Path:
     """Checkpoint file of --odometry auto of a recording."""
-    return out / f"unfinished-{number}.odometry.npz"
+    return out / f"unfinished-{number}.odometry.log"
 
 
 def _why_not(recording: "Recording") -> str:

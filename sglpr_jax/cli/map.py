@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 UNFINISHED = ".unfinished"
 """Suffix of the checkpoint directory of a running command, beside the map."""
-TRAJECTORY, ODOMETRY = ".odometry.tum", ".odometry.npz"
+TRAJECTORY, ODOMETRY = ".odometry.tum", ".odometry.log"
 """Suffixes of the odometry of --poses auto and of its checkpoint, beside the map."""
 
 

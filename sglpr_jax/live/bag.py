@@ -26,7 +26,6 @@ class BagSource:
 
     @property
     def dropped(self) -> int:
-        """Number of scans that were replaced by newer ones before they were taken."""
         return self._latest.dropped
 
     def frames(self) -> Iterator[LiveFrame | None]:
@@ -42,7 +41,6 @@ class BagSource:
         yield self._latest.take(0.0)
 
     def close(self) -> None:
-        """Stop the replay."""
         self._stopped.set()
 
     def _replay(self) -> None:

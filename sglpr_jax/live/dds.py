@@ -85,7 +85,6 @@ class DdsTransport:
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """Receive the messages of a topic that have one of these types."""
         qos = _qos(depth, reliable=reliable, latched=latched)
         asked = f"{topic}: expected a publisher with the QoS {_described(reliable, latched)}, found one without"
         for kind in kinds:
@@ -96,7 +95,6 @@ class DdsTransport:
         self._watched.append((asked, self._readers[-1].reader.get_requested_incompatible_qos_status))
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
-        """Return a function that publishes messages of one type."""
         qos = _qos(depth, reliable=True, latched=latched)
         writer = DataWriter(self._participant, self._topic(topic, kind), qos=qos)
         offered = f"{topic}: expected subscribers that accept the QoS {_described(True, latched)}, found one that asks"
@@ -113,7 +111,6 @@ class DdsTransport:
         return publish
 
     def published(self) -> dict[str, set[str]]:
-        """Topics with a publisher, and their types."""
         found: dict[str, set[str]] = {}
         for one in self._publications.read(N=10_000):
             name, alive = one.topic_name, one.sample_info.instance_state == InstanceState.Alive
@@ -122,7 +119,6 @@ class DdsTransport:
         return found
 
     def close(self) -> None:
-        """Stop the thread and leave the domain."""
         self._closed.set()
         self._thread.join()
         for held in (self._watched, self._readers, self._writers, self._topics):
@@ -201,33 +197,24 @@ class _Raw:
     def deserialize(cls, data: bytes) -> Any:
         return cls(data)
 
-    @classmethod
-    def deserialize_key(cls, data: bytes) -> Any:
-        """A notice that a publisher has ended: it holds no message."""
-        return cls(data)
+    deserialize_key = deserialize  # a notice that a publisher has ended: it holds no message
 
 
 @functools.cache
 def _raw_type(kind: str) -> Any:
     """Type of messages that stay encoded. Others see the fields of ROS 2."""
-    found = make_idl_struct(*_names(kind), _fields(kind), dataclassify=False)
+    found = _type.__wrapped__(kind)
     for name in ("__init__", "serialize", "deserialize", "deserialize_key"):
         setattr(found, name, vars(_Raw)[name])
     return found
 
 
 @functools.cache
-def _inner_type(kind: str) -> Any:
-    return make_idl_struct(*_names(kind), _fields(kind), dataclassify=False)
-
-
-def _names(kind: str) -> tuple[str, str]:
+def _type(kind: str) -> Any:
+    """Type with the fields of ROS 2."""
     name = wire_type(kind).replace("::", ".")
-    return name.rpartition(".")[2], name
-
-
-def _fields(kind: str) -> dict[str, Any]:
-    return {name: _field(*of) for name, of in typestore().fielddefs[kind][1]}
+    fields = {field: _field(*of) for field, of in typestore().fielddefs[kind][1]}
+    return make_idl_struct(name.rpartition(".")[2], name, fields, dataclassify=False)
 
 
 def _field(node: Any, of: Any) -> Any:
@@ -235,7 +222,7 @@ def _field(node: Any, of: Any) -> Any:
     if node.name == "BASE":
         return _NUMBERS[of[0]]
     if node.name == "NAME":
-        return _inner_type(of)
+        return _type(of)
     (inner, count) = of
     return types.array[_field(*inner), count] if node.name == "ARRAY" else types.sequence[_field(*inner)]
 

@@ -28,31 +28,23 @@ class Source(Protocol):
         react to signals. Ends if no more scans can come."""
         ...
 
-    def close(self) -> None:
-        """Release threads and connections."""
-        ...
-
     @property
     def dropped(self) -> int:
         """Number of scans that were replaced by newer ones before they were taken."""
         ...
+
+    def close(self) -> None: ...
 
 
 @runtime_checkable
 class Sink(Protocol):
     """Receiver of results. A sink that raises an error is reported once and left out."""
 
-    def frame(self, status: FrameStatus) -> None:
-        """Receive the status after a scan."""
-        ...
+    def frame(self, status: FrameStatus) -> None: ...
 
-    def loop(self, edge: LoopEdge) -> None:
-        """Receive a loop. It is on disk before."""
-        ...
+    def loop(self, edge: LoopEdge) -> None: ...
 
-    def close(self) -> None:
-        """Release files and connections."""
-        ...
+    def close(self) -> None: ...
 
 
 Taken = Callable[[str], bool]

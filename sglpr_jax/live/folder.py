@@ -67,7 +67,6 @@ class FolderSource:
             yield from self._frame(path, received)
 
     def close(self) -> None:
-        """End `frames`."""
         self._stopped = True
 
     def _look(self) -> None:
@@ -186,9 +185,7 @@ class GrowingPoses:
     def of(self, row: int, time: float | None) -> Float[np.ndarray, "4 4"] | None:
         """Pose of a scan, or None if the file does not have it yet.
 
-        Arguments:
-          row: Number of the scan in its folder, for files with a line for each scan, and scans without times.
-          time: Time of the scan in seconds, for tum files, or None.
+        Files with a line for each scan, and scans without times, need `row`. Tum files need the time in seconds.
         """
         if time is None or self._format not in ("auto", "tum"):
             return self._poses[row] if row < len(self._poses) else None

@@ -22,11 +22,9 @@ class JsonLines:
         self._file = file
 
     def frame(self, status: FrameStatus) -> None:
-        """Write the status after a scan."""
         self._line("frame", status)
 
     def loop(self, edge: LoopEdge) -> None:
-        """Write a loop."""
         self._line("loop", edge)
 
     def close(self) -> None:

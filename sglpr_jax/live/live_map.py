@@ -49,11 +49,9 @@ class LiveScan(NamedTuple):
     name: str
     """`Record.name` of the scan."""
     stamp: float
-    """Time of the header, in seconds."""
     time: float
-    """Time of `Clock`, in seconds."""
     wall: float
-    """Time of the computer when the scan was added, in seconds since 1970."""
+    """Times of the header, of `Clock`, and of the computer (since 1970) when the scan was added, in seconds."""
 
 
 class LiveMap:
@@ -81,7 +79,7 @@ class LiveMap:
           detector: Detector without frames.
           folder: Folder of the map.
           report: Function for events that need no action.
-          sensor_height: Height of the sensor in metres, or "auto" to estimate it in the first scans.
+          sensor_height: Height in metres, or "auto" to estimate it in the first scans.
           expects_odometry: Whether the first scans wait for odometry.
 
         Raises:
@@ -247,7 +245,9 @@ def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
         return write_json(path, wanted)
     found = read_json(path)
     if not isinstance(found, dict) or found.get("format") != FRAME_FORMAT:
-        raise ValueError(f"{path}: expected the settings of a live map ({FRAME_FORMAT}), found others; use another --out")
+        raise ValueError(
+            f"{path}: expected the settings of a live map ({FRAME_FORMAT}), found others; use another --out"
+        )
     other = [name for name, value in wanted.items() if not _holds(found.get(name), value)]
     if other:
         raise ValueError(

@@ -1,5 +1,6 @@
 """Values that pass through the live node: scans, status, loop edges, and reports of trouble."""
 
+import math
 import sys
 import threading
 import time
@@ -87,19 +88,15 @@ class Latest(Generic[T]):
     """
 
     def __init__(self):
-        self._item: T | None = None
-        self._dropped = 0
-        self._changed = threading.Condition()
-
-    @property
-    def dropped(self) -> int:
+        self.dropped = 0
         """Number of items that were replaced before they were taken."""
-        return self._dropped
+        self._item: T | None = None
+        self._changed = threading.Condition()
 
     def put(self, item: T) -> None:
         """Make this the newest item."""
         with self._changed:
-            self._dropped += self._item is not None
+            self.dropped += self._item is not None
             self._item = item
             self._changed.notify()
 
@@ -118,22 +115,16 @@ class Reports:
     """
 
     def __init__(self, write: Callable[[str], object] | None = None, *, clock: Callable[[], float] = time.monotonic):
-        self.counts: dict[str, int] = {}
-        """Number of events of each kind."""
-        self._write, self._clock = write or _to_stderr, clock
+        self._write = write or (lambda text: print(text, file=sys.stderr, flush=True))
+        self._clock = clock
         self._said: dict[str, tuple[float, int]] = {}
+        """Time of the last line of each kind, and number of events since."""
 
     def __call__(self, kind: str, text: str) -> None:
-        """Count an event and print it, unless its kind was printed in the last `AGAIN_S` seconds."""
-        count = self.counts[kind] = self.counts.get(kind, 0) + 1
-        at, before = self._said.get(kind, (-AGAIN_S, 0))
-        now = self._clock()
-        if before and now - at < AGAIN_S:
+        """Print an event, or count it if its kind was printed in the last `AGAIN_S` seconds."""
+        now, (at, more) = self._clock(), self._said.get(kind, (-math.inf, 0))
+        if now - at < AGAIN_S:
+            self._said[kind] = at, more + 1
             return
-        self._said[kind] = now, count
-        more = count - before - 1
+        self._said[kind] = now, 0
         self._write(f"{text} ({more} more since the last line)" if more else text)
-
-
-def _to_stderr(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

@@ -37,15 +37,7 @@ class Node:
         say: Callable[[str], object],
         corrected: CorrectedTrajectory | None = None,
     ):
-        """Connect a map to sinks.
-
-        Arguments:
-          live: The map, after `recall`.
-          sinks: Receivers of results.
-          report: Function for trouble.
-          say: Function for lines about the progress.
-          corrected: Trajectory that is corrected after each scan.
-        """
+        """Connect a map, after `recall`, to sinks. `corrected` is updated after each scan."""
         self._corrected = corrected
         self._live, self._sinks, self._report, self._say = live, list(sinks), report, say
         self._seconds: deque[float] = deque(maxlen=LATEST)

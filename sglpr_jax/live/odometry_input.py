@@ -60,12 +60,7 @@ class Continuity:
         self._used, self._last, self._time, self._known, self._resumed = pose is not None, pose, time, known, True
 
     def placed(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> Placed | None:
-        """Place the next scan, or return None if it is to be left out.
-
-        Arguments:
-          pose: Pose by odometry, or None if it is unknown.
-          time: Time of the scan, in seconds, which does not decrease.
-        """
+        """Place the next scan by its odometry, or return None if it is to be left out. Times do not decrease."""
         if self._used is None and not self._decided(pose, time):
             return None
         resumed, self._resumed = self._resumed, False
@@ -129,23 +124,12 @@ class Clock:
         self._received = 0.0
 
     def resume(self, time: float, stamp: float, *, received: float) -> None:
-        """Continue after a scan of an earlier process.
-
-        Arguments:
-          time: Time of the last scan by this clock, in seconds.
-          stamp: Time of its header.
-          received: Time at which it arrived, by `time.monotonic()` of this process.
-        """
+        """Continue after a scan of an earlier process: its time by this clock, by its header, and of its arrival."""
         self._last, self._received = time, received
         self._offset = time - stamp if _is_time(stamp) else 0.0
 
     def time(self, stamp: float, received: float) -> float:
-        """Return the time of the next scan, in seconds, which is not before that of the previous one.
-
-        Arguments:
-          stamp: Time of the header, in seconds.
-          received: Time at which the scan arrived, by `time.monotonic()`.
-        """
+        """Return the time of the next scan, in seconds, which is not before that of the previous one."""
         passed = max(received - self._received, 0.0)
         expected = received if self._last is None else self._last + passed
         found = stamp + self._offset

@@ -49,7 +49,6 @@ class RerunSink:
             self._check()
 
     def loop(self, edge: LoopEdge) -> None:
-        """Draw a loop at the frame of its query."""
         self._at(edge.query, edge.query_time)
         text = f"query {edge.query}, match {edge.match}: probability {edge.probability:.4f}"
         self._stream.log("loops", rerun.TextLog(text))

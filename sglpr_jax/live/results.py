@@ -1,7 +1,6 @@
 """Results of a live map: the trajectory that its loops correct after each scan, and files for other programs."""
 
 from collections import deque
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -11,10 +10,10 @@ from jaxtyping import Float
 from sglpr_jax.files import write_all
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.messages import Report
-from sglpr_jax.pose_graph.files import write_g2o, write_loops_csv, write_rejected_jsonl, write_tum
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.pose_graph.folder import graph_files
 from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
-GRAPH, TABLE, REJECTED = "loops.g2o", "loops.csv", "rejected.jsonl"
 TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
 
 
@@ -62,22 +61,16 @@ def corrected_trajectory(live: LiveMap, *, odometry: bool, report: Report) -> Co
 
 
 def write_results(live: LiveMap, folder: Path, *, corrected: CorrectedTrajectory | None = None) -> list[Path]:
-    """Write the loops as g2o and csv, the rejected pairs, and the odometry as tum, if there is any.
+    """Write the loops as g2o and csv, the rejected pairs, and the odometry and its correction as tum, if there is any.
 
-    With `corrected`, write its trajectory, too, without parts that no loop connects with the first one.
-
-    The graph has no edge between scans whose motion is unknown, as before and after a restart. Returns the paths.
-    Raises WriteError if a file cannot be written.
+    The graph has no edge between scans whose motion is unknown, as before and after a restart. The correction lacks
+    parts that no loop connects with the first one. Returns the paths. Raises WriteError if a file cannot be written.
     """
     detector, odometry = live.detector, live.odometry
     segments = detector.finder.motion.segments
     parts = np.split(np.arange(len(odometry)), np.flatnonzero(np.diff(segments)) + 1) if len(odometry) else []
     driven = [(rows, odometry[rows]) for rows in parts]
-    files: dict[str, Callable[[Path], object]] = {
-        GRAPH: partial(write_g2o, loops=detector.loops, chains=driven, drift=detector.config.drift),
-        TABLE: partial(write_loops_csv, loops=detector.loops),
-        REJECTED: partial(write_rejected_jsonl, rejected=detector.rejected),
-    }
+    files = graph_files(detector.loops, detector.rejected, driven, drift=detector.config.drift)
     if len(odometry):
         files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)
     if len(odometry) and corrected is not None:

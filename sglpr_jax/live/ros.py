@@ -50,15 +50,9 @@ class Transport(Protocol):
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """Receive the messages of a topic that have one of these types.
+        """Receive the messages of a topic that have one of these types. At most `depth` messages wait for `receive`.
 
-        Arguments:
-          topic: Name of the topic.
-          kinds: Types of the messages.
-          receive: Function that takes a message.
-          depth: Number of messages that wait for `receive`. Older ones are dropped.
-          reliable: Whether lost messages are requested again.
-          latched: Whether messages of before the subscription are requested.
+        `reliable` requests lost messages again, and `latched` the messages of before the subscription.
         """
         ...
 
@@ -71,23 +65,14 @@ class Transport(Protocol):
         """Topics with a publisher, and their types."""
         ...
 
-    def close(self) -> None:
-        """Release threads and connections."""
-        ...
+    def close(self) -> None: ...
 
 
 class RosSource:
-    """Source of the scans of a topic. See `sources.Source`."""
+    """Source of the scans of a topic."""
 
     def __init__(self, transport: Transport, options: LiveOptions, report: Report, *, missing_s: float = MISSING_S):
-        """Subscribe to the topics.
-
-        Arguments:
-          transport: Open connection. `close` closes it.
-          options: Topics, and whether lost scans are requested again.
-          report: Function for trouble with single messages.
-          missing_s: Time without scans after which the existing topics are reported, in seconds.
-        """
+        """Subscribe to the topics. After `missing_s` seconds without scans, the existing topics are reported."""
         self.topic = full_name(options.topic or CLOUD_TOPIC)
         self._transport, self._report, self._missing_s = transport, report, missing_s
         self._latest: Latest[Received] = Latest()
@@ -95,20 +80,16 @@ class RosSource:
         self._heard = self._reported = time.monotonic()
         self._closed = threading.Event()
         transport.subscribe(self.topic, CLOUDS, self._receive, depth=1, reliable=options.reliable, latched=False)
-        self._odometry = self._subscribed(options.odometry_topic)
-
-    def _subscribed(self, topic: str | None) -> LiveOdometry | None:
-        if topic is None:
-            return None
-        odometry = LiveOdometry(full_name(topic), self._report)
-        many = {"depth": POSES_KEPT, "reliable": False}
-        self._transport.subscribe(odometry.topic, KINDS, odometry.receive, **many, latched=False)
-        fixed = {"depth": POSES_KEPT, "reliable": True}
-        self._transport.subscribe(STATIC_TOPIC, (TRANSFORMS,), odometry.receive_static, **fixed, latched=True)
-        return odometry
+        self._odometry = None
+        if options.odometry_topic is not None:
+            found = self._odometry = LiveOdometry(full_name(options.odometry_topic), report)
+            for topic, kinds, receive, fixed in (
+                (found.topic, KINDS, found.receive, False),
+                (STATIC_TOPIC, (TRANSFORMS,), found.receive_static, True),
+            ):
+                transport.subscribe(topic, kinds, receive, depth=POSES_KEPT, reliable=fixed, latched=fixed)
 
     def frames(self) -> Iterator[LiveFrame | None]:
-        """Yield scans as they arrive, and None after each `WAIT_S` seconds without a scan."""
         while not self._closed.is_set():
             message = self._latest.take(WAIT_S)
             if message is None:
@@ -116,22 +97,19 @@ class RosSource:
             yield None if message is None else self._frame(message)
 
     def close(self) -> None:
-        """End the connection."""
         self._closed.set()
         self._transport.close()
 
     @property
     def dropped(self) -> int:
-        """Number of scans that were replaced by newer ones before they were taken."""
         return self._latest.dropped
 
     def _receive(self, message: Received) -> None:
         """Keep the scan, if it is of the publisher in use."""
         if message.publisher != self._publisher:
             if self._publisher is not None and message.at - self._heard < TAKEN_OVER_S:
-                found = "found several; the scans of the first are used"
-                self._report("publishers", f"{self.topic}: expected one publisher, {found}")
-                return
+                expected = f"{self.topic}: expected one publisher"
+                return self._report("publishers", f"{expected}, found several; the scans of the first are used")
             self._publisher = message.publisher
         self._heard = message.at
         self._latest.put(message)
@@ -167,7 +145,7 @@ class RosSource:
 
 
 class RosSink:
-    """Publishes loops. See `sinks.Sink`.
+    """Publishes loops.
 
     The topics are `PREFIX/loops` (`ros_messages.edge_message`), `PREFIX/loop_markers` and `/tf`. The transform from map
     to odometry is that of the corrected trajectory (`FrameStatus.map_from_world`).
@@ -201,7 +179,6 @@ class RosSink:
         self._markers(encode(drawn))
 
     def close(self) -> None:
-        """End the connection."""
         self._transport.close()
 
 

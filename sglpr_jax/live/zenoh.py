@@ -49,16 +49,10 @@ class ZenohTransport:
     """Session of zenoh. See `ros.Transport`."""
 
     def __init__(self, endpoint: str, domain: int, report: Report):
-        """Open a session.
+        """Open a session. Raises ValueError if the endpoint or the configuration is invalid.
 
-        Arguments:
-          endpoint: Endpoint of a router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that
-            ZENOH_SESSION_CONFIG_URI names configures the session, or else it uses rmw_zenoh's router on this computer.
-          domain: Number of the ROS 2 domain.
-          report: Function for trouble with single messages.
-
-        Raises:
-          ValueError: If the endpoint or the configuration is invalid.
+        `endpoint` is that of a router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that
+        ZENOH_SESSION_CONFIG_URI names configures the session, or else it uses rmw_zenoh's router on this computer.
         """
         self._domain, self._report = domain, report
         try:
@@ -92,7 +86,6 @@ class ZenohTransport:
             self._declared.append(self._session.declare_subscriber(key, take))
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
-        """Return a function that publishes messages of one type."""
         type_hash = typestore().hash_rihs01(kind)
         key = f"{self._domain}{topic}/{wire_type(kind)}/{type_hash}"
         drop = zenoh.CongestionControl.DROP
@@ -125,7 +118,6 @@ class ZenohTransport:
         return found
 
     def close(self) -> None:
-        """Close the session."""
         for one in self._declared:
             one.undeclare()
         self._session.close()
@@ -140,19 +132,15 @@ def _config(endpoint: str) -> zenoh.Config:
     """Configuration of a peer that finds others by a router, as rmw_zenoh's."""
     given = "" if endpoint else os.environ.get("ZENOH_SESSION_CONFIG_URI")
     config = zenoh.Config.from_file(given) if given else zenoh.Config()
-    settings: dict[str, Any] = (
-        {}
-        if given
-        else {
-            "mode": "peer",
-            "connect/endpoints": [endpoint or ROUTER],
-            "listen/endpoints": ["tcp/localhost:0"],
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": True,
-        }
-    )
-    settings["timestamping/enabled"] = True  # needed by publishers with a cache
-    for key, value in settings.items():
+    settings = {
+        "mode": "peer",
+        "connect/endpoints": [endpoint or ROUTER],
+        "listen/endpoints": ["tcp/localhost:0"],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+    }
+    settings = {} if given else settings
+    for key, value in {**settings, "timestamping/enabled": True}.items():  # publishers with a cache need timestamps
         config.insert_json5(key, json.dumps(value))
     return config
 

@@ -155,7 +155,9 @@ def add_scans(
     """
     path = None if kept_in is None else Path(kept_in) / LOG
     if path is not None and path.with_name(OLD).exists():
-        raise ValueError(f"{path.parent}: expected a checkpoint of this version, found that of an earlier one")
+        raise ValueError(
+            f"{path.parent}: expected a checkpoint of this version, found that of an earlier one; delete it"
+        )
     with RunLog(path, {} if path is None else settings(recording, finder, **given)) as log:
         for frame, content in enumerate(log.records):
             seen, compared, *_ = read_frame(content, frame, {}, source=log.path)

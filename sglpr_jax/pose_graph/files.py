@@ -9,7 +9,7 @@ import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -137,7 +137,11 @@ def write_loops_jsonl(
 
 def loop_lines(loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None) -> str:
     """Return the lines of a file of `write_loops_jsonl`."""
-    return "".join(f"{json.dumps(_as_json(loop, ids, recordings))}\n" for loop in loops)
+    lines = []
+    for loop in loops:
+        numbers = {"match_from_query": loop.match_from_query.tolist(), "covariance": loop.covariance.tolist()}
+        lines.append(f"{json.dumps({**_named(loop, ids, recordings), **numbers, **_shares(loop)})}\n")
+    return "".join(lines)
 
 
 def write_rejected_jsonl(
@@ -176,30 +180,6 @@ def write_loops_csv(path: Path | str, loops: Sequence[Loop], recordings: Ids | N
     write_text(Path(path), text.getvalue())
 
 
-def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "4 4"], float]]:
-    """Read query, match, match_from_query and probability from a table of `write_loops_csv`.
-
-    Raises the errors of `read_g2o`.
-    """
-    path, found = Path(path), []
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a table of loops, found no file")
-    lines = path.read_text(errors="replace").splitlines()
-    if not lines or tuple(lines[0].split(",")) not in (COLUMNS, (*COLUMNS, *OF_RECORDINGS)):
-        raise ValueError(
-            f"{path}, line 1: expected {','.join(COLUMNS)}, found {lines[0][:200] if lines else 'nothing'}"
-        )
-    for i, line in enumerate(lines[1:]):
-        words, where = line.split(","), f"{path}, line {i + 2}"
-        words = words[: len(COLUMNS)] if lines[0].endswith(OF_RECORDINGS[-1]) else words
-        words = words[:-1] if len(words) == len(COLUMNS) and not words[-1] else words  # no overlap
-        values = numbers_of(words, columns=len(words) if len(words) in (10, 11) else 10, where=where)
-        query, match = _frames(values[:2], where)
-        _check_loop(query, match, values[9:].tolist(), where)
-        found.append((query, match, _pose(values[2:9], where), float(values[9])))
-    return found
-
-
 def _poses_of(loops: Sequence[Loop]) -> Float[np.ndarray, "n 4 4"]:
     return np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
 
@@ -212,16 +192,11 @@ def _pose_rows(poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
 
 
 def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
-    return from_quaternions(values[None, :3], _quaternions(values[None, 3:], where))[0]
-
-
-def _quaternions(values: Float[np.ndarray, "n 4"], where: Path | str) -> Float[np.ndarray, "n 4"]:
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
-        lengths = np.linalg.norm(values, axis=1)
-    wrong = np.flatnonzero(np.abs(lengths - 1) > 0.01)
-    if wrong.size:
-        raise ValueError(f"{where}, pose {wrong[0]}: expected a quaternion of length 1, found {values[wrong[0]]}")
-    return values
+        length = np.linalg.norm(values[3:])
+    if abs(length - 1) > 0.01:
+        raise ValueError(f"{where}: expected a quaternion of length 1, found {values[3:]}")
+    return from_quaternions(values[None, :3], values[None, 3:])[0]
 
 
 def _frames(values: Float[np.ndarray, " n"], where: str) -> tuple[int, ...]:
@@ -229,14 +204,6 @@ def _frames(values: Float[np.ndarray, " n"], where: str) -> tuple[int, ...]:
     if (values < 0).any() or (values != np.round(values)).any():
         raise ValueError(f"{where}: expected frames, counted from 0, found {' '.join(map(str, values))}")
     return tuple(int(value) for value in values)
-
-
-def _check_loop(query: int, match: int, shares: Sequence[float], where: str) -> None:
-    """Raise ValueError if the match is not the earlier frame, or if a share is outside [0, 1]."""
-    if not match < query:
-        raise ValueError(f"{where}: expected a match before the query, found {match} and {query}")
-    if not all(0 <= share <= 1 for share in shares):
-        raise ValueError(f"{where}: expected probability and overlap from 0 to 1, found {shares}")
 
 
 def _all_digits(values: Float[np.ndarray, " n"]) -> str:
@@ -247,11 +214,6 @@ def _all_digits(values: Float[np.ndarray, " n"]) -> str:
 
 def _numbers(values: Float[np.ndarray, " n"]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
-
-
-def _as_json(loop: Loop, ids: Ids | None, recordings: Ids | None) -> dict:
-    pose, covariance = loop.match_from_query.tolist(), loop.covariance.tolist()
-    return {**_named(loop, ids, recordings), "match_from_query": pose, "covariance": covariance, **_shares(loop)}
 
 
 def _named(loop: Loop, ids: Ids | None, recordings: Ids | None) -> dict:
@@ -270,29 +232,17 @@ def _from_json(line: bytes, where: str) -> Loop:
     value = parse_json(line, source=where)
     try:
         query, match = value["query"], value["match"]
-        shares = [share for share in (value["probability"], value["overlap"]) if share is not None]
-        if not (
-            all(type(frame) is int and frame >= 0 for frame in (query, match)) and value["probability"] is not None
-        ):
-            raise ValueError(f"frames {query}, {match} and probability {value['probability']}")
-        if not all(type(share) in (int, float) for share in shares):
-            raise ValueError(f"probability and overlap {shares}")
-        shares = [float(share) for share in shares]  # whole numbers of any size
-        pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
-        if not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
+        pose, covariance = (np.array(value[name], np.float64) for name in ("match_from_query", "covariance"))
+        if type(query) is not int or type(match) is not int or not 0 <= match < query:
+            raise ValueError(f"match {match} and query {query}")
+        if pose.shape != (4, 4) or not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
             raise ValueError(f"an invalid pose: {pose.tolist()}")
+        if covariance.shape != (6, 6) or not (np.isfinite(covariance).all() and np.isfinite(pose).all()):
+            raise ValueError(f"a covariance {covariance.shape}: {covariance.tolist()}")
+        overlap = None if value["overlap"] is None else float(value["overlap"])
+        loop = Loop(query, match, pose, covariance, float(value["probability"]), overlap)
+        if not all(0 <= share <= 1 for share in (loop.probability, loop.overlap or 0.0)):
+            raise ValueError(f"probability {loop.probability} and overlap {loop.overlap}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
-    _check_loop(query, match, shares, where)
-    overlap = None if len(shares) == 1 else shares[1]
-    return Loop(query, match, pose, covariance, shares[0], overlap)
-
-
-def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:
-    """Rows of JSON as a matrix of finite numbers."""
-    if not all(type(number) in (int, float) for row in rows for number in row):
-        raise ValueError(f"values that are not numbers: {rows}")
-    matrix = np.array(rows, np.float64)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise ValueError(f"a matrix {matrix.shape}: {rows}")
-    return matrix
+    return loop

@@ -8,14 +8,16 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import file_name, text_bytes, write_all, write_json
-from sglpr_jax.loops.closure import renumbered
+from sglpr_jax.loops.closure import Loop, Rejected, renumbered
 from sglpr_jax.loops.frame_alignment import AlignedParts, Part
 from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.pose_graph.files import (
+    Ids,
     write_g2o,
     write_kitti,
     write_loops_csv,
@@ -76,12 +78,8 @@ def write_found(
         if one.odometry is not None
     ]
     comments, drift = _comments(found, names, of), found.sessions[0].drift
-    files: dict[str, Callable[[Path], object]] = {
-        GRAPH: partial(write_g2o, loops=loops, chains=chains, drift=drift, comments=comments),
-        LINES: partial(write_loops_jsonl, loops=loops, ids=ids, recordings=recordings),
-        TABLE: partial(write_loops_csv, loops=loops, recordings=recordings),
-        REJECTED: partial(write_rejected_jsonl, rejected=rejected, ids=ids, recordings=recordings),
-    }
+    files = graph_files(loops, rejected, chains, drift=drift, comments=comments, ids=ids, recordings=recordings)
+    files[LINES] = partial(write_loops_jsonl, loops=loops, ids=ids, recordings=recordings)
     if recordings is not None:
         files[FRAMES] = partial(write_json, value=frames_json(found))
     files |= _trajectories(found, names, optimized)
@@ -89,6 +87,24 @@ def write_found(
     written = write_all(folder, files)
     _warn_of_others(folder, files)
     return written
+
+
+def graph_files(
+    loops: Sequence[Loop],
+    rejected: Sequence[Rejected],
+    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
+    *,
+    drift: DriftModel,
+    comments: Sequence[str] = (),
+    ids: Ids | None = None,
+    recordings: Ids | None = None,
+) -> dict[str, Callable[[Path], object]]:
+    """Writers of the graph, the table and the rejected pairs, by file name. See `write_g2o` for the arguments."""
+    return {
+        GRAPH: partial(write_g2o, loops=loops, chains=chains, drift=drift, comments=comments),
+        TABLE: partial(write_loops_csv, loops=loops, recordings=recordings),
+        REJECTED: partial(write_rejected_jsonl, rejected=rejected, ids=ids, recordings=recordings),
+    }
 
 
 def unique_names(found: FoundLoops) -> list[str]:

@@ -1,6 +1,6 @@
 """Computes the descriptor file of a recording, with a model or with any function of images or points."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -14,12 +14,14 @@ from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scaled import SCALE, scale_of
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
+from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.methods.method import LABELLED, Method, check_descriptors, require_content
 from sglpr_jax.methods.registry import checked_view, network
-from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.config import WHITENING_POWER, ModelConfig
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import unwhitened, whitened
 from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
 
 SCANS_AHEAD = 8
@@ -152,3 +154,30 @@ def _file(
         weights_hash=method.weights_hash,
         distance=method.distance,
     )
+
+
+def whiten(
+    params: Params,
+    recordings: Iterable[Recording],
+    *,
+    power: float = WHITENING_POWER,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Params:
+    """Return the weights with a whitening layer fitted to the descriptors of all scans. It replaces an existing layer.
+
+    If there are not more scans than numbers in a descriptor, a warning is issued.
+
+    Arguments:
+      params: Weights of the model.
+      recordings: Recordings of the sensor.
+      power: Principal components are divided by their spread to this power. With 1, all have equal spread.
+      on_progress: Called with the number of finished scans of a recording.
+    """
+    params = unwhitened(params)
+    found = np.concatenate([embed(params, each, on_progress=on_progress).descriptors for each in recordings])
+    n, d = found.shape
+    if n <= d:
+        warn(
+            f"expected more than {d} scans for whitening (the length of a descriptor), better ten times that, found {n}"
+        )
+    return whitened(params, found, power=power)

@@ -134,9 +134,7 @@ class Index:
         positions: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> None:
-        """Add one place, or several in order.
-
-        Either all places of an index have times or none has. The same applies to positions.
+        """Add one place, or several in order. Either all places of an index have times, or none; so for positions.
 
         Arguments:
           descriptors: One descriptor (d,) or several (n, d).
@@ -146,8 +144,8 @@ class Index:
           weights_hash: Hash of the weights that made the descriptors. None skips the check.
 
         Raises:
-          ValueError: If the descriptors have another width or come from other weights, if a value is not finite, or if
-            the places have other fields than the places before.
+          ValueError: If descriptors have another width or weights, if a value is not finite, or if the places have
+            other fields than the places before.
         """
         check_weights(self.weights_hash, weights_hash)
         rows = checked_rows(descriptors, self.width)
@@ -204,12 +202,10 @@ class Index:
           weights_hash: Hash of the weights that made the descriptors. None skips the check.
 
         Returns:
-          Rows and distances, nearest first. Places with equal distances are in the order they were added. If fewer than
-            `k` places can be returned, the remaining rows are -1.
+          Rows and distances, nearest first. Equal distances keep the order of the places. Missing rows are -1.
 
         Raises:
-          ValueError: If the descriptors have another width or come from other weights, or if the answers exceed the
-            bounds of `check_asked`.
+          ValueError: If descriptors have another width or weights, or if too much is asked for (`check_asked`).
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
@@ -252,11 +248,7 @@ class Index:
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "Index":
-        """Read a file written by `save`.
-
-        Arguments:
-          path: File of the index.
-          weights_hash: Hash of the weights that the index must have. None skips the check.
+        """Read a file written by `save`. With `weights_hash`, the index must have these weights.
 
         Raises:
           FileNotFoundError: If the file does not exist.

@@ -206,9 +206,6 @@ FORMATS = {
     "loops .jsonl": Format(
         "a.jsonl", written(lambda path: loop_files.write_loops_jsonl(path, LOOPS), "a"), loop_files.read_loops_jsonl
     ),
-    "loops .csv": Format(
-        "a.csv", written(lambda path: loop_files.write_loops_csv(path, LOOPS), "a"), loop_files.read_loops_csv
-    ),
     "configuration": Format(CONFIG_FILE, CONFIG_JSON, lambda path: config_from_dict(read_json(path), source=path)),
     "weights": Format(
         WEIGHTS_FILE,

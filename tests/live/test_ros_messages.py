@@ -45,13 +45,6 @@ def test_a_damaged_cloud_is_one_clear_error(kind, message):
             decode_cloud(message[:length], kind)
 
 
-def test_a_cloud_without_z_names_its_fields():
-    two = typestore().deserialize_cdr(cloud(), CLOUD)
-    two.fields = two.fields[:2]
-    with pytest.raises(ValueError, match="expected the fields x, y and z, found x y"):
-        decode_cloud(encode(two), CLOUD)
-
-
 def test_an_edge_has_times_and_pose_and_its_covariance_is_about_the_axes_of_the_match():
     """Small motions of the query in its own frame, seen as those of its pose in the match's frame."""
     covariance = np.diag([0.4, 0.1, 0.05, 0.002, 0.001, 0.01]) ** 2

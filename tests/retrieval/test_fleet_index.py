@@ -1,8 +1,5 @@
 """The index of a fleet: answers, conditions, several writers, and tables of other weights."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pyarrow
 import pytest
@@ -55,14 +52,6 @@ def test_a_place_is_added_once_and_all_processes_see_it(filled):
     assert len(filled) == 61 and other.about == {"width": 8, "weights_hash": "abc", "scale": 1}
 
 
-def test_two_that_create_a_table_and_add_the_same_places_add_them_once(tmp_path):
-    first, second = FleetIndex(tmp_path), FleetIndex(tmp_path)
-    rows = place_rows(file_of(30), "first")
-    assert first.add(rows) + second.add(rows) == 30 == len(first)
-    with pytest.raises(ValueError, match="expected places with weights_hash abc, found xyz"):
-        second.add(place_rows(file_of(3, weights_hash="xyz"), "other"))
-
-
 @pytest.mark.slow
 def test_an_approximate_index_finds_nearest_places_and_those_added_later(tmp_path):
     index = FleetIndex(tmp_path)
@@ -88,13 +77,6 @@ def test_places_of_other_weights_are_refused(filled):
     assert len(filled) == 60
 
 
-def test_an_index_without_places_says_so(tmp_path):
-    index = FleetIndex(tmp_path)
-    assert len(index) == 0
-    with pytest.raises(ValueError, match="expected an index with places, found none"):
-        index.query(draw(1))
-
-
 def test_other_tables_and_broken_ones_are_refused(tmp_path, filled):
     other = FleetIndex(tmp_path / "other")
     other._connection.create_table(TABLE, [{"x": 1}])
@@ -103,20 +85,6 @@ def test_other_tables_and_broken_ones_are_refused(tmp_path, filled):
     for file in (tmp_path / f"{TABLE}.lance" / "_versions").iterdir():
         file.write_bytes(b"nothing")
     with pytest.raises(ValueError, match=rf"^{tmp_path}: expected a store that can be read and written, found"):
-        FleetIndex(tmp_path)
-
-
-@pytest.mark.parametrize("size", [1, 500])
-def test_data_that_are_cut_are_named_when_they_are_read(filled, size):
-    for file in (Path(filled.place) / f"{TABLE}.lance" / "data").iterdir():
-        file.write_bytes(file.read_bytes()[:-size])
-    with pytest.raises(ValueError, match=rf"^{filled.place}: expected a store that can be read and written, found"):
-        FleetIndex(filled.place).query(draw(1))
-
-
-def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "lancedb", None)
-    with pytest.raises(ImportError, match=r"expected the extra `fleet`"):
         FleetIndex(tmp_path)
 
 

@@ -11,7 +11,6 @@ from PIL import Image
 from recordings import of_images
 
 from sglpr_jax.bev import even_cells, rasterize, rasterize_labels
-from sglpr_jax.data.density_image import density_bev, density_label_bev
 from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.grid import Grid
@@ -95,23 +94,6 @@ def test_cells_the_network_is_not_sure_of_are_left_unlabelled(params):
     expected = np.where(confidence >= least, every.predicted, 0)
     np.testing.assert_array_equal(found.predicted[clear], expected[clear])
     assert 0 < found.seen.sum() < every.seen.sum()
-
-
-@pytest.mark.slow
-def test_the_map_of_a_model_for_density_images_lies_on_such_an_image(random_params):
-    config = dataclasses.replace(model_preset("tiny"), grid=Grid(0.4, 32, 32), image="density")
-    params = random_params(config)
-    rng = np.random.default_rng(0)
-    points = rng.normal(0, [5, 5, 1], (700, 3)).astype(np.float32)
-    classes = rng.integers(1, 20, 700).astype(np.int32)
-    found = semantic_map(params, Record(points=points, labels=to_raw(classes)))
-    whole = (density_bev(points), density_label_bev(points, classes))
-    counts, truth = (np.asarray(even_cells(jnp.asarray(view)))[60:92, 60:92] for view in whole)
-    np.testing.assert_array_equal(found.counts, counts)
-    np.testing.assert_array_equal(found.seen, counts > 0)
-    np.testing.assert_array_equal(found.truth, np.where(counts > 0, truth, 0))
-    likeliest = probabilities(params, counts).argmax(-1) + 1
-    np.testing.assert_array_equal(found.predicted, np.where(counts > 0, likeliest, 0))
 
 
 @pytest.mark.slow

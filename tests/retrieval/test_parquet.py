@@ -6,7 +6,6 @@ import sys
 import uuid
 from pathlib import Path
 
-import fsspec
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -79,15 +78,6 @@ def test_a_file_that_cannot_be_finished_does_not_appear(scans, tmp_path, monkeyp
     with pytest.raises(ValueError, match=r"\.parquet: expected a store .* No space left on device"):
         embed_to_store(f"{tmp_path}/places/", method, opened(scans))
     assert not [path for path in (tmp_path / "places").rglob("*") if path.is_file()]
-
-
-def test_a_store_without_rights_is_one_clear_error(scans, monkeypatch, method):
-    def refuse(self, path, value, **options):
-        raise PermissionError("Access Denied")
-
-    monkeypatch.setattr(type(fsspec.filesystem("memory")), "pipe_file", refuse)
-    with pytest.raises(ValueError, match=r"^memory://x/.*\.parquet: expected a store .* found: Access Denied"):
-        embed_to_store("memory://x", method, opened(scans))
 
 
 def test_files_that_are_no_places_are_refused(tmp_path):
