@@ -23,7 +23,6 @@ from sglpr_jax.files import (
     replacing,
     write_all,
     write_json,
-    write_text,
     writing,
 )
 
@@ -106,18 +105,6 @@ def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files)
     assert names(tmp_path) == []
 
 
-def test_a_folder_that_cannot_be_made_is_an_error_that_names_the_file(tmp_path):
-    (tmp_path / "file").write_text("")
-    path = tmp_path / "file" / "a.txt"
-    with pytest.raises(WriteError, match=rf"^{path}: cannot be written: (Not a directory|File exists)"):
-        write_json(path, {})
-
-
-def test_an_error_of_another_file_stays_as_it_is(tmp_path):
-    with pytest.raises(FileNotFoundError, match="elsewhere"), replacing(tmp_path / "a.txt"):
-        (tmp_path / "elsewhere").read_text()
-
-
 def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
     (tmp_path / "run" / ".weights.1.tmp" / "in").mkdir(parents=True)
     (tmp_path / "run" / "test").mkdir()
@@ -128,19 +115,15 @@ def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
     assert names(tmp_path / "run") == ["test"] and names(tmp_path / "run" / "test") == ["a.png"]
 
 
-def test_a_name_that_is_not_utf_8_is_written_escaped(tmp_path):
-    write_text(tmp_path / "t.txt", "Zürich n\udcff")
-    assert (tmp_path / "t.txt").read_text(encoding="utf-8") == "Zürich n\\udcff"
-
-
 def test_whether_a_file_can_be_written_is_known_before(tmp_path):
     check_writable(tmp_path / "new" / "folder" / "a.npz")
     assert names(tmp_path) == []
     (tmp_path / "file").write_text("")
     with pytest.raises(IsADirectoryError, match="expected a file to write, found a folder"):
         check_writable(tmp_path)
-    with pytest.raises(WriteError, match=rf"{tmp_path}/file/a: cannot be written: Not a directory"):
-        check_writable(tmp_path / "file" / "a")
+    for write in (check_writable, lambda path: write_json(path, {"a": [1]})):
+        with pytest.raises(WriteError, match=rf"{tmp_path}/file/a: cannot be written: (Not a directory|File exists)"):
+            write(tmp_path / "file" / "a")
 
 
 def test_several_files_are_written_together_or_not_at_all(tmp_path):
@@ -154,21 +137,6 @@ def test_several_files_are_written_together_or_not_at_all(tmp_path):
     with pytest.raises(WriteError, match=rf"{tmp_path}/c: cannot be written: No space left on device"):
         write_all(tmp_path, {"b": write, "c": fail})
     assert names(tmp_path) == ["new"]
-
-
-def test_an_error_below_a_temporary_path_names_the_final_one(tmp_path, monkeypatch):
-    def full(path, content):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(WriteError, match=rf"^{tmp_path}/a: cannot be written: No space left on device$"):
-        write_all(tmp_path, {"a": lambda path: write_text(path, "x")})
-    assert names(tmp_path) == []
-
-
-def test_json_comes_back(tmp_path):
-    write_json(tmp_path / "a.json", {"a": [1, None, "b"]})
-    assert read_json(tmp_path / "a.json") == {"a": [1, None, "b"]}
 
 
 @pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": 1, "a": 2}', b"1" * 5000])
@@ -197,11 +165,7 @@ def test_any_other_name_becomes_the_name_of_a_file_in_the_folder(tmp_path, name)
     path = tmp_path / file_name(name)
     path.write_text("")
     assert [*tmp_path.iterdir()] == [path] and len(path.name.encode()) <= MOST_BYTES
-
-
-def test_different_names_have_different_files():
-    names = (*HOSTILE, "a_b", "..-escaped", "x" * (2**20 + 1), "\ud801")
-    assert len({file_name(name) for name in names}) == len(names)
+    assert all(file_name(other) != path.name for other in (*HOSTILE, "a_b", "..-escaped") if other != name)
 
 
 def test_a_table_names_files_inside_its_dataset():
