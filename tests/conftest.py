@@ -37,6 +37,7 @@ RUN_LONG = (
     "cli/test_live",
     "cli/test_loops",
     "cli/test_map.py",
+    "cli/test_survival.py",
     "docs/test_blocks.py::test_python_runs[README.md]",
     "docs/test_blocks.py::test_python_runs[docs/guides/loops.md]",
     "docs/test_blocks.py::test_python_runs[docs/guides/maps.md]",

@@ -1,21 +1,26 @@
 """Drives for the tests: one that is simulated, and synthetic ones with loops that a detector might find on them."""
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.closure import Loop, planar_loop
 from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.se3 import inverse, transform, yaw_of
 from sglpr_jax.sim import recording
+from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.sensor import Sensor
 
 SCANS = 240
 SENSOR = Sensor(elevations_deg=tuple(np.linspace(2, -24, 32)), azimuth_steps=600)
 
+PASS = 20
+"""Scans of `street` in each direction."""
 LOOP_COVARIANCE = np.diag([0.1, 0.1, np.radians(0.3)]) ** 2
 
 
@@ -31,6 +36,19 @@ def simulated_drive() -> SimulatedRecording:
 def drive() -> SimulatedRecording:
     """`simulated_drive`."""
     return simulated_drive()
+
+
+def part_of_drive(rows: Sequence[int], name: str = "08") -> SimulatedRecording:
+    """Some scans of the drive as a recording of their own."""
+    whole, rows = simulated_drive(), list(rows)
+    poses = TimedPoses(whole.poses.world_from_lidar[rows], whole.poses.times[rows])
+    return dataclasses.replace(only(whole, rows), name=name, rows=None, poses=poses)
+
+
+@pytest.fixture(scope="session")
+def street() -> SimulatedRecording:
+    """40 scans, 3.5 m apart: a street, and 40 s later the same street the other way."""
+    return part_of_drive((*range(0, 2 * PASS, 2), *range(SCANS - 2 * PASS, SCANS, 2)))
 
 
 @pytest.fixture(scope="session")

@@ -19,12 +19,10 @@ from sglpr_jax.bev import (
     rotate_points,
     uncropped,
 )
-from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.readers import open_recording
 from sglpr_jax.grid import Grid
 
 # At 0.26 m, 1 / r rounded once differs from the reciprocal of a rounded r, and from a division.
-GRIDS = [Grid(), Grid(0.1), Grid(0.4, 128, 128), Grid(0.26, 96, 160), Grid(0.7, 2, 6)]
+GRIDS = [Grid(), Grid(0.26, 96, 160), Grid(0.7, 2, 6)]
 SMALL = Grid(0.26, 10, 16)
 CLOUD_SIZE = 32
 
@@ -47,16 +45,6 @@ def reference(points, grid, labels=None):
             image[int(v), int(u)] += 1
             semantic[int(v), int(u)] = 0 if labels is None else labels[i]
     return image, semantic, len(points) - image.sum()
-
-
-def fast_reference(points, grid):
-    """The image of `reference` for large clouds of finite points."""
-    x, y = np.floor(points[:, :2] * np.float32(1 / grid.resolution_m)).astype(np.int64).T
-    u, v = grid.width // 2 + x, grid.height // 2 - y - 1
-    inside = (u >= 0) & (u < grid.width) & (v >= 0) & (v < grid.height)
-    image = np.zeros((grid.height, grid.width), np.int32)
-    np.add.at(image, (v[inside], u[inside]), 1)
-    return image
 
 
 def border_values(grid):
@@ -120,14 +108,6 @@ def test_the_axes_of_equation_1():
     assert count_outside(points, grid=grid) == 2  # the window's upper borders are outside
 
 
-def test_the_last_point_gives_the_label():
-    points = np.float32([[0.1, 0.1, 0], [5, 5, 0], [0.2, 0.2, 0]])
-    image = rasterize_labels(points, np.int32([3, 4, 0]), grid=Grid(1.0, 2, 2))
-    np.testing.assert_array_equal(image, np.zeros((2, 2)))
-    image = rasterize_labels(points[::-1], np.int32([0, 4, 3]), grid=Grid(1.0, 2, 2))
-    np.testing.assert_array_equal(image, [[0, 3], [0, 0]])
-
-
 @pytest.mark.slow
 def test_batches_vmap_jit_and_eager_agree():
     rng = np.random.default_rng(0)
@@ -156,39 +136,12 @@ def test_batches_vmap_jit_and_eager_agree():
             np.testing.assert_array_equal(found, np.reshape(wanted, found.shape))
 
 
-def test_an_empty_cloud_is_an_empty_image():
-    points, labels = np.zeros((2, 0, 3), np.float32), np.zeros((2, 0), np.int32)
-    assert rasterize(points, grid=SMALL).shape == (2, 10, 16)
-    assert not np.any(rasterize(points, grid=SMALL))
-    np.testing.assert_array_equal(rasterize_labels(points, labels, grid=SMALL), np.zeros((2, 10, 16)))
-    np.testing.assert_array_equal(count_outside(points, grid=SMALL), [0, 0])
-
-
 @pytest.mark.parametrize(
     "changed", [{"resolution_m": 0.0}, {"resolution_m": float("nan")}, {"height": 0}, {"width": 151}]
 )
 def test_a_grid_without_a_centre_is_refused(changed):
     with pytest.raises(ValueError, match=next(iter(changed)).removesuffix("_m")):
         Grid(**changed)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("grid", GRIDS)
-def test_real_scans_equal_the_reference(shared, grid):
-    samples = shared / "data/samples"
-    scans = [read_scan(path) for path in sorted(samples.rglob("*.bin"))]
-    for name in ("00", "08"):
-        sequence = open_recording(shared / "data/kitti_odometry", name)
-        scans += [sequence.points(i) for i in range(len(sequence))]
-    assert len(scans) == 2 + 11 + 3
-    counts = np.int32([len(points) for points in scans])
-    padded = np.full((len(scans), counts.max(), 3), 0.05, np.float32)  # padding that would count if it were not masked
-    for row, points in zip(padded, scans, strict=True):
-        row[: len(points)] = points
-    images = np.asarray(rasterize(padded, grid=grid, count=counts))
-    for image, points in zip(images, scans, strict=True):
-        np.testing.assert_array_equal(image, fast_reference(points, grid))
-    np.testing.assert_array_equal(count_outside(padded, grid=grid, count=counts), counts - images.sum((1, 2)))
 
 
 angles = st.floats(-10, 10, width=32)
@@ -207,23 +160,11 @@ def test_points_turn_as_numpy_turns_them(points, turns):
     np.testing.assert_allclose(jax.vmap(rotate_points)(points, turns), found, atol=1e-5)
 
 
-def test_a_quarter_turn_takes_forward_to_left():
-    turned = rotate_points(np.float32([[1, 0, 5]]), np.float32(np.pi / 2))
-    np.testing.assert_allclose(turned, [[0, 1, 5]], atol=1e-6)
-
-
-@pytest.mark.parametrize("size", [8, 9])
-@pytest.mark.parametrize("quarters", [0, 1, 2, 3, -1])
+@pytest.mark.parametrize(("size", "quarters"), [(8, 1), (9, 2), (8, -1)])
 def test_quarter_turns_of_images_move_whole_cells(size, quarters):
     image = np.random.default_rng(0).uniform(0, 10, (size, size)).astype(np.float32)
     turned = rotate_image(image, np.float32(quarters * np.pi / 2))
     np.testing.assert_allclose(turned, np.rot90(image, quarters), atol=2e-4)
-
-
-def test_beyond_the_border_is_zero():
-    turned = np.asarray(rotate_image(np.ones((9, 9), np.float32), np.float32(np.pi / 4)))
-    assert turned[4, 4] == pytest.approx(1.0)
-    assert turned[0, 0] == turned[0, 8] == turned[8, 0] == turned[8, 8] == 0.0
 
 
 def bump(centre, size, resolution_m):
@@ -239,17 +180,6 @@ def test_images_turn_as_their_points_do(angle, x, y):
     turned_centre = np.asarray(rotate_points(np.float32([[x, y, 0]]), np.float32(angle)))[0]
     found = rotate_image(bump((x, y), 64, 0.4), np.float32(angle))
     np.testing.assert_allclose(found, bump(turned_centre, 64, 0.4), atol=0.01)
-
-
-def test_turned_points_and_turned_images_rasterise_alike():
-    """On a dense cloud, where a cell's count is smooth, turning before and after eq. 1 is the same up to noise."""
-    rng = np.random.default_rng(0)
-    points = np.concatenate([rng.normal([4, 1, 0], 2, (100_000, 3)), rng.normal([-3, -4, 0], 2, (100_000, 3))])
-    points, angle, grid = points.astype(np.float32), np.float32(0.7), Grid(0.5, 64, 64)
-    before = np.asarray(rasterize(rotate_points(points, angle), grid=grid))
-    after = np.asarray(rotate_image(rasterize(points, grid=grid).astype(jnp.float32), angle))
-    assert np.corrcoef(before.ravel(), after.ravel())[0, 1] > 0.995
-    assert np.corrcoef(before.ravel(), np.rot90(after).ravel())[0, 1] < 0.7
 
 
 def test_image_batches_vmap_and_jit_agree():

@@ -32,12 +32,6 @@ def test_copied_files_exist_and_are_not_ignored():
         assert (ROOT / name).exists() and f"!{name.partition('/')[0]}" in ignored
 
 
-def test_the_extras_and_the_python_are_those_of_the_project():
-    extras = re.search(r"^ARG EXTRAS=(.+)$", DOCKERFILE, re.MULTILINE)[1].split(",")
-    assert set(extras) <= set(PROJECT["optional-dependencies"])
-    assert re.search(r"^ARG PYTHON=3\.1[1-9]$", DOCKERFILE, re.MULTILINE)
-
-
 def test_commands_run_with_and_without_the_prefix_and_an_unknown_one_lists_them(tmp_path):
     for name in ("loops", "sglpr-loops"):
         assert entry_point(tmp_path, name, "my scans").stdout == "sglpr-loops:my scans\n"

@@ -75,16 +75,6 @@ def test_decisions_are_counted_at_every_distinct_score(items):
     np.testing.assert_allclose(np.stack([curve.precision, curve.recall], axis=1), expected, atol=1e-12)
 
 
-def test_an_item_that_counts_for_nothing_changes_no_precision():
-    curve = decision_curve(
-        np.array([3.0, 2.0, 1.0]),
-        true_if_accepted=np.array([True, False, True]),
-        false_if_accepted=np.array([False, False, False]),
-        missed_if_rejected=np.array([True, False, True]),
-    )
-    assert curve.f1_max == 1.0
-
-
 def test_best_is_the_highest_of_equally_good_thresholds():
     curve = classification_curve(np.array([3.0, 2.0, 1.0, 0.0]), np.array([True, False, False, True]))
     # F1 is 2/3 when only the first is accepted, and again when all four are.

@@ -12,15 +12,9 @@ from recordings import kitti_trajectory
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.revisits import database_end, revisits
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S, POSITIVE_M
-from sglpr_jax.se3 import are_rotations, distances, positions_from_camera
+from sglpr_jax.se3 import are_rotations, distances
 
 coordinates = st.floats(-1e4, 1e4)
-
-
-def test_camera_axes_become_forward_left_up():
-    world_from_camera = np.zeros((1, 3, 4))
-    world_from_camera[0, :, 3] = [1, 2, 3]  # right, down, forward
-    np.testing.assert_array_equal(positions_from_camera(world_from_camera), [[3, -1, -2]])
 
 
 @hypothesis.settings(deadline=None, max_examples=25)
@@ -87,9 +81,7 @@ def test_height_counts_only_in_3d():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "sequence, count", [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
-)
+@pytest.mark.parametrize("sequence, count", [("00", 777), ("02", 296), ("08", 321)])
 def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
     published = json.loads((shared / "data/protocol/logg3d_is_revisit_D-3_T-30.json").read_text())[sequence]
     positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
@@ -99,14 +91,8 @@ def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
     assert revisits(positions).sum() == count  # 290 frames stand for 30 s
 
 
-@pytest.mark.parametrize("sequence, count", [("02", 217), ("08", 158)])
-def test_the_pose_file_matters(shared, sequence, count):
-    positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="kitti")
-    assert revisits(positions, times=times).sum() == count
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("sequence, count", [("00", 774), ("02", 217), ("06", 268)])
+@pytest.mark.parametrize("sequence, count", [("02", 217)])
 def test_revisits_of_the_bev_images(shared, sequence, count):
     positions = read_poses(shared / f"data/kitti_bev/{sequence}/pose.txt")[:, :, 3]
     assert revisits(positions).sum() == count

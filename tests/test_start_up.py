@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 import sglpr_jax
 
@@ -45,12 +44,6 @@ for command in {COMMANDS}:
     check(command)
 """
     assert imported_by(program) == set()
-
-
-@pytest.mark.slow
-def test_a_name_of_the_library_brings_what_it_needs():
-    program = "import sglpr_jax, sys; sglpr_jax.CATEGORIES; assert 'jax' not in sys.modules; sglpr_jax.describe"
-    assert imported_by(program) == set(SLOW)
 
 
 def test_a_folder_of_scans_is_opened_without_scipy_and_without_the_simulator(tmp_path):

@@ -5,6 +5,7 @@ import importlib
 import io
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +15,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sglpr_jax.data.formats.pose_files import read_kitti
+from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
 
-SCANS = 40
+SCANS, WALK = 40, 8
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
 TINY = Path(__file__).resolve().parents[1] / "tiny.py"
 
@@ -67,6 +70,21 @@ def _own_cache(tmp_path_factory):
 def town(once) -> Path:
     """Recordings 00, 05 and 08 of 40 thin scans, with labels; 08 revisits places."""
     return once("town", lambda root: simulate(root, scans=SCANS, sensor=SENSOR))
+
+
+@pytest.fixture(scope="session")
+def walk(town, once) -> Path:
+    """Folder with `scans`, the first 8 scans of 08 twice, without times, and their true poses in `poses.tum`."""
+
+    def make(root: Path) -> None:
+        (root / "scans").mkdir(parents=True)
+        for number in range(2 * WALK):
+            scan = town / f"sequences/08/velodyne/{number % WALK:06d}.bin"
+            shutil.copy(scan, root / "scans" / f"{number:06d}.bin")
+        poses = read_kitti(town / "sequences/08/poses.txt")[:WALK]
+        write_tum(root / "poses.tum", np.concatenate([poses, poses]), np.arange(2.0 * WALK))
+
+    return once("walk", make)
 
 
 @pytest.fixture(scope="session")

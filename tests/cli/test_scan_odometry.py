@@ -5,11 +5,12 @@ import sys
 
 import numpy as np
 import pytest
+from drives import simulated_drive
 
 from sglpr_jax.data.formats.pose_files import read_tum
+from sglpr_jax.loops import search
+from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.odometry import kiss_icp
-from sglpr_jax.sim.recording import simulate_recording
-from sglpr_jax.sim.sensor import Sensor
 
 from .conftest import assert_one_line_error
 
@@ -22,8 +23,7 @@ def street(once):
 
     def make(folder):
         folder.mkdir()
-        sensor = Sensor(elevations_deg=tuple(np.linspace(2, -24, 32)), azimuth_steps=300)
-        recording = simulate_recording("08", scans=240, sensor=sensor, seed=3)
+        recording = simulated_drive()
         for row in range(SCANS):
             recording.render(row)[0].astype("<f4").tofile(folder / f"{row:06d}.bin")
         np.savetxt(folder / "times.txt", recording.times[:SCANS])
@@ -53,7 +53,14 @@ def test_loops_of_scans_alone_end_with_a_trajectory(command, run, tmp_path):
 
 
 @pytest.mark.slow
-def test_several_recordings_have_their_own_odometry(command, run, street, tmp_path):
+def test_several_recordings_have_their_own_odometry(command, run, street, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        search,
+        "find_loops",
+        lambda recordings, params, *, odometry, **_: FoundLoops(
+            tuple(Session(one, SCANS, poses) for one, poses in zip(recordings, odometry, strict=True))
+        ),
+    )
     ended = command("loops", street, *run, "--odometry", "auto", "--no-register", "--out", tmp_path / "found")
     assert ended.status == 0, ended.error
     assert {"trajectory-street.tum", "trajectory-street~2.tum"} < {path.name for path in (tmp_path / "found").iterdir()}

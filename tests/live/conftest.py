@@ -1,28 +1,19 @@
-"""A short simulated drive that comes back, and reports as a list."""
+"""A simulated street that is driven twice, and reports as a list."""
 
 import dataclasses
 
-import numpy as np
 import pytest
+from drives import PASS, street
 
 import sglpr_jax
 from sglpr_jax.live.messages import LiveFrame
-from sglpr_jax.sim import recording
-from sglpr_jax.sim.recording import SimulatedRecording
-from sglpr_jax.sim.sensor import Sensor
 
-SCANS = 130
-SENSOR = Sensor(elevations_deg=tuple(np.linspace(2, -24, 16)), azimuth_steps=180)
+SCANS = 2 * PASS
 BEGIN = 1_700_000_000.25
 """Time of the first scan, in seconds."""
 
 
-@pytest.fixture(scope="session")
-def drive() -> SimulatedRecording:
-    """130 scans, about 3 m apart, which end where they began. Each scan is rendered once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recording, "KEPT_SCANS", SCANS)
-        return recording.simulate_recording("08", scans=SCANS, sensor=SENSOR, seed=3)
+drive = street
 
 
 @pytest.fixture(scope="session")

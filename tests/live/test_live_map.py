@@ -23,7 +23,7 @@ from sglpr_jax.se3 import inverse
 from tests.live.conftest import SCANS, live_frame
 
 CONFIG = DetectorConfig(min_probability=0.5)
-HALF = 70
+HALF = 20
 DRAW = np.random.default_rng(0)
 FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(5, 2))))
 SEEN = Seen(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))

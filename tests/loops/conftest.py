@@ -1,13 +1,14 @@
-"""A simulated town that is driven through twice, and pairs without a comparison of images."""
+"""A simulated street that is driven twice, what a detector finds in it, and pairs without a comparison of images."""
 
 from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
-from drives import drive, revisit  # noqa: F401
+from drives import drive, revisit, street  # noqa: F401
 
 import sglpr_jax
 from sglpr_jax.loops.comparison import Candidate, Comparer
+from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.keyframes import described as describe_scan
 from sglpr_jax.loops.probability import Evidence
@@ -22,9 +23,17 @@ def params() -> Params:
 
 
 @pytest.fixture(scope="session")
-def described(drive, params) -> list[Seen]:  # noqa: F811
-    """Description of each scan of the drive."""
-    return [describe_scan(params, drive.record(i, labels=False)) for i in range(len(drive))]
+def described(street, params) -> list[Seen]:  # noqa: F811
+    """Description of each scan of the street."""
+    return [describe_scan(params, street.record(i, labels=False)) for i in range(len(street))]
+
+
+@pytest.fixture(scope="session")
+def streamed(street, described, params):  # noqa: F811
+    """The detector after the whole street, with odometry, and what it returned frame by frame."""
+    detector = LoopDetector(params)
+    frames = zip(described, street.times.tolist(), street.poses.world_from_lidar, strict=True)
+    return detector, [detector.add_seen(seen, time=time, odometry=pose) for seen, time, pose in frames]
 
 
 @pytest.fixture
@@ -33,7 +42,7 @@ def compare_only(monkeypatch) -> Callable[[Mapping[int, tuple[int, np.ndarray]]]
     with clear images, and with the deviation of this pose from the motion."""
 
     def only(pairs: Mapping[int, tuple[int, np.ndarray]]) -> None:
-        def candidates(self, query, fits, searched, **_) -> list[Candidate]:
+        def candidates(self, query, fits, *_, **__) -> list[Candidate]:
             if query.frame not in pairs:
                 return []
             match, pose = pairs[query.frame]

@@ -29,11 +29,6 @@ FLAT = np.zeros((2, 4, 4))
 EMPTY = Seen(np.ones(256, np.float32), np.zeros((152, 152), np.uint8), None)
 
 
-@pytest.fixture
-def recording():
-    return of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
-
-
 def test_lists_are_taken_for_arrays():
     np.testing.assert_array_equal(given_poses(POSES, of="odometry"), np.array(POSES))
     np.testing.assert_array_equal(given_pose(POSES[0]), np.eye(4))
@@ -48,10 +43,8 @@ def test_lists_are_taken_for_arrays():
 @pytest.mark.parametrize(
     ("call", "kind", "message"),
     [
-        (lambda: given_poses("odometry.tum", of="odometry"), TypeError, r"odometry \(n, 4, 4\), found the path odo"),
         (lambda: given_poses(Path("a.tum"), of="poses"), TypeError, "path a.tum; read it with sglpr_jax.read_odometry"),
-        (lambda: given_poses({"a": 1}, of="poses"), TypeError, r"poses \(n, 4, 4\), found a dict"),
-        (lambda: given_poses([np.eye(4), np.eye(3)], of="poses"), TypeError, "found a list"),
+        (lambda: given_poses([np.eye(4), np.eye(3)], of="poses"), TypeError, r"poses \(n, 4, 4\), found a list"),
         (lambda: given_poses(np.zeros((5, 3)), of="odometry"), ValueError, r"odometry .*, found .* shape \(5, 3\)"),
         (lambda: given_poses(FLAT, of="odometry"), ValueError, r"with rotations, found \[\[0\.0.* in row 0"),
         (lambda: given_pose(np.eye(3)), ValueError, "odometry as a 4 x 4 pose with a rotation, found"),
@@ -61,20 +54,17 @@ def test_lists_are_taken_for_arrays():
         (lambda: given_time("now"), TypeError, "expected a time in seconds, found 'now'"),
         (lambda: given_time(np.nan), ValueError, "expected a time in seconds, found nan"),
         (lambda: check_is("a", Params, by="load"), TypeError, "a Params, found 'a'; sglpr_jax.load returns one"),
-        (lambda: check_is([], Params, by="load"), TypeError, "found a list"),
     ],
-)  # fmt: skip
+)
 def test_what_is_something_else_is_named(call, kind, message):
     with pytest.raises(kind, match=message):
         call()
 
 
-def test_the_functions_ask_so(recording, params):
-    for given, found in (("a.tum", "found the path a.tum"), (np.eye(4), r"found an array of shape \(4, 4\)")):
-        with pytest.raises((TypeError, ValueError), match=rf"expected odometry \(n, 4, 4\), {found}"):
-            find_loops(recording, params, odometry=given)
-    with pytest.raises(ValueError, match=r"expected poses \(n, 4, 4\), found an array of shape \(2, 3\)"):
-        map_recording(recording, params, np.zeros((2, 3)))
+def test_the_functions_ask_so(params):
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
+    with pytest.raises(TypeError, match=r"expected odometry \(n, 4, 4\), found the path a\.tum"):
+        find_loops(recording, params, odometry="a.tum")
     with pytest.raises(ValueError, match="08: expected a pose for each of 2 scans, found 1"):
         map_recording(recording, params, POSES[:1])
     with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
@@ -101,8 +91,6 @@ def test_points_are_looked_for_in_a_map_as_those_of_its_sensor(params, monkeypat
     monkeypatch.setattr(CandidateFinder, "seen", lambda self, record: seen.append(record) or EMPTY)
     assert places.relocate(params, [[5, 3, 1]]) == [] and places.relocate(params, np.zeros((9, 9))) == []
     assert seen[0].mounting == Mounting(2.5) and seen[1].image is not None
-    with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
-        places.relocate(params, "0.bin")
 
 
 def test_loops_and_maps_warn_of_poses_in_the_cameras_axes(params):

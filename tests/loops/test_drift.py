@@ -104,8 +104,7 @@ def test_the_steps_of_a_graph_add_up_to_the_model_after_100_m(tmp_path):
     assert information[0, 0] == pytest.approx(1 / (1.0 + 2.5e-5), rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["metres_per_metre", "degrees_per_metre", "position_m", "max_deviation"])
-@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
+@pytest.mark.parametrize(("name", "value"), [("metres_per_metre", -0.1), ("position_m", 0.0), ("position_m", np.nan)])
 def test_an_impossible_drift_is_an_error(name, value):
     with pytest.raises(ValueError, match=f"expected {name} >=? ?0, found"):
         DriftModel(**{name: value})

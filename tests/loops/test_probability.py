@@ -38,15 +38,6 @@ def model_of(evidence: Evidence, is_loop: np.ndarray, made_with: str = "") -> Lo
     return LoopModel(fit(evidence._asdict(), is_loop), made_with)
 
 
-def test_probabilities_are_those_of_pairs_that_were_not_fitted():
-    model = model_of(*pairs(6000, noise=2.0))
-    evidence, is_loop = pairs(6000, seed=1, noise=2.0)
-    probabilities = model.probability(evidence)
-    for low in np.arange(0, 1, 0.2):
-        chosen = (probabilities >= low) & (probabilities < low + 0.2)
-        assert abs(probabilities[chosen].mean() - is_loop[chosen].mean()) < 0.1
-
-
 def test_the_fit_finds_the_curve_that_the_pairs_were_drawn_from():
     """Log odds that bend once, which a straight line cannot follow."""
     rng, n = np.random.default_rng(0), 40_000

@@ -1,3 +1,29 @@
-"""A simulated town that is driven through twice."""
+"""A simulated street that is driven twice, and a map of the first time."""
 
-from drives import drive, revisit  # noqa: F401
+import numpy as np
+import pytest
+from drives import PASS, drive, part_of_drive  # noqa: F401
+
+import sglpr_jax
+from sglpr_jax.maps.build import map_recording
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.models.params import Params
+from sglpr_jax.sim.recording import SimulatedRecording
+
+
+@pytest.fixture(scope="session")
+def params() -> Params:
+    return sglpr_jax.load("circular")
+
+
+@pytest.fixture(scope="session")
+def first() -> tuple[SimulatedRecording, np.ndarray]:
+    """Every second scan of the street, 7 m apart, and their poses."""
+    recording = part_of_drive(range(0, 2 * PASS, 4))
+    return recording, recording.poses.world_from_lidar
+
+
+@pytest.fixture(scope="session")
+def places(first, params) -> PlaceMap:
+    """The map of these."""
+    return map_recording(first[0], params, first[1]).places

@@ -9,59 +9,31 @@ import pytest
 from recordings import with_points
 from scipy.spatial.transform import Rotation
 
-import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record
 from sglpr_jax.data.views import rotated
-from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, yaw_of
 
-MAPPED = 60
-
-
-@pytest.fixture(scope="module")
-def params():
-    return sglpr_jax.load("circular")
-
-
-@pytest.fixture(scope="module")
-def first(drive):
-    """Every second of the first scans of the drive, and their poses."""
-    rows = list(range(0, MAPPED, 2))
-    parts = {name: tuple(getattr(drive, name)[i] for i in rows) for name in ("ids", "paths", "label_paths")}
-    arrays = {name: getattr(drive, name)[rows] for name in ("positions", "times")}
-    return dataclasses.replace(drive, **parts, **arrays), drive.poses.world_from_lidar[rows]
-
-
-@pytest.fixture(scope="module")
-def places(first, params) -> PlaceMap:
-    recording, poses = first
-    return map_recording(recording, params, poses).places
+PLACES = 10
 
 
 @pytest.mark.slow
-def test_scans_between_those_of_the_map_find_themselves_however_they_are_turned(drive, places, params):
-    for frame in (11, 31, 51):
+def test_scans_between_those_of_the_map_find_themselves_and_one_from_elsewhere_does_not(drive, places, params):
+    for frame in (10, 18, 30):
         angle = 2.0 + frame
         found = places.relocate(params, Record(points=rotated(drive.points(frame), angle)))
         true = drive.poses.world_from_lidar[frame]
         error = inverse(true) @ found[0].world_from_query
         assert found[0].probability > 0.5 and np.linalg.norm(error[:2, 3]) < 0.4
         assert abs(np.angle(np.exp(1j * (yaw_of(error) + angle)))) < np.radians(2)
-        assert found[0].place == f"08/{drive.ids[frame - 1]}" or found[0].place == f"08/{drive.ids[frame + 1]}"
+        assert found[0].place in (f"08/{drive.ids[frame - 2]}", f"08/{drive.ids[frame + 2]}")
         assert [one.probability for one in found] == sorted((one.probability for one in found), reverse=True)
         assert len({one.place for one in found}) == len(found)
-
-
-@pytest.mark.slow
-def test_a_scan_from_elsewhere_is_improbable(drive, places, params):
-    apart = np.linalg.norm(drive.positions[:, None] - drive.positions[None, :MAPPED], axis=2).min(axis=1)
-    far = int(apart.argmax())
-    assert apart[far] > 40
-    assert places.relocate(params, drive.record(far))[0].probability < 0.5
+    assert np.linalg.norm(drive.positions[120] - drive.positions[:40], axis=1).min() > 40
+    assert all(one.probability < 0.5 for one in places.relocate(params, drive.record(120)))
 
 
 @pytest.mark.slow
@@ -69,11 +41,11 @@ def test_a_map_comes_back_from_its_file(places, tmp_path):
     path = tmp_path / "town.safetensors"
     places.save(path)
     again = PlaceMap.load(path, weights_hash=places.index.weights_hash)
-    assert len(again) == len(places) == MAPPED // 2 and again.index.ids == places.index.ids
+    assert len(again) == len(places) == PLACES and again.index.ids == places.index.ids
     np.testing.assert_array_equal(again.images, places.images)
     np.testing.assert_array_equal(again.world_from_place, places.world_from_place)
     whole = path.read_bytes()
-    for place in np.linspace(0, len(whole) - 1, 20).astype(int):
+    for place in np.linspace(0, len(whole) - 1, 5).astype(int):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
         with pytest.raises(ValueError, match=r"town\.safetensors: expected an index"):
             PlaceMap.load(path)
@@ -81,15 +53,16 @@ def test_a_map_comes_back_from_its_file(places, tmp_path):
 
 @pytest.mark.slow
 def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, first, places, params):
-    recording, poses = first
-    sunday = dataclasses.replace(recording, name="sunday")
-    shifted = poses.copy()
+    shifted = first[1].copy()
     shifted[:, 2, 3] += 1.0
-    other = map_recording(sunday, params, shifted).places
+    ids = [name.replace("08/", "sunday/") for name in places.index.ids]
+    index = Index.empty(places.index.width, weights_hash=places.index.weights_hash)
+    index.add(places.index.descriptors, ids=ids, positions=shifted[:, :3, 3])
+    other = dataclasses.replace(places, index=index, world_from_place=shifted)
     both = places.merged(other)
-    assert both.index.ids == places.index.ids + other.index.ids
+    assert both.index.ids == places.index.ids + ids
     np.testing.assert_array_equal(both.index.positions, both.world_from_place[:, :3, 3])
-    np.testing.assert_array_equal(both.world_from_place[MAPPED // 2 :], shifted)
+    np.testing.assert_array_equal(both.world_from_place[PLACES:], shifted)
     found = both.relocate(params, drive.record(20), candidates=2)
     assert {one.place.split("/")[0] for one in found} == {"08", "sunday"}
     assert min(one.probability for one in found) > 0.5
@@ -116,7 +89,7 @@ def synthetic(scans: Sequence[int], *, drive: int) -> PlaceMap:
 
 @pytest.mark.parametrize(
     ("here", "own", "mark"),
-    [([0], [], "~2"), ([9], [], "~2"), ([9], [4], "~2"), ([20], [], ""), ([], [3, 8], ""), ([20], [8, 9], "")],
+    [([0], [], "~2"), ([9], [4], "~2"), ([], [3, 8], ""), ([20], [8, 9], "")],
 )
 def test_places_of_a_drive_are_called_the_same_wherever_it_was_stopped(here, own, mark):
     """`here` are scans of another drive of this name, `own` those of the same drive, in the map before."""
@@ -132,82 +105,29 @@ def test_places_of_a_drive_are_called_the_same_wherever_it_was_stopped(here, own
 
 
 @pytest.mark.slow
-def test_a_map_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(first, places, params, tmp_path):
-    recording, poses = first
-    reached, seen = [], []
-    read = with_points(recording, lambda path: seen.append(path) or recording.read(path, None, False).points)
-    for scans in (0, 4, 9, 100):
-        asked = []
-        made = map_recording(
-            read,
-            params,
-            poses,
-            kept_in=tmp_path / "kept",
-            should_stop=lambda asked=asked, scans=scans: asked.append(None) or len(asked) > scans,
-        )
-        reached.append((len(made.places), made.scans))
-    assert reached == [(0, 0), (4, 4), (13, 13), (MAPPED // 2, MAPPED // 2)]
-    assert len(seen) == MAPPED // 2  # no scan was read twice
-    made.places.save(tmp_path / "stopped.safetensors")
-    places.save(tmp_path / "whole.safetensors")
-    assert (tmp_path / "stopped.safetensors").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
-
-    with pytest.warns(DataWarning, match="the same settings, found another spacing_m"):
-        other = map_recording(read, params, poses, spacing_m=30.0, kept_in=tmp_path / "kept")
-    assert 1 < len(other.places) < MAPPED // 2
-    moved = poses.copy()
-    moved[:, 0, 3] += 1
-    with pytest.warns(DataWarning, match="the same settings, found another poses"):
-        map_recording(read, params, moved, spacing_m=30.0, kept_in=tmp_path / "kept", should_stop=lambda: True)
-
-
-@pytest.mark.slow
-def test_scans_that_cannot_be_read_are_left_out_of_a_map(first, places, params, tmp_path):
-    recording, poses = first
-    broken = {recording.paths[row] for row in (0, 7)}
-
-    def points_of(path):
-        if path in broken:
-            raise ValueError("expected a whole scan, found half of one")
-        return recording.read(path, None, False).points
-
-    bad, said = with_points(recording, points_of), []
-    with pytest.raises(ValueError, match="found half of one"):
-        map_recording(bad, params, poses)
-    options = {"on_bad_scan": lambda scan, error: said.append(scan), "kept_in": tmp_path / "kept"}
-    for _ in range(2):  # the second one reads nothing
-        made = map_recording(bad, params, poses, **options)
-        assert made.skipped == (recording.ids[0], recording.ids[7]) == tuple(said)
-        names = [name for row, name in enumerate(places.index.ids) if row not in (0, 7)]
-        assert made.places.index.ids == names
-    with pytest.raises(ValueError, match="found half of one"):  # without leave to skip, the scan is read again
-        map_recording(bad, params, poses, kept_in=tmp_path / "kept")
-
-
-@pytest.mark.slow
 def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(first, places, params, tmp_path):
     recording, poses = first
     assert len(map_recording(recording, params, np.tile(poses[:1], (len(poses), 1, 1))).places) == 1
-    with pytest.raises(ValueError, match="08: expected a pose for each of 30 scans, found 3"):
-        map_recording(recording, params, poses[:3])
     assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
-    empty = with_points(recording, lambda path: np.full((1, 3), 5, np.float32))
-    with pytest.raises(ValueError, match="08: expected at least one scan that is not empty, found 30 empty ones"):
-        map_recording(dataclasses.replace(empty, label_paths=()), params, poses)
-    at_origin = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
-    with pytest.raises(ValueError, match=r"scan 000000 of sequence 08: expected points around the sensor"):
-        map_recording(dataclasses.replace(at_origin, label_paths=()), params, poses)
+    for cloud, words in (
+        (np.full((1, 3), 5, np.float32), "08: expected at least one scan that is not empty, found 10 empty ones"),
+        (np.zeros((3, 3), np.float32), "scan 000000 of sequence 08: expected points around the sensor"),
+    ):
+        bad = dataclasses.replace(with_points(recording, lambda path, cloud=cloud: cloud), label_paths=())
+        with pytest.raises(ValueError, match=words):
+            map_recording(bad, params, poses)
     places.index.save(tmp_path / "index.safetensors")
     with pytest.raises(ValueError, match="expected a map of places, found an index without images"):
         PlaceMap.load(tmp_path / "index.safetensors")
     places.save(tmp_path / "town.safetensors")
-    with pytest.raises(ValueError, match="expected descriptors of the weights"):
-        PlaceMap.load(tmp_path / "town.safetensors", weights_hash="other")
     other = dataclasses.replace(places, index=dataclasses.replace(places.index, weights_hash="other"))
-    with pytest.raises(ValueError, match="expected descriptors of the weights"):
-        places.merged(other)
-    with pytest.raises(ValueError, match="expected descriptors of the weights"):
-        other.relocate(params, recording.record(0))
+    for use in (
+        lambda: PlaceMap.load(tmp_path / "town.safetensors", weights_hash="other"),
+        lambda: places.merged(other),
+        lambda: other.relocate(params, recording.record(0)),
+    ):
+        with pytest.raises(ValueError, match="expected descriptors of the weights"):
+            use()
 
 
 def small_map(path: Path, *, distance: str = "l2", **change) -> Path:
@@ -219,12 +139,6 @@ def small_map(path: Path, *, distance: str = "l2", **change) -> Path:
     return path
 
 
-def changed(array: np.ndarray, where: tuple, value: float) -> np.ndarray:
-    array = array.copy()
-    array[where] = value
-    return array
-
-
 POSES = np.tile(np.eye(4), (3, 1, 1))
 LEVEL = np.tile([1.73, 0, 0, 1], (3, 1))
 
@@ -233,10 +147,8 @@ LEVEL = np.tile([1.73, 0, 0, 1], (3, 1))
     ("change", "message"),
     [
         ({"world_from_place": 2 * POSES}, r"expected world_from_place \(n, 4, 4\), with rotations"),
-        ({"world_from_place": POSES[:2]}, "expected world_from_place as float64"),
         ({"images": np.zeros((3, 7, 7), np.uint8)}, "expected images of an even number of cells"),
-        ({"mountings": changed(LEVEL, (0, 0), 1000)}, "expected the sensor's height above the ground"),
-        ({"mountings": changed(LEVEL, (0, 3), 2)}, "expected up directions of length 1"),
+        ({"mountings": np.tile([1000.0, 0, 0, 1], (3, 1))}, "expected the sensor's height above the ground"),
         ({"distance": "cosine"}, "expected descriptors compared by l2, found cosine"),
     ],
 )

@@ -1,3 +1,3 @@
-"""A simulated town that is driven through twice."""
+"""A simulated drive."""
 
-from drives import drive, revisit  # noqa: F401
+from drives import drive  # noqa: F401

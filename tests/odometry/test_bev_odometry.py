@@ -74,7 +74,7 @@ def test_a_link_after_a_gap_drifts_by_what_the_sensor_may_have_moved_meanwhile()
     assert set(motion.segments) == {0}
 
 
-@pytest.mark.parametrize("factor", [0.25, 4.0, 1e9])
+@pytest.mark.parametrize("factor", [0.25, 1e9])
 def test_a_drive_at_another_speed_has_the_same_motion(factor):
     links = [None, link(1.0), *[None] * 6, link(2.0), link(3.5), link(1.0, second=0.85)]
     slow, fast = moved(links), moved(links, factor=factor)

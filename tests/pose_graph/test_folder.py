@@ -74,23 +74,6 @@ def test_trajectories_of_an_earlier_run_stay_with_a_warning(found, tmp_path):
         assert (out / name).read_bytes() == written[name]
 
 
-def test_rejected_pairs_have_a_file_of_their_own(found, tmp_path):
-    rejected = Loop(5, 1, transform(2.0, 0.0, 0.0), np.eye(6), 0.25)
-    write_found(dataclasses.replace(found, rejected=(Rejected(rejected, "repeats"),)), tmp_path)
-    assert [loop.query for loop in read_loops_jsonl(tmp_path / "loops.jsonl")] == [4]
-    (line,) = (tmp_path / "rejected.jsonl").read_text().splitlines()
-    assert json.loads(line) == {
-        "query": 5,
-        "match": 1,
-        "query_id": "000005",
-        "match_id": "000001",
-        "reason": "repeats",
-        "probability": 0.25,
-        "overlap": None,
-        "match_from_query": rejected.match_from_query.tolist(),
-    }
-
-
 def test_a_full_disk_leaves_the_files_of_the_earlier_run(found, tmp_path, monkeypatch):
     write_found(found, tmp_path, optimized=corrected(found), texts={"index.html": "old"})
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -105,7 +88,7 @@ def test_a_full_disk_leaves_the_files_of_the_earlier_run(found, tmp_path, monkey
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_frames_keep_the_numbers_of_the_recording(found, tmp_path):
+def test_frames_keep_the_numbers_of_the_recording_and_rejected_pairs_have_a_file(found, tmp_path):
     """Also if scans without a pose were left out before the search. Without times, the numbers are the times."""
     images = {tmp_path / f"{i:06d}.png": np.eye(8, dtype=np.float32) for i in range(80)}
     some = only(of_images(images), [70, 71, 72, 75, 76, 77])

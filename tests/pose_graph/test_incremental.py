@@ -31,12 +31,6 @@ def last_error(trajectory, true, odometry) -> float:
     return float(np.linalg.norm((trajectory.map_from_world @ odometry[-1])[:3, 3] - true[-1, :3, 3]))
 
 
-def test_without_loops_the_odometry_stays(two_laps_odometry):
-    trajectory = driven(two_laps_odometry, ())
-    np.testing.assert_allclose(trajectory.poses, two_laps_odometry, atol=1e-6)
-    np.testing.assert_allclose(trajectory.map_from_world, np.eye(4), atol=1e-6)
-
-
 def test_loops_correct_the_last_pose_and_the_path(two_laps, two_laps_odometry, second_lap_loops):
     trajectory = driven(two_laps_odometry, second_lap_loops)
     batch = PoseGraph({0: two_laps_odometry}, second_lap_loops).solve().poses

@@ -51,7 +51,7 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
         at_scans(recording, poses, path, format="tum")
 
 
-@pytest.mark.parametrize(("stamps", "by_row"), [(0.0, True), (5e-4, True), (0.02, False), ("numbers", True)])
+@pytest.mark.parametrize(("stamps", "by_row"), [(5e-4, True), (0.02, False), ("numbers", True)])
 def test_as_many_poses_as_scans_go_row_by_row_only_where_their_times_are_the_same(tmp_path, poses, stamps, by_row):
     """0, 1, 2, ... are numbers of rows and no times."""
     times = 7 + 0.9 * np.arange(5)
@@ -94,10 +94,8 @@ def test_scans_without_times_get_those_of_a_tum_file(tmp_path, poses):
     [
         ("", "auto", "found an empty file"),
         ("1 2 3\n", "auto", "found 3 numbers a line"),
-        ("\n0 0 0 0 0 0 0 1\n", "auto", "line 1: expected 8 numbers, found 0"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", "auto", "found 12 numbers a line; for 12 numbers a line, name the axes"),
         ("2 0 0 0 0 2 0 0 0 0 2 0\n", "lidar", "expected a rotation and a translation in row 1"),
-        ("", "kitti", "expected at least one pose, found none"),
         ("VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1\n", "g2o", "expected vertices 0, 1, 2"),
     ],
 )

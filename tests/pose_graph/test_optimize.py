@@ -87,13 +87,6 @@ def test_sessions_fit_together_better_than_by_one_transform():
     assert trajectory_error(corrected.poses, truth) < 0.8 * before
 
 
-def test_sessions_without_a_common_place_stay_as_they_are():
-    found = dataclasses.replace(found_pair(), loops=(), transforms=())
-    assert [group for group, _ in placements(found)] == [0, 1]
-    expected = np.concatenate([one.odometry for one in found.sessions])
-    np.testing.assert_allclose(optimize_trajectory(found).poses, expected, atol=1e-9)
-
-
 def test_a_third_session_is_placed_through_the_second():
     pair = found_pair()
     (first,) = pair.transforms

@@ -7,7 +7,7 @@ import pytest
 from scenes import place, relative, seen_from
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
-from sglpr_jax.registration.bev_search import SECOND_DEG, SECOND_M, search, search_near, search_spectra
+from sglpr_jax.registration.bev_search import SECOND_DEG, SECOND_M, coarse_correlations, search, search_near
 from sglpr_jax.registration.bev_spectra import (
     cells,
     lower_half,
@@ -65,19 +65,6 @@ def test_the_pose_lies_between_the_cells():
     assert np.mean(errors) < 0.2  # of cells of .8 m, whose middles would be .3 m off
 
 
-def test_rotations_by_quarter_turns_follow_from_the_first_quarter():
-    query = seen_from(place(3), (0.4, -0.2, 1.0))
-    angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
-    rotated = rotations(merged(prepared(query, SMALL), SMALL.coarse), jnp.asarray(angles))
-    whole = np.asarray(spectrum(rotated, DENSITY_RESOLUTION_M * SMALL.coarse, SMALL))
-    whole, (size, width) = whole.reshape(4, -1, *whole.shape[1:]), whole.shape[1:]
-    found = np.asarray(query_spectra(query, config=SMALL)).swapaxes(1, 2)
-    inside = np.s_[..., np.arange(size) != size // 2, : width - 1]  # the highest frequency stands for its opposite, too
-    np.testing.assert_allclose(found[inside], whole[:2][inside], atol=1e-3)
-    np.testing.assert_allclose(found.conj()[inside], whole[2:][inside], atol=1e-3)
-    np.testing.assert_allclose(abs(found), abs(whole[:2]), atol=1e-3)
-
-
 def test_the_lower_half_of_a_spectrum_is_that_of_larger_cells():
     """Of an image without high frequencies, up to a factor: the power is 1 for both."""
     size, cell_m = 40, DENSITY_RESOLUTION_M * SMALL.coarse
@@ -106,14 +93,14 @@ def test_a_pose_near_an_expected_one_is_found_beside_the_best_one():
     assert wrong.correlation[1] < wrong.correlation[0] and np.hypot(wrong.x[1] + 2, wrong.y[1] - 2) < 3.5
 
 
-def test_matches_beyond_the_count_are_not_searched():
-    query = query_spectra(seen_from(place(1), (0.7, -0.5, 2.0)), config=SMALL)
-    matches = match_spectra(np.stack([seen_from(place(k), (0.0, 0.0, 0.0)) for k in (1, 2, 3)]), config=SMALL)
-    whole, part = (jax.device_get(search_spectra(query, matches, count, config=SMALL)) for count in (None, 2))
-    for values, some in zip(whole, part, strict=True):
-        np.testing.assert_allclose(some, [*values[:2], 0.0], atol=1e-6)
+PLACES, TRUE = 12, 7
 
 
-def test_rotations_are_whole_quarter_turns():
-    with pytest.raises(ValueError, match="expected turns to be a multiple of 4, found 70"):
-        VerificationConfig(turns=70)
+def test_the_true_place_has_the_highest_coarse_correlation():
+    images = np.stack([seen_from(place(seed), (0.0, 0.0, 0.0)).astype(np.uint8) for seed in range(PLACES)])
+    query = query_spectra(seen_from(place(TRUE), (1.2, -0.8, 2.5)).astype(np.uint8))
+    found = np.asarray(coarse_correlations(query, match_spectra(images)))
+    assert found.argmax() == TRUE and np.delete(found, TRUE).max() < 0.5 < found[TRUE]
+    some = np.asarray(coarse_correlations(query, match_spectra(images), TRUE))
+    np.testing.assert_allclose(some[:TRUE], found[:TRUE], atol=1e-6)
+    assert (some[TRUE:] == -1).all()
