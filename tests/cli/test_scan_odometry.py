@@ -88,7 +88,7 @@ def test_an_interrupted_run_keeps_its_odometry(command, run, tmp_path, monkeypat
     ended = command("loops", *run, "--odometry", "auto", "--out", out)
     assert ended.status == 130
     assert f"odometry of 3 of {SCANS} scans; run the same command again to continue\n" in ended.out
-    assert [path.name for path in out.iterdir()] == ["unfinished-0.odometry.npz"]
+    assert [path.name for path in out.iterdir()] == ["unfinished-0.odometry.log"]
 
 
 def test_images_and_a_missing_library_are_one_clear_error(command, images, run, tmp_path, monkeypatch):

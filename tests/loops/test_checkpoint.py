@@ -175,7 +175,8 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
     stopped = find_loops(recording, params, **options, should_stop=lambda: len(done) >= 2)
     overlaps = [loop.overlap for loop in stopped.loops]
     assert overlaps == [0.9] * 2 + [None] * (len(overlaps) - 2) and len(overlaps) >= 8
-    assert stopped.frames == 24 and not stopped.whole and stopped.sessions[0].unregistered == len(overlaps) - 2
+    (session,) = stopped.sessions
+    assert session.frames == 24 and not stopped.whole and session.unregistered == len(overlaps) - 2
     assert str(stopped).endswith(f", {len(overlaps) - 2} not registered")
     read = with_points(recording, lambda path: asked.append(path) or recording.read(path, None, False).points)
     found = find_loops(read, params, **options)

@@ -52,8 +52,13 @@ def test_a_stopped_run_resumes_with_the_same_poses(start, tmp_path, monkeypatch)
     options = {"kept_in": kept, "on_progress": done.append}
     part = kiss_icp.scan_odometry(start, should_stop=lambda: len(done) == 7, **options)
     assert len(part) == 7 and kept.exists()
-    align = kiss_icp._FrontEnd._aligned
-    monkeypatch.setattr(kiss_icp._FrontEnd, "_aligned", lambda self, *given: aligned.append(1) or align(self, *given))
+    add = kiss_icp._FrontEnd.add
+
+    def counted(self, given, *, known=None):
+        aligned.extend([1] if known is None else [])
+        return add(self, given, known=known)
+
+    monkeypatch.setattr(kiss_icp._FrontEnd, "add", counted)
     whole = kiss_icp.scan_odometry(start, **options)
     np.testing.assert_array_equal(whole[:7], part)
     assert len(aligned) == 5
