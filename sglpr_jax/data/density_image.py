@@ -8,7 +8,6 @@ its distance to the sensor. The rows of the image point against x (forward), and
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, Num, UInt8
 
-from sglpr_jax.data.readers.bev_images import as_counts
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, DENSITY_SIZE
 
 REACH_M = 25.0
@@ -38,6 +37,11 @@ def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 
     The result equals writing `density_image` to a PNG and reading it as a ready-made image.
     """
     return as_counts(np.rot90(density_image(points), -1))
+
+
+def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Scale grey values 0..255 to counts 0..10."""
+    return np.ascontiguousarray(grey) * np.float32(DENSITY_MAX_COUNT / 255)
 
 
 def density_label_bev(

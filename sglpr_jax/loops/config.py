@@ -21,6 +21,8 @@ SPACING_M = 1.0
 PlaceCount = Annotated[int, Bounds(1, 1000)]
 PlaceCountOrNone = Annotated[int, Bounds(0, 1000)]
 """Number of places whose images are compared with a query. Each takes milliseconds."""
+INDEPENDENT_M = 25.0
+"""Travelled distance after which two frames are nearly independent, in metres: the reach of an image."""
 MIN_CELLS = 20
 """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
 CANDIDATES = 5

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.loops.closure import Loop, covariance_in_metres, frames_of
-from sglpr_jax.loops.sequence import INDEPENDENT_M
+from sglpr_jax.loops.config import INDEPENDENT_M
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import adjoint, inverse, moved_covariance, yaw_of
 

@@ -15,7 +15,7 @@ from scipy.special import expit, logit
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.closure import Loop, Reason, planar_loop
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.config import INDEPENDENT_M, DetectorConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.odometry.bev_odometry import Motion
@@ -24,8 +24,6 @@ from sglpr_jax.odometry.path import DrivenPath
 
 WINDOW_M = 50.0
 """Travelled distance before and after a query within which other queries are its neighbours, in metres."""
-INDEPENDENT_M = 25.0
-"""Travelled distance after which two frames are nearly independent, in metres: the reach of an image."""
 BLOCK = 64
 """Number of pairs that are tested at a time, to limit memory."""
 

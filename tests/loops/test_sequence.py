@@ -5,8 +5,9 @@ import pytest
 
 from sglpr_jax.loops import sequence
 from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.config import INDEPENDENT_M
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.sequence import INDEPENDENT_M, WINDOW_M, Pair, neighbour_weights, verdict
+from sglpr_jax.loops.sequence import WINDOW_M, Pair, neighbour_weights, verdict
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import inverse, transform

@@ -9,14 +9,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
+from sglpr_jax.data.density_image import as_counts
 from sglpr_jax.data.formats.png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, image_record
-from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
+from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
@@ -48,11 +49,6 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
     """Return an 8-bit image in the orientation of eq. 1, in counts 0..10. Raises what `read_grey_png` raises."""
     return as_counts(read_grey_png(path, bits=8))
-
-
-def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Scale grey values 0..255 to counts 0..10."""
-    return np.ascontiguousarray(grey) * np.float32(DENSITY_MAX_COUNT / 255)
 
 
 READER = Reader("NN/imgs/*.png (BEV images)", partial(names_of, pattern="*/imgs/"), open_recording, rank=1)
