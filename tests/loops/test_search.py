@@ -173,7 +173,7 @@ def test_one_street_on_two_days_has_a_transform_with_and_without_odometry(params
     error = inverse(inverse(frames[0]) @ frames[1]) @ found.transforms[0].match_from_query
     assert np.linalg.norm(error[:2, 3]) < 0.3 and abs(np.degrees(yaw_of(error))) < 0.5
     assert "first and second: " in str(found) and "transform x " in str(found)
-    assert found.within(1).recording is found.sessions[1].recording
+    assert found.within(1).sessions[0].recording is found.sessions[1].recording
     bare = find_loops(both, params, registered=False).between(0, 1)
     assert bare.transforms and not bare.transforms[0].match.is_odometry and len(bare.loops) >= 5
 
