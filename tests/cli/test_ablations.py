@@ -95,7 +95,7 @@ def test_a_head_that_reads_labels_resumes_and_embeds_a_drive_with_labels_only(ru
     shutil.copytree(town, bare)
     shutil.rmtree(bare / "sequences" / "08" / "labels")
     ended = command("embed", *options[:2], "--data", bare, *options[4:], "--skip-bad")
-    assert_one_line_error(ended, "model.head.input", "labels", "found none in sequence 08")
+    assert_one_line_error(ended, "needs labels", "found none in sequence 08")
     flags = ("--data", bare, "--preset", preset, "--out", tmp_path / "other", *flags_of("RB+RS, 15"))
     ended = command("train", "--seq", "08", *flags)
     assert_one_line_error(ended, "model.head.input", "sequence 08", "found 0 of 40")
