@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.files import replacing
 from sglpr_jax.se3 import inverse, transform
 from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
@@ -80,6 +81,20 @@ def in_memory(recording: SimulatedRecording, frames: Sequence[int] | np.ndarray 
     chosen = range(len(recording)) if frames is None else frames
     rendered = {recording.paths[i]: recording.points(int(i)) for i in chosen}
     return dataclasses.replace(recording, read=lambda path, labels, lasers: Record(points=rendered[path]))
+
+
+def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
+    """The recording, with scans from a folder in KITTI's format. The folder is written unless it exists."""
+    if not folder.exists():
+        with replacing(folder) as temporary:
+            temporary.mkdir(parents=True)
+            for i, scan in enumerate(recording.ids):
+                recording.render(i)[0].astype("<f4").tofile(temporary / f"{scan}.bin")
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        return Record(points=np.fromfile(folder / f"{path.name}.bin", "<f4").reshape(-1, 4)[:, :3])
+
+    return dataclasses.replace(recording, read=read, label_paths=())
 
 
 def recording_of(name: str, records: Sequence[Record], times: Float[np.ndarray, " n"] | None = None) -> Recording:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from benchmarks.drives import lidar
-from benchmarks.speed.simulator_rates import measurements
+from benchmarks.gpu.simulator_rates import measurements
 from benchmarks.speed.training import Timing, about_device, configured, describe_work, measured, step_work
 from sglpr_jax.data.training_recordings import leave_one_out
 from sglpr_jax.evaluation.final_test import final_test

@@ -15,15 +15,14 @@ from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from benchmarks.drives import Case, odometry_of
+from benchmarks.drives import Case, odometry_of, on_disk
 from benchmarks.quality.scoring import Closure, closures_of, counted, repeating_rule, told, town_rule
 from benchmarks.timing import run_command
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Record
-from sglpr_jax.evaluation.protocols import protocol_named
 from sglpr_jax.evaluation.protocols.source import TopK
-from sglpr_jax.files import replacing
+from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
@@ -52,13 +51,9 @@ class Drive(NamedTuple):
     folder: Path
 
     def files(self) -> Path:
-        """The folder of the scans in KITTI's format, written unless it exists."""
-        if not self.folder.exists():
-            with replacing(self.folder) as temporary:
-                temporary.mkdir(parents=True)
-                for i, scan in enumerate(self.recording.ids):
-                    self.recording.render(i)[0].astype("<f4").tofile(temporary / f"{scan}.bin")
-                np.savetxt(temporary / "times.txt", self.recording.poses.times)
+        """The folder of the scans in KITTI's format, with their times."""
+        on_disk(self.recording, self.folder)
+        np.savetxt(self.folder / "times.txt", self.recording.poses.times)
         return self.folder
 
 
@@ -268,5 +263,5 @@ def _report_top1(found: FoundLoops, poses: Float[np.ndarray, "n 4 4"], descripto
             nearest=np.array([pairs[i][1] for i in chosen])[:, None],
             scores=scores[chosen][:, None],
         )
-        result = protocol_named("top1-f1max").score(source)
+        result = TOP1_F1MAX(source)
         print(f"  {title}: top-1 F1max {result.score:.4f}, recall@1 (3 m) {result.recalls[1]:.4f}")

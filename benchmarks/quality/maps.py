@@ -11,13 +11,12 @@ from jaxtyping import Bool, Float, Float32
 from scipy.spatial.transform import Rotation
 
 import sglpr_jax
-from benchmarks.drives import lidar
+from benchmarks.drives import lidar, on_disk
 from benchmarks.quality.submaps import APART_M, PASSES, RIGHT_M, rendered, scored, submaps_of_passes
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers import cloud_map
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.odometry.kiss_icp import scan_odometry
@@ -47,12 +46,9 @@ class Drive(NamedTuple):
     """Scans of one sensor in a folder, and their true poses."""
 
     folder: Path
+    scans: Recording
     world_from_lidar: Float[np.ndarray, "n 4 4"]
     sensor: str
-
-    def points(self, row: int) -> Float32[np.ndarray, "n 3"]:
-        """Points of a scan."""
-        return np.fromfile(self.folder / f"{row:06d}.bin", "<f4").reshape(-1, 4)[:, :3]
 
     def recording(self) -> Recording:
         """The recording of the folder, with the sensor's height."""
@@ -62,17 +58,9 @@ class Drive(NamedTuple):
 def _driven(root: Path, *, seed: int, sensor: str, day: int, scans: int, azimuth_steps: int) -> Drive:
     """A drive through a town on a day. Its scans are rendered unless they exist."""
     folder = root / f"{seed}-{sensor}-day{day}-{scans}x{azimuth_steps}"
-    poses_file = folder / "poses.npy"
-    if not poses_file.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        options = {"scans": scans, "rate_hz": scans / DRIVE_S, "seed": seed, "sensor": lidar(sensor, azimuth_steps)}
-        recording = plan_sessions(DAYS, route=ROUTES[seed % len(ROUTES)], **options)[day].simulate()
-        for row in range(len(recording)):
-            rows = np.pad(recording.points(row), ((0, 0), (0, 1)), constant_values=1)
-            rows.astype("<f4").tofile(folder / f"{row:06d}.bin")
-        with replacing(poses_file) as temporary, temporary.open("wb") as file:
-            np.save(file, recording.poses.world_from_lidar)
-    return Drive(folder, np.load(poses_file), sensor)
+    options = {"scans": scans, "rate_hz": scans / DRIVE_S, "seed": seed, "sensor": lidar(sensor, azimuth_steps)}
+    recording = plan_sessions(DAYS, route=ROUTES[seed % len(ROUTES)], **options)[day].simulate()
+    return Drive(folder, on_disk(recording, folder), recording.poses.world_from_lidar, sensor)
 
 
 def cloud(
@@ -173,7 +161,7 @@ def _cloud_of(drive: Drive, poses: Float[np.ndarray, "n 4 4"]) -> Float32[np.nda
     """Centroids of the voxels of all scans, in the frame of the poses."""
     parts = []
     for row, pose in enumerate(poses):
-        points = drive.points(row)
+        points = drive.scans.points(row)
         points = points[np.linalg.norm(points, axis=1) < FAR_M]
         parts.append((points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
     points = np.concatenate(parts)
@@ -209,7 +197,7 @@ def _located_in(
     for row in np.flatnonzero(apart.min(axis=1) < APART_M)[::every].tolist():
         near = int(apart[row].argmin())
         expected = poses[near] @ inverse(first.world_from_lidar[near]) @ query.world_from_lidar[row]
-        best = places.relocate(params, Record(points=query.points(row), mounting=mounting))[0]
+        best = places.relocate(params, Record(points=query.scans.points(row), mounting=mounting))[0]
         fits = is_right(best.world_from_query, expected)
         right, sure, count = right + fits, sure + (fits and best.probability >= 0.9), count + 1
     return right, sure, count

@@ -1,19 +1,16 @@
 """Single scans and submaps on a street that is driven five times, in both directions and a lane aside."""
 
-import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.lib.format import open_memmap
 
 import sglpr_jax
-from benchmarks.drives import drifted, lidar
-from sglpr_jax.data.recording import Record, Recording
+from benchmarks.drives import drifted, lidar, on_disk
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.files import replacing
 from sglpr_jax.se3 import distances
 from sglpr_jax.sim.drive import PlanarPath, plan_path, timed
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
@@ -110,25 +107,10 @@ def submaps_of_passes(drive: Drive, length_m: float, *, seed: int) -> Recording:
 
 
 def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Path) -> Drive:
-    """The drive with its scans in a file, which is written if it does not exist."""
-    path = folder / f"{sensor}-{seed}-{metres}-{azimuth_steps}.npy"
+    """The drive with its scans in a folder (`on_disk`)."""
     recording, passes = _drive(sensor, seed, metres, azimuth_steps)
-    ends_file = path.with_suffix(".ends.npy")
-    if not ends_file.exists():
-        clouds = [recording.points(i) for i in range(len(recording))]
-        folder.mkdir(parents=True, exist_ok=True)
-        for target, values in ((path, np.concatenate(clouds)), (ends_file, np.cumsum([len(one) for one in clouds]))):
-            with replacing(target) as temporary, temporary.open("wb") as file:
-                np.save(file, values)
-    points, ends = open_memmap(path, mode="r"), np.load(ends_file)
-    row_of = {name: i for i, name in enumerate(recording.paths)}
-
-    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
-        i = row_of[path]
-        return Record(points=np.array(points[ends[i - 1] if i else 0 : ends[i]]))
-
-    poses = recording.poses.world_from_lidar
-    return Drive(dataclasses.replace(recording, read=read, label_paths=()), poses, passes)
+    stored = on_disk(recording, folder / f"{sensor}-{seed}-{metres}-{azimuth_steps}")
+    return Drive(stored, recording.poses.world_from_lidar, passes)
 
 
 def _drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[SimulatedRecording, Int[np.ndarray, " n"]]:

@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -10,6 +11,10 @@ from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import PoseFormat
+
+if TYPE_CHECKING:
+    from sglpr_jax.evaluation.evaluation_page import Pictures
+    from sglpr_jax.evaluation.scoring import Evaluation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,30 +68,29 @@ class EvaluateCommand:
 
 def evaluate_file(command: EvaluateCommand) -> Path:
     """Run the command. Returns the output folder."""
-    from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_sessions  # slow imports, not needed for --help
-    from sglpr_jax.evaluation.sessions import evaluate_session_files
+    from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_evaluation  # slow imports, not needed for --help
+    from sglpr_jax.evaluation.sessions import evaluate_sessions
     from sglpr_jax.files import check_writable
 
     _check_options(command)
-    folder = command.out or _folder(command.file)
+    folder, pictures = command.out or _folder(command.file), None
     check_writable(folder / NUMBERS)
     if command.database is not None:
         files = (command.file, *command.more)
-        across = evaluate_session_files(command.database, files, command.protocol, published=command.published)
-        console().print(across)
-        written = write_sessions(across, folder)
+        found = evaluate_sessions(command.database, files, command.protocol, published=command.published)
+        console().print(found)
     else:
-        written = _evaluate_recording(command, folder)
-    for path in (*written, record_command(command, folder)):
+        found, pictures = _evaluate_recording(command)
+    for path in (*write_evaluation(found, folder, pictures), record_command(command, folder)):
         print(f"written: {path}")
     return folder
 
 
-def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
-    """Score the methods, print the table and write the results. Returns the paths written."""
+def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures | None]":
+    """Score the methods and print the table. Returns the results, and pictures if there is a dataset."""
     from sglpr_jax.data.formats.pose_files import read_trajectory
     from sglpr_jax.evaluation import figures
-    from sglpr_jax.evaluation.evaluation_page import poses_of, recording_rows, take_pictures, write_evaluation
+    from sglpr_jax.evaluation.evaluation_page import poses_of, recording_rows, take_pictures
     from sglpr_jax.evaluation.inputs import read_methods
     from sglpr_jax.evaluation.scoring import evaluate_methods
     from sglpr_jax.models.weights_file import load
@@ -111,8 +115,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     console().print(found)
     if not figures.can_draw():
         print("no drawings: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
-    pictures = None if recording is None else take_pictures(recording, params, source, found.worst)
-    return write_evaluation(found, folder, pictures)
+    return found, None if recording is None else take_pictures(recording, params, source, found.worst)
 
 
 def _check_options(command: EvaluateCommand) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -10,6 +11,10 @@ from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
 from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+
+if TYPE_CHECKING:
+    from sglpr_jax.data.recording import Record
+    from sglpr_jax.retrieval.image_maps import SemanticMap
 
 RESULT_FILE = "segmentation.json"
 
@@ -38,14 +43,12 @@ class SegmentCommand:
     """Minimum probability of the most likely class. Cells below it stay unlabelled and are not scored."""
 
 
-def segment_recording(command: SegmentCommand) -> Path:
+def segment(command: SegmentCommand) -> Path:
     """Run the command. Returns the output folder."""
-    import numpy as np  # slow imports, not needed for --help
-
-    from sglpr_jax.evaluation.segmentation import confusion_matrix, draw_segmentation, score_confusion, title_of
+    from sglpr_jax.evaluation.segmentation import segment_recording  # slow imports, not needed for --help
     from sglpr_jax.files import check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
-    from sglpr_jax.retrieval.image_maps import save_map, semantic_maps
+    from sglpr_jax.retrieval.image_maps import save_map
 
     check_writable(command.out / RESULT_FILE)
     params = load(command.weights)
@@ -53,18 +56,17 @@ def segment_recording(command: SegmentCommand) -> Path:
         raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none")
     recording, least = command.source.open(command.data), command.min_confidence
     command.out.mkdir(parents=True, exist_ok=True)
-    categories, classes, labelled, cells = params.config.categories, params.config.classes, 0, 0
-    confusion = np.zeros((classes, classes), np.int64)
-    with progress_bar(f"segment {recording.name}", len(recording)) as show:
-        for row, record, found in semantic_maps(params, recording, min_confidence=least, on_progress=show):
-            path = command.out / f"{file_name(recording.ids[row])}.png"
-            save_map(path, found, record, categories=categories)
-            confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
-            labelled, cells = labelled + found.seen.sum(), cells + (found.counts > 0).sum()
+    labelled = cells = 0
+
+    def save(row: int, record: "Record", found: "SemanticMap") -> None:
+        nonlocal labelled, cells
+        path = command.out / f"{file_name(recording.ids[row])}.png"
+        save_map(path, found, record, categories=params.config.categories)
+        labelled, cells = labelled + found.seen.sum(), cells + (found.counts > 0).sum()
+
+    scores = segment_recording(params, recording, command.out, on_map=save, min_confidence=least, progress=progress_bar)
     print(f"{command.out}: {len(recording)} semantic maps of {labelled / max(cells, 1):.0%} of the cells with points")
-    if recording.has_labels:
-        scores = score_confusion(confusion, categories=categories, title=title_of(recording))
-        draw_segmentation(params, recording, command.out, min_confidence=least)
+    if scores is not None:
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())
     record_command(command, command.out)
@@ -73,7 +75,7 @@ def segment_recording(command: SegmentCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: parse_command(SegmentCommand, "segment"), segment_recording)
+    run(lambda: parse_command(SegmentCommand, "segment"), segment)
 
 
 if __name__ == "__main__":

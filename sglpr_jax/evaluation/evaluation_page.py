@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Num
@@ -23,9 +23,7 @@ from sglpr_jax.evaluation.page import (
     missing,
     render,
 )
-from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.scoring import Evaluation, FalsePositive
-from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, AcrossSessions
 from sglpr_jax.files import file_name, json_text, read_json, text_bytes, write_all
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.params import Params
@@ -138,27 +136,15 @@ def write_evaluation(found: Evaluation, folder: Path, pictures: Pictures | None 
     Returns:
       The paths written.
     """
-    curves, trajectory = (draw_curves(found), draw_trajectory(found)) if figures.can_draw() else ({}, {})
-    html = evaluation_page(found, curves=curves, trajectory=trajectory, pictures=pictures or Pictures())
-    return _write(folder, found.to_json(), curves | trajectory, html)
-
-
-def write_sessions(found: AcrossSessions, folder: Path) -> list[Path]:
-    """Write numbers and page of an evaluation across sessions. Otherwise as `write_evaluation`."""
-    note = [Text(PUBLISHED_NOTE, "about")] if found.published else []
-    html = render(found.title, found.about, [Section("Sessions", [found.table(), *note]), _results(found.results)])
-    return _write(folder, found.to_json(), {}, html)
-
-
-def _write(folder: Path, numbers: Mapping[str, Any], plots: Plots, html: str) -> list[Path]:
-    """Replace an earlier evaluation in the folder, completely or not at all. Returns the paths written."""
+    plots = draw(found) if figures.can_draw() else {}
+    html = evaluation_page(found, plots, pictures or Pictures())
     try:
         results = [result["protocol"] for result in read_json(folder / NUMBERS)["results"]]
         earlier = {CURVES, TRAJECTORY, *map(_curves_name, results)}
     except (OSError, ValueError, LookupError, TypeError, AttributeError):  # missing, damaged, or from another command
         earlier = set()
     drawn = {name: functools.partial(figures.write, figure) for name, figure in plots.items()}
-    texts = {NUMBERS: json_text(numbers), PAGE: html}
+    texts = {NUMBERS: json_text(found.to_json()), PAGE: html}
     said = {name: functools.partial(Path.write_bytes, data=text_bytes(text)) for name, text in texts.items()}
     written = write_all(folder, {NUMBERS: said[NUMBERS], **drawn, PAGE: said[PAGE]})
     for name in earlier - set(plots):
@@ -166,30 +152,29 @@ def _write(folder: Path, numbers: Mapping[str, Any], plots: Plots, html: str) ->
     return written
 
 
-def draw_curves(found: Evaluation) -> Plots:
-    """Draw precision-recall curves.
+def draw(found: Evaluation) -> Plots:
+    """Draw precision-recall curves, and the trajectory with the decisions of the first protocol that has decisions.
 
-    A single method gets one plot with a line for each protocol. Several methods get one plot for each protocol, with a
-    line for each method.
+    A single method gets one plot of curves with a line for each protocol. Several methods get one plot for each
+    protocol, with a line for each method.
     """
-    if len(found.methods) == 1:
-        curves = {result.name: result.curve for result in found.results if result.curve is not None}
-        return {CURVES: figures.precision_recall(curves, title=found.title)} if curves else {}
+    lines = {CURVES: (found.title, {result.name: result.curve for result in found.results})}
+    if len(found.methods) > 1:
+        each = zip(*found.methods.values(), strict=True)
+        by_method = (zip(found.methods, of_one, strict=True) for of_one in each)
+        lines = {}
+        for pairs in map(dict, by_method):
+            title = next(iter(pairs.values())).name
+            lines[_curves_name(title)] = title, {method: result.curve for method, result in pairs.items()}
     plots = {}
-    for of_one in zip(*found.methods.values(), strict=True):
-        pairs = zip(found.methods, of_one, strict=True)
-        curves = {method: result.curve for method, result in pairs if result.curve is not None}
-        if curves:
-            plots[_curves_name(of_one[0].name)] = figures.precision_recall(curves, title=of_one[0].name)
+    for name, (title, curves) in lines.items():
+        drawn = {label: curve for label, curve in curves.items() if curve is not None}
+        if drawn:
+            plots[name] = figures.precision_recall(drawn, title=title)
+    decided = next((result for result in found.results if result.decisions is not None), None)
+    if found.positions is not None and decided is not None and decided.decisions is not None:
+        plots[TRAJECTORY] = figures.trajectory(found.positions, decided.decisions, title=decided.name)
     return plots
-
-
-def draw_trajectory(found: Evaluation) -> Plots:
-    """Draw the trajectory with the decisions of the first protocol that has decisions."""
-    for result in found.results:
-        if found.positions is not None and result.decisions is not None:
-            return {TRAJECTORY: figures.trajectory(found.positions, result.decisions, title=result.name)}
-    return {}
 
 
 def _curves_name(result: str) -> str:
@@ -197,14 +182,20 @@ def _curves_name(result: str) -> str:
     return f"precision-recall-{file_name(result.lower().replace(' ', '-').replace(':', '-'))}.png"
 
 
-def evaluation_page(found: Evaluation, *, curves: Plots, trajectory: Plots, pictures: Pictures) -> str:
+def evaluation_page(found: Evaluation, plots: Plots, pictures: Pictures) -> str:
     """Return the page as HTML. If a section cannot be filled, one line names the option that adds it."""
-    sections = [_results(found.results)]
+    table = report.results_table(found.results, published_on=True)
+    sections = [Section("Results", [table, Text(INTERVALS, "about"), report.threshold_table(found.results)])]
+    if found.database is not None:
+        note = [Text(report.SESSIONS_NOTE, "about")] if found.published else []
+        return render(found.title, found.about, [Section("Sessions", [found.table(), *note]), *sections])
     if len(found.methods) > 1:
-        sections.append(Section("Methods side by side", [report.comparison(found.methods)]))
+        sections.append(Section("Methods side by side", [found.table()]))
     if found.published:  # apart from our results: these are of real KITTI and by several protocols
         table = report.published_table(found.published)
         sections.append(Section("Published numbers", [table, Text(report.PUBLISHED_NOTE, "about")]))
+    trajectory = {TRAJECTORY: plots[TRAJECTORY]} if TRAJECTORY in plots else {}
+    curves = {name: figure for name, figure in plots.items() if name not in trajectory}
     no_curve = "No protocol of this evaluation has a curve."
     no_decisions = (
         "Decisions along the recording: add --poses, and a protocol that answers queries (--protocol top1-f1max)."
@@ -218,12 +209,6 @@ def evaluation_page(found: Evaluation, *, curves: Plots, trajectory: Plots, pict
         _drawn("Feature heat maps", pictures.heat, lambda frame: (f"feature heat maps of {frame}", frame), activation),
     ]
     return render(found.title, found.about, sections)
-
-
-def _results(results: Sequence[Result]) -> Section:
-    """Tables of one method: rule, score, interval, counts and poses of every protocol, and thresholds."""
-    table = report.results_table(results, published_on=True)
-    return Section("Results", [table, Text(INTERVALS, "about"), report.threshold_table(results)])
 
 
 def _drawn(

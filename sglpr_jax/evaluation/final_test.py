@@ -11,7 +11,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures, report
 from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.scoring import score
-from sglpr_jax.evaluation.segmentation import SegmentationScore, score_segmentation
+from sglpr_jax.evaluation.segmentation import SegmentationScore, segment_recording
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.names import BESIDE, NETWORK
 from sglpr_jax.methods.registry import method_beside, network
@@ -103,7 +103,7 @@ def final_test(
             _draw(results[title], recording, folder, title)
     semantics = None
     if params.config.segments and recording.has_labels:
-        semantics = score_segmentation(params, recording, folder=folder, progress=progress)
+        semantics = segment_recording(params, recording, folder, progress=progress)
     found = FinalTest(recording.name, results, semantics)
     write_json(folder / "results.json", found.to_json())
     return found

@@ -5,12 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.evaluation.protocols.protocol import Result
-from sglpr_jax.evaluation.published import LEARNED, TABLE_1
+from sglpr_jax.evaluation.published import LEARNED, TABLE_1, TABLE_3
 from sglpr_jax.files import printable
 from sglpr_jax.metrics import PrecisionRecallCurve
 
@@ -27,6 +29,7 @@ PUBLISHED_NOTE = (
     f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
     "protocol: rows from RINet's paper use pairs-f1max, the others top1-f1max as far as is known."
 )
+SESSIONS_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset}, by bevplace-nclt-recall's rule."
 
 
 class PrintsItself:
@@ -123,6 +126,38 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> T
     return TextTable(("protocol", *methods), rows, list(methods), title)
 
 
+def sessions_table(
+    sessions: Mapping[str, Sequence[Result]], published: Sequence[tuple[str, ...]], *, title: str
+) -> TextTable:
+    """Return the score of each query session and their mean, in a row for each protocol. Published rows follow."""
+    header = ("", *map(printable, sessions), "mean")
+    rows = [
+        (name, *(format_score(result.score) for result in results), format_score(mean_score(results)))
+        for name, results in _by_protocol(sessions).items()
+    ]
+    return TextTable(header, [*rows, *published], header[1:], title)
+
+
+def sessions_to_json(sessions: Mapping[str, Sequence[Result]]) -> dict[str, Any]:
+    """Return values for `json.dump`: for each protocol the mean score, and the result of each query session."""
+    return {
+        name: {"mean": _number(mean_score(results)), "sessions": dict(zip(sessions, to_json(results), strict=True))}
+        for name, results in _by_protocol(sessions).items()
+    }
+
+
+def _by_protocol(sessions: Mapping[str, Sequence[Result]]) -> dict[str, tuple[Result, ...]]:
+    """Return the results of all sessions by the protocol's name on the command line."""
+    names = {protocol.title: name for name, protocol in PROTOCOLS.items()}
+    return {names[of_one[0].name]: of_one for of_one in zip(*sessions.values(), strict=True)}
+
+
+def mean_score(results: Sequence[Result]) -> float:
+    """Return the mean score over the sessions with a revisit, or NaN if no session has one."""
+    scores = [result.score for result in results if not math.isnan(result.score)]
+    return float(np.mean(scores)) if scores else math.nan
+
+
 def published_rows(sequence: str) -> list[tuple[str, ...]]:
     """Return method, score and source of the learned methods in table 1 of the paper, for one KITTI sequence.
 
@@ -151,7 +186,7 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
         {
             "protocol": result.name,
             "rule": result.rule,
-            "score": None if math.isnan(result.score) else result.score,
+            "score": _number(result.score),
             "interval": None if result.interval is None else list(result.interval),
             "counts": result.counts,
             "dimensions": result.dimensions,
@@ -164,6 +199,10 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
         }
         for result in results
     ]
+
+
+def _number(score: float) -> float | None:
+    return None if math.isnan(score) else score
 
 
 def _at_f1max(result: Result) -> dict[str, float] | None:

@@ -15,15 +15,16 @@ from rich.console import Console, ConsoleOptions
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation import report
 from sglpr_jax.evaluation.inputs import Input, as_descriptors, check_agreement, read_input
-from sglpr_jax.evaluation.protocols import chosen_protocols, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols import PROTOCOLS, chosen_protocols
 from sglpr_jax.evaluation.protocols.protocol import Decision, Result
-from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK, kind_of
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
 from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 
 APART = 10
 """Minimum gap between the queries of two shown mistakes, in frames. Neighbouring frames make the same mistake."""
+MOST_SHOWN = 6
 
 
 @dataclass(frozen=True)
@@ -40,24 +41,29 @@ class FalsePositive:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(report.PrintsItself):
-    """Results of one method and of the methods it is compared with, by the same protocols. Prints itself as tables."""
+    """Results of methods on one recording, or of one method across sessions. Prints itself as tables."""
 
     title: str
     about: str
     """Description of the input and its distance, in one line."""
     methods: Mapping[str, Sequence[Result]]
-    """Results by the name of the method. The first method is the evaluated one; the others are for comparison."""
-    positions: Float[np.ndarray, "n 3"] | None
-    """Position of each frame in metres, z up. None for labelled pairs without positions."""
+    """Results by the name of the method, one for each protocol. The first method is the evaluated one; the others are
+    for comparison. Across sessions: by the name of the query session."""
+    positions: Float[np.ndarray, "n 3"] | None = None
+    """Position of each frame in metres, z up. None across sessions and for labelled pairs without positions."""
     published: Sequence[tuple[str, ...]] = ()
-    """`report.published_rows` of the sequence, if requested."""
+    """Rows of the paper's numbers, if requested."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
-    """JSON values: the file, and the configuration, weights and distance of its descriptors."""
+    """JSON values: the files, and the configuration, weights and distance of the descriptors."""
+    database: str | None = None
+    """Name of the database session. None for one recording."""
 
     @property
     def results(self) -> Sequence[Result]:
-        """Results of the evaluated method, one for each protocol."""
-        return next(iter(self.methods.values()))
+        """Results of the evaluated method, one for each protocol and, across sessions, for each query session."""
+        if self.database is None:
+            return next(iter(self.methods.values()))
+        return [result for of_one in zip(*self.methods.values(), strict=True) for result in of_one]
 
     @cached_property
     def judged(self) -> Result | None:
@@ -66,13 +72,36 @@ class Evaluation(report.PrintsItself):
 
     @cached_property
     def worst(self) -> Sequence[FalsePositive]:
-        """The worst false positives of `judged`."""
-        if self.judged is None or self.positions is None:
-            return []
-        return worst_false_positives(self.judged, self.positions)
+        """Up to `MOST_SHOWN` false positives of `judged`, in order of descriptor distance."""
+        result, positions, worst = self.judged, self.positions, list[FalsePositive]()
+        if result is None or positions is None:
+            return worst
+        assert result.answers is not None and result.answer_distances is not None and result.decisions is not None
+        wrong = np.flatnonzero(result.decisions == Decision.FALSE_POSITIVE)
+        for query in wrong[np.argsort(result.answer_distances[wrong], kind="stable")].tolist():
+            if len(worst) < MOST_SHOWN and all(abs(query - other.query) >= APART for other in worst):
+                answer = int(result.answers[query])
+                apart = (positions[query] - positions[answer])[: result.dimensions]
+                metres = float(np.linalg.norm(apart))
+                worst.append(FalsePositive(query, answer, metres, float(result.answer_distances[query])))
+        return worst
+
+    def table(self) -> report.TextTable:
+        """Return the table of all scores: methods side by side, or the query sessions, their mean and the paper's."""
+        if self.database is None:
+            return report.comparison(self.methods)
+        return report.sessions_table(self.methods, self.published, title=self.title)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for `json.dump`."""
+        if self.database is not None:
+            beside = {"about": report.SESSIONS_NOTE, "columns": self.table().header, "rows": self.published}
+            return {
+                **self.made_with,
+                "database_session": self.database,
+                "results": report.sessions_to_json(self.methods),
+                **({"published": beside} if self.published else {}),
+            }
         others = list(self.methods.items())[1:]
         return {
             **self.made_with,
@@ -83,14 +112,16 @@ class Evaluation(report.PrintsItself):
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[report.TextTable | str]:
-        yield report.results_table(self.results, title=self.title)
-        if any(result.curve is not None for result in self.results):
+        alone = self.database is None
+        yield report.results_table(self.results, title=self.title if alone else "")
+        if alone and any(result.curve is not None for result in self.results):
             yield report.threshold_table(self.results)
-        if len(self.methods) > 1:
-            yield report.comparison(self.methods)
+        if not alone or len(self.methods) > 1:
+            yield self.table()
         if self.published:
-            yield report.published_table(self.published)
-            yield report.PUBLISHED_NOTE
+            yield from (
+                [report.published_table(self.published), report.PUBLISHED_NOTE] if alone else [report.SESSIONS_NOTE]
+            )
 
 
 def evaluate(
@@ -121,9 +152,10 @@ def evaluate(
       print(sglpr_jax.evaluate("08.npz"))
     """
     clock = None if times is None else np.asarray(times, np.float64)
-    given = None
+    poses, given = {}, None
     if positions is not None:
         given = Trajectory(np.asarray(positions, np.float64), clock, "positions given as an array", by_row=True)
+        poses = {"positions": given.positions, "pose_source": given.source}
     if isinstance(source, str | Path):
         path = Path(source)
         read = read_input(path, given, sequence=path.stem, distance=distance)
@@ -132,17 +164,16 @@ def evaluate(
     if distance is not None:
         distance_function(distance)
     if isinstance(source, Input):
-        poses = {} if given is None else {"positions": given.positions, "pose_source": given.source}
         source = _with_options(source, **poses, times=clock, distance=distance)
-        return evaluate_methods({"descriptors": source}, protocols, published=published)
-    rows = np.asarray(source)
-    if rows.ndim != 2:
-        raise ValueError(
-            f"expected a file, an opened input, or descriptors (n, d), found an array of shape {rows.shape}"
-        )
-    if given is None:
-        raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
-    source = as_descriptors(rows, given, sequence="", method="", distance=distance or "l2")
+    else:
+        rows = np.asarray(source)
+        if rows.ndim != 2:
+            raise ValueError(
+                f"expected a file, an opened input, or descriptors (n, d), found an array of shape {rows.shape}"
+            )
+        if given is None:
+            raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
+        source = as_descriptors(rows, given, sequence="", method="", distance=distance or "l2")
     return evaluate_methods({"descriptors": source}, protocols, published=published)
 
 
@@ -178,7 +209,7 @@ def evaluate_methods(
     for name, of_one in methods.items():
         with naming(name):
             check_agreement(source, of_one)
-            results[name] = score(of_one, chosen_protocols(of_one, chosen))
+            results[name] = score(of_one, chosen)
     if isinstance(source, ScoredPairs):
         sequence, title = "scored pairs", f"{'pairs' if file is None else file.name}, {len(source.pairs)} pairs"
     else:
@@ -197,26 +228,8 @@ def evaluate_methods(
 
 
 def score(source: Input, protocols: Sequence[str] = ()) -> list[Result]:
-    """Return the result of each named protocol. Without names, the default protocols that fit are used.
-
-    Raises ValueError if positions are missing or if a protocol does not exist or does not fit `source`.
-    """
-    known = protocols_taking(kind_of(source))
-    return [protocol_named(name, known)(source) for name in protocols or chosen_protocols(source, ())]
-
-
-def worst_false_positives(result: Result, positions: Float[np.ndarray, "n 3"], *, most: int = 6) -> list[FalsePositive]:
-    """Return up to `most` false positives of a protocol that applies a threshold, in order of descriptor distance."""
-    assert result.answers is not None and result.answer_distances is not None and result.decisions is not None
-    positions = positions[:, : result.dimensions or 3]
-    wrong = np.flatnonzero(result.decisions == Decision.FALSE_POSITIVE)
-    worst: list[FalsePositive] = []
-    for query in wrong[np.argsort(result.answer_distances[wrong], kind="stable")].tolist():
-        if len(worst) < most and all(abs(query - other.query) >= APART for other in worst):
-            answer = int(result.answers[query])
-            metres = float(np.linalg.norm(positions[query] - positions[answer]))
-            worst.append(FalsePositive(query, answer, metres, float(result.answer_distances[query])))
-    return worst
+    """Return the result of each named protocol (`chosen_protocols`). Raises ValueError if positions are missing."""
+    return [PROTOCOLS[name](source) for name in chosen_protocols(source, protocols)]
 
 
 def _about(source: Input) -> str:

@@ -1,19 +1,20 @@
 """Score of the segmentation head: intersection over union (IoU) of semantic maps, beside predicting one class."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
 from sglpr_jax.models.params import Params
 from sglpr_jax.progress import Progress, no_progress
-from sglpr_jax.retrieval.image_maps import semantic_map, semantic_maps
+from sglpr_jax.retrieval.image_maps import SemanticMap, semantic_map
 
 PICTURE = "segmentation.png"
 
@@ -79,48 +80,53 @@ class SegmentationScore(PrintsItself):
         return TextTable(header, rows, header[1:], self.title, f"{self.cells} cells with points and a label")
 
 
-def score_segmentation(
-    params: Params, recording: Recording, *, folder: Path, progress: Progress = no_progress
-) -> SegmentationScore:
-    """Score the segmentation head on every labelled scan of a recording, and draw one scan into `folder`.
+def segment_recording(
+    params: Params,
+    recording: Recording,
+    folder: Path,
+    *,
+    on_map: Callable[[int, Record, SemanticMap], None] | None = None,
+    min_confidence: float = 0.0,
+    progress: Progress = no_progress,
+) -> SegmentationScore | None:
+    """Predict semantic maps of a recording, score them, and draw the middle labelled scan into `folder` (figure 7).
 
     Arguments:
       params: Parameters of a network with a segmentation head.
-      recording: Recording with labels.
-      folder: Folder for a figure of one scan (`draw_segmentation`).
+      recording: Scans or ready-made images.
+      folder: Folder for the figure. Without matplotlib, no figure is drawn.
+      on_map: Called with row, record and map of every scan. If None, only labelled scans are predicted.
+      min_confidence: See `semantic_map`.
       progress: Reports the progress.
 
+    Returns:
+      Score of all labelled scans. None without labels.
+
     Raises:
-      ValueError: If no cell is counted.
+      ValueError: If there are labels, but no cell is counted.
     """
-    rows, config = _labelled_rows(recording), params.config
-    confusion = np.zeros((config.classes, config.classes), np.int64)
+    config, labelled = params.config, np.flatnonzero(recording.labelled).tolist()
+    rows = labelled if on_map is None else range(len(recording))
+    shown, confusion = None, np.zeros((config.classes, config.classes), np.int64)
     with progress(f"segment {recording.name}", len(rows)) as show:
-        for _, _, found in semantic_maps(params, recording, rows, on_progress=show):
+        for done, row in enumerate(rows, start=1):
+            record = recording.record(row)
+            found = semantic_map(params, record, min_confidence=min_confidence)
+            if on_map is not None:
+                on_map(row, record, found)
+            if labelled and row == labelled[len(labelled) // 2]:
+                shown = found
             confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=config.classes)
-    score = score_confusion(confusion, categories=config.categories, title=title_of(recording))
-    draw_segmentation(params, recording, folder)
+            show(done)
+    if shown is None:
+        return None
+    title = f"segmentation of {len(labelled)} scans of {recording.name}"
+    score = score_confusion(confusion, categories=config.categories, title=title)
+    if figures.can_draw():
+        about = {"resolution_m": config.grid.resolution_m, "categories": config.categories}
+        panel = figures.segmentation_panel(shown.counts, shown.truth, shown.predicted, **about)
+        figures.save(panel, folder / PICTURE)
     return score
-
-
-def title_of(recording: Recording) -> str:
-    """Return the title of the score of a recording."""
-    return f"segmentation of {len(_labelled_rows(recording))} scans of {recording.name}"
-
-
-def draw_segmentation(params: Params, recording: Recording, folder: Path, *, min_confidence: float = 0.0) -> None:
-    """Draw input, truth and prediction of the middle labelled scan into `folder`. Does nothing without matplotlib."""
-    if not figures.can_draw():
-        return
-    rows = _labelled_rows(recording)
-    found = semantic_map(params, recording.record(rows[len(rows) // 2]), min_confidence=min_confidence)
-    about = {"resolution_m": params.config.grid.resolution_m, "categories": params.config.categories}
-    panel = figures.segmentation_panel(found.counts, found.truth, found.predicted, **about)
-    figures.save(panel, folder / PICTURE)
-
-
-def _labelled_rows(recording: Recording) -> list[int]:
-    return [row for row, labelled in enumerate(recording.labelled) if labelled]
 
 
 def confusion_matrix(

@@ -1,6 +1,6 @@
 """Maps on the grid of the image: classes that the segmentation head predicts, and the strength of features."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from PIL import Image
 
 from sglpr_jax.bev import uncropped
 from sglpr_jax.data.formats.png import label_image_pixels
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.recording import Record
 from sglpr_jax.data.views import view
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import UNLABELLED, to_raw
@@ -56,29 +56,6 @@ def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0)
     counts, truth = view(record, config.grid, image=config.image, categories=categories)
     truth = jnp.zeros(counts.shape, jnp.int32) if truth is None else truth
     return SemanticMap(*jax.device_get((counts, *_predict(params, counts, truth, jnp.float32(min_confidence)))))
-
-
-def semantic_maps(
-    params: Params,
-    recording: Recording,
-    rows: Sequence[int] | None = None,
-    *,
-    min_confidence: float = 0.0,
-    on_progress: Callable[[int], None] = lambda done: None,
-) -> Iterator[tuple[int, Record, SemanticMap]]:
-    """Yield the row, the record and the semantic map of every scan of a recording, or of the given rows.
-
-    Arguments:
-      params: Weights of the model.
-      recording: Scans or ready-made images.
-      rows: Rows of the recording, or None for all.
-      min_confidence: See `semantic_map`.
-      on_progress: Called with the number of finished scans.
-    """
-    for done, row in enumerate(range(len(recording)) if rows is None else rows):
-        record = recording.record(row)
-        yield row, record, semantic_map(params, record, min_confidence=min_confidence)
-        on_progress(done + 1)
 
 
 def save_map(path: Path, found: SemanticMap, record: Record, *, categories: int) -> None:

@@ -12,11 +12,9 @@ from PIL import Image
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.evaluation_page import (
     Pictures,
-    draw_curves,
-    draw_trajectory,
+    draw,
     evaluation_page,
     write_evaluation,
-    write_sessions,
 )
 from sglpr_jax.evaluation.scoring import Evaluation, evaluate_methods, score
 from sglpr_jax.evaluation.sessions import evaluate_sessions
@@ -62,13 +60,18 @@ def found(mistaken):
 
 
 @pytest.fixture(scope="module")
-def sessions(mistaken):
-    return evaluate_sessions(mistaken, [dataclasses.replace(mistaken, sequence="tuesday")])
+def sessions(mistaken, tmp_path_factory):
+    return across(mistaken, "tuesday", tmp_path_factory.mktemp("sessions"))
+
+
+def across(file, other, folder):
+    file.save(folder / "a.npz")
+    dataclasses.replace(file, sequence=other).save(folder / "b.npz")
+    return evaluate_sessions(folder / "a.npz", [folder / "b.npz"], ["bevplace-nclt-recall"])
 
 
 def render(found, pictures=None):
-    curves, trajectory = draw_curves(found), draw_trajectory(found)
-    html = evaluation_page(found, curves=curves, trajectory=trajectory, pictures=pictures or Pictures())
+    html = evaluation_page(found, draw(found), pictures or Pictures())
     return html, Parsed(html)
 
 
@@ -116,7 +119,7 @@ def test_methods_stand_side_by_side(found, make_file, two_laps):
     _, seen = render(both)
     for word in ("mine", "blind", f"{blind[0].score:.3f}"):
         assert word in seen.texts["Methods side by side"]
-    assert list(draw_curves(both)) == ["precision-recall-top-1-f1max.png"]
+    assert list(draw(both)) == ["precision-recall-top-1-f1max.png", "trajectory.png"]
 
 
 def names_in(folder) -> set[str]:
@@ -127,8 +130,8 @@ def test_plots_of_an_earlier_evaluation_go_and_other_files_stay(found, sessions,
     two = dataclasses.replace(found, methods={"mine": found.results, "same": found.results})
     mine = tmp_path / "precision-recall-raw.png"
     mine.write_bytes(b"not of this command")
-    for write, results in ((write_evaluation, two), (write_evaluation, found), (write_sessions, sessions)):
-        written = write(results, tmp_path)
+    for results in (two, found, sessions):
+        written = write_evaluation(results, tmp_path)
         assert names_in(tmp_path) == {mine.name, *(path.name for path in written)}
     assert len(written) == 2
 
@@ -137,12 +140,12 @@ def test_where_no_evaluation_was_nothing_is_removed(sessions, tmp_path):
     (tmp_path / "trajectory.png").write_bytes(b"not of this command")
     for numbers in ("{", '{"sequence": "08", "raw": {}}', '{"results": [{"protocol": 3}]}'):
         (tmp_path / "results.json").write_text(numbers)
-        write_sessions(sessions, tmp_path)
+        write_evaluation(sessions, tmp_path)
         assert names_in(tmp_path) == {"trajectory.png", "results.json", "report.html"}
 
 
 def test_a_full_disk_leaves_the_earlier_evaluation_as_it_was(found, sessions, tmp_path, small_files):
-    write_sessions(sessions, tmp_path)
+    write_evaluation(sessions, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with (
         small_files(len(before["results.json"]) * 4),
@@ -157,10 +160,8 @@ def test_a_name_with_markup_is_printed_drawn_and_written_as_it_is(mistaken, tmp_
     file = dataclasses.replace(mistaken, sequence=name)
     other = dataclasses.replace(file, descriptors=file.descriptors[:, ::-1].copy())
     found = evaluate_methods({name: file, "other": other}, ["top1-f1max"], file=tmp_path / "a.npz")
-    across = evaluate_sessions(file, [dataclasses.replace(file, sequence=f"{name}2")], ["bevplace-nclt-recall"])
-    write_evaluation(found, tmp_path / "one")
-    write_sessions(across, tmp_path / "sessions")
-    for result, folder in ((found, "one"), (across, "sessions")):
+    for result, folder in ((found, "one"), (across(file, f"{name}2", tmp_path), "sessions")):
+        write_evaluation(result, tmp_path / folder)
         assert printable(name) in str(result)
         page = (tmp_path / folder / "report.html").read_text(encoding="utf-8")
         assert "<b>" not in page and "</red>" not in page and page.count("<h1>") == 1

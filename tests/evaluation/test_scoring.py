@@ -10,7 +10,7 @@ import pytest
 from sglpr_jax.evaluation.protocols.protocol import Decision
 from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
 from sglpr_jax.evaluation.protocols.top1 import OVERLAP_TRANSFORMER_F1MAX, TOP1_F1MAX
-from sglpr_jax.evaluation.scoring import evaluate, score, worst_false_positives
+from sglpr_jax.evaluation.scoring import Evaluation, evaluate, score
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_the_result_prints_itself_and_becomes_json(file, tmp_path):
 def test_the_surest_mistakes_come_first_and_neighbours_once(mistaken):
     result = TOP1_F1MAX(mistaken)
     assert np.sum(result.decisions == Decision.FALSE_POSITIVE) == 3
-    first, second = worst_false_positives(result, mistaken.positions)
+    first, second = Evaluation("", "", {"": [result]}, mistaken.positions).worst
     assert (first.query, first.answer, first.distance) == (500, 10, 0)
     assert (second.query, second.answer) == (600, 20)
     assert second.distance == pytest.approx(0.001, rel=1e-3)
@@ -91,4 +91,5 @@ def test_metres_have_the_dimensions_of_the_protocol(mistaken):
     hills = mistaken.positions + np.arange(800)[:, None] * [0, 0, 1.0]
     flat = OVERLAP_TRANSFORMER_F1MAX(mistaken)
     assert flat.dimensions == 2
-    assert worst_false_positives(flat, hills) == worst_false_positives(flat, mistaken.positions)
+    one, other = (Evaluation("", "", {"": [flat]}, positions).worst for positions in (hills, mistaken.positions))
+    assert one == other

@@ -24,10 +24,23 @@ def session(make_file):
     return make
 
 
-def test_columns_are_the_protocols_scores_and_their_mean(session):
+@pytest.fixture
+def evaluate(tmp_path):
+    """Evaluate sessions that are written to files."""
+
+    def call(database, queries, names=(), **options):
+        paths = [tmp_path / f"{number}.npz" for number in range(1 + len(queries))]
+        for path, file in zip(paths, (database, *queries), strict=True):
+            file.save(path)
+        return evaluate_sessions(paths[0], paths[1:], names, **options)
+
+    return call
+
+
+def test_columns_are_the_protocols_scores_and_their_mean(session, evaluate):
     database, queries = session(MAP), [session(NCLT[0]), session(NCLT[1])]
-    found = evaluate_sessions(database, queries)
-    assert list(evaluate_sessions(database, queries, ["pointnetvlad-recall"]).protocols) == ["pointnetvlad-recall"]
+    found = evaluate(database, queries)
+    assert len(evaluate(database, queries, ["pointnetvlad-recall"]).table().rows) == 1
     nclt = [BEVPLACE_NCLT_RECALL(database, file).score for file in queries]
     runs = [POINTNETVLAD_RECALL(database, file).score for file in queries]
     assert 0 < min(nclt) < 1 and found.table().header == ("", NCLT[0], NCLT[1], "mean")
@@ -37,32 +50,30 @@ def test_columns_are_the_protocols_scores_and_their_mean(session):
     ]
 
 
-def test_a_session_without_revisits_says_so_and_is_no_part_of_the_mean(session):
+def test_a_session_without_revisits_says_so_and_is_no_part_of_the_mean(session, evaluate):
     near, beside = session(NCLT[0]), session(NCLT[1])
     beside = dataclasses.replace(beside, positions=np.add(beside.positions, [0, 12, 0]))
-    (row,) = evaluate_sessions(session(MAP), [near, beside], ["bevplace-nclt-recall"]).table().rows
+    (row,) = evaluate(session(MAP), [near, beside], ["bevplace-nclt-recall"]).table().rows
     assert row[2] == "no revisit" and row[1] == row[3] != row[2]
-    (alone,) = evaluate_sessions(session(MAP), [beside], ["bevplace-nclt-recall"]).table().rows
+    (alone,) = evaluate(session(MAP), [beside], ["bevplace-nclt-recall"]).table().rows
     assert alone[1:] == ("no revisit", "no revisit")
 
 
-def test_published_rows_are_table_3s_in_the_same_columns(session):
+def test_published_rows_are_table_3s_in_the_same_columns(session, evaluate):
     queries = [session(name) for name in NCLT]
-    whole = evaluate_sessions(session(MAP), queries, ["bevplace-nclt-recall"], published=True)
+    whole = evaluate(session(MAP), queries, ["bevplace-nclt-recall"], published=True)
     assert [row[0] for row in whole.published] == [f"published: {row.method}" for row in TABLE_3.rows]
     assert whole.published[-1][1:] == ("0.947", "0.936", "0.931", "0.916", "0.914", "0.913", "0.926")
     part = published_rows(MAP, [NCLT[5], "2013-04-05", NCLT[0]])
     assert part[-1] == ("published: SG-LPR", "0.913", "", "0.947", "0.930")
 
 
-def test_sessions_of_two_worlds_or_named_twice_are_refused(session):
+def test_sessions_of_two_worlds_or_named_twice_are_refused(session, evaluate):
     database = session(MAP)
     with pytest.raises(ValueError, match=r"2012-02-04 in the world frame of the database .* no place is in both"):
-        evaluate_sessions(database, [session(NCLT[0], offset_m=2000)])
+        evaluate(database, [session(NCLT[0], offset_m=2000)])
     with pytest.raises(ValueError, match=f"expected different sessions, found database {MAP}, queries {MAP}"):
-        evaluate_sessions(database, [database])
+        evaluate(database, [database])
     with pytest.raises(ValueError, match="expected different sessions"):
-        evaluate_sessions(database, [session(NCLT[0]), session(NCLT[0])])
-    with pytest.raises(ValueError, match="expected positions to score sequence 2012-02-04"):
-        evaluate_sessions(database, [dataclasses.replace(session(NCLT[0]), positions=None)])
-    evaluate_sessions(database, [session(NCLT[0], offset_m=510)])  # the end of one street is the start of the next
+        evaluate(database, [session(NCLT[0]), session(NCLT[0])])
+    evaluate(database, [session(NCLT[0], offset_m=510)])  # the end of one street is the start of the next

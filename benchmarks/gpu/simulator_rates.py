@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.drives import lidar
 from benchmarks.speed.inputs import random_scans
-from benchmarks.timing import about, median_seconds
+from benchmarks.timing import median_seconds
 from sglpr_jax.bev import rasterize
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.grid import Grid
@@ -105,31 +105,3 @@ def _densities(points: int, repeats: int) -> Row:
     cloud = random_scans(points, grid=GRID)[0]
     seconds = median_seconds(lambda: density_bev(cloud), repeats=repeats)
     return {"seconds": seconds, "points_per_second": points / seconds}
-
-
-def simulate(
-    *,
-    sensor: str = "hdl64e",
-    azimuth_steps: int = 1800,
-    seq: str = "00",
-    scans: int = 100,
-    batch: int = 16,
-    points: int = 120_000,
-    repeats: int = 5,
-) -> None:
-    """Time the simulator and images of clouds: scans a second in one and two threads, and where the time goes.
-
-    Args:
-        sensor: one of the sensor presets.
-        azimuth_steps: rays of a laser in one turn.
-        seq: the drive.
-        scans: scans of the drive, all of which are made in every repeat.
-        batch: scans and clouds in one call, beside one.
-        points: points of a cloud.
-        repeats: how often everything is timed.
-    """
-    sizes = {"route": seq, "scans": scans, "batch": batch, "points": points, "repeats": repeats}
-    for key, measure in measurements(sensor, azimuth_steps, **sizes):
-        row = measure()
-        print(f"{key}: {', '.join(f'{name} {value:.4g}' for name, value in row.items())}", flush=True)
-    print("\n".join(about("jax").values()))
