@@ -124,17 +124,9 @@ def semantic_figure(recording: Recording, params: Params, row: int, *, title: st
 
 
 def write_evaluation(found: Evaluation, folder: Path, pictures: Pictures | None = None) -> list[Path]:
-    """Write numbers, plots and page to `folder`, and remove the plots of an earlier evaluation there.
+    """Write numbers, plots (with matplotlib) and page to a folder, and remove the plots of an earlier evaluation there.
 
-    Without matplotlib no plots are written.
-
-    Arguments:
-      found: Results to write.
-      folder: Output folder. It is created if needed.
-      pictures: Images of a dataset and a model, by frame.
-
-    Returns:
-      The paths written.
+    Returns the paths written.
     """
     plots = draw(found) if figures.can_draw() else {}
     html = evaluation_page(found, plots, pictures or Pictures())
@@ -155,8 +147,7 @@ def write_evaluation(found: Evaluation, folder: Path, pictures: Pictures | None 
 def draw(found: Evaluation) -> Plots:
     """Draw precision-recall curves, and the trajectory with the decisions of the first protocol that has decisions.
 
-    A single method gets one plot of curves with a line for each protocol. Several methods get one plot for each
-    protocol, with a line for each method.
+    One method gets a plot of curves with a line for each protocol, several methods a plot for each protocol.
     """
     lines = {CURVES: (found.title, {result.name: result.curve for result in found.results})}
     if len(found.methods) > 1:

@@ -127,15 +127,9 @@ def segmentation_panel(
     categories: int = 20,
     title: str = "",
 ) -> "matplotlib.figure.Figure":
-    """Draw point counts, true classes and predicted classes side by side (figure 7).
+    """Draw point counts, true classes (if known) and predicted classes side by side (figure 7).
 
-    Arguments:
-      bev: Number of points in each cell.
-      truth: True class of each cell. If None, the figure has no panel of true classes.
-      prediction: Predicted class of each cell.
-      resolution_m: Side of a cell, in metres. The axes are in metres, with the sensor at the origin.
-      categories: Number of categories in the taxonomy of the classes (`labels.taxonomy`).
-      title: Title of the figure.
+    The axes are in metres, with the sensor at the origin. The classes are those of `labels.taxonomy(categories)`.
     """
     from matplotlib.patches import Patch
 
@@ -177,13 +171,7 @@ def heat_maps(
 def loops(
     positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]], *, wrong: Sequence[tuple[int, int]] = ()
 ) -> "matplotlib.figure.Figure":
-    """Draw a trajectory from above, with a line between the two frames of each loop.
-
-    Arguments:
-      positions: Position of each frame, in metres.
-      pairs: Query and match of each loop, except those known to be wrong.
-      wrong: Query and match of each loop known to be wrong, drawn in red.
-    """
+    """Draw a trajectory from above, with a line between query and match of each loop. `wrong` loops are red."""
     figure, axes = axes_from_above(positions)
     axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
     for name, some, colour, layer in (("loops", pairs, BLUE, 3), ("wrong", wrong, RED, 4)):
@@ -210,12 +198,7 @@ def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.f
 def loops_between(
     named: Mapping[str, Float[np.ndarray, "_ 3"]], pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> "matplotlib.figure.Figure":
-    """Draw trajectories of several recordings in one frame from above, with a line between the scans of each loop.
-
-    Arguments:
-      named: Positions of each recording, in metres, by its name.
-      pairs: Positions of query and match of each loop between two recordings, in metres.
-    """
+    """Draw trajectories of several recordings in one frame, with a line between the positions of each loop."""
     figure, axes = axes_from_above(np.concatenate(list(named.values())))
     for name, positions in named.items():
         axes.plot(*positions[:, :2].T, linewidth=1.2, label=name)
@@ -226,11 +209,7 @@ def loops_between(
 
 
 def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.Figure":
-    """Draw the share of loops over the predicted probability.
-
-    Arguments:
-      bins: Mean predicted probability, share of loops and number of pairs of each bin. The number labels its point.
-    """
+    """Draw the share of loops over the probability. A bin has mean probability, share and number of pairs."""
     figure = new_figure(5.0, 4.6)
     axes = figure.add_subplot(xlabel="predicted probability", ylabel="share of loops", xlim=(-0.03, 1.09))
     axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)
@@ -250,13 +229,9 @@ def loops_in_time(
     wrong: Sequence[tuple[int, int]] = (),
     rejected: Sequence[tuple[int, int]] = (),
 ) -> "matplotlib.figure.Figure":
-    """Plot the frame number of each match over that of its query.
+    """Plot the frame of each match over that of its query, coloured by the probability.
 
-    Arguments:
-      found: Query, match and probability of each loop. Less probable loops are lighter.
-      frames: Number of frames.
-      wrong: Query and match of each loop known to be wrong, drawn as red crosses.
-      rejected: Query and match of each rejected pair, drawn as small grey dots behind the loops.
+    Loops known to be `wrong` are red crosses, `rejected` pairs are small grey dots behind the loops.
     """
     figure = new_figure(5.0, 4.2)
     axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))

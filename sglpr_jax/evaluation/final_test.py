@@ -76,18 +76,13 @@ def final_test(
       params: Parameters of the trained network.
       recording: Recording with poses.
       folder: Folder for descriptors, figures and results.json.
-      methods: Names of the methods to compare with. `untrained` is the same network with random weights drawn from
-        `seed`. `shipped` is the network with the weights `DEFAULT_WEIGHTS` of the package. Other names are handcrafted
-        methods.
+      methods: Handcrafted methods to compare with, `untrained` (the network with random weights drawn from `seed`) or
+        `shipped` (the network with `DEFAULT_WEIGHTS`).
       seed: Seed of the weights of `untrained`.
       progress: Reports the progress of each embedding.
 
     Raises:
       ValueError: If a method does not fit the recording.
-      OSError: If a file cannot be read or written.
-
-    Example:
-      print(final_test(result.params, recording, result.folder / "test"))
     """
     folder.mkdir(parents=True, exist_ok=True)
     beside = {name: method_beside(params, name, recording, seed=seed) for name in methods}

@@ -45,7 +45,6 @@ def read_input(path: Path, trajectory: Trajectory | None, *, sequence: str, dist
         own distance.
 
     Raises:
-      FileNotFoundError: If the file does not exist.
       ValueError: If the file is invalid or does not fit the other arguments. The message names the file.
     """
     if not path.is_file():
@@ -71,19 +70,14 @@ def read_methods(
     sequence: str | None = None,
     distance: str | None = None,
 ) -> dict[str, Input]:
-    """Read the file of every method and return the inputs by method name, which is the name of the file.
+    """Read the file of every method by `read_input`. Returns the inputs by method name, which is the name of the file.
 
     Arguments:
       paths: Files of the methods.
-      poses: Positions that replace those of every file. If they have no times, the times of the first file with times
-        are used for all files.
+      poses: Positions that replace those of every file. Without times, all files get those of the first that has any.
       dataset: Positions for files without positions, if the first file has no positions either.
       sequence: Name of the sequence. By default the name of each file.
       distance: Name of the distance between descriptors, for the first file and for every .npy file.
-
-    Raises:
-      FileNotFoundError: As `read_input`.
-      ValueError: As `read_input`.
     """
     methods: dict[str, Input] = {}
     of_first = None
@@ -129,10 +123,9 @@ def as_descriptors(
 def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> DescriptorFile:
     """Read a descriptor file, optionally with the positions of another trajectory.
 
-    A trajectory replaces the positions of the file. Its times replace those of the file if the file has no times, or if
-    they were given for the frames (`Trajectory.by_row`). If `bin/embed` skipped scans, the trajectory may have a pose
-    for every scan of the recording. If the times of the trajectory and the file differ, positions are interpolated
-    (`poses_at_scans`) and frames without a pose are dropped.
+    Times of the trajectory replace those of the file if the file has none, or if they were given for the frames
+    (`Trajectory.by_row`). If `bin/embed` skipped scans, the trajectory may have a pose for every scan. If the times
+    differ, positions are interpolated (`poses_at_scans`) and frames without a pose are dropped.
 
     Raises ValueError if the trajectory does not fit or if there are no positions.
     """

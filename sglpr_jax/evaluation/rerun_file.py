@@ -38,16 +38,8 @@ def write_rerun(found: FoundLoops, path: Path | str, *, optimized: OptimizedTraj
 
     The time line counts frames. With poses (odometry or, without it, known poses) the file has the trajectory, the
     corrected one, the scan at every 5 m, and a line for each loop. Without poses it has the images of the loops laid
-    over each other, and the probabilities. Loops that are wrong by known poses are red.
-
-    Arguments:
-      found: Loops of a recording.
-      path: File to write. An existing file is replaced.
-      optimized: Corrected trajectory.
-
-    Raises:
-      ImportError: If rerun is not installed.
-      WriteError: If the file cannot be written.
+    over each other, and the probabilities. Loops that are wrong by known poses are red. Raises ImportError if rerun is
+    not installed, WriteError if the file cannot be written.
     """
     check_installed()
     rerun: Any = importlib.import_module("rerun")

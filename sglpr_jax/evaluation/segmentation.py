@@ -91,13 +91,7 @@ def segment_recording(
 ) -> SegmentationScore | None:
     """Predict semantic maps of a recording, score them, and draw the middle labelled scan into `folder` (figure 7).
 
-    Arguments:
-      params: Parameters of a network with a segmentation head.
-      recording: Scans or ready-made images.
-      folder: Folder for the figure. Without matplotlib, no figure is drawn.
-      on_map: Called with row, record and map of every scan. If None, only labelled scans are predicted.
-      min_confidence: See `semantic_map`.
-      progress: Reports the progress.
+    `on_map` is called with row, record and map of every scan; without it, only labelled scans are predicted.
 
     Returns:
       Score of all labelled scans. None without labels.
@@ -138,8 +132,7 @@ def confusion_matrix(
 ) -> Int[np.ndarray, "k k"]:
     """Return the number of counted cells of true class i that are predicted as class j.
 
-    As in SemanticKITTI, cells of class 0 (unlabelled) are ignored: a scan without labels has only zeros. Matrices of
-    several scans may be added.
+    As in SemanticKITTI, cells of class 0 (unlabelled) are ignored. Matrices of several scans may be added.
     """
     counted = counted & (truth != UNLABELLED)
     pairs = truth[counted].astype(np.int64) * classes + prediction[counted]

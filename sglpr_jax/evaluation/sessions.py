@@ -30,8 +30,8 @@ def evaluate_sessions(
       published: Whether to add the rows of table 3 of the paper.
 
     Raises:
-      ValueError: If a file has no descriptors or no positions, if a session occurs twice, does not overlap with the
-        database or has descriptors of another method, or if a protocol is unknown.
+      ValueError: If a file has no positions, if a session occurs twice, does not overlap with the database or has
+        descriptors of another method, or if a protocol is unknown.
     """
     for path in (database, *queries):
         if path.suffix != ".npz":

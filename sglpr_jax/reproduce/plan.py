@@ -33,11 +33,7 @@ def check(
 ) -> None:
     """Check recordings, methods, weights and sessions for the chosen tables and figures.
 
-    Raises:
-      ValueError: A method is unknown, or poses, points or labels are missing. Also if there is no second recording to
-        train on, or no second session in `nclt`. Also if nothing is trained, but an experiment needs it.
-      FileNotFoundError: `nclt` has no sessions, or weights are missing.
-      ImportError: Figures are chosen, but matplotlib is not installed.
+    Raises ValueError, FileNotFoundError or ImportError (matplotlib) that names what is unknown or missing.
     """
     if not names:
         raise ValueError(f"expected tables or figures, found none; choose from all, {', '.join(EXPERIMENTS)}")

@@ -118,7 +118,6 @@ def test_methods_are_compared_on_one_page(score, laps):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("mine.npy",), ("mine.npy", "--poses", "found none")),
         (("mine.npy", "--poses", "lidar.txt"), ("lidar.txt", "--pose-format kitti", "or lidar")),
         (
             ("mine.npy", "--poses", "tum.txt", "--protocol", "top1"),
@@ -126,7 +125,6 @@ def test_methods_are_compared_on_one_page(score, laps):
         ),
         (("mine.npy", "--times", "times.txt"), ("times.txt", "expected --poses with --times")),
         (("mine.npy", "--poses", "tum.txt", "--weights", "run"), ("run", "expected --data with --weights")),
-        (("mine.npy", "--published", "--poses", "tum.txt"), ("sequence with published numbers", "00, 02", "mine")),
         (("08.npz", "mine.npy"), ("--database", "--compare")),
         (("08.npz", "--protocol", "bevplace-nclt-recall"), ("expected --database", "bevplace-nclt-recall")),
     ],

@@ -1,7 +1,6 @@
 """bin/reproduce: leave-one-out runs on the small town, and the tables and figures made of them."""
 
 import json
-import shutil
 
 import pytest
 
@@ -38,15 +37,6 @@ def reproduced(town, preset, sessions, tmp_path_factory):
     ended = run_command("reproduce", *WANTED, *options)
     assert ended.status == 0, ended.error
     return folder, ended, options
-
-
-def test_a_scan_that_vanishes_on_the_way_is_missed(town, preset, tmp_path):
-    data = shutil.copytree(town, tmp_path / "town")
-    runs = Runs(tmp_path / "out", data, str(preset), load_preset(str(preset)))
-    scan = runs.recording("08").paths[1]
-    scan.unlink()
-    with pytest.raises(FileNotFoundError, match=scan.name):
-        runs.descriptors("polar-fft", "08")
 
 
 @pytest.mark.slow
@@ -123,15 +113,11 @@ def test_bad_input_is_refused_before_anything_is_trained(town, images, preset, t
 
     options = ("--data", town, "--seq", "08", "--method", "polar-fft", "--nclt")
     simulate(tmp_path / "one", sessions=DAYS[:1], scans=2, sensor=SENSOR)
-    assert_one_line_error(refused("table3", *options, tmp_path / "none"), tmp_path / "none")
     assert_one_line_error(refused("figure8", *options, tmp_path / "one"), "one", "two sessions", DAYS[0])
-    assert_one_line_error(refused("--data", town), "expected tables or figures", "table1")
     assert_one_line_error(refused("table1", "--data", town, "--method", "bow"), "'bow'", "scan-context")
-    assert_one_line_error(refused("table1", "--data", town, "--seq", "99"), "99")
     assert_one_line_error(refused("table1", "--data", images, "--method", "m2dp"), "m2dp needs points", "00")
     assert_one_line_error(refused("table5", "--data", images), "table5 is about semantics", "expected labels")
     assert_one_line_error(refused("table5", "--data", town, "--no-train"), "--no-train", "table5")
-    assert refused("table9", "--data", town).status == 2
     assert not (tmp_path / "out").exists()
 
 

@@ -113,15 +113,6 @@ def test_pictures_stand_where_they_belong(found):
     assert f"frame 500 answered with 10: {mistake.metres:.1f} m apart" in said and "descriptor distance 0" in said
 
 
-def test_methods_stand_side_by_side(found, make_file, two_laps):
-    blind = score(make_file(two_laps, np.ones((800, 2))), ["top1-f1max", "ssc-recall"])
-    both = Evaluation("town", "", {**found.methods, "blind": blind}, two_laps)
-    _, seen = render(both)
-    for word in ("mine", "blind", f"{blind[0].score:.3f}"):
-        assert word in seen.texts["Methods side by side"]
-    assert list(draw(both)) == ["precision-recall-top-1-f1max.png", "trajectory.png"]
-
-
 def names_in(folder) -> set[str]:
     return {path.name for path in folder.iterdir()}
 

@@ -57,16 +57,6 @@ def test_a_trajectory_shows_each_decision_in_its_colour(tmp_path, two_laps):
     assert shows(picture, (0x2B, 0x5F, 0xC4))
 
 
-def test_learning_curves_have_a_panel_each_over_the_same_steps(tmp_path):
-    terms = {"loss": [(10, 0.5), (30, 0.2)], "dice": [(10, 0.9), (30, 0.8)]}
-    figure = figures.learning_curves({"loss": terms, "score": {}, "gradient norm": {"norm": [(30, 2.0)]}})
-    assert [axes.get_ylabel() for axes in figure.axes] == ["loss", "score", "gradient norm"]
-    assert legend(figure) == ["loss", "dice"]
-    assert [line.get_ydata().tolist() for line in figure.axes[0].lines] == [[0.5, 0.2], [0.9, 0.8]]
-    assert figure.axes[0].get_xlim() == figure.axes[2].get_xlim() and figure.axes[2].get_xlabel() == "step"
-    assert pixels(figure, tmp_path / "curves.png").std() > 10
-
-
 def test_a_segmentation_panel_is_in_metres_and_in_the_names_and_colours_of_its_classes(tmp_path):
     bev = np.zeros((20, 40), np.int32)
     bev[:, :20] = 3
@@ -105,10 +95,3 @@ def test_a_right_pose_makes_the_picture_white_and_a_wrong_one_coloured():
 
     assert agreement(right) > 0.5 > 0.3 > agreement(wrong)
     np.testing.assert_array_equal(right[..., 1], right[..., 2])
-
-
-def test_without_a_motion_the_query_stays_and_an_empty_one_is_black():
-    image = seen_from(place(1), (0.0, 0.0, 0.0))
-    same = figures.overlaid(image, image, np.eye(4))
-    np.testing.assert_allclose(same[..., 0], same[..., 1], atol=1e-6)
-    assert figures.overlaid(np.zeros_like(image), image, np.eye(4))[..., 1].max() == 0

@@ -101,13 +101,8 @@ class Recall(Protocol):
 def published_split(paper: str, splits: Mapping[str, tuple[int, int, int]]) -> Callable[..., Split]:
     """Return the split of BEVPlace: the first part of a recording is the database, a later part has the queries.
 
-    The published split is used if name and number of frames are those of a KITTI sequence with a published split. For
-    other recordings the database is the first 60 % of the frames, and the queries begin at the first frame 20 m from
-    the last frame of the database.
-
-    Arguments:
-      paper: Name of the method that published the splits.
-      splits: End of the database, start of the queries and end of the queries, by sequence.
+    `splits` apply if name and number of frames are those of a KITTI sequence. For other recordings the database is the
+    first 60 % of the frames, and the queries begin at the first frame 20 m from its last frame.
     """
 
     def split(source: Source, positions: Float[np.ndarray, "n _"]) -> Split:
