@@ -10,20 +10,29 @@ Both commands can be repeated: what is done is not done again.
 import contextlib
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import fsspec
+import numpy as np
 import tyro
 
 import sglpr_jax
-from benchmarks.fleet.overlaps import overlaps
 from sglpr_jax.files import replacing
 from sglpr_jax.methods.registry import network
 from sglpr_jax.pose_graph.folder import write_found
 from sglpr_jax.retrieval.fleet_index import FleetIndex
 from sglpr_jax.retrieval.parquet import embed_to_store, read_places, stored_places
+
+if TYPE_CHECKING:
+    import pyarrow
+
+BLOCK, NEAREST = 256, 10
+"""Scans that are searched at a time, and places that are found for each."""
+MAX_DISTANCE, MIN_SCANS = 0.8, 5
+"""Recordings may overlap if so many scans of one have a place of the other within this distance of descriptors."""
 
 
 def embed(
@@ -126,12 +135,27 @@ def proposed(places: str, index: str, *, where: str = "") -> list[dict[str, Any]
         fleet.add(rows)
         sources[rows["recording"][0].as_py()] = rows["source"][0].as_py()
     fleet.optimize()
-    found = {one[:2] for address in stored_places(places) for one in overlaps(fleet, read_places(address), where=where)}
+    found = set[tuple[str, str]]().union(*(overlaps(fleet, read_places(one), where) for one in stored_places(places)))
     return [
         {"pair": f"{a}--{b}", "first": sources[a], "second": sources[b]}
         for a, b in sorted(found)
         if a in sources and b in sources
     ]
+
+
+def overlaps(index: FleetIndex, rows: "pyarrow.Table", where: str) -> set[tuple[str, str]]:
+    """Pairs of recordings, by name, that may overlap with the one recording of `rows`: `MIN_SCANS` scans are near."""
+    own = rows["recording"][0].as_py()
+    condition = f"recording != '{own.replace(chr(39), 2 * chr(39))}'" + (f" AND ({where})" if where else "")
+    pairs = set[tuple[int, str]]()
+    descriptors = np.stack(rows["descriptor"].to_numpy())
+    for start in range(0, len(descriptors), BLOCK):
+        found = index.query(descriptors[start : start + BLOCK], NEAREST, where=condition, columns=["recording"])
+        near = found["distance"].to_numpy() <= MAX_DISTANCE
+        queries, others = found["query"].to_numpy()[near] + start, found["recording"].to_numpy()[near]
+        pairs |= set(zip(queries.tolist(), others.tolist(), strict=True))
+    counted = Counter(other for _, other in pairs)
+    return {(min(own, other), max(own, other)) for other, scans in counted.items() if scans >= MIN_SCANS}
 
 
 class PairSearch:

@@ -3,12 +3,9 @@
     python -m benchmarks repeating render --seeds 1 --out build/fit
     python -m benchmarks repeating fit build/fit
 
-Every drive is searched by the loop detector's finder without odometry, once as it is and once with a break of the
-motion in its middle, and every third drive with odometry that drifts. A pair is a loop if its pose is right within
-1.5 m and 6 degrees on the same storey, and none if it is wrong by more than 3 m or 15 degrees, or, with odometry, on
-another storey. All kinds of drives count alike. Each scenery is judged by a model that was fitted to the others: the
-table has its pairs, with neighbours and alone, the share of right pairs above two probabilities, the wrong pairs, and
-the expected calibration error. With `--without-each`, the same follows for models that lack one term.
+Every drive is searched without odometry, once as it is and once with a break of the motion in its middle, and every
+third drive with odometry that drifts. All kinds of drives count alike. A pair is a loop or none by `scoring.PoseErrors`.
+Each scenery is judged by a model that was fitted to the others.
 """
 
 import dataclasses
@@ -26,10 +23,11 @@ from scipy.special import expit
 
 import sglpr_jax
 from benchmarks.drives import Odometry
-from benchmarks.quality.repeating import compared, finder_of, read
+from benchmarks.quality.repeating import compared, read
 from benchmarks.quality.scoring import STOREY_M, pose_errors
 from sglpr_jax.files import write_json
 from sglpr_jax.loops.calibration import calibration_error, reliability
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
@@ -72,6 +70,9 @@ def fit_model(
     out: Path = DEFAULT,
 ) -> None:
     """Fit and write the model.
+
+    The table has the pairs of each scenery, with neighbours and alone, the share of right pairs above two
+    probabilities, the wrong pairs, and the expected calibration error.
 
     Args:
         drives: folder of `repeating render`.
@@ -165,7 +166,7 @@ def fitted(found: Sequence[Pairs], kinds: Sequence[str], *, without: str | None 
 
 def _pairs(path: Path, odometry: Odometry, breaks: bool, params: Params) -> Pairs:
     """The candidates of one drive that the motion allows. With `breaks`, the motion is unknown in the middle."""
-    drive, finder = read(path), finder_of(params)
+    drive, finder = read(path), CandidateFinder(params)
     frames = compared(path, drive, params, odometry=odometry, breaks=breaks)
     poses, found = drive.odometry(odometry), []
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):

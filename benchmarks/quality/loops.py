@@ -32,7 +32,7 @@ from sglpr_jax.loops.result import FoundLoops
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
 from sglpr_jax.models.params import Params
 from sglpr_jax.pose_graph.files import read_loops_jsonl
-from sglpr_jax.pose_graph.optimize import PoseGraph, trajectory_error
+from sglpr_jax.pose_graph.optimize import trajectory_error
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import SimulatedRecording
@@ -68,16 +68,12 @@ class Found(NamedTuple):
     """Loops of two scans with their poses, if the method has such loops."""
 
 
-def _ours(drive: Drive, *, drifting: bool, weights: str, **_: Any) -> Found:
-    """`find_loops` without odometry, or with odometry that drifts and is corrected."""
-    params, poses = sglpr_jax.load(weights), drive.recording.poses.world_from_lidar
-    odometry = odometry_of("drifting" if drifting else "none", poses, seed=0)
-    start = time.perf_counter(), time.process_time()
-    loops = sglpr_jax.find_loops(drive.recording, params, odometry=odometry, registered=False).loops
+def _ours(drive: Drive, *, weights: str, **_: Any) -> Found:
+    """`find_loops` without odometry."""
+    params, start = sglpr_jax.load(weights), (time.perf_counter(), time.process_time())
+    loops = sglpr_jax.find_loops(drive.recording, params, registered=False).loops
     taken = time.perf_counter() - start[0], time.process_time() - start[1]
-    return Found(
-        closures_of(loops), None if odometry is None else PoseGraph({0: odometry}, loops).solve().poses, *taken, loops
-    )
+    return Found(closures_of(loops), None, *taken, loops)
 
 
 class _ByScanContext(StoredScans):
@@ -137,8 +133,7 @@ def _local_maps(drive: Drive, *, method: str, environment: Path, **_: Any) -> Fo
 
 
 METHODS: dict[str, Callable[..., Found]] = {
-    "sglpr": functools.partial(_ours, drifting=False),
-    "drifting": functools.partial(_ours, drifting=True),
+    "sglpr": _ours,
     "scan-context": _scan_context,
     "bin-loops": _bin_loops,
     "kiss-slam": functools.partial(_local_maps, method="kiss-slam"),
@@ -179,7 +174,7 @@ def simulated(
         drives: WORLD:ROUTE:SEED[:SENSOR]. In a town, route 00 revisits places in the same direction, 08 in the opposite
             one. In a scenery that repeats, the route is none, same or opposite.
         sensors: sensors of drives without one, with +CARRIER.
-        methods: sglpr, drifting (with odometry that drifts), scan-context, bin-loops, kiss-slam, map-closures.
+        methods: sglpr, scan-context, bin-loops, kiss-slam, map-closures.
         scans: scans of each drive.
         azimuth_steps: firings of the sensor per turn.
         weights: model that describes the scans.

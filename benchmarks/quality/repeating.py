@@ -6,9 +6,8 @@ Each drive is a file SCENERY-REVISIT-SENSOR-SEED.npz with these arrays, n scans 
     scenery, sensor, revisit: names; seed
     scale: factor for lengths of the images; poses are in real metres
 
-Comparisons of a scan with those that may show its place take most of the time of a search, and do not depend on the
-model of the probability. They are kept beside the drives, in `compared/`, for the same settings of the finder; delete
-the folder after a change of its code.
+Comparisons of scans take most of the time of a search. They are kept beside the drives, in `compared/`, for the same
+settings of the finder; delete the folder after a change of its code.
 """
 
 import dataclasses
@@ -116,10 +115,7 @@ def _render(case: Case, params: Params, *, scans: int, azimuth_steps: int, scale
             sensor=case.sensor,
             seed=case.seed,
         )
-    seconds, empty = (
-        time.perf_counter() - begin,
-        np.mean([np.count_nonzero(one.image) < MIN_CELLS for one in seen]),
-    )
+    seconds, empty = time.perf_counter() - begin, np.mean([np.count_nonzero(one.image) < MIN_CELLS for one in seen])
     return f"{_name(case)}: {len(seen)} scans in {seconds:.1f} s, {empty:.0%} nearly empty"
 
 
@@ -163,11 +159,6 @@ def chosen(folder: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> It
             yield path
 
 
-def finder_of(params: Params) -> CandidateFinder:
-    """An empty finder with the settings of the loop detector. It needs no model of the probability."""
-    return CandidateFinder(params)
-
-
 def compared(
     path: Path, drive: RenderedDrive, params: Params, *, odometry: Odometry = "none", breaks: bool = False
 ) -> list[Compared]:
@@ -175,7 +166,7 @@ def compared(
 
     With `breaks`, the motion is unknown in the middle of the drive.
     """
-    finder = finder_of(params)
+    finder = CandidateFinder(params)
     name = f"{path.stem}-{_settings(finder, odometry)}{'-broken' * breaks}.log"
     path = path.parent / "compared" / name
     if not path.exists():

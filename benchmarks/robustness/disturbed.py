@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import os
 import random
 import shutil
@@ -140,7 +141,8 @@ def _killed(writer: Writer, folder: Path, *, times: int, seed: int) -> Iterator[
         place = _fresh(folder, writer)
         process = writer.begin(place)
         if attempt % 2:
-            _wait_for_changes(process, place, draw.randint(1, whole.changes))
+            for _ in itertools.islice(_changing(process, place), draw.randint(1, whole.changes)):
+                pass
             time.sleep(draw.uniform(0, 5e-3))
         else:
             time.sleep(draw.uniform(0, whole.seconds))
@@ -154,9 +156,8 @@ def _killed(writer: Writer, folder: Path, *, times: int, seed: int) -> Iterator[
         if not _finishes(writer, place):
             counts["next run fails"] += 1
         else:
-            counts["other bytes"] += _told(
-                writer, "is another one after the next run", writer.unlike(place, whole.files)
-            )
+            unlike = writer.differing(written(place), whole.files, complete=True)
+            counts["other bytes"] += _told(writer, "is another one after the next run", unlike)
     yield {"seconds": whole.seconds, "files": len(whole.files), **counts}
 
 
@@ -174,7 +175,8 @@ def _together(writer: Writer, folder: Path, *, times: int) -> Iterator[Row]:
         counts["both end well" if not bad else "one is refused" if refused else "fail"] += 1
         for error in bad:
             print(f"{writer.name}: one of two ended with: {error[-2000:]}", file=sys.stderr)
-        counts["other bytes"] += _told(writer, "is another one after two at once", writer.unlike(place, whole.files))
+        unlike = writer.differing(written(place), whole.files, complete=True)
+        counts["other bytes"] += _told(writer, "is another one after two at once", unlike)
     yield dict(counts)
 
 
@@ -216,24 +218,6 @@ def _read_only(writer: Writer, place: Path, whole: Whole, draw: random.Random) -
     return status
 
 
-def _vanishes(writer: Writer, place: Path, whole: Whole, draw: random.Random) -> int:
-    """One of the files that it reads is removed meanwhile."""
-    return _meanwhile(writer, place, whole, draw, Path.unlink)
-
-
-def _half_there(writer: Writer, place: Path, whole: Whole, draw: random.Random) -> int:
-    """One of the files that it reads is written anew meanwhile, and has come as far as the middle of a number."""
-    return _meanwhile(writer, place, whole, draw, lambda path: os.truncate(path, path.stat().st_size // 2 | 1))
-
-
-TROUBLES: dict[str, Callable[[Writer, Path, Whole, random.Random], int]] = {
-    "full disk": _full,
-    "read-only folder": _read_only,
-    "a file vanishes": _vanishes,
-    "a file is half there": _half_there,
-}
-
-
 def _meanwhile(writer: Writer, place: Path, whole: Whole, draw: random.Random, change: Callable[[Path], None]) -> int:
     """Change a file that the command names, or a scan of the drive that it names, at any time of its run."""
     inputs, before = place.parent / INPUTS, place.parent / "inputs-before"
@@ -250,18 +234,25 @@ def _meanwhile(writer: Writer, place: Path, whole: Whole, draw: random.Random, c
         before.rename(inputs)
 
 
+def _half(path: Path) -> None:
+    """Cut a file in the middle of a number."""
+    os.truncate(path, path.stat().st_size // 2 | 1)
+
+
+TROUBLES: dict[str, Callable[[Writer, Path, Whole, random.Random], int]] = {
+    "full disk": _full,
+    "read-only folder": _read_only,
+    "a file vanishes": functools.partial(_meanwhile, change=Path.unlink),
+    "a file is half there": functools.partial(_meanwhile, change=_half),
+}
+
+
 def _fresh(folder: Path, writer: Writer) -> Path:
     """An empty folder for one run; always the same, for some commands write down where they are."""
     place = folder / writer.name.replace(" ", "-")
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
     return place
-
-
-def _wait_for_changes(process: Process, place: Path, count: int) -> None:
-    for done, _ in enumerate(_changing(process, place), 1):
-        if done == count:
-            return
 
 
 def _finishes(writer: Writer, place: Path) -> bool:

@@ -40,8 +40,7 @@ class Writer:
     line: str
     """Its arguments."""
     varies: tuple[str, ...] = ()
-    """Files with the time of day or measured seconds in them, that are added to while the command runs, or that only a
-    killed run leaves for the next: patterns of their paths below `OUT`."""
+    """Patterns of files below `OUT` with times in them, that grow, or that only a killed run leaves for the next."""
     resumed_by: str = ""
     """Where this file is there already, --resume has it go on."""
     refuses: str = ""
@@ -53,18 +52,11 @@ class Writer:
         resume = self.resumed_by and (folder / OUT / self.resumed_by).exists()
         return start(self.name.split()[0], (*self.line.split(), *["--resume"] * bool(resume)), folder, **options)
 
-    def differing(self, found: dict[str, bytes], whole: dict[str, bytes]) -> list[str]:
-        """The files that are not as in an undisturbed run, those apart that never are."""
-        return [name for name, content in found.items() if not self._varies(name) and content != whole.get(name)]
-
-    def unlike(self, folder: Path, whole: dict[str, bytes]) -> list[str]:
-        """The same, with the files of an undisturbed run that are not there."""
-        found = written(folder)
-        return self.differing(found, whole) + [one for one in whole if one not in found and not self._varies(one)]
-
-    def _varies(self, name: str) -> bool:
-        """Whether a file is another one each time."""
-        return any(fnmatch.fnmatch(name, pattern) for pattern in self.varies)
+    def differing(self, found: dict[str, bytes], whole: dict[str, bytes], *, complete: bool = False) -> list[str]:
+        """The files that are not as in an undisturbed run, less those that vary; missing ones if `complete`."""
+        names = {**found, **whole} if complete else found
+        unlike = [name for name in names if found.get(name) != whole.get(name)]
+        return [name for name in unlike if not any(fnmatch.fnmatch(name, pattern) for pattern in self.varies)]
 
 
 RUN_FILES = ("*/checkpoints/*", "*/environment.json", "*/metrics.jsonl", "*/learning-curves.png", "*/mining/*")
