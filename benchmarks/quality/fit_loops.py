@@ -4,8 +4,8 @@
     python -m benchmarks repeating fit build/fit
 
 Every drive is searched without odometry, once as it is and once with a break of the motion in its middle, and every
-third drive with odometry that drifts. All kinds of drives count alike. `scoring.PoseErrors` decides whether a pair is a loop.
-Each scenery is judged by a model that was fitted to the others.
+third drive with odometry that drifts. All kinds of drives count alike. A pair is a loop by
+`scoring.PoseErrors`. Each scenery is judged by a model that was fitted to the others.
 """
 
 import dataclasses

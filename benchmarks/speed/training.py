@@ -111,30 +111,23 @@ class Work:
     """The compiled program; after the job has run nothing is compiled for it."""
 
 
-class StepJob:
-    """A job: training steps, one after another."""
+def step_work(config: TrainConfig, calls: int, *, labels: bool = True) -> Work:
+    """Training steps, one after another, on a random batch that is on the device: all but reading.
 
-    def __init__(self, config: TrainConfig, batch: Batch, steps: int):
-        self._network, self._batch, self._steps = ImageNetwork(config), batch, steps
-        self._state = self._network.new_state()
+    The job raises FloatingPointError if the loss is no longer finite.
+    """
+    batch, network = jax.device_put(random_batch(config, config.max_points, labels=labels)), ImageNetwork(config)
+    state = network.new_state()
 
-    def __call__(self) -> None:
-        """Make the steps. Raises FloatingPointError if the loss is no longer finite."""
-        for _ in range(self._steps):
-            self._state, metrics = train_step(self._state, self._batch, network=self._network)
+    def job() -> None:
+        nonlocal state
+        for _ in range(calls):
+            state, metrics = train_step(state, batch, network=network)
         if not np.isfinite(metrics["loss"]):
             raise FloatingPointError(f"the loss is {metrics['loss']}: what was timed is no training")
 
-    def program(self) -> jax.stages.Compiled:
-        """The compiled step."""
-        return train_step.lower(self._state, self._batch, network=self._network).compile()
-
-
-def step_work(config: TrainConfig, calls: int, *, labels: bool = True) -> Work:
-    """Training steps on a random batch that is on the device: all but reading."""
-    batch = jax.device_put(random_batch(config, config.max_points, labels=labels))
-    job = StepJob(config, batch, calls)
-    return Work(job, step_flops(config, batch), config.images, job.program)
+    flops = step_flops(config, batch)
+    return Work(job, flops, config.images, lambda: train_step.lower(state, batch, network=network).compile())
 
 
 def describe_work(config: TrainConfig, batch: int, calls: int) -> Work:

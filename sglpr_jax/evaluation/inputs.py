@@ -130,28 +130,27 @@ def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> De
     Raises ValueError if the trajectory does not fit or if there are no positions.
     """
     file = DescriptorFile.load(path)
-    if trajectory is not None:
-        with naming(path):
-            file = _placed(file, trajectory, path.name)
-    if file.positions is None:
-        raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
-    return file
-
-
-def _placed(file: DescriptorFile, trajectory: Trajectory, name: str) -> DescriptorFile:
-    """Return the frames of a file that have a pose, with the positions of the trajectory."""
+    if trajectory is None:
+        if file.positions is None:
+            raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
+        return file
     poses, times = trajectory.positions, trajectory.times
     recorded = file.recorded
     if len(poses) == len(recorded) != len(file):
         poses, times = poses[recorded], None if times is None else times[recorded]
-    stamps = None if trajectory.by_row else times
-    found = poses_at_scans(
-        trajectory.source, poses_of(poses), stamps, file.times, scans=len(file), of=f"frame of {name}"
-    )
+    stamps, about = None if trajectory.by_row else times, {"scans": len(file), "of": f"frame of {path.name}"}
+    with naming(path):
+        found = poses_at_scans(trajectory.source, poses_of(poses), stamps, file.times, **about)
     keeps_times = times is None or (file.times is not None and not trajectory.by_row)
     source = f"{trajectory.source}, {found.said}" if found.said else trajectory.source
-    placed = replace(file if found.kept.all() else file.only(found.kept), pose_source=source)
-    return replace(placed, positions=found.poses[:, :3, 3], times=placed.times if keeps_times else times)
+    placed = file if found.kept.all() else file.only(found.kept)
+    with naming(path):
+        return replace(
+            placed,
+            positions=found.poses[:, :3, 3],
+            times=placed.times if keeps_times else times,
+            pose_source=source,
+        )
 
 
 def _read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str) -> DescriptorFile:

@@ -141,7 +141,10 @@ def sessions_table(
 def sessions_to_json(sessions: Mapping[str, Sequence[Result]]) -> dict[str, Any]:
     """Return values for `json.dump`: for each protocol the mean score, and the result of each query session."""
     return {
-        name: {"mean": _number(mean_score(results)), "sessions": dict(zip(sessions, to_json(results), strict=True))}
+        name: {
+            "mean": score_or_none(mean_score(results)),
+            "sessions": dict(zip(sessions, to_json(results), strict=True)),
+        }
         for name, results in _by_protocol(sessions).items()
     }
 
@@ -186,7 +189,7 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
         {
             "protocol": result.name,
             "rule": result.rule,
-            "score": _number(result.score),
+            "score": score_or_none(result.score),
             "interval": None if result.interval is None else list(result.interval),
             "counts": result.counts,
             "dimensions": result.dimensions,
@@ -201,7 +204,8 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
     ]
 
 
-def _number(score: float) -> float | None:
+def score_or_none(score: float) -> float | None:
+    """Return the score, or None for a recording without revisits."""
     return None if math.isnan(score) else score
 
 

@@ -1,7 +1,6 @@
 """Tables 1 to 7 with the reproduced and the published numbers, for the terminal, as JSON and as Markdown."""
 
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL
 from sglpr_jax.evaluation.published import TABLES
-from sglpr_jax.evaluation.report import PrintsItself, TextTable
+from sglpr_jax.evaluation.report import PrintsItself, TextTable, score_or_none
 from sglpr_jax.files import write_json, write_text
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1
 from sglpr_jax.reproduce.runs import Runs, content_of
@@ -132,7 +131,7 @@ class Reproduction:
 
     def _row(self, method: str, label: str, protocol: str, *, rotated: bool) -> Row:
         results = {seq: scored(self.runs, method, seq, protocol=protocol, rotated=rotated) for seq in self.seqs}
-        return Row(label, OURS, {seq: _score_or_none(result) for seq, result in results.items()})
+        return Row(label, OURS, {seq: score_or_none(result.score) for seq, result in results.items()})
 
     def _across_sessions(self, name: str) -> PaperTable:
         """Return Recall@1 of each later session in the first one.
@@ -148,7 +147,7 @@ class Reproduction:
                 continue
             there = self.runs.descriptors(method, seq, of=database)
             found = {q.name: BEVPLACE_NCLT_RECALL(there, self.runs.descriptors(method, seq, of=q)) for q in queries}
-            ours.append(Row(label, OURS, {name: _score_or_none(result) for name, result in found.items()}))
+            ours.append(Row(label, OURS, {name: score_or_none(result.score) for name, result in found.items()}))
         columns = [query.name for query in queries]
         return self._table(name, columns, ours, f"without recording {seq}", ["Recall@1 within 5 m"])
 
@@ -203,11 +202,6 @@ def write_tables(name: str, found: Reproduction, folder: Path) -> list[PaperTabl
         write_text(folder / f"{file}.md", table.markdown())
         write_json(folder / f"{file}.json", table.to_json())
     return list(tables.values())
-
-
-def _score_or_none(result: Result) -> float | None:
-    """Return the score, or None for a recording without revisits."""
-    return None if math.isnan(result.score) else result.score
 
 
 def _text(score: float | None, missing: str = NONE) -> str:

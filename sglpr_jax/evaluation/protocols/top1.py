@@ -52,7 +52,7 @@ class Top1(Protocol):
         """Score descriptors or a top-k list with scores. Raises ValueError if positions or scores are missing."""
         if isinstance(source, TopK) and source.scores is None:
             raise ValueError(f"{self.title}: expected a list with scores for the threshold, found no scores")
-        n, positions, ends = len(source), positions_of(source, self.dimensions), self._database_end(source)
+        n, positions, (ends, excluded) = len(source), positions_of(source, self.dimensions), self._databases(source)
         queries = np.flatnonzero(ends)
         numbers = sorted({*self.numbers, max(round(n / 100), 1)} if self.one_percent else self.numbers)
         nearest, distance = nearest_frames(source, queries, ends[queries], k=numbers[-1])
@@ -67,7 +67,7 @@ class Top1(Protocol):
         answers, distances = np.full(n, -1, dtype=np.int64), np.full(n, np.inf)
         answers[queries], distances[queries] = nearest, distance
         result = replace(
-            self.result(f"{self.metres}, {self._excluded(source)}", source),
+            self.result(f"{self.metres}, {excluded}", source),
             counts={"queries": len(queries), "revisits": int(revisited.sum())},
             recalls=recalls,
             answers=answers,
@@ -89,20 +89,15 @@ class Top1(Protocol):
         )
         return replace(result, decisions=decisions)
 
-    def _database_end(self, source: Source) -> Int[np.ndarray, " n"]:
-        """Return, for each frame, the number of first frames that are its database. A frame with 0 is no query."""
+    def _databases(self, source: Source) -> tuple[Int[np.ndarray, " n"], str]:
+        """Return the number of first frames that are the database of each frame (0: no query), and the gap in words."""
         if self.gap is None:
-            return database_end(len(source), times=source.times)
+            last = f"{EXCLUDED_FRAMES} frames" if source.times is None else f"{EXCLUDED_S:g} s"
+            return database_end(len(source), times=source.times), f"last {last} excluded"
         ends = np.maximum(np.arange(len(source)) - self.min_age + 1, 0)
         if not self.last_is_query:
             ends[-1] = 0
-        return ends
-
-    def _excluded(self, source: Source) -> str:
-        """Describe the frames that are excluded from the database."""
-        if self.gap is not None:
-            return f"gap {self.gap} frames"
-        return f"last {EXCLUDED_FRAMES} frames excluded" if source.times is None else f"last {EXCLUDED_S:g} s excluded"
+        return ends, f"gap {self.gap} frames"
 
 
 TOP1_F1MAX = Top1(
