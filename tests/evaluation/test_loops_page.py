@@ -57,14 +57,12 @@ def test_rejected_pairs_are_counted_by_reason(found):
     assert "Rejected pairs are grey." in page.texts["Trajectory"]
 
 
-def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(found, known):
+def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(known):
     page = Parsed(loops_page(known))
     assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Trajectory"]
     table = page.texts["Loops"]
     assert "true distance [m]" in table and "94.0" in table
     assert table.index("000007") < table.index("000005") < table.index("000006")
-    unknown = Parsed(loops_page(found)).texts
-    assert "wrong (red)" not in unknown["Trajectory"] and "true distance" not in unknown["Loops"]
 
 
 @pytest.fixture
@@ -79,12 +77,11 @@ def known(found) -> FoundLoops:
     return with_session(dataclasses.replace(found, model=model), recording=recording, candidates=candidates)
 
 
-def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known):
+def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(known):
     page = Parsed(loops_page(known))
     assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs", "Reliability"]
     said = page.texts["Reliability"]
     assert "0.99 to 1" in said and "1.000" in said and "0 to 0.01" in said and "by poses.txt" in said
-    assert "not known" in Parsed(loops_page(found)).texts["Reliability"]
     assert "No pair was compared." in loops_page(with_session(known, candidates=()))
 
 
@@ -119,8 +116,5 @@ def test_transforms_pairs_and_recordings_are_shown(several):
     poses = np.concatenate([one.odometry for one in several.sessions])
     corrected = OptimizedTrajectory(poses, np.ones(len(several.loops), bool))
     assert "corrected by 7 of 7 loops" in Parsed(loops_page(several, optimized=corrected)).texts["Together"]
-
-
-def test_no_common_place_is_said(several):
     page = Parsed(loops_page(dataclasses.replace(several, loops=several.loops[:-1], transforms=())))
     assert "no common place found" in page.texts["Transforms"] and "Together" not in page.texts

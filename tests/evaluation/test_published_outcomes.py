@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from recordings import kitti_trajectory
 
-from sglpr_jax.evaluation.protocols.pairs import LISTED_PAIRS_F1MAX, frame_pairs, is_revisit, pair_distances
+from sglpr_jax.evaluation.protocols.pairs import frame_pairs, is_revisit
 from sglpr_jax.evaluation.protocols.recall import SSC_RECALL
-from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
+from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.evaluation.protocols.top1 import CONTOUR_CONTEXT_F1MAX, TOP1_F1MAX
 
 
@@ -64,16 +64,9 @@ def test_revisits_are_logg3ds(shared, make_file, sequence, revisits):
     assert result.counts["revisits"] == revisits
 
 
-@pytest.fixture(scope="module")
-def neg_100(shared):
-    """Return RINet's list for 07: pairs (p, 2) and whether each is positive."""
+def test_positive_pairs_are_rinets_on_kittis_own_poses(shared):
     rows = np.loadtxt(shared / "data/protocol/neg_100_07.txt", dtype=np.int64)
-    return rows[:, :2], rows[:, 2] == 1
-
-
-def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
-    pairs, positive = neg_100
-    published = {tuple(pair) for pair in pairs[positive].tolist()}
+    published = {tuple(pair) for pair in rows[rows[:, 2] == 1, :2].tolist()}
     found = {}
     for poses in ("kitti", "semantickitti"):
         positions, _, _ = kitti_trajectory(shared / "data/kitti_odometry", "07", pose_source=poses)
@@ -81,16 +74,3 @@ def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
     assert found["kitti"] == published
     assert len(published) == 1833
     assert found["semantickitti"] != published
-
-
-def test_rinets_list_scores_descriptors(shared, make_file, neg_100):
-    pairs, positive = neg_100
-    positions, _, _ = kitti_trajectory(shared / "data/kitti_odometry", "07", pose_source="kitti")
-    noise = np.random.default_rng(0).normal(scale=10, size=positions.shape)
-    file = make_file(positions, positions + noise, sequence="07")
-    scores = -pair_distances(file, pairs.T)
-    by_label = LISTED_PAIRS_F1MAX(ScoredPairs(pairs, scores, positive))
-    by_position = LISTED_PAIRS_F1MAX(ScoredPairs(pairs, scores, positions=file.positions))
-    assert by_label.counts == by_position.counts == {"positive pairs": 1833, "negative pairs": 183_300}
-    assert by_label.score == by_position.score
-    assert 0 < by_label.interval[0] < by_label.score < by_label.interval[1] < 1

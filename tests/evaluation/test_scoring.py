@@ -1,14 +1,13 @@
 """One call scores a descriptor file, a path or arrays; its result prints itself and has the worst mistakes."""
 
 import dataclasses
-import json
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.protocols.protocol import Decision
-from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
+from sglpr_jax.evaluation.protocols.source import ScoredPairs
 from sglpr_jax.evaluation.protocols.top1 import OVERLAP_TRANSFORMER_F1MAX, TOP1_F1MAX
 from sglpr_jax.evaluation.scoring import Evaluation, evaluate, score
 
@@ -52,29 +51,16 @@ def test_options_stand_in_for_what_a_file_says_itself(file, tmp_path):
         assert "last 30 s excluded" in moved.results[0].rule
 
 
-def test_options_that_cannot_apply_are_refused(file, tmp_path):
-    (tmp_path / "pairs.txt").write_text("0 1 0.5 1\n0 2 0.1 0\n")
+def test_options_that_cannot_apply_are_refused(file):
     pairs = ScoredPairs(np.array([[0, 1], [0, 2]]), np.array([0.5, 0.1]), np.array([True, False]))
-    answers = TopK("town", file.positions, None, None, np.array([700]), np.array([[300]]))
     for source, options, message in (
         (pairs, {"times": file.times}, "^expected no times beside scored pairs"),
-        (tmp_path / "pairs.txt", {"times": file.times}, "pairs.txt: expected no times beside scored pairs"),
-        (answers, {"distance": "l2"}, "expected no distance beside up to 1 retrieved frames"),
         (file, {"distance": "cosin"}, "did you mean cosine"),
         (file.descriptors, {}, "expected positions of 800 frames"),
         (file, {"positions": file.positions[:9]}, r"found float64 \(9, 3\)"),
     ):
         with pytest.raises(ValueError, match=message):
             evaluate(source, **options)
-
-
-def test_the_result_prints_itself_and_becomes_json(file, tmp_path):
-    file.save(tmp_path / "town.npz")
-    found = evaluate(tmp_path / "town.npz", ["top1-f1max"])
-    assert "sequence town, 800 scans" in str(found) and f"{found.results[0].score:.3f}" in str(found)
-    plain = json.loads(json.dumps(found.to_json()))
-    assert plain["file"].endswith("town.npz") and plain["distance"] == "l2"
-    assert [result["protocol"] for result in plain["results"]] == ["top-1 F1max"]
 
 
 def test_the_surest_mistakes_come_first_and_neighbours_once(mistaken):
@@ -88,8 +74,6 @@ def test_the_surest_mistakes_come_first_and_neighbours_once(mistaken):
 
 
 def test_metres_have_the_dimensions_of_the_protocol(mistaken):
-    hills = mistaken.positions + np.arange(800)[:, None] * [0, 0, 1.0]
-    flat = OVERLAP_TRANSFORMER_F1MAX(mistaken)
-    assert flat.dimensions == 2
+    hills, flat = mistaken.positions + np.arange(800)[:, None] * [0, 0, 1.0], OVERLAP_TRANSFORMER_F1MAX(mistaken)
     one, other = (Evaluation("", "", {"": [flat]}, positions).worst for positions in (hills, mistaken.positions))
     assert one == other
