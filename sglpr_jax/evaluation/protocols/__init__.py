@@ -7,48 +7,28 @@ To add a protocol, add it to the file of its kind (`top1`, `pairs`, `recall`) an
 import difflib
 from collections.abc import Mapping, Sequence
 
-from sglpr_jax.evaluation.protocols.pairs import (
-    LISTED_PAIRS_F1MAX,
-    PAIRS_1_F1MAX,
-    PAIRS_10_F1MAX,
-    PAIRS_ALL_F1MAX,
-    PAIRS_F1MAX,
-    SGPR_PAIRS_F1MAX,
-)
+from sglpr_jax.evaluation.protocols import pairs, recall, top1
 from sglpr_jax.evaluation.protocols.protocol import Protocol
-from sglpr_jax.evaluation.protocols.recall import (
-    BEVPLACE_NCLT_RECALL,
-    BEVPLACE_RECALL_AT_1,
-    BEVPLACE_V1_RECALL,
-    POINTNETVLAD_RECALL,
-    SSC_RECALL,
-)
 from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, Source, kind_of
-from sglpr_jax.evaluation.protocols.top1 import (
-    CONTOUR_CONTEXT_F1MAX,
-    OVERLAP_TRANSFORMER_F1MAX,
-    SCAN_CONTEXT_F1MAX,
-    TOP1_F1MAX,
-)
 
 PROTOCOLS: Mapping[str, Protocol] = {
     protocol.name: protocol
     for protocol in (
-        TOP1_F1MAX,
-        PAIRS_F1MAX,
-        BEVPLACE_RECALL_AT_1,
-        SCAN_CONTEXT_F1MAX,
-        CONTOUR_CONTEXT_F1MAX,
-        OVERLAP_TRANSFORMER_F1MAX,
-        PAIRS_1_F1MAX,
-        PAIRS_10_F1MAX,
-        PAIRS_ALL_F1MAX,
-        SGPR_PAIRS_F1MAX,
-        SSC_RECALL,
-        BEVPLACE_V1_RECALL,
-        LISTED_PAIRS_F1MAX,
-        BEVPLACE_NCLT_RECALL,
-        POINTNETVLAD_RECALL,
+        top1.TOP1_F1MAX,
+        pairs.PAIRS_F1MAX,
+        recall.BEVPLACE_RECALL_AT_1,
+        top1.SCAN_CONTEXT_F1MAX,
+        top1.CONTOUR_CONTEXT_F1MAX,
+        top1.OVERLAP_TRANSFORMER_F1MAX,
+        pairs.PAIRS_1_F1MAX,
+        pairs.PAIRS_10_F1MAX,
+        pairs.PAIRS_ALL_F1MAX,
+        pairs.SGPR_PAIRS_F1MAX,
+        recall.SSC_RECALL,
+        recall.BEVPLACE_V1_RECALL,
+        pairs.LISTED_PAIRS_F1MAX,
+        recall.BEVPLACE_NCLT_RECALL,
+        recall.POINTNETVLAD_RECALL,
     )
 }
 """All protocols by their names on the command line, in the order of tables."""
