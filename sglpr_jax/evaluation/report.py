@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1, TABLE_3
 from sglpr_jax.files import printable
@@ -124,35 +123,6 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> T
         return TextTable(("method", *names), rows, names, title)
     rows = [(name, *line) for name, line in zip(names, zip(*scores, strict=True), strict=True)]
     return TextTable(("protocol", *methods), rows, list(methods), title)
-
-
-def sessions_table(
-    sessions: Mapping[str, Sequence[Result]], published: Sequence[tuple[str, ...]], *, title: str
-) -> TextTable:
-    """Return the score of each query session and their mean, in a row for each protocol. Published rows follow."""
-    header = ("", *map(printable, sessions), "mean")
-    rows = [
-        (name, *(format_score(result.score) for result in results), format_score(mean_score(results)))
-        for name, results in _by_protocol(sessions).items()
-    ]
-    return TextTable(header, [*rows, *published], header[1:], title)
-
-
-def sessions_to_json(sessions: Mapping[str, Sequence[Result]]) -> dict[str, Any]:
-    """Return values for `json.dump`: for each protocol the mean score, and the result of each query session."""
-    return {
-        name: {
-            "mean": score_or_none(mean_score(results)),
-            "sessions": dict(zip(sessions, to_json(results), strict=True)),
-        }
-        for name, results in _by_protocol(sessions).items()
-    }
-
-
-def _by_protocol(sessions: Mapping[str, Sequence[Result]]) -> dict[str, tuple[Result, ...]]:
-    """Return the results of all sessions by the protocol's name on the command line."""
-    names = {protocol.title: name for name, protocol in PROTOCOLS.items()}
-    return {names[of_one[0].name]: of_one for of_one in zip(*sessions.values(), strict=True)}
 
 
 def mean_score(results: Sequence[Result]) -> float:

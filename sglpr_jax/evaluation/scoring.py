@@ -86,22 +86,33 @@ class Evaluation(report.PrintsItself):
                 worst.append(FalsePositive(query, answer, metres, float(result.answer_distances[query])))
         return worst
 
+    def _by_protocol(self) -> dict[str, list[Result]]:
+        """Return the results of all methods or query sessions by the protocol's name on the command line."""
+        names = {protocol.title: name for name, protocol in PROTOCOLS.items()}
+        return {names[of_one[0].name]: list(of_one) for of_one in zip(*self.methods.values(), strict=True)}
+
     def table(self) -> report.TextTable:
         """Return the table of all scores: methods side by side, or the query sessions, their mean and the paper's."""
         if self.database is None:
             return report.comparison(self.methods)
-        return report.sessions_table(self.methods, self.published, title=self.title)
+        header = ("", *map(printable, self.methods), "mean")
+        each = {name: [*(one.score for one in of), report.mean_score(of)] for name, of in self._by_protocol().items()}
+        rows = [(name, *map(report.format_score, scores)) for name, scores in each.items()]
+        return report.TextTable(header, [*rows, *self.published], header[1:], self.title)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for `json.dump`."""
         if self.database is not None:
-            beside = {"about": report.SESSIONS_NOTE, "columns": self.table().header, "rows": self.published}
-            return {
-                **self.made_with,
-                "database_session": self.database,
-                "results": report.sessions_to_json(self.methods),
-                **({"published": beside} if self.published else {}),
+            results = {
+                name: {
+                    "mean": report.score_or_none(report.mean_score(of_one)),
+                    "sessions": dict(zip(self.methods, report.to_json(of_one), strict=True)),
+                }
+                for name, of_one in self._by_protocol().items()
             }
+            beside = {"about": report.SESSIONS_NOTE, "columns": self.table().header, "rows": self.published}
+            published = {"published": beside} if self.published else {}
+            return {**self.made_with, "database_session": self.database, "results": results, **published}
         others = list(self.methods.items())[1:]
         return {
             **self.made_with,
