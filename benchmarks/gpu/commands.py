@@ -58,7 +58,7 @@ class KeptRows:
         self.rows: list[Row] = rows
 
     def find(self, key: Row) -> Row | None:
-        """The row that says so of all that `key` names."""
+        """The row with the values of `key`."""
         return next((row for row in self.rows if key.items() <= row.items()), None)
 
     def add(self, key: Row, measure: Callable[[], Row]) -> None:

@@ -49,8 +49,7 @@ def recall(
     """Measure Recall@1 of single scans and of submaps. Prints a row for each sensor and length.
 
     The first pass is the map. A query is a scan of another pass. It is right if the nearest descriptor of the map is
-    within 5 m. The odometry is 1 % too long and turns by one degree every 100 m. The scans are rendered once and kept
-    in `out`; delete the folder after a change of the simulator.
+    within 5 m. The odometry is 1 % too long and turns by one degree every 100 m. The scans are kept in `out`.
 
     Args:
         sensors: names of sensors.

@@ -1,7 +1,7 @@
 """Latency of bin/live from the publication of a scan to its loops, between processes, with dropped scans and memory.
 
-A process publishes a simulated drive at a fixed rate, there and back again and again. bin/live runs in another process.
-The latency of a scan is the time from before it is published to the line of bin/live that reports it or its loop.
+A process publishes a simulated drive at a fixed rate, there and back. bin/live runs in another process. The latency of
+a scan is the time from before it is published to the line of bin/live that reports it or its loop.
 """
 
 import json

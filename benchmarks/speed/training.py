@@ -33,9 +33,8 @@ NOMINAL_TYPE = "bfloat16"
 def count_flops(program: ClosedJaxpr) -> int:
     """Operations of the matrix products and convolutions of a traced program, less what no output needs.
 
-    Two for each product of two numbers that are added up, on every device. Of a branch the dearer side counts. XLA's
-    own cost analysis counts the body of a loop once, knows nothing of library calls on a GPU, and adds up operations
-    of all kinds. Raises ValueError for a product in a loop whose turns depend on values.
+    A product and its addition count two; of a branch the dearer side counts. XLA's own analysis counts the body of a
+    loop once. Raises ValueError for a product in a loop whose turns depend on values.
     """
     needed, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars))
     return _count(needed)
