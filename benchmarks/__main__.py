@@ -39,6 +39,7 @@ PROGRAMS = {
     "sensors deskew": Program("quality.sensors", "deskew", "scans on a fast turn before and after deskewing"),
     "sensors rotation": Program("quality.sensors", "rotation", "movement of a descriptor when the scan rotates"),
     "methods baselines": Program("quality.methods", "baselines", "methods beside each other: scores and times"),
+    "realism compare": Program("quality.realism", "compare", "histograms of real and simulated scans"),
     "realism semantics": Program("quality.realism", "semantics", "semantics of real scans by simulated training"),
     "speed embed": Program("speed.embed", "embed", "from a scan's file to its descriptor"),
     "speed loops": Program("speed.loops", "loops", "memory and time of the loop detector on a long drive"),

@@ -1,20 +1,204 @@
-"""Semantics of real scans by weights that were trained in the simulator."""
+"""Real scans beside simulated ones: their histograms, and what weights of the simulator know of real semantics."""
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
+from sglpr_jax.bev import rasterize, rasterize_labels
+from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.evaluation.figures import save, segmentation_panel
 from sglpr_jax.evaluation.segmentation import confusion_matrix, score_confusion
-from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_raw
+from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
+from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_classes, to_raw
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.image_maps import semantic_map
+
+GRID = model_preset("sglpr").grid
+
+Measures = Mapping[str, np.ndarray]
+
+_RANGES = (0, 3, 5, 7.5, 10, 15, 20, 30, 40, 60, 80)
+_HEIGHTS = (-np.inf, -2.4, -2, -1.8, -1.6, -1.4, -1.2, -0.8, -0.4, 0, 0.5, 1, 1.5, 2, 3, np.inf)
+_COUNTS = (1, 2, 3, 5, 9, 17, 33, 65, np.inf)
+_DISTANCES = (0, 5, 7.5, 10, 12.5, 15, 17.5, 20, 25, 36)
+_LATERALS = (0, *np.arange(1.8, 20, 2), 25.4)  # five rows of pixels each, but for the first and the last
+_BINS = {
+    "range": ("points by range, m", _RANGES),
+    "height": ("points by height over the sensor, m", _HEIGHTS),
+    "count": ("occupied cells by points in them", _COUNTS),
+    "image_density": ("density image: pixels above 0 by value, tenths", np.arange(0.5, 11)),
+    "image_distance": ("density image: pixels above 0 by distance, m", _DISTANCES),
+    "image_lateral": ("density image: pixels above 0 by distance to the side, m", _LATERALS),
+}
+
+
+def _bin_names(edges: Sequence[float]) -> tuple[str, ...]:
+    return tuple(f"{low:g} to {high:g}" for low, high in itertools.pairwise(edges))
+
+
+HISTOGRAMS = {name: (title, _bin_names(edges)) for name, (title, edges) in _BINS.items()} | {
+    "class_of_points": ("points by class", CATEGORIES),
+    "class_of_cells": ("occupied cells by class", CATEGORIES),
+    "class_of_pixels": ("density image's window: cells by class", CATEGORIES),
+}
+"""Title and names of the bins of every histogram. A bin holds its lower edge and not its upper one."""
+
+
+def compare(
+    *,
+    out: Path,
+    real: tuple[Path, ...] = (),
+    real_range: Path | None = None,
+    simulated: tuple[Path, ...] = (),
+    scans: int = 30,
+) -> None:
+    """Measure real and simulated drives; print how far their histograms are apart, and write histograms.png.
+
+    Args:
+        out: folder of the picture.
+        real: datasets of real scans, or of density images in BEVPlace's layout.
+        real_range: folder of labelled range images, NN_FFFFFF.npz with `points` and `label` (learning classes).
+        simulated: datasets that bin/simulate made.
+        scans: the most scans of a drive that are measured, evenly spread over it.
+    """
+    sources = dict(one for root in real for one in _measured("real", root, scans))
+    sources |= dict(_measured_range_images(real_range)) if real_range else {}
+    sources |= dict(one for root in simulated for one in _measured("simulated", root, scans))
+    if not sources:
+        raise SystemExit("nothing to measure: name datasets with --real, --real-range or --simulated")
+    table = Table("total variation from the real drives, %", *sources)
+    for measure, (title, _) in HISTOGRAMS.items():
+        table.add_row(title, *(_distance_from_real(name, measure, sources) for name in sources))
+    Console(width=200).print(table)
+    save(_draw(sources), out / "histograms.png")
+    print(out / "histograms.png")
+
+
+def _measured(kind: str, root: Path, scans: int) -> Iterator[tuple[str, Measures]]:
+    """Mean measures of each drive of a dataset."""
+    for name in recording_names(root):
+        drive = open_recording(root, name)
+        rows = np.unique(np.linspace(0, len(drive) - 1, min(scans, len(drive))).astype(int)).tolist()
+        what = "images" if drive.has_images else "scans"
+        yield f"{kind} {what} {name}", _mean([_measures(drive, row) for row in rows])
+
+
+def _measures(drive: Recording, row: int) -> Measures:
+    if drive.has_images:
+        return _image_measures(np.rint(drive.image(row) * (255 / DENSITY_MAX_COUNT)).astype(np.uint8))
+    labels = drive.labels(row)
+    return _scan_measures(drive.points(row), None if labels is None else to_classes(labels))
+
+
+def _measured_range_images(folder: Path) -> Iterator[tuple[str, Measures]]:
+    """Mean measures of each drive of a folder of range images."""
+    for name, of_drive in itertools.groupby(_range_image_paths(folder), key=lambda path: path.stem[:2]):
+        yield f"real range images {name}", _mean([_scan_measures(*_read_range_image(path)) for path in of_drive])
+
+
+def _mean(each: Sequence[Measures]) -> Measures:
+    """Means over the scans; of classes over those with labels."""
+    names = dict.fromkeys(name for measures in each for name in measures)
+    return {name: np.mean([one[name] for one in each if name in one], axis=0) for name in names}
+
+
+def _distance_from_real(name: str, measure: str, sources: Mapping[str, Measures]) -> str:
+    """How much of a histogram must move to make the mean of the real drives (of the others, for a real one)."""
+    others = [
+        one[measure] for other, one in sources.items() if other.startswith("real") and other != name if measure in one
+    ]
+    if measure not in sources[name] or not others:
+        return ""
+    return f"{50 * np.abs(sources[name][measure] - np.mean(others, axis=0)).sum():.0f}"
+
+
+def _draw(sources: Mapping[str, Measures]) -> Figure:
+    """One panel for each histogram: real drives in grey, simulated ones in colours."""
+    figure = Figure(figsize=(15, 12), layout="constrained")
+    dashes = itertools.cycle(("-", "--", "-.", ":"))
+    styles = {
+        name: {"color": "0.4", "linestyle": next(dashes)} if name.startswith("real") else {"linewidth": 2}
+        for name in sources
+    }
+    for axes, (measure, (title, bins)) in zip(figure.subplots(3, 3).flat, HISTOGRAMS.items(), strict=True):
+        for name, measures in sources.items():
+            values = 100 * measures.get(measure, np.full(len(bins), np.nan))
+            axes.plot(values, marker="o", markersize=3, label=name, **styles[name])
+        axes.set_title(f"{title}, %", fontsize=10)
+        axes.set_xticks(range(len(bins)), bins, rotation=60, ha="right", fontsize=7)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _scan_measures(points: np.ndarray, classes: np.ndarray | None) -> Measures:
+    """All measures of a scan (n, 3) in metres; those of classes only where it has them."""
+    padding = (0, (1 << len(points).bit_length()) - len(points))  # few sizes, so few compilations
+    padded, count = jnp.asarray(np.pad(points, (padding, (0, 0)))), jnp.asarray(len(points))
+    counts = np.asarray(rasterize(padded, grid=GRID, count=count))
+    measures = {
+        "range": _histogram("range", np.linalg.norm(points, axis=1)),
+        "height": _histogram("height", points[:, 2]),
+        "count": _histogram("count", counts[counts > 0]),
+        **_image_measures(np.rot90(density_image(points), -1)),
+    }
+    if classes is None:
+        return measures
+    cells = np.asarray(rasterize_labels(padded, jnp.asarray(np.pad(classes, padding)), grid=GRID, count=count))
+    return measures | {
+        "class_of_points": _share_of_classes(classes),
+        "class_of_cells": _share_of_classes(cells[counts > 0]),
+        "class_of_pixels": _share_of_classes(density_label_image(points, classes)),
+    }
+
+
+def _image_measures(image: np.ndarray) -> Measures:
+    """The measures of a density image (151, 151) of grey values, in the orientation of eq. 1."""
+    half = image.shape[0] // 2
+    down, right = np.nonzero(image)
+    x, y = (right - half) * DENSITY_RESOLUTION_M, (half - down) * DENSITY_RESOLUTION_M
+    values = image[down, right]
+    return {
+        "image_density": _histogram("image_density", values / 25.5),
+        "image_distance": _histogram("image_distance", np.hypot(x, y)),
+        "image_lateral": _histogram("image_lateral", np.abs(y)),
+    }
+
+
+def _histogram(name: str, values: np.ndarray) -> np.ndarray:
+    _, edges = _BINS[name]
+    counts = np.histogram(values, bins=edges)[0]
+    return counts / max(counts.sum(), 1)
+
+
+def _share_of_classes(classes: np.ndarray) -> np.ndarray:
+    """The shares of the classes; class 0, which is no class, has none."""
+    counts = np.bincount(classes.ravel(), minlength=len(CATEGORIES))
+    counts[0] = 0
+    return counts / max(counts.sum(), 1)
+
+
+def _range_image_paths(folder: Path) -> list[Path]:
+    """The files of a folder, in order; ends the program where there are none."""
+    paths = sorted(folder.glob("*.npz"))
+    if not paths:
+        raise SystemExit(f"{folder}: expected range images (*.npz), found none")
+    return paths
+
+
+def _read_range_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) in metres and the class of each (n,)."""
+    with np.load(path, allow_pickle=False) as file:
+        return np.ascontiguousarray(file["points"][:, :3]), file["label"].astype(np.int32)
 
 
 def semantics(
@@ -33,7 +217,7 @@ def semantics(
         out: folder of pictures of real scans, which KITTI's licence keeps private.
         prior: simulated dataset from which each cell's commonest class is taken.
         scans: datasets in KITTI's layout; their labelled scans are scored.
-        range_images: folder of labelled range images, NN_FFFFFF.npz with `points` and `label` (learning classes).
+        range_images: folder of labelled range images.
         prior_scans: scans of each simulated recording that make the prior.
     """
     params = sglpr_jax.load(weights)
@@ -69,12 +253,8 @@ def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Itera
             for row, labelled in enumerate(recording.labelled):
                 if labelled and not recording.has_images:
                     yield f"scans of {name}", recording.record(row)
-    paths = sorted(range_images.glob("*.npz")) if range_images else []
-    if range_images and not paths:
-        raise SystemExit(f"{range_images}: expected range images (*.npz), found none")
-    for path in paths:
-        with np.load(path, allow_pickle=False) as file:
-            points, classes = np.ascontiguousarray(file["points"][:, :3]), file["label"].astype(np.int32)
+    for path in _range_image_paths(range_images) if range_images else ():
+        points, classes = _read_range_image(path)
         yield f"range images of {path.stem[:2]}", Record(points=points, labels=to_raw(classes))
 
 

@@ -26,6 +26,7 @@ RUN = (
     "repeating search drives --weights circular",
     "repeating evidence drives --sensor vlp16 --weights circular",
     "sensors rotation --data images --weights circular --scans 2 --step-deg 120 --among 20",
+    "realism compare --real town --simulated images --scans 2 --out compared",
     f"speed training --preset {TINY} --size 64 --repeats 1 --steps 1",
     f"speed profile --preset {TINY} --steps 1",
     "speed loops --frames 40 --repeats 1 --azimuth-steps 90 --weights circular",
