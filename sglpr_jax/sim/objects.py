@@ -11,8 +11,6 @@ Range = tuple[float, float]
 Kind = Literal["box", "cylinder", "ellipsoid"]
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")
 """Kinds in the order of `shapes.Scene`."""
-Zone = Literal["bay", "verge", "plot"]
-"""Place of a thing: parked along its street, on the strips beside the road, or behind the strips."""
 _BELOW_M = 1.0
 """Depth of a building below the ground, in metres. It prevents gaps under buildings on slopes."""
 _FACADE_M = 0.06
@@ -36,18 +34,6 @@ class Part(NamedTuple):
 
 Thing = tuple[Part, ...]
 """Parts that stand, appear and disappear together."""
-
-
-class Beside(NamedTuple):
-    """Thing beside a street, s metres along the street and d metres outwards from the kerb."""
-
-    thing: Thing
-    s: float
-    d: float
-    yaw: float = 0.0  # of the thing's x axis relative to the street, positive outwards, radians
-    zone: Zone = "plot"
-    since: float = -np.inf  # seconds
-    until: float = np.inf  # seconds
 
 
 def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:

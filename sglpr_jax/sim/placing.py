@@ -1,7 +1,7 @@
 """Things with their poses in the world, their conversion to shapes, and distances between shapes and a path."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +16,9 @@ CLEARANCE_M = 1.6
 HEAD_ROOM_M = 2.0
 """Minimum height of parts that may be above the vehicle, or overhang a street or its sidewalk, in metres."""
 
+Zone = Literal["bay", "verge", "plot"]
+"""Place of a thing: parked along its street, on the strips beside the road, or behind the strips."""
+
 
 class Spot(NamedTuple):
     """Thing and its pose in the world. If `side` is -1, its y axis is mirrored."""
@@ -29,6 +32,7 @@ class Spot(NamedTuple):
     since: float = -np.inf  # seconds
     until: float = np.inf  # seconds
     time: float = 0.0  # seconds
+    zone: Zone = "plot"
 
 
 class Placed(NamedTuple):

@@ -42,8 +42,7 @@ class Stretch(NamedTuple):
     start: int
     stop: int
     half_width: float  # half width of the carriageway, metres
-    left: Side
-    right: Side
+    sides: tuple[Side, Side]  # left and right
 
 
 class Street(NamedTuple):
@@ -111,10 +110,9 @@ def revisits(path: Path) -> Bool[np.ndarray, " n"]:
 def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
     """Yields the first index of each run of True, and one past the last. Gaps shorter than `gap` are closed."""
     indices = np.flatnonzero(keep)
-    breaks = np.flatnonzero(np.diff(indices) > gap)
-    firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(indices) - 1]])
-    for first, last in zip(indices[firsts].tolist(), indices[lasts].tolist(), strict=True):
-        yield first, last + 1
+    for run in np.split(indices, np.flatnonzero(np.diff(indices) > gap) + 1):
+        if len(run):
+            yield int(run[0]), int(run[-1]) + 1
 
 
 def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) -> tuple[Street, ...]:
@@ -162,7 +160,7 @@ def _draw_stretches(
         other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
         left = draw_side(rng, here, median=median, look_alike=look_alike)
         right = draw_side(rng, other, median=False, look_alike=look_alike)
-        yield Stretch(start, stop, half_width, left, right)
+        yield Stretch(start, stop, half_width, (left, right))
         start = stop
 
 
@@ -195,7 +193,7 @@ def _sharp_turns(heading: Float[np.ndarray, " n"]) -> Iterator[int]:
     if len(heading) <= 60:
         return
     turned = np.abs(heading[20:] - heading[:-20])
-    for first, last in runs(turned > np.radians(50), gap=5) if np.any(turned > np.radians(50)) else ():
+    for first, last in runs(turned > np.radians(50), gap=5):
         peak = first + int(turned[first:last].argmax())
         if turned[peak] < np.radians(120):
             yield peak + 10
@@ -222,7 +220,7 @@ def roundabouts(path: Path) -> tuple[Island, ...]:
     turning = gaussian_filter1d(np.gradient(path.heading), 2.0)
     round_it = (turning > 1 / ROUNDABOUT_M[1]) & (turning < 1 / ROUNDABOUT_M[0])
     islands = []
-    for first, last in runs(round_it, gap=3) if round_it.any() else ():
+    for first, last in runs(round_it, gap=3):
         if path.heading[last - 1] - path.heading[first] > np.radians(150):
             radius = (last - first) / (path.heading[last - 1] - path.heading[first])
             centre = (path.xy[first:last] + radius * path.left[first:last]).mean(axis=0)
@@ -243,7 +241,7 @@ class Network:
         self.stretches = tuple(stretch for street in streets for stretch in street.stretches)
         self.stretch = np.repeat(np.arange(len(self.stretches)), [part.stop - part.start for part in self.stretches])
         self.half_width = np.array([part.half_width for part in self.stretches])[self.stretch]
-        verges = np.array([(part.left.verge, part.right.verge) for part in self.stretches])
+        verges = np.array([[side.verge for side in part.sides] for part in self.stretches])
         self.verge = verges[self.stretch]  # (n, 2): left and right
         self._tree = KDTree(self.middle)
 
@@ -315,7 +313,7 @@ def _profiles(stretches: tuple[Stretch, ...]) -> Profiles:
     bounds = np.full((2 * len(stretches), _STRIPS + 1), np.inf)
     names = np.full((2 * len(stretches), _STRIPS + 2), TERRAIN)
     for i, stretch in enumerate(stretches):
-        for row, side in ((2 * i, stretch.left), (2 * i + 1, stretch.right)):
+        for row, side in enumerate(stretch.sides, 2 * i):
             widths = [stretch.half_width, *(strip.width for strip in side.strips), GARDEN_M]
             labels = [ROAD, *(strip.label for strip in side.strips), side.style.garden]
             bounds[row, : len(widths)] = np.cumsum(widths)

@@ -57,7 +57,7 @@ def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
     same_way = np.cos(path.heading - network.heading[nearest])
     to_middle = -network.offset(path.xy, nearest) * np.sign(same_way)
     to_middle = np.where(np.abs(same_way) > 0.9, to_middle.clip(-3, 4), MIDDLE_M)
-    pairs = [(part.left, part.right) for part in network.stretches]
+    pairs = [part.sides for part in network.stretches]
     half_width, stretch = network.half_width[nearest], network.stretch[nearest]
     away = {}
     for name, turned in (("left walk", same_way < 0), ("right walk", same_way > 0)):

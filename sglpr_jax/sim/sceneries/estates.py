@@ -17,6 +17,7 @@ from sglpr_jax.sim.sceneries.site import (
     along,
     grid,
     jittered,
+    on_both_sides,
     painted_ground,
     rolling,
     rounded,
@@ -52,8 +53,8 @@ def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     plan = rows(length_m, run_m=rng.uniform(110, 160), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
     streets = pitch * np.arange(-1, plan.count + 1)
     module, xs = _module(rng, wide), np.arange(HOUSES_FREE_M + wide / 2, plan.run_m - HOUSES_FREE_M, wide)
-    houses = [spot for side in (1, -1) for spot in grid(xs, streets, lambda: module, side=side)]
-    bays = [spot for side in (1, -1) for spot in grid(xs, streets + side * (ROAD_M - 0.9), lambda: parked(rng))]
+    houses = on_both_sides(xs, streets, 0.0, lambda: module)
+    bays = on_both_sides(xs, streets, ROAD_M - 0.9, lambda: parked(rng))
     lamps = grid(xs[:: max(1, round(30 / wide))] + wide / 2, streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 6.0),))
     ground = _street(plan.line, HOUSES_WALK_M, rolling(rng))
     return Site(plan.line, [*houses, *jittered(rng, bays, 0.2, keep=rng.uniform(0.2, 0.5)), *lamps], ground)
@@ -138,8 +139,8 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
             away = rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
             dx, dy = ((beside, away), (away, beside))[rng.integers(2)]
             spots.append(Spot(_plant(rng, 6.0), x + dx, y + dy, rng.uniform(0, 2 * np.pi)))
-    spots += along(shifted(line, 2.5), lambda: (post(POLE, 0.15, 4.5),), rng.uniform(18, 26))
-    spots += along(shifted(line, -2.6), lambda: (block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40))
+    spots += along(shifted(line, 2.5), ((post(POLE, 0.15, 4.5),), rng.uniform(18, 26)))
+    spots += along(shifted(line, -2.6), ((block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40)))
     left, right, low, high = (pitch * np.array([columns[0], columns[-1] + 1, lines[0], lines[-1] + 1])).tolist()
     along_x, along_y = np.arange(left, right, STEP_M), np.arange(low, high, STEP_M)
     middles = [np.stack([along_x, np.full(len(along_x), y)], axis=1) for y in np.arange(low, high + 1, pitch)]

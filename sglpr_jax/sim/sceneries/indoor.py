@@ -102,7 +102,7 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
         corners += _visit(k * pitch, ROOMS_SIDE_M, into)
     if closed:  # back on the other side of the corridor
         corners += [(corners[-1][0] + 1.0, 0.0), (corners[-1][0] + 1.0, -0.4), (-pitch / 2, -0.4)]
-    line = rounded(np.array(corners), corner_m=0.15, closed=closed)
+    line = rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
     middles = pitch * np.arange(-ROOMS_MORE, count + ROOMS_MORE)
     same = _room_furniture(rng, size, deep)
     inside = grid(middles, (ROOMS_HALF_M + WALL_M,), lambda: same if equal else _room_furniture(rng, size, deep))
@@ -112,7 +112,7 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
     wall = block(BUILDING, length, 0.3, height, y=-ROOMS_HALF_M - 0.15)
     ceiling = block(BUILDING, length, 2 * ROOMS_HALF_M + 2 * deep + 2, 0.3, bottom=height)
     spots = [*inside, *shell, Spot((*ends, wall, ceiling), middle, 0.0)]
-    return Site(line if closed else line[: round(length_m / STEP_M)], spots, painted_ground(OTHER_GROUND))
+    return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
 def _room_walls(pitch: float, size: float, deep: float, height: float) -> Thing:
@@ -174,10 +174,10 @@ def indoor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     count = 2 if closed else int(np.ceil(length_m / (floor.run_m + floor.pitch_m))) + 1
     first, more = _wing(rng, floor), range(count + 2 * WINGS_MORE)
     wings = [[_like(rng, room, floor) for room in first] if rng.random() < ALIKE else _wing(rng, floor) for _ in more]
-    line = _tour(floor, [wing[VISITED] for wing in wings[WINGS_MORE : WINGS_MORE + count]], closed)
+    line = _tour(floor, [wing[VISITED] for wing in wings[WINGS_MORE : WINGS_MORE + count]], length_m, closed)
     spots = [spot for k, wing in enumerate(wings, -WINGS_MORE) for room in wing for spot in _spots(floor, room, k)]
     spots += _shell(floor, count)
-    return Site(line if closed else line[: round(length_m / STEP_M)], spots, painted_ground(OTHER_GROUND))
+    return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
 def _wing(rng: np.random.Generator, floor: Floor) -> list[Room]:
@@ -220,7 +220,7 @@ def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Part]
     return parts
 
 
-def _tour(floor: Floor, visited: list[Room], closed: bool) -> Line:
+def _tour(floor: Floor, visited: list[Room], length_m: float, closed: bool) -> Line:
     """Path back and forth through the wings, into one room of each, and back along the cross corridor if closed."""
     corners = []
     for k, room in enumerate(visited):
@@ -228,7 +228,7 @@ def _tour(floor: Floor, visited: list[Room], closed: bool) -> Line:
         ends = [(0.0, 0.0), (floor.run_m, 0.0)][::ahead]
         way = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + INSIDE_M, ahead)
         corners += [(x, y + k * floor.pitch_m) for x, y in (ends[0], *way, ends[1])]
-    return rounded(np.array(corners), corner_m=0.15, closed=closed)
+    return rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
 
 
 def _spots(floor: Floor, room: Room, wing: int) -> list[Spot]:

@@ -5,11 +5,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from sglpr_jax.sim import objects
 from sglpr_jax.sim.drive import shifted
 from sglpr_jax.sim.ground import draw_relief
 from sglpr_jax.sim.labels import POLE, TRUNK, VEGETATION
-from sglpr_jax.sim.objects import Range, Thing, ball, bush, post, tree
+from sglpr_jax.sim.objects import Range, Thing, ball, bush, garage, post, tree
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, along, road, rolling, rounded, track
@@ -26,9 +25,13 @@ def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Track through fields, with posts or poles along it, some bushes, and single trees and sheds far away."""
     whole, driven = road(rng, length_m, closed)
     (every, thick, high), beside = ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)], rng.choice((-1, 1)) * 5.0
-    posts = along(shifted(whole, beside), lambda: (post(POLE, thick, high),), every)
+    posts = along(shifted(whole, beside), ((post(POLE, thick, high),), every))
     bushes = _beside(rng, whole, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
-    far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), lambda: _tree_or_shed(rng))
+
+    def tree_or_shed() -> Thing:
+        return garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
+
+    far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), tree_or_shed)
     ground = track(whole, 1.5, rolling(rng))
     return Site(driven, [*posts, *bushes, *far], ground)
 
@@ -42,10 +45,6 @@ def _beside(
         row = int(rng.integers(1, len(line) - 1))
         x, y = shifted(line[row - 1 : row + 2], away)[1].tolist()
         yield Spot(make(), x, y, rng.uniform(0, 2 * np.pi))
-
-
-def _tree_or_shed(rng: np.random.Generator) -> Thing:
-    return objects.garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
 
 
 def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:

@@ -1,14 +1,22 @@
 """Places to park: an open car park, a garage with floors side by side, and one with storeys above one another."""
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.sim.labels import BUILDING, PARKING, POLE
 from sglpr_jax.sim.objects import Thing, block, car, parked, post
 from sglpr_jax.sim.placing import Spot
-from sglpr_jax.sim.sceneries.site import Site, closed_box, grid, jittered, painted_ground, rounded, rows, wall
+from sglpr_jax.sim.sceneries.site import (
+    Site,
+    closed_box,
+    grid,
+    jittered,
+    on_both_sides,
+    painted_ground,
+    rounded,
+    rows,
+    wall,
+)
 from sglpr_jax.sim.world import Levels
 
 FREE_M = 6.0
@@ -30,8 +38,6 @@ LONGER = 2.0
 STOREY_PITCH_M = 45.0
 """Distance between two storeys in the world that holds them side by side, in metres."""
 
-Places = Float[np.ndarray, " _"]
-
 
 def car_park(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Equal aisles, 22 to 28 m apart, with parked cars on both sides and lamps between the aisles."""
@@ -39,9 +45,9 @@ def car_park(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     plan = rows(length_m, run_m=rng.uniform(60, 100), pitch_m=pitch, closed=closed, back_m=7.0, corner_m=2.5)
     aisles = pitch * np.arange(-MORE, plan.count + MORE)
     stalls, away = np.arange(FREE_M, plan.run_m - FREE_M, stall), rng.uniform(5.8, 6.5)
-    cars = _on_both_sides(stalls, aisles, away, lambda: parked(rng))
-    lamp = (post(POLE, 0.25, 7.0),)
-    lamps = grid(np.arange(FREE_M, plan.run_m, rng.uniform(20, 30)), aisles + pitch / 2, lambda: lamp)
+    cars = on_both_sides(stalls, aisles, away, lambda: parked(rng), np.pi / 2)
+    xs = np.arange(FREE_M, plan.run_m, rng.uniform(20, 30))
+    lamps = grid(xs, aisles + pitch / 2, lambda: (post(POLE, 0.25, 7.0),))
     return Site(plan.line, [*jittered(rng, cars, 0.15, keep=full), *lamps], painted_ground(PARKING))
 
 
@@ -58,18 +64,12 @@ def garage(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(plan.line, [*spots, shell], painted_ground(PARKING))
 
 
-def _on_both_sides(xs: Places, aisles: Places, away: float, make: Callable[[], Thing]) -> list[Spot]:
-    """Cars across both sides of each aisle."""
-    left = grid(xs, aisles + away, make, heading=np.pi / 2)
-    return left + grid(xs, aisles - away, make, heading=-np.pi / 2)
-
-
 def _floor(
-    rng: np.random.Generator, run_m: float, aisles: Places, *, stall: float, height: float, full: float
+    rng: np.random.Generator, run_m: float, aisles: Float[np.ndarray, " _"], *, stall: float, height: float, full: float
 ) -> list[Spot]:
     """Parked cars and pillars along the aisles of one floor."""
     xs, pillar = np.arange(TURN_M, run_m - TURN_M, stall), (block(BUILDING, 0.4, 0.6, height),)
-    cars = jittered(rng, _on_both_sides(xs, aisles, CAR_M, lambda: car(rng)), 0.12, keep=full)
+    cars = jittered(rng, on_both_sides(xs, aisles, CAR_M, lambda: car(rng), np.pi / 2), 0.12, keep=full)
     return cars + grid(xs[::3] - stall / 2, np.concatenate([aisles - PILLAR_M, aisles + PILLAR_M]), lambda: pillar)
 
 
@@ -109,6 +109,6 @@ def storeys(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     lap = [(0.0, WIDE_M), (0.0, 0.0), (run, 0.0), (run, WIDE_M)]
     ramp = [(run, WIDE_M + RAMP_M), (0.0, WIDE_M + RAMP_M)]
     corners = [*lap * closed, *(lap + ramp) * count]
-    line = rounded(np.array(corners[: -len(ramp)]), corner_m=1.5)
+    line = rounded(corners[: -len(ramp)], corner_m=1.5)
     levels = Levels(rise, STOREY_PITCH_M, inner, TURN_M, run - TURN_M)
     return Site(line, spots, painted_ground(PARKING), levels, returns=closed)

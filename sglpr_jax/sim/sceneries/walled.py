@@ -11,7 +11,7 @@ from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT, PARKING, 
 from sglpr_jax.sim.objects import Thing, bicycle, block, bush, car, post, tree
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
-from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded, wall
+from sglpr_jax.sim.sceneries.site import Site, grid, painted_ground, rounded, wall
 
 GATE_M = 3.2
 """Width of the gate between two places, in metres."""
@@ -57,17 +57,17 @@ def _places(
     else:
         count = int(np.ceil(length_m / long_m)) + 1
         gates = (wide_m * rng.uniform(-BEND, BEND, count - 1)).tolist()
-        line = _onward(rng, gates, long_m, wide_m)[: round(length_m / STEP_M)]
+        line = _onward(rng, gates, length_m, long_m, wide_m)
     ends, half = (len(gates) + 1) * long_m, wide_m / 2
     walls = [wall((0.0, side * half), (ends, side * half), height_m) for side in (-1, 1)]
     walls += [wall((x, -half), (x, half), height_m) for x in (0.0, ends)]
     for k, y in enumerate(gates, 1):
-        walls.append(wall((k * long_m, -half), (k * long_m, y - GATE_M / 2), height_m))
-        walls.append(wall((k * long_m, y + GATE_M / 2), (k * long_m, half), height_m))
+        beside = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
+        walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in beside]
     return Places(line, tuple(walls), len(gates) + 1, long_m, wide_m)
 
 
-def _onward(rng: np.random.Generator, gates: list[float], long_m: float, wide_m: float) -> Line:
+def _onward(rng: np.random.Generator, gates: list[float], length_m: float, long_m: float, wide_m: float) -> Line:
     """Path along x through all gates, with a bend in the middle of each place."""
     bends = (wide_m * rng.uniform(-BEND, BEND, len(gates) + 1)).tolist()
     corners = [(MARGIN_M, bends[0])]
@@ -75,7 +75,7 @@ def _onward(rng: np.random.Generator, gates: list[float], long_m: float, wide_m:
         x = (k + 1) * long_m
         corners += [((k + 0.5) * long_m, bends[k]), (x - STRAIGHT_M, gate), (x + STRAIGHT_M, gate)]
     corners.append(((len(gates) + 1) * long_m - MARGIN_M, bends[-1]))
-    return rounded(np.array(corners), corner_m=CORNER_M)
+    return rounded(corners, corner_m=CORNER_M, length_m=length_m)
 
 
 def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_m: float) -> Line:
@@ -86,7 +86,7 @@ def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_
         corner = rng.uniform(low, high)
         if np.linalg.norm(corner - corners[-1]) > min(long_m, wide_m) / 2:
             corners.append(corner)
-    return rounded(np.array(corners), corner_m=CORNER_M, closed=True)
+    return rounded(corners, corner_m=CORNER_M, closed=True)
 
 
 def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
