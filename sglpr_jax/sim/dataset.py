@@ -90,37 +90,34 @@ def simulate(
 ) -> Simulated:
     """Drives a simulated LiDAR through simulated towns and writes scans, labels and poses.
 
-    Existing files are kept: the same call completes an interrupted dataset. Recordings can be added to a dataset, but
-    not sessions, because their streets depend on the number of days.
+    Existing files are kept: the same call completes an interrupted dataset, and recordings can be added to one, but not
+    sessions, because their streets depend on the number of days.
 
     Arguments:
       out: Output folder.
-      routes: Routes "00" to "10", each with its own town, which depends on `seed` and the route. None drives 00, 05 and
-        08, or no route if there is `along`.
+      routes: Routes "00" to "10", each with its own town. None drives 00, 05 and 08, or no route if there is `along`.
       along: KITTI pose files to drive along, see `read_path`.
-      sessions: Dates such as "2012-01-15". One town is driven on each of these days, in NCLT's layout, see
-        `plan_sessions`. `routes` may then hold one route; None is 00.
+      sessions: Dates such as "2012-01-15" on which one town is driven, in NCLT's layout, see `plan_sessions`. `routes`
+        may then hold one route; None is 00.
       scans: Number of scans of each recording, at least 2. Along a pose file it is the maximum.
       sensor: LiDAR, or its name from `SENSORS`. None is hdl64e, or hdl32e-nclt with `sessions`.
       azimuth_steps: Firings per revolution. None is the sensor's own number.
       seed: Seed of the towns, at least 0.
-      rate_hz: Scans per second of a route. Not used along pose files. None is 4 in towns, elsewhere the rate of the
-        carrier or of the scenery.
-      scenery: Name from `SCENERIES` (towns), or from `REPEATING`. In the latter, a route stands only for the direction
-        of its revisits, and the drive is that of `simulate_repeating`.
+      rate_hz: Scans per second of a route. None is 4 in towns, elsewhere the rate of the carrier or of the scenery.
+      scenery: Name from `SCENERIES` (towns), or from `REPEATING`, where routes only give the direction of revisits.
       carrier: Name from `CARRIERS`. In towns, only its height and sway are used. `sessions` need a vehicle.
       submap_m: Travelled distance of submaps, in metres. 0 writes scans.
       images: Whether to write density images with label images instead of scans.
       vary: Whether the images show scans that are rotated about z, some of them with lost points. See `layouts.vary`.
-      on_start: Function that is called with the dataset's description after all arguments are checked.
-      on_progress: Function that is called with the number of completed scans, counting `scans` for each recording.
+      on_start: Called with the dataset's description after all arguments are checked.
+      on_progress: Called with the number of completed scans, counting `scans` for each recording.
 
     Returns:
       Description of the dataset.
 
     Raises:
-      ValueError: An argument is unknown or out of range, a pose file is malformed, or arguments contradict each other.
-        Or `out` holds other files, or a dataset with other settings.
+      ValueError: An argument is unknown or out of range, arguments contradict each other, a pose file is malformed, or
+        `out` holds other files or a dataset with other settings.
       OSError: A file cannot be read or written. The message names the file.
 
     Example:
@@ -263,10 +260,7 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
-    """Stored settings with the current field names.
-
-    Older datasets have `TOWN`, sensors that repeat their rings, and a vehicle.
-    """
+    """Stored settings with the current field names, and with the values of fields that older datasets lack."""
     settings = read_json(path)
     scenery = settings.get("scenery", dataclasses.asdict(TOWN)) if isinstance(settings, dict) else None
     if not isinstance(scenery, dict):

@@ -73,11 +73,9 @@ class TimedPoses(NamedTuple):
 def plan_path(
     rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ, days: int = 1
 ) -> PlanarPath:
-    """Returns the path of a drive along route `name`, with a pose about every 0.1 s.
+    """Returns the path along route `name`, with a pose about every 0.1 s, for `scans / rate_hz` seconds or SHORTEST_S.
 
-    The drive lasts `scans / rate_hz` seconds, but at least SHORTEST_S. The vehicle keeps right with a small sway that
-    differs between visits. The path has `days` equally long parts along the same streets, each with a multiple of
-    `scans` poses.
+    It has `days` equally long parts along the same streets, each with a multiple of `scans` poses.
     """
     if name not in ROLES:
         raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
@@ -90,10 +88,7 @@ def plan_path(
 
 
 def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps: float, poses: int) -> PlanarPath:
-    """Returns the drive along `line`, with a pose about every 0.1 s. The number of poses is a multiple of `poses`.
-
-    `free_mps` is the mean speed on free streets, in m/s. The vehicle is slower in corners.
-    """
+    """Drive along `line`, with a multiple of `poses` poses. `free_mps` is the mean speed on free streets, in m/s."""
     heading = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
     clock = _clock(rng, line, heading, free_mps)
     times = _even_times(clock[-1], poses)

@@ -26,10 +26,7 @@ CHANGING_BUSHES = 0.1
 def frontage(
     rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock, bystanders: Iterator[Callable]
 ) -> Iterator[Spot]:
-    """Yields the things along one side from s = `start` to `stop`, where no other street joins.
-
-    `bystanders` yields functions that draw people, bicycles and similar things, in the order of their use.
-    """
+    """Yields the things along one side from s = `start` to `stop`. `bystanders` makes people and the like."""
     if side.bays:
         d = side.strips[0].width / 2 + 0.1
         for s in _steps(rng, start + 4, stop - 4, (5.4, 6.4)):
@@ -67,10 +64,7 @@ def _poisson(rng: np.random.Generator, per_metre: float, start: float, stop: flo
 
 
 def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float = STAY_S) -> Iterator[Clock]:
-    """Yields the stays at a place that is occupied for the fraction `occupied` of the time.
-
-    A stay lasts `stay_s` seconds on average. A stay that exists at the start of the drive begins at -inf.
-    """
+    """Yields the stays at a place that is occupied for the fraction `occupied`. The first may begin at -inf."""
     time = clock[0]
     taken = rng.random() < occupied
     while time < clock[1]:
@@ -290,10 +284,7 @@ def _bin_or_bench(rng: np.random.Generator) -> Thing:
 
 
 def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generator], Thing]]:
-    """Yields functions that draw bystanders, without end.
-
-    Each block of ten contains three people, three bicycles and one of each other kind.
-    """
+    """Yields makers of bystanders, without end: in ten, three people, three bicycles and one of each other kind."""
     kinds = [*3 * [objects.person], *3 * [objects.bicycle]]
     kinds += [objects.bicyclist, objects.motorcycle, objects.motorcyclist, _bin_or_bench]
     while True:

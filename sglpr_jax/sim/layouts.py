@@ -1,7 +1,4 @@
-"""File layouts of simulated drives: scans as in KITTI or NCLT, or images with label images as in BEVPlace.
-
-Images may show varied scans, for training: rotated about z, some with lost points, as with other sensors and weather.
-"""
+"""File layouts of simulated drives: scans as in KITTI or NCLT, or images with label images as in BEVPlace."""
 
 import functools
 import io
@@ -92,10 +89,7 @@ def _row(matrix: Float[np.ndarray, "r 4"]) -> str:
 
 
 def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
-    """Calibration, times and poses. The simulator has no camera, so the projections are identities.
-
-    A line of poses.txt is world_from_camera. The axes of its world are those of a camera, too.
-    """
+    """Calibration with identity projections, times, and poses world_from_camera, both in a camera's axes."""
     projections = "".join(f"P{i}: {_row(np.eye(4))}" for i in range(4))
     world_from_camera = CAMERA_FROM_LIDAR @ poses.world_from_lidar @ CAMERA_FROM_LIDAR.T
     return {
@@ -106,10 +100,7 @@ def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
 
 
 def _nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting | None) -> tuple[bytes, ...]:
-    """Returns the bytes of a scan in NCLT's body frame: x forward, y right, z down, origin on the ground.
-
-    `points` are x, y, z in metres from the sensor, with z up, and reflectivities from 0 to 1.
-    """
+    """Bytes of a scan in NCLT's body frame: x forward, y right, z down, origin on the ground."""
     above_ground = np.add(points[:, :3].astype(np.float64), [0, 0, NCLT_HEIGHT_M])
     body = above_ground * Z_UP_FROM_Z_DOWN
     records = np.zeros(len(points), NCLT_RECORD)
@@ -173,7 +164,7 @@ def vary(
 ) -> tuple[Float32[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
     """Removes points of some scans, levels the scan, and rotates it about z by a random angle.
 
-    The random seed is a hash of `points`, which are in the LiDAR frame. Returns the remaining points and labels.
+    The random seed is a hash of `points`, which are in the LiDAR frame.
     """
     seed = zlib.crc32(points.tobytes())
     rng = np.random.default_rng(seed)

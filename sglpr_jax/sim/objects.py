@@ -224,11 +224,7 @@ def _block(width: float, depth: float, height: float, x: float, front: float, gl
 
 
 def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
-    """House with the middle of its front at the origin. The y axis points into the house.
-
-    About two of three houses have a recess or a wing: a second box at another depth. Some houses have balconies. With
-    `porch`, which needs room in front of the house, some have a porch.
-    """
+    """House with the middle of its front at the origin, and y into the house. A `porch` needs room in front of it."""
     width, depth, height = plan.width, plan.depth, plan.height
     parts = [_block(width, depth, height, 0.0, 0.0, plan.glass)]
     if width > 5 and rng.random() < 0.65:

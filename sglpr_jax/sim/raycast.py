@@ -1,7 +1,7 @@
 """First hit of each ray with a shape, and whether it returns: surfaces, windows, weak echoes and mixed edges.
 
-The host lists the shapes that overlap each sector of columns, nearest first. The device processes all sectors in
-parallel, one shape per sector at a time, until the remaining shapes are farther than all hits.
+The host lists the shapes in each sector of columns, nearest first. The device tests one shape per sector at a time,
+until the remaining shapes are farther than all hits.
 """
 
 from collections.abc import Sequence
@@ -79,10 +79,7 @@ def find_candidates(
     reach_m: float,
     slots: tuple[int, ...] = SLOTS,
 ) -> tuple[Candidates, ...]:
-    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`.
-
-    The azimuth steps divide the azimuths from the first to the second of `azimuths_deg`.
-    """
+    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`."""
     first, last = np.radians(azimuths_deg)
     step = (last - first) / azimuth_steps
     middle = first + (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
@@ -164,9 +161,8 @@ def nearest_hit(
 ) -> tuple[Float[Array, "lasers azimuths"], Int[Array, "lasers azimuths"]]:
     """Returns the distance to the first shape that each ray from the sensor hits, and its slot.
 
-    Slots count boxes, then cylinders, then ellipsoids. A ray without a hit nearer than `limit` has the distance `limit`
-    and slot -1. Shapes around the sensor are not hit. A rough shape returns a ray from a random depth, if it is not
-    thinner than that.
+    Slots count boxes, then cylinders, then ellipsoids. Without a hit nearer than `limit`, they are `limit` and -1.
+    Shapes around the sensor are not hit. A rough shape returns a ray from a random depth, if it is not thinner.
     """
     sectors = (limit.shape[0], -1, COLUMNS)
     rays, limit, chance = jax.tree.map(
@@ -306,8 +302,7 @@ def mix_edges(
 ) -> Float[Array, "lasers azimuths"]:
     """Replaces the fraction `share` of the ranges by random values between them and the range of the next azimuth.
 
-    This models the width of beams. It requires that both rays returned and their ranges differ by less than
-    EDGE_JUMP_M. `chance` is uniform in [0, 1).
+    Both rays must return, with ranges that differ by less than EDGE_JUMP_M. `chance` is uniform in [0, 1).
     """
     jump = jnp.roll(reach, -1, axis=1) - reach
     mixed = returned & jnp.roll(returned, -1, axis=1) & (jnp.abs(jump) < EDGE_JUMP_M) & (chance < share)

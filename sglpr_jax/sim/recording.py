@@ -140,7 +140,7 @@ def drive_through(
 
     Arguments:
       world: Town.
-      path: Path of the vehicle. Its times are those of the town.
+      path: Path of the vehicle, with the times of the town.
       rows: Rows of `path` at which scans are taken.
       name: Name of the recording.
       ids: Names of the scans. None numbers them.
@@ -148,7 +148,7 @@ def drive_through(
       sensor: LiDAR.
       key: Random key of the measurements.
       rng: Random generator of the sway of the carrier.
-      carrier: Carrier of the sensor, which follows `path`. Its height and sway are used.
+      carrier: Carrier of the sensor. Its height and sway are used.
     """
     clock = path.times[rows]
     ids, times = ids or numbered(len(rows)), clock if times is None else times

@@ -35,12 +35,10 @@ def simulate_repeating(
       scans: Number of scans, evenly spaced over the drive.
       seed: Seed of the scenery and the drive, at least 0.
       sensor: LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of at most 0.5 m.
-      revisit: "none" never returns to a place: frames 30 s apart are more than `other_m` apart. "opposite" drives to
-        the end and returns on the same way. "same" drives one and a half laps along a closed path.
+      revisit: "none": frames 30 s apart are more than `other_m` apart. "opposite": returns on the same way.
+        "same": drives one and a half laps along a closed path.
       rate_hz: Scans per second. None uses the rate of the carrier or of the scenery.
-      carrier: Carrier of the sensor, such as one of `CARRIERS`. Halts make the drive longer, so its scans are farther
-        apart in time. With revisit "none", a carrier that stands or is slower than the scenery's may have frames 30 s
-        apart that are within `other_m`.
+      carrier: Carrier of the sensor, such as one of `CARRIERS`. Slow ones and halts bring frames 30 s apart closer.
 
     Raises:
       ValueError: The name or `revisit` is unknown, `rate_hz` is not positive, or `seed` is negative.

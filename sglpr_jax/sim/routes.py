@@ -124,10 +124,9 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
 
 
 def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -> list[Node]:
-    """Returns a walk that is `days` times as long as one of `plan_walk`, along the same streets.
+    """Returns a walk `days` times as long as one of `plan_walk`, along the same streets.
 
-    Each later day begins with a U-turn at a roundabout. At a crossing, the walk takes the street ahead that was driven
-    least often in that direction. The later days therefore partly drive in the opposite direction.
+    Each later day begins with a U-turn at a roundabout, and takes the streets driven least often in its direction.
     """
     walk = plan_walk(rng, role, blocks=blocks)
     ahead = defaultdict(set)
@@ -157,10 +156,7 @@ def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> l
 
 
 def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: int, again: int) -> list[Node]:
-    """`nodes`, then `new` streets back to an earlier crossing, then `again` streets for the second time.
-
-    The result is an empty list if the walk reaches a dead end.
-    """
+    """`nodes`, `new` streets back to an earlier crossing, and `again` streets once more; or [] at a dead end."""
     wandering = int(rng.integers(new // 2, max(new - 1, 1) + 1))
     walk = _wandered(rng, role, nodes, wandering)
     left = new - wandering

@@ -142,10 +142,7 @@ SENSORS = {
 
 
 class View(NamedTuple):
-    """Shapes and ground that a sensor may hit from one pose.
-
-    Array shapes are the same for every pose, so views can be stacked.
-    """
+    """Shapes and ground that a sensor may hit from one pose. Array shapes are the same for every pose."""
 
     candidates: tuple[Candidates, ...]
     ground: GroundView
@@ -171,9 +168,7 @@ def scan(
     time: float = 0.0,
     velocity: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
-    """Simulates one scan of a world.
-
-    Points are in the order of KITTI's files: laser by laser, each counter-clockwise from the first azimuth.
+    """Simulates one scan of a world: points laser by laser, each counter-clockwise from the first azimuth, as in KITTI.
 
     Arguments:
       key: Random key of the measurements.
@@ -181,7 +176,7 @@ def scan(
       world_from_lidar: Pose of the LiDAR.
       sensor: LiDAR.
       time: Time in the world, in seconds.
-      velocity: Velocity of the sensor in the LiDAR frame, in m/s. Sensors with `motion_distortion` need it.
+      velocity: Velocity of the sensor in its own frame, in m/s, for sensors with `motion_distortion`.
 
     Returns:
       Points (x, y, z in metres in the LiDAR frame, intensity from 0 to 1) and their raw labels.
@@ -223,10 +218,7 @@ def view_of(
 
 @functools.partial(jax.jit, static_argnames="sensor")
 def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
-    """Casts the rays of one revolution.
-
-    This is a pure function of arrays, so `jax.vmap` over keys and views simulates many revolutions.
-    """
+    """Casts the rays of one revolution. `jax.vmap` over keys and views simulates many revolutions."""
     key_surface, key_echoes = jax.random.split(key)
     surface = first_surface(key_surface, view, sensor=sensor)
     reach, returned = _echoes(key_echoes, surface, sensor)
@@ -248,10 +240,7 @@ def returned_points(turn: Turn) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarra
 
 @functools.partial(jax.jit, static_argnames="sensor")
 def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
-    """Finds the ground or shape that each ray (lasers, azimuths) hits first within the sensor's range.
-
-    Lasers are processed in blocks. Low lasers hit the ground in front of most shapes, so their blocks finish early.
-    """
+    """Finds the ground or shape that each ray (lasers, azimuths) hits first. Blocks of low lasers finish early."""
     rays = _rays_of(view, sensor)
     lasers, azimuths = rays.x.shape
     key_depth, key_pores = jax.random.split(key)
@@ -316,10 +305,9 @@ def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
 
 
 def scattered(elevations_deg: Sequence[float], azimuths: int, *, time: float) -> Float[np.ndarray, "lasers {azimuths}"]:
-    """Elevation of each ray of a scan that does not repeat its pattern, as those of Livox, in degrees.
+    """Elevation of each ray in degrees, for a sensor that, like those of Livox, does not repeat its pattern.
 
-    A low-discrepancy sequence fills the bands of elevations around `elevations_deg` evenly in space and, scan after
-    scan, in time. It does not follow the curves of the prisms of a real sensor.
+    A low-discrepancy sequence fills the bands around `elevations_deg` evenly in space and, scan after scan, in time.
     """
     middle = np.array(elevations_deg)
     height = abs(middle[1] - middle[0])

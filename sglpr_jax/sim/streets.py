@@ -32,8 +32,6 @@ BLOCK_CELLS = 2
 """Width of a block in cells. All cells of a block use the same nearest point of a street."""
 _CHUNK = 500_000
 _STRIPS = 5  # maximum on one side
-Profiles = tuple[np.ndarray, np.ndarray]
-"""Bounds (2 n, strips) and labels (2 n, strips + 1) across both sides of n stretches."""
 
 
 class Stretch(NamedTuple):
@@ -167,10 +165,7 @@ def _draw_stretches(
 def _branch_starts(
     rng: np.random.Generator, street: Street, scenery: Scenery
 ) -> list[tuple[Float[np.ndarray, "2"], float]]:
-    """Start points and headings of possible side streets.
-
-    They lead straight ahead at sharp bends of the street, and sideways at random points.
-    """
+    """Start points and headings of possible side streets: ahead at sharp bends, and sideways at random points."""
     starts = []
     for turn in _sharp_turns(street.heading):
         before, after = max(turn - 10, 0), min(turn + 10, len(street.heading) - 1)
@@ -250,10 +245,7 @@ class Network:
         return np.asarray(self._tree.query(xy)[1])
 
     def offset(self, xy: Float[np.ndarray, "m 2"], index: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Distance of each position to the left of the street at point `index`, negative to the right.
-
-        Beyond the end of a street it is the distance from the end, so that a dead end is round.
-        """
+        """Distance to the left of the street at point `index`, negative to the right. Dead ends are round."""
         away, cos, sin = xy - self.middle[index], np.cos(self.heading[index]), np.sin(self.heading[index])
         left, ahead = cos * away[:, 1] - sin * away[:, 0], np.abs(cos * away[:, 0] + sin * away[:, 1])
         return np.copysign(np.hypot(left, np.maximum(ahead - 1, 0)), left)
@@ -287,14 +279,15 @@ def _near_streets(points: Float[np.ndarray, "n 2"], size: tuple[int, int], reach
     near = np.zeros([-(-axis // coarse) for axis in size], bool)
     near[tuple((points // coarse).astype(int).T)] = True
     near = binary_dilation(near, np.ones((3, 3)), iterations=4)
-    corners = coarse * np.argwhere(near)
-    inside = np.stack(np.meshgrid(np.arange(coarse), np.arange(coarse), indexing="ij"), axis=-1).reshape(-1, 2)
-    blocks = (corners[:, None] + inside[None]).reshape(-1, 2)
-    return blocks[np.all(blocks < size, axis=1)]
+    near = near.repeat(coarse, axis=0).repeat(coarse, axis=1)
+    return np.argwhere(near[: size[0], : size[1]])
 
 
 def _labels(
-    network: Network, profiles: Profiles, xy: Float[np.ndarray, "m 2"], nearest: Int[np.ndarray, " m"]
+    network: Network,
+    profiles: tuple[np.ndarray, np.ndarray],
+    xy: Float[np.ndarray, "m 2"],
+    nearest: Int[np.ndarray, " m"],
 ) -> UInt8[np.ndarray, " m"]:
     """Label at each position, from the nearest point of a street."""
     bounds, names = profiles
@@ -308,7 +301,7 @@ def _labels(
     return np.where(dash, LANE_MARKING, label).astype(np.uint8)
 
 
-def _profiles(stretches: tuple[Stretch, ...]) -> Profiles:
+def _profiles(stretches: tuple[Stretch, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the strips on both sides of each stretch, in metres from the middle, and the labels between them."""
     bounds = np.full((2 * len(stretches), _STRIPS + 1), np.inf)
     names = np.full((2 * len(stretches), _STRIPS + 2), TERRAIN)

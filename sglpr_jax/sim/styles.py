@@ -78,7 +78,7 @@ _PLOTS = {
     "highway":  (0.0,  (3.0, 11.0),  (3.0, 8.0),   (6.0, 30.0),   "rail"),
 }
 _SIZES = {
-    # garden, width, depth, height, glass
+    # garden, width, depth, height, glass; styles that are not listed are those of the suburb
     "centre":   (SIDEWALK,     (7.0, 18.0),  (8.0, 13.0),  (7.0, 16.0), (0.15, 0.4)),
     "suburb":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
     "estate":   (TERRAIN,      (18.0, 38.0), (10.0, 13.0), (8.0, 13.0), (0.1, 0.35)),
@@ -86,11 +86,7 @@ _SIZES = {
     "park":     (TERRAIN,      (6.0, 9.0),   (4.0, 6.0),   (3.0, 4.0),  (0.1, 0.35)),
     "square":   (OTHER_GROUND, (10.0, 22.0), (8.0, 14.0),  (9.0, 16.0), (0.15, 0.4)),
     "country":  (TERRAIN,      (10.0, 20.0), (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
-    "walled":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
-    "hillside": (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
-    "hedged":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
     "gardens":  (TERRAIN,      (8.0, 16.0),  (7.0, 11.0),  (5.0, 9.0),  (0.1, 0.35)),
-    "highway":  (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
 }
 _PLANTS = {
     # street_trees, trees, wood, banks, slopes, old_trees, bystanders, groups
@@ -108,7 +104,10 @@ _PLANTS = {
     "highway":  (0.0,  0.2,  0.25, 0.6,  0.0, False, 0.0,   False),
 }
 # fmt: on
-STYLES = {name: Style(*_STREETS[name], *_PLOTS[name], *_SIZES[name], *_PLANTS[name]) for name in _STREETS}
+STYLES = {
+    name: Style(*_STREETS[name], *_PLOTS[name], *_SIZES.get(name, _SIZES["suburb"]), *_PLANTS[name])
+    for name in _STREETS
+}
 
 
 class Strip(NamedTuple):

@@ -120,23 +120,16 @@ def _pieces(
     middle = (along[:-1] + along[1:]) / 2
     heading = np.interp(middle, index, path.heading) + (np.pi if direction < 0 else 0.0)
     pieces = (xy[:-1][inside], xy[1:][inside], heading[inside], times[:-1][inside], times[1:][inside])
-    clear = _clear(thing, *pieces, path)
+    clear = _clear(thing, pieces, path)
     begin, end, heading, since, until = (leaf[clear] for leaf in pieces)
     velocity = (end - begin) / (until - since)[:, None]
     rows = np.column_stack([(begin + end) / 2, heading, velocity, since, until, (since + until) / 2]).tolist()
     return [Spot(thing, x, y, turn, 1, (vx, vy), *when) for x, y, turn, vx, vy, *when in rows]
 
 
-def _clear(
-    thing: Thing,
-    begin: np.ndarray,
-    end: np.ndarray,
-    heading: np.ndarray,
-    since: np.ndarray,
-    until: np.ndarray,
-    path: Path,
-) -> Bool[np.ndarray, " k"]:
+def _clear(thing: Thing, pieces: tuple[np.ndarray, ...], path: Path) -> Bool[np.ndarray, " k"]:
     """Whether each piece stays clear of the vehicle: CLEARANCE_M beside it, KEPT_M ahead of it and behind."""
+    begin, end, heading, since, until = pieces
     half = np.max([(abs(part.x) + part.size[0] / 2, part.size[1] / 2, 0.0) for part in thing], axis=0)
     half = np.tile(half, (len(heading), 1))
     clear = np.ones(len(heading), bool)

@@ -27,9 +27,8 @@ _TOLERANCE_M = 0.3
 class Levels:
     """Equal storeys above one another, joined by ramps above one another that descend along x. All are in metres.
 
-    In the world, storey k is shifted by k * `pitch_m` along y, with a level copy of the ramp. In the middle of the
-    ramp, a path changes to the next storey. A scan on a ramp therefore shows a level ramp that is parallel to the
-    sensor. Its true pose follows the slope, whose change over 1 m is at most about 1.5 degrees.
+    In the world, storey k is shifted by k * `pitch_m` along y, with a level copy of the ramp. A path changes to the
+    next storey in the middle of the ramp. Scans there show a level ramp. True poses follow the slope.
     """
 
     rise_m: float  # height of a storey

@@ -61,10 +61,7 @@ def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _module(rng: np.random.Generator, wide: float) -> Thing:
-    """House with wing, porch, shed, and a front garden with fences and a tree.
-
-    The y axis points from the middle of the street to the house.
-    """
+    """House with its front garden. The y axis points from the middle of the street to the house."""
     garden, deep, high, recess = rng.uniform((3, 8, 5.5, 0.5), (7, 11, 9, 2.5)).tolist()
     front, main = HOUSES_WALK_M + garden, rng.choice((1.0, 0.7)) * wide
     body = block(BUILDING, main, deep, high + 1, 0.0, front + deep / 2, bottom=-1.0, roughness=0.06, glass=0.2)
@@ -117,9 +114,9 @@ def _slab(long: float, deep: float, high: float) -> Thing:
 
 
 def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Large separate buildings on lawns, 42 to 52 m apart, with trees and bicycle stands. Two buildings are equal.
+    """Large separate buildings on lawns, 42 to 52 m apart, with paths between them. Two buildings are equal.
 
-    There is a path between each two buildings. A closed path leads around one building.
+    A closed path leads around one building.
     """
     pitch = rng.uniform(42, 52)
     if closed:

@@ -167,8 +167,7 @@ class Room(NamedTuple):
 def indoor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Wings of 22 to 30 m with rooms of 3 to 8 m, halls, glass fronts, and a branch in the middle of each wing.
 
-    Six of ten wings have the rooms of the first wing, partly with the same furniture. The path visits one room in each
-    wing. A closed path leads through two wings.
+    Six of ten wings look like the first one. The path visits a room in each wing, and two wings if it is closed.
     """
     floor = Floor(*rng.uniform((22, 1.0, 4.2, 2.5), (30, 1.4, 6.0, 3.2)).tolist())
     count = 2 if closed else int(np.ceil(length_m / (floor.run_m + floor.pitch_m))) + 1
@@ -201,10 +200,7 @@ def _like(rng: np.random.Generator, room: Room, floor: Floor) -> Room:
 
 
 def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Part]:
-    """Cupboards, shelves or beds along the side walls and at the back, and a desk, in the frame of a room.
-
-    The room begins at y = 0, and its door is at x = 0.
-    """
+    """Furniture along the walls, and a desk, in a room that begins at y = 0 with its door at x = 0."""
     parts = []
     for side in (-1, 1):
         for low in np.arange(0.2, deep - 1.8, rng.uniform(1.6, 2.4)):

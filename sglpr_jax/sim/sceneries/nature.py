@@ -48,10 +48,7 @@ def _beside(
 
 
 def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Trees of one stand on slopes: 250 to 900 trunks a hectare, 0.1 to 0.6 m thick.
-
-    There is a bush for every 3 to 30 trunks. All positions are random.
-    """
+    """Trees of one stand on slopes, 250 to 900 a hectare, with a bush for every 3 to 30 trunks."""
     line = _path(rng, length_m, closed)
     density, thick = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
     branches, shrubs = rng.uniform(3.0, 7.0), 1 / rng.uniform(3, 30)

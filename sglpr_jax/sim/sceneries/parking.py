@@ -52,10 +52,7 @@ def car_park(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def garage(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Floors side by side, each followed by a ramp. Rows 0, 2, 4, ... are floors, and the other rows are ramps.
-
-    Walls hide each floor from the others.
-    """
+    """Floors side by side, hidden from each other by walls. Rows 0, 2, 4, ... are floors, the others ramps."""
     run, height, full = rng.uniform(30, 40), rng.uniform(2.4, 3.0), rng.uniform(0.75, 0.92)
     plan = rows(length_m, run_m=run, pitch_m=PITCH_M, closed=closed, back_m=9.0, corner_m=1.5)
     aisles, stall = PITCH_M * np.arange(0, plan.count, 2), rng.uniform(2.5, 2.7)
@@ -91,8 +88,7 @@ def _shell(count: int, run_m: float, height: float, closed: bool) -> Thing:
 def storeys(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Three to six storeys with the same walls and pillars, and with different cars, joined by ramps.
 
-    The path laps each storey once on its way up. A closed path laps the lowest storey twice. The length of the path is
-    between `length_m` and LONGER times this length if this gives three to six storeys.
+    The path laps each storey once on its way up, a closed one the lowest twice, for up to LONGER times `length_m`.
     """
     run, rise, stall, full = rng.uniform((34, 3.0, 2.5, 0.7), (44, 3.6, 2.7, 0.9)).tolist()
     lap_m = 2 * (run + WIDE_M + RAMP_M)

@@ -64,10 +64,7 @@ def _tube(half: float, height: float, niche: float) -> Thing:
 
 
 def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Deck above water or a valley, with railings, lamps and pylons, half of the time with hangers.
-
-    Rays beyond the deck do not return.
-    """
+    """Deck that rays beyond it do not hit, with railings, lamps and pylons, half of the time with hangers."""
     whole, driven = road(rng, length_m, closed)
     half, rail, hang, lit, span = rng.uniform((5, 0.9, 8, 25, 120), (8, 1.3, 15, 45, 260)).tolist()
     bars = [block(FENCE, OVERLAP * RAILING_M, 0.06, 0.08, y=half, bottom=z * rail) for z in (0.5, 0.95)]

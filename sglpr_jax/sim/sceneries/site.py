@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.sim.drive import shifted, waves
@@ -84,10 +85,7 @@ def mirrored(*parts: Part) -> Thing:
 
 
 def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep: float = 1.0) -> list[Spot]:
-    """Keeps the fraction `keep` of the spots, and shifts and rotates them at random.
-
-    The standard deviation of a shift is `metres` along x and y. Rotations are at most 3 degrees.
-    """
+    """Keeps the fraction `keep` of the spots, shifts them by about `metres`, and turns them by up to 3 degrees."""
     kept = [spot for spot in spots if rng.random() < keep]
     moves = rng.normal(scale=metres, size=(len(kept), 2)).tolist()
     turns = np.radians(rng.uniform(-3, 3, len(kept))).tolist()
@@ -175,24 +173,16 @@ def _integrated(curvature: Float[np.ndarray, " n"]) -> Line:
     return np.cumsum(STEP_M * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
 
 
-def rounded(
-    corners: Iterable[tuple[float, float]], *, corner_m: float, closed: bool = False, length_m: float | None = None
-) -> Line:
-    """Polygon through `corners`, rounded by a Gaussian with standard deviation `corner_m`.
-
-    If it is not closed, it ends after `length_m` metres.
-    """
-    polygon = np.array([*corners])
+def rounded(corners: ArrayLike, *, corner_m: float, closed: bool = False, length_m: float | None = None) -> Line:
+    """Polygon through `corners`, rounded by a Gaussian of `corner_m`. An open one ends after `length_m` metres."""
+    polygon = np.asarray(corners)
     polygon = resampled(np.concatenate([polygon, polygon[:1]]), STEP_M)[:-1] if closed else resampled(polygon, STEP_M)
     line = gaussian_filter1d(polygon, corner_m / STEP_M, axis=0, mode="wrap" if closed else "nearest")
     return resampled(line, STEP_M)[: None if closed or length_m is None else round(length_m / STEP_M)]
 
 
 def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m: float, corner_m: float) -> Rows:
-    """Path of about `length_m` metres back and forth through rows of about `run_m` metres.
-
-    A closed path returns from the last row to the first at x = -`back_m`.
-    """
+    """Path of about `length_m` metres through rows of about `run_m` metres. If closed, it returns at x = -`back_m`."""
     if closed:
         count = 2 * max(1, round((length_m - 2 * back_m) / (run_m + 2 * pitch_m) / 2))
         run_m = (length_m - 2 * back_m - 2 * (count - 1) * pitch_m) / count
@@ -206,8 +196,7 @@ def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m:
 def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
     """Path of a vehicle `right_m` metres to the right of `line`, with a sway of up to `sway_m` metres.
 
-    With revisit "opposite", the vehicle turns at the end and returns. With "same", it drives LAPS laps, and `line`
-    must be closed.
+    Revisits are on the way back ("opposite"), or in LAPS laps of a closed line ("same").
     """
     if revisit == "same":
         line = np.concatenate([line, line[: round((LAPS - 1) * len(line))]])

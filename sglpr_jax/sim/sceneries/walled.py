@@ -1,7 +1,4 @@
-"""Walled places of equal size in a row: yards and halls. A scan shows all of a place.
-
-The path leads from one place to the next, or criss-cross through a single one.
-"""
+"""Walled yards and halls of equal size in a row, crossed one after another, or a single one criss-cross."""
 
 from typing import NamedTuple
 
@@ -48,10 +45,7 @@ class Places(NamedTuple):
 def _places(
     rng: np.random.Generator, length_m: float, closed: bool, *, long_m: float, wide_m: float, height_m: float
 ) -> Places:
-    """Draws a path of about `length_m` metres through one place after another, joined by gates.
-
-    A closed path stays in a single place, and crosses itself.
-    """
+    """Draws a path of about `length_m` metres through places joined by gates, or a closed one in a single place."""
     if closed:
         line, gates = _criss_cross(rng, length_m, long_m, wide_m), []
     else:
@@ -123,10 +117,7 @@ def _lumber(rng: np.random.Generator) -> Thing:
 
 
 def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Halls of 30 to 60 m with equal walls and columns and different things, joined by gates.
-
-    A closed path stays in one hall.
-    """
+    """Halls of 30 to 60 m with equal walls and columns and different things. A closed path stays in one."""
     long, wide, height, span = rng.uniform((30, 30, 5, 6), (60, 45, 9, 10)).tolist()
     plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
     column, along = (block(POLE, 0.4, 0.4, height),), plan.count * long
