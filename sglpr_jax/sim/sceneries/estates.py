@@ -28,14 +28,6 @@ ROAD_M = 3.8
 """Half width of the carriageway, in metres."""
 HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8
 """Half width of the street with its sidewalks, between row houses and between slabs, in metres."""
-HOUSES_FREE_M, SLABS_FREE_M = 12.0, 10.0
-"""Length of a crossing at both ends of a street, in metres."""
-TREE_M = 14.0
-"""Mean distance between two trees along one side of a street of slabs, in metres."""
-CAMPUS_ROW = 2
-"""Number of buildings along a path of the campus before it turns."""
-CAMPUS_MORE = 1
-"""Number of buildings beyond the driven paths, on each side."""
 TWINS = {(0, 0), (1, 0)}
 """Column and row of the two equal buildings of the campus. Both are on the left of the first path."""
 LAWN_M = 6.0
@@ -52,7 +44,7 @@ def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     pitch, wide = rng.uniform(46, 56), rng.uniform(5.5, 9)
     plan = rows(length_m, run_m=rng.uniform(110, 160), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
     streets = pitch * np.arange(-1, plan.count + 1)
-    module, xs = _module(rng, wide), np.arange(HOUSES_FREE_M + wide / 2, plan.run_m - HOUSES_FREE_M, wide)
+    module, xs = _module(rng, wide), np.arange(12.0 + wide / 2, plan.run_m - 12.0, wide)
     houses = on_both_sides(xs, streets, 0.0, lambda: module)
     bays = on_both_sides(xs, streets, ROAD_M - 0.9, lambda: parked(rng))
     lamps = grid(xs[:: max(1, round(30 / wide))] + wide / 2, streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 6.0),))
@@ -88,12 +80,12 @@ def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     streets = pitch * np.arange(-1, plan.count + 1)
     slab, middles = _slab(long, deep, high), np.arange(gap / 2 + long / 2, plan.run_m, long + gap)
     buildings = grid(middles, streets + pitch / 2, lambda: slab)
-    xs, aside = np.arange(SLABS_FREE_M, plan.run_m - SLABS_FREE_M, 6.0), ROAD_M - 0.9
+    xs, aside = np.arange(10.0, plan.run_m - 10.0, 6.0), ROAD_M - 0.9
     bays = grid(xs, np.concatenate([streets - aside, streets + aside]), lambda: parked(rng))
     lamps = grid(xs[::5], streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 7.0),))
     spots = [*buildings, *jittered(rng, bays, 0.2, keep=rng.uniform(0.3, 0.6)), *lamps]
     low, high = (0, SLABS_WALK_M + 1.0), (plan.run_m, (pitch - deep) / 2 - 2.0)  # between sidewalks and slabs
-    for street, side, _ in itertools.product(streets.tolist(), (-1, 1), range(round(plan.run_m / TREE_M))):
+    for street, side, _ in itertools.product(streets.tolist(), (-1, 1), range(round(plan.run_m / 14.0))):
         x, away = rng.uniform(low, high).tolist()
         spots.append(Spot(_plant(rng, 5.0), x, street + side * away, rng.uniform(0, 2 * np.pi)))
     return Site(plan.line, spots, _street(plan.line, SLABS_WALK_M, rolling(rng)))
@@ -122,10 +114,10 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     if closed:
         line, count = rounded(pitch * np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), corner_m=1.5, closed=True), 2
     else:
-        plan = rows(length_m, run_m=CAMPUS_ROW * pitch, pitch_m=pitch, closed=False, back_m=0.0, corner_m=1.5)
+        plan = rows(length_m, run_m=2 * pitch, pitch_m=pitch, closed=False, back_m=0.0, corner_m=1.5)
         line, count = plan.line, plan.count
-    columns = np.arange(-CAMPUS_MORE, CAMPUS_ROW + CAMPUS_MORE)
-    lines = np.arange(-CAMPUS_MORE - 1, count + CAMPUS_MORE)
+    columns = np.arange(-1, 3)
+    lines = np.arange(-2, count + 1)
     twin, spots = _building(rng, pitch), []
     for column, row in itertools.product(columns.tolist(), lines.tolist()):
         building = twin if (column, row) in TWINS else _building(rng, pitch)

@@ -18,7 +18,6 @@ WIDE_M = 38.0
 """Half width of the forest on both sides of the path, in metres."""
 BEND_M = 25.0
 """Distance between two bends of the path through the forest, in metres."""
-_HILLS = dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0))
 
 
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -55,7 +54,11 @@ def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     spots = [Spot(_tree(rng, thick, branches), x, y) for x, y in _scattered(rng, line, density)]
     for x, y in _scattered(rng, line, shrubs * density):
         spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
-    return Site(line, spots, track(line, 0.6, draw_relief(rng, _HILLS)))
+    return Site(
+        line,
+        spots,
+        track(line, 0.6, draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))),
+    )
 
 
 def _path(rng: np.random.Generator, length_m: float, closed: bool) -> Line:

@@ -26,24 +26,18 @@ LANE_M = 3.5
 
 The vehicle uses the inner lanes, other traffic the outer lanes.
 """
-WALL_M = 4.0
-"""Length of a piece of wall, in metres."""
 TUNNEL_M, NICHE_M = 6.0, 1.3
 """Length of a piece of a tunnel, and depth of its niches, in metres."""
 THICK_M = 2.0
 """Thickness of a tunnel's walls, in metres. It exceeds the depth of a niche, so neighbouring pieces close its sides."""
-RAILING_M = 2.0
-"""Distance between two posts of a railing, in metres."""
-PIECE_S = 1.5
-"""Duration of a straight piece of a vehicle's motion, in seconds."""
 
 
 def walls(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Road between two walls without features."""
     whole, driven = road(rng, length_m, closed)
     left, right, height = rng.uniform(3.5, 8), rng.uniform(3, 7), rng.uniform(1.8, 4)
-    pair = tuple(block(FENCE, OVERLAP * WALL_M, 0.4, height, y=y, roughness=0.02) for y in (left + 0.2, -right - 0.2))
-    return Site(driven, along(whole, (pair, WALL_M)), painted_ground(ROAD))
+    pair = tuple(block(FENCE, OVERLAP * 4.0, 0.4, height, y=y, roughness=0.02) for y in (left + 0.2, -right - 0.2))
+    return Site(driven, along(whole, (pair, 4.0)), painted_ground(ROAD))
 
 
 def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -67,9 +61,9 @@ def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Deck that rays beyond it do not hit, with railings, lamps and pylons, half of the time with hangers."""
     whole, driven = road(rng, length_m, closed)
     half, rail, hang, lit, span = rng.uniform((5, 0.9, 8, 25, 120), (8, 1.3, 15, 45, 260)).tolist()
-    bars = [block(FENCE, OVERLAP * RAILING_M, 0.06, 0.08, y=half, bottom=z * rail) for z in (0.5, 0.95)]
-    kerb = block(FENCE, OVERLAP * RAILING_M, 0.3, 0.25, y=half)
-    things = [(mirrored(*bars, kerb, post(FENCE, 0.1, rail, y=half)), RAILING_M)]
+    bars = [block(FENCE, OVERLAP * 2.0, 0.06, 0.08, y=half, bottom=z * rail) for z in (0.5, 0.95)]
+    kerb = block(FENCE, OVERLAP * 2.0, 0.3, 0.25, y=half)
+    things = [(mirrored(*bars, kerb, post(FENCE, 0.1, rail, y=half)), 2.0)]
     if rng.random() < 0.5:
         things.append((mirrored(post(POLE, 0.16, 14.0, y=half + 0.6)), hang))
     lamp = post(POLE, 0.2, 8.0, y=half + 0.3)
@@ -113,12 +107,12 @@ def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]
 
 
 def _drive(thing: Thing, lane: Line, start: float, speed: float) -> list[Spot]:
-    """Drive along the whole lane, as pieces of straight motion."""
-    times = np.arange(start, start + len(lane) * STEP_M / speed, PIECE_S)
+    """Drive along the whole lane, as pieces of straight motion of 1.5 s."""
+    times = np.arange(start, start + len(lane) * STEP_M / speed, 1.5)
     at = ((times - start) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)
     spots = []
     for k in range(len(times) - 1):
-        velocity = (lane[at[k + 1]] - lane[at[k]]) / PIECE_S
+        velocity = (lane[at[k + 1]] - lane[at[k]]) / 1.5
         x, y = (lane[at[k]] - velocity * times[k]).tolist()
         heading = float(np.arctan2(velocity[1], velocity[0]))
         spots.append(Spot(thing, x, y, heading, 1, tuple(velocity.tolist()), times[k], times[k + 1]))

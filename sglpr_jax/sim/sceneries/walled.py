@@ -16,11 +16,6 @@ MARGIN_M = 2.5
 """Minimum distance of the corners of a path from the walls, in metres."""
 BEND = 0.15
 """Maximum distance of gates and bends from the middle of a place, as a fraction of its width."""
-CORNER_M = 0.6
-STRAIGHT_M = 1.5
-"""Length of the straight path on each side of a gate, in metres."""
-YARD_M2, HALL_M2 = 22.0, 40.0
-"""Area for each thing in a yard and in a hall, in square metres."""
 
 
 class Places(NamedTuple):
@@ -51,7 +46,12 @@ def _places(
     else:
         count = int(np.ceil(length_m / long_m)) + 1
         gates = (wide_m * rng.uniform(-BEND, BEND, count - 1)).tolist()
-        line = _onward(rng, gates, length_m, long_m, wide_m)
+        bends = (wide_m * rng.uniform(-BEND, BEND, count)).tolist()
+        corners = [(MARGIN_M, bends[0])]
+        for k, (gate, bend) in enumerate(zip(gates, bends, strict=False)):
+            x = (k + 1) * long_m
+            corners += [((k + 0.5) * long_m, bend), (x - 1.5, gate), (x + 1.5, gate)]  # straight through the gate
+        line = rounded([*corners, (count * long_m - MARGIN_M, bends[-1])], corner_m=0.6, length_m=length_m)
     ends, half = (len(gates) + 1) * long_m, wide_m / 2
     walls = [wall((0.0, side * half), (ends, side * half), height_m) for side in (-1, 1)]
     walls += [wall((x, -half), (x, half), height_m) for x in (0.0, ends)]
@@ -59,17 +59,6 @@ def _places(
         beside = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
         walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in beside]
     return Places(line, tuple(walls), len(gates) + 1, long_m, wide_m)
-
-
-def _onward(rng: np.random.Generator, gates: list[float], length_m: float, long_m: float, wide_m: float) -> Line:
-    """Path along x through all gates, with a bend in the middle of each place."""
-    bends = (wide_m * rng.uniform(-BEND, BEND, len(gates) + 1)).tolist()
-    corners = [(MARGIN_M, bends[0])]
-    for k, gate in enumerate(gates):
-        x = (k + 1) * long_m
-        corners += [((k + 0.5) * long_m, bends[k]), (x - STRAIGHT_M, gate), (x + STRAIGHT_M, gate)]
-    corners.append(((len(gates) + 1) * long_m - MARGIN_M, bends[-1]))
-    return rounded(corners, corner_m=CORNER_M, length_m=length_m)
 
 
 def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_m: float) -> Line:
@@ -80,7 +69,7 @@ def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_
         corner = rng.uniform(low, high)
         if np.linalg.norm(corner - corners[-1]) > min(long_m, wide_m) / 2:
             corners.append(corner)
-    return rounded(corners, corner_m=CORNER_M, closed=True)
+    return rounded(corners, corner_m=0.6, closed=True)
 
 
 def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -89,7 +78,7 @@ def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
     spots = [Spot(plan.walls, 0.0, 0.0)]
     for k in range(plan.count):
-        spots += [Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in plan.anywhere(rng, YARD_M2)]
+        spots += [Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in plan.anywhere(rng, 22.0)]
         for side in (-1, 1):  # sheds, stairs and ducts at the two walls along x
             for place in rng.uniform(2.0, long - 2.0, int(rng.integers(1, 4))).tolist():
                 length, deep, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
@@ -125,7 +114,7 @@ def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     ceiling = block(BUILDING, along, wide, 0.3, along / 2, bottom=height, roughness=0.02)
     spots = [Spot((*plan.walls, ceiling), 0.0, 0.0), *columns]
     for k in range(plan.count):
-        for x, y, heading in plan.anywhere(rng, HALL_M2, away_m=2.5):
+        for x, y, heading in plan.anywhere(rng, 40.0, away_m=2.5):
             turned = heading if rng.random() < 0.3 else round(2 * heading / np.pi) * np.pi / 2
             spots.append(Spot(_machine(rng), x + k * long, y, turned))
     return Site(plan.line, spots, painted_ground(OTHER_GROUND))
