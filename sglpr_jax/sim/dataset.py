@@ -13,7 +13,7 @@ from sglpr_jax.sim import RATE_HZ, SCANS
 from sglpr_jax.sim.drive import CARRIERS, check_drawing, name_of_path, read_path, scan_rows
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, numbered, simulate_recording, with_submaps
-from sglpr_jax.sim.repeating import default_rate, simulate_repeating
+from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import SENSORS, Sensor
@@ -27,17 +27,14 @@ OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}
 """Field names of a scenery in older datasets, and their current names."""
 WORKERS = 2
 """Number of rendering threads. The compiled program leaves capacity for more than one."""
-ROUTES = ("00", "05", "08")
-"""Default routes in towns."""
+ROUTES = ("00", "05", "08")  # default routes in towns
 REVISITED = ("01", "06", "08")
 """Default routes where places repeat: without revisits, in the same and in the opposite direction."""
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
-AZIMUTH_STEPS = 900
-"""Firings per revolution in the default datasets."""
+AZIMUTH_STEPS = 900  # firings per revolution in the default datasets
 BYTES_PER_RAY = {"scans": 16, "nclt": 5}
 """Approximate size of a scan with its labels, in bytes per ray, by layout. Most rays return."""
-BYTES_PER_IMAGE = 3500
-"""Approximate size of an image with its label image, in bytes."""
+BYTES_PER_IMAGE = 3500  # approximate size of an image with its label image, in bytes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,12 +42,9 @@ class Simulated:
     """Description of a simulated dataset, before or after it is written."""
 
     root: Path
-    names: tuple[str, ...]
-    """Names of the recordings."""
-    scans: int
-    """Maximum number of scans in each recording."""
-    layout: str
-    """Name of the layout, from `LAYOUTS`."""
+    names: tuple[str, ...]  # names of the recordings
+    scans: int  # maximum number of scans in each recording
+    layout: str  # name of the layout, from `LAYOUTS`
     sensor: Sensor
 
     @property
@@ -129,7 +123,7 @@ def simulate(
     if routes is None:
         routes = () if along or sessions else REVISITED if repeats else ROUTES
     if rate_hz is None:
-        rate_hz = default_rate(REPEATING[scenery], CARRIERS[carrier]) if repeats else RATE_HZ
+        rate_hz = CARRIERS[carrier].rate_hz or REPEATING[scenery].rate_hz if repeats else RATE_HZ
     layout = "nclt" if sessions else "varied" if vary else "images" if images else "scans"
     options = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
     surroundings = {"repeating": scenery} if repeats else dataclasses.asdict(SCENERIES[scenery])

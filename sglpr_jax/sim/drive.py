@@ -33,21 +33,15 @@ STEERING_M = 3.0
 LATERAL_ACCELERATION = 2.0
 ACCELERATION = 1.5
 """Maximum lateral and longitudinal acceleration, in m/s^2. They limit speed in corners and changes of speed."""
-FREE_SPEED = 1.35
-"""Speed on a free street, as a multiple of the mean speed."""
+FREE_SPEED = 1.35  # speed on a free street, as a multiple of the mean speed
 TILT_DEG = 0.6
 """Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
-TILT_S = 0.5
-"""Approximate duration of a tilt, in seconds."""
+TILT_S = 0.5  # approximate duration of a tilt, in seconds
 
-STEPS_HZ = 2.0
-"""Steps of a walking person per second."""
-SHIFT_S = 3.0
-"""Duration of standing before and after a reversal, in seconds."""
-BRAKING_S = 1.0
-"""Standard deviation of the Gaussian that smooths starts and stops, in seconds."""
-REVERSE_SPEED = 0.5
-"""Speed in reverse, as a fraction of the speed forward."""
+STEPS_HZ = 2.0  # steps of a walking person per second
+SHIFT_S = 3.0  # duration of standing before and after a reversal, in seconds
+BRAKING_S = 1.0  # standard deviation of the Gaussian that smooths starts and stops, in seconds
+REVERSE_SPEED = 0.5  # speed in reverse, as a fraction of the speed forward
 
 
 class PlanarPath(NamedTuple):
@@ -229,19 +223,15 @@ class Carrier:
     """Whether the sensor sways with the steps of a person. Otherwise it tilts like the body of a car."""
     tilt_deg: float = TILT_DEG
     """Standard deviation of pitch and roll, in degrees. With `walks`, their maximum."""
-    bob_m: float = 0.0
-    """Amplitude of the vertical motion with the steps, in metres."""
-    sway_m: float = 0.0
-    """Amplitude of the motion to the left and right with the steps, in metres."""
+    bob_m: float = 0.0  # amplitude of the vertical motion with the steps, in metres
+    sway_m: float = 0.0  # amplitude of the motion to the left and right with the steps, in metres
     halt_every_s: Range | None = None
     """Range of the driving time between two halts, in seconds. A halt is a stand or, every second time, a reversal.
 
     None never halts.
     """
-    stand_s: Range = (5.0, 60.0)
-    """Range of the duration of a stand, in seconds."""
-    reverse_m: Range = (5.0, 15.0)
-    """Range of the length of a reversal, in metres."""
+    stand_s: Range = (5.0, 60.0)  # range of the duration of a stand, in seconds
+    reverse_m: Range = (5.0, 15.0)  # range of the length of a reversal, in metres
 
     def motion(
         self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float

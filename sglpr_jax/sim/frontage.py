@@ -17,8 +17,7 @@ from sglpr_jax.sim.styles import Side, draw_house
 
 Clock = tuple[float, float]
 """Start and end of a period, such as the drive, in seconds."""
-STAY_S = 600.0
-"""Mean time that a parked car stays, in seconds."""
+STAY_S = 600.0  # mean time that a parked car stays, in seconds
 CHANGING_BUSHES = 0.1
 """Fraction of the bushes that are present only temporarily. They model growth and cutting between two visits."""
 
@@ -30,15 +29,16 @@ def frontage(
     if side.bays:
         d = side.strips[0].width / 2 + 0.1
         for s in _steps(rng, start + 4, stop - 4, (5.4, 6.4)):
-            yaw = rng.choice((0.0, np.pi))
-            yield from _changing(rng, objects.parked, s, d, yaw, "bay", clock, side.occupied)
+            bay = Spot((), s, d, rng.choice((0.0, np.pi)), zone="bay")
+            yield from _changing(rng, objects.parked, bay, clock, side.occupied)
     yield from _street_furniture(rng, side, start, stop)
     yield from _tree_row(rng, side, start, stop)
     for s in _poisson(rng, side.style.bystanders, start, stop):
         d = side.verge - rng.uniform(0.3, max(side.strips[-1].width, 0.6) if side.strips else 0.6)
         make = next(bystanders)
         make = objects.people if side.style.groups and make is objects.person else make
-        yield from _changing(rng, make, s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), "verge", clock, 0.65)
+        place = Spot((), s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), zone="verge")
+        yield from _changing(rng, make, place, clock, 0.65)
     if side.wood:
         yield from _wood(rng, side, start, stop)
     elif side.bank:
@@ -75,19 +75,13 @@ def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float
 
 
 def _changing(
-    rng: np.random.Generator,
-    make: Callable[[np.random.Generator], Thing],
-    s: float,
-    d: float,
-    yaw: float,
-    zone: Zone,
-    clock: Clock,
-    occupied: float,
+    rng: np.random.Generator, make: Callable[[np.random.Generator], Thing], place: Spot, clock: Clock, occupied: float
 ) -> Iterator[Spot]:
     """Yields the things that occupy one place one after another."""
     for since, until in stays(rng, clock, occupied):
-        shift, turn = rng.normal(0, 0.15, 2), rng.normal(0, 0.03)
-        yield Spot(make(rng), s + shift[0], d + shift[1] / 2, yaw + turn, since=since, until=until, zone=zone)
+        (dx, dy), turn = rng.normal(0, 0.15, 2), rng.normal(0, 0.03)
+        pose = {"x": place.x + dx, "y": place.y + dy / 2, "heading": place.heading + turn}
+        yield place._replace(thing=make(rng), **pose, since=since, until=until)
 
 
 def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
@@ -142,10 +136,6 @@ def _wall(_: np.random.Generator, length: float, thickness: float, height: float
     return (objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=porosity),)
 
 
-def _fence(rng: np.random.Generator, *size: float) -> Thing:
-    return _wall(rng, *size, porosity=0.45)
-
-
 def _trimmed(rng: np.random.Generator, *size: float) -> Thing:
     """Hedge that is straight and dense like a wall."""
     return objects.hedge(*size, roughness=rng.uniform(0.05, 0.2), porosity=rng.uniform(0.05, 0.25))
@@ -170,7 +160,7 @@ _BORDERS = {
     "hedge": Border(1.0, (0.9, 2.6), 0.9, lambda rng, *size: objects.hedge(*size)),
     "trimmed": Border(0.8, (0.9, 2.2), 0.9, _trimmed),
     "hedgerow": Border(0.3, (1.2, 3.0), 0.95, objects.hedgerow),
-    "fence": Border(0.06, (0.9, 1.8), 0.85, _fence),
+    "fence": Border(0.06, (0.9, 1.8), 0.85, lambda rng, *size: _wall(rng, *size, porosity=0.45)),
     "lattice": Border(0.08, (0.8, 1.5), 0.9, _lattice),
     "wall": Border(0.25, (0.7, 2.2), 0.9, _wall),
     "screen": Border(0.2, (1.6, 3.5), 1.0, _wall),
@@ -227,7 +217,7 @@ def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, 
     middle, d = s + gap / 2, side.verge
     if what == "cars":
         for at in np.arange(s + 1.4, s + min(gap, 14) - 1.2, 2.6).tolist():
-            yield from _changing(rng, objects.parked, at, d + 4.5, np.pi / 2, "plot", clock, 0.6)
+            yield from _changing(rng, objects.parked, Spot((), at, d + 4.5, np.pi / 2), clock, 0.6)
     elif what == "garage":
         yield Spot(objects.garage(rng, min(gap, rng.uniform(3, 7))), middle, d + rng.uniform(3, 9))
     elif what == "hedge":
@@ -245,7 +235,7 @@ def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, c
         elif kind < 0.35:
             yield Spot(objects.conifer(rng), s, d)
         elif rng.random() < CHANGING_BUSHES:
-            yield from _changing(rng, objects.bush, s, d, 0.0, "plot", clock, 0.5)
+            yield from _changing(rng, objects.bush, Spot((), s, d), clock, 0.5)
         else:
             yield Spot(objects.bush(rng), s, d)
 

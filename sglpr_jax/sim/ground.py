@@ -15,12 +15,9 @@ from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
 from sglpr_jax.sim.shapes import AnyArray, Vectors
 from sglpr_jax.sim.styles import TOWN, Scenery
 
-CELL_M = 0.25
-"""Size of a cell of the raster, in metres."""
-KERB_M = 0.12
-"""Height of sidewalks, gardens and fields above the road, in metres."""
-ROAD_LEVEL = (ROAD, PARKING, OTHER_GROUND, LANE_MARKING)
-"""Labels of ground at the level of the road."""
+CELL_M = 0.25  # size of a cell of the raster, in metres
+KERB_M = 0.12  # height of sidewalks, gardens and fields above the road, in metres
+ROAD_LEVEL = (ROAD, PARKING, OTHER_GROUND, LANE_MARKING)  # labels of ground at the level of the road
 
 _WAVES = 4
 _NEAR_M = 3.0

@@ -25,17 +25,14 @@ THINNED, FEWER_BEAMS = 0.4, 0.3
 """Fraction of the scans that lose random points, and fraction that loses whole rings. Other scans keep all points."""
 MOST_LOST = 0.95
 """Maximum fraction of the points of a scan that are lost. The fraction is uniformly distributed."""
-BEAMS = (32.0, 16.0)
-"""Possible numbers of remaining beams."""
+BEAMS = (32.0, 16.0)  # possible numbers of remaining beams
 
 
 class Layout(NamedTuple):
     """Folder, file names and file contents of a drive."""
 
-    folder: str
-    """Folder of drive `{name}`, relative to the dataset's folder."""
-    scan_files: tuple[str, ...]
-    """Files of scan `{id}`, relative to the drive's folder."""
+    folder: str  # folder of drive `{name}`, relative to the dataset's folder
+    scan_files: tuple[str, ...]  # files of scan `{id}`, relative to the drive's folder
     scan_contents: Callable[[np.ndarray, np.ndarray, Mounting | None], tuple[bytes, ...]]
     """Function that returns the contents of these files from points (n, 4), labels (n,) and the sensor's mounting.
 
@@ -56,12 +53,6 @@ class Layout(NamedTuple):
     def is_finished(self, root: Path, name: str) -> bool:
         """Whether drive `name` is complete."""
         return self.file_of_drive(root, name, self.last_file).exists()
-
-
-def _points_and_labels(
-    points: Float[np.ndarray, "n 4"], labels: np.ndarray, _mounting: Mounting | None
-) -> tuple[bytes, ...]:
-    return points.astype("<f4").tobytes(), labels.astype("<u4").tobytes()
 
 
 def _image_and_labels(
@@ -138,7 +129,7 @@ LAYOUTS = {
     "scans": Layout(
         folder="sequences/{name}",
         scan_files=("velodyne/{id}.bin", "labels/{id}.label"),
-        scan_contents=_points_and_labels,
+        scan_contents=lambda points, labels, _: (points.astype("<f4").tobytes(), labels.astype("<u4").tobytes()),
         drive_contents=_kitti_files,
         last_file="poses.txt",
     ),

@@ -9,8 +9,7 @@ from sglpr_jax.sim import labels
 Range = tuple[float, float]
 """Minimum and maximum of a uniform distribution."""
 Kind = Literal["box", "cylinder", "ellipsoid"]
-KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")
-"""Kinds in the order of `shapes.Scene`."""
+KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")  # kinds in the order of `shapes.Scene`
 _BELOW_M = 1.0
 """Depth of a building below the ground, in metres. It prevents gaps under buildings on slopes."""
 _FACADE_M = 0.06

@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sglpr_jax.sim import labels
 from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
 
-COLUMNS = 32
-"""Number of azimuth steps in a sector."""
+COLUMNS = 32  # number of azimuth steps in a sector
 SLOTS = 64, 48, 128
 """Maximum numbers of boxes, cylinders and ellipsoids in a sector. If there are more, the nearest are kept.
 
@@ -28,10 +27,8 @@ _MARGIN = 1e-3
 _PORE_FACTORS = np.random.default_rng(0).integers(2**32, size=sum(SLOTS), dtype=np.uint32) | np.uint32(1)
 Nearest = tuple[Array, Array]
 """Distance and slot of the nearest hit of each ray. The slot is -1 without a hit."""
-STOREY_M, BAY_M = 3.0, 2.5
-"""Height and width of a piece of facade with one window, in metres."""
-WINDOW_LOSS = 0.9
-"""Fraction of the rays into a window that do not return."""
+STOREY_M, BAY_M = 3.0, 2.5  # height and width of a piece of facade with one window, in metres
+WINDOW_LOSS = 0.9  # fraction of the rays into a window that do not return
 LEAF_FACING = 0.5
 """Mean cosine of the angle between a ray and the normal of a leaf, for all rough shapes and all directions."""
 EDGE_JUMP_M = 2.0

@@ -41,8 +41,7 @@ KEPT_SCANS = 8
 class SimulatedRecording(Recording):
     """Recording whose labelled scans are rendered on demand. `paths` and `label_paths` do not name files."""
 
-    poses: TimedPoses = field(kw_only=True)
-    """Pose of the LiDAR and time of each scan."""
+    poses: TimedPoses = field(kw_only=True)  # pose of the LiDAR and time of each scan
     render: Callable[[int], tuple[np.ndarray, np.ndarray]] = field(kw_only=True)
     """Function that returns points (n, 4) with intensities and labels (n,) of scan i.
 

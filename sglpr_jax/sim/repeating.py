@@ -14,8 +14,7 @@ from sglpr_jax.sim.world import World
 
 SHORTEST_S = 75.0
 """Minimum duration of a drive, in seconds. Few scans are spread over this time."""
-LEAST_RANGE_M = 0.5
-"""Highest minimum range of the sensor of a small robot, in metres."""
+LEAST_RANGE_M = 0.5  # highest minimum range of the sensor of a small robot, in metres
 
 
 def simulate_repeating(
@@ -51,7 +50,8 @@ def simulate_repeating(
     if revisit not in REVISITS:
         raise ValueError(f"revisit: expected one of {', '.join(REVISITS)}, found {revisit!r}")
     scenery = REPEATING[name]
-    check_drawing(rate_hz := default_rate(scenery, carrier) if rate_hz is None else rate_hz, seed)
+    rate_hz = carrier.rate_hz or scenery.rate_hz if rate_hz is None else rate_hz
+    check_drawing(rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
     world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
     rows = scan_rows(path, scans)
@@ -84,11 +84,6 @@ def driven_line(rng: np.random.Generator, site: Site, scenery: Repeating, revisi
     """Path along the line of a site."""
     laps = "none" if site.returns and revisit == "same" else revisit
     return way(rng, site.line, laps, right_m=scenery.right_m, sway_m=scenery.sway_m)
-
-
-def default_rate(scenery: Repeating, carrier: Carrier) -> float:
-    """Scans per second of the carrier, or of the scenery if the carrier has no rate."""
-    return scenery.rate_hz if carrier.rate_hz is None else carrier.rate_hz
 
 
 def _mounted(sensor: Sensor, scenery: Repeating, carrier: Carrier) -> Sensor:

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-STEP_M = 0.5
-"""Distance between two points of a route's line, in metres."""
+STEP_M = 0.5  # distance between two points of a route's line, in metres
 BLOCKS_PER_LOOP = 12
 ROUNDABOUT_RADIUS_M = 10.0
 SHORTEST_LOOP = {False: 6, True: 4}
@@ -39,22 +38,17 @@ class Role:
 
     speed_mps: float
     """Approximate mean speed, in m/s. The vehicle is faster on free streets and slower in corners."""
-    again: float = 0.0
-    """Fraction of the streets that are driven a second time."""
-    opposite: bool = False
-    """Whether the second visit is in the opposite direction."""
+    again: float = 0.0  # fraction of the streets that are driven a second time
+    opposite: bool = False  # whether the second visit is in the opposite direction
     loops: int = 1
     """Maximum number of loops. A route with one loop ends with its second visit."""
-    straight: float = 0.5
-    """Probability of driving straight ahead at a crossing."""
-    block_m: float = 60.0
-    """Distance between neighbouring crossings of the lattice, in metres."""
+    straight: float = 0.5  # probability of driving straight ahead at a crossing
+    block_m: float = 60.0  # distance between neighbouring crossings of the lattice, in metres
     winding: float = 0.2
     """Maximum shift of a crossing, and twice the maximum bend of a street, as fractions of `block_m`."""
     corner_m: float = 9.0
     """Standard deviation of the Gaussian that rounds corners, in metres. Corners have about this radius."""
-    roundabouts: float = 0.08
-    """Fraction of the crossings that are roundabouts."""
+    roundabouts: float = 0.08  # fraction of the crossings that are roundabouts
 
     @property
     def revisit(self) -> Revisit:

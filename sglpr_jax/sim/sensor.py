@@ -46,8 +46,7 @@ def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
     return tuple(((edges[:-1] + edges[1:]) / 2).tolist())
 
 
-TURN_S = 0.1
-"""Duration of a scan, in seconds."""
+TURN_S = 0.1  # duration of a scan, in seconds
 STEPS = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
 """Steps of the sequence from one azimuth, laser and scan to the next: irrational numbers without a common multiple."""
 LASERS_AT_A_TIME = 16
@@ -63,23 +62,18 @@ class Sensor:
 
     elevations_deg: tuple[float, ...] = HDL64E_DEG
     azimuth_steps: int = 1800
-    azimuths_deg: tuple[float, float] = (0.0, 360.0)
-    """First and last azimuth of a scan, counter-clockwise, in degrees."""
+    azimuths_deg: tuple[float, float] = (0.0, 360.0)  # first and last azimuth of a scan, counter-clockwise, in degrees
     pattern: ScanPattern = "rings"
     """"rings" repeats the elevations in every scan. "scattered" gives every ray another elevation in the band around
     its laser's elevation, differently in every scan. "scattered-round" also has a round field of view."""
-    height_m: float = 1.73
-    """Height above the road, in metres."""
+    height_m: float = 1.73  # height above the road, in metres
     min_range_m: float = 2.5
     max_range_m: float = 80.0
-    range_noise_m: float = 0.015
-    """Standard deviation of the range, in metres."""
-    dropout: float = 0.02
-    """Fraction of the returns that are lost, whatever the surface."""
+    range_noise_m: float = 0.015  # standard deviation of the range, in metres
+    dropout: float = 0.02  # fraction of the returns that are lost, whatever the surface
     faintest_echo: float = 6e-6
     """Strength of an echo that is detected with a probability of 63 %, see `raycast.echo_returns`."""
-    edge_share: float = 0.3
-    """Fraction of the returns at an edge with a range between those of its two sides."""
+    edge_share: float = 0.3  # fraction of the returns at an edge with a range between those of its two sides
     shadows_deg: tuple[tuple[float, float, float], ...] = ()
     """Occlusions by the vehicle: first azimuth, last azimuth (counter-clockwise) and elevation, in degrees.
 
@@ -90,10 +84,8 @@ class Sensor:
 
     def __post_init__(self):
         if not self.elevations_deg or self.azimuth_steps < 1:
-            raise ValueError(
-                "a sensor needs at least one elevation and one azimuth step, found "
-                f"{len(self.elevations_deg)} and {self.azimuth_steps}"
-            )
+            found = f"{len(self.elevations_deg)} and {self.azimuth_steps}"
+            raise ValueError(f"a sensor needs at least one elevation and one azimuth step, found {found}")
         if not 0 < self.azimuths_deg[1] - self.azimuths_deg[0] <= 360:
             raise ValueError(f"expected azimuths_deg over at most 360 degrees, found {self.azimuths_deg}")
         if not 0 <= self.min_range_m < self.max_range_m:
@@ -113,12 +105,7 @@ SENSORS = {
     "hdl64e": HDL64E,
     "hdl32e": Sensor(_even(10.67, -30.67, 32), azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
     # Mounted upside down on a Segway. Elevations and height fit a real scan of NCLT.
-    "hdl32e-nclt": Sensor(
-        tuple(-elevation for elevation in _even(10.67, -30.67, 32)),
-        azimuth_steps=2160,
-        min_range_m=1.9,
-        height_m=NCLT_HEIGHT_M,
-    ),
+    "hdl32e-nclt": Sensor(_even(-10.67, 30.67, 32), azimuth_steps=2160, min_range_m=1.9, height_m=NCLT_HEIGHT_M),
     "vlp16": Sensor(_even(15.0, -15.0, 16), min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
     "xt32": Sensor(_even(15.0, -16.0, 32), azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
     "os1-64": Sensor(_even(22.5, -22.5, 64), azimuth_steps=1024, min_range_m=0.5, height_m=1.2),

@@ -16,8 +16,7 @@ from sglpr_jax.sim.world import build_world
 
 PAUSE_S = 1800.0
 """Pause between two days in the town's time, in seconds. It is three times the mean stay of a parked car."""
-START_H = 12
-"""Hour (UTC) at which each session starts."""
+START_H = 12  # hour (UTC) at which each session starts
 
 
 def plan_sessions(

@@ -98,5 +98,4 @@ def ball(o: Vectors, d: Vectors) -> Interval:
     return _round(square, towards, towards**2 - square * (o.x**2 + o.y**2 + o.z**2 - 1))
 
 
-SOLIDS: tuple[Solid, Solid, Solid] = (cube, cylinder, ball)
-"""Solids of boxes, cylinders and ellipsoids, in this order."""
+SOLIDS: tuple[Solid, Solid, Solid] = (cube, cylinder, ball)  # solids of boxes, cylinders and ellipsoids, in this order

@@ -17,8 +17,7 @@ MIDDLE_M = 1.2
 SAME_STREET_M = 7.0
 """Maximum distance between two passes along the same street, in metres. The passes are nearly parallel."""
 HIGHWAY_MPS = 17.0
-ROUNDABOUT_M = (5.5, 16.0)
-"""Minimum and maximum radius of the path around a roundabout, in metres."""
+ROUNDABOUT_M = (5.5, 16.0)  # minimum and maximum radius of the path around a roundabout, in metres
 
 _LOOK_BACK_M = 30  # distance along the path within which points belong to the same pass
 _SIDE_STREET_M = (30.0, 60.0)
@@ -26,8 +25,7 @@ _STRETCH_M = (40.0, 150.0)
 _LOOK_ALIKE_M = (300.0, 600.0)
 REACH_M = 40.0
 """Maximum distance of painted ground from a street, in metres. Farther ground is terrain."""
-GARDEN_M = 30.0
-"""Depth of the gardens behind the sidewalk, in metres."""
+GARDEN_M = 30.0  # depth of the gardens behind the sidewalk, in metres
 BLOCK_CELLS = 2
 """Width of a block in cells. All cells of a block use the same nearest point of a street."""
 _CHUNK = 500_000

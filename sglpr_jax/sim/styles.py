@@ -9,10 +9,8 @@ import numpy as np
 from sglpr_jax.sim.labels import OTHER_GROUND, PARKING, ROAD, SIDEWALK, TERRAIN
 from sglpr_jax.sim.objects import House, Range
 
-BAY_M = 2.3
-"""Depth of a row of parked cars, in metres."""
-CARRIAGEWAY_M = 7.0
-"""Width of the second carriageway of a street with a median, in metres."""
+BAY_M = 2.3  # depth of a row of parked cars, in metres
+CARRIAGEWAY_M = 7.0  # width of the second carriageway of a street with a median, in metres
 
 
 class Style(NamedTuple):
@@ -186,12 +184,9 @@ class Scenery:
 
     styles: Mapping[str, float]
     """Relative frequencies of `STYLES` in new neighbourhoods. Where the vehicle drives fast, there is a highway."""
-    look_alike: float = 0.12
-    """Fraction of the stretches that are long and uniform."""
-    crossing_every_m: Range = (60.0, 150.0)
-    """Distance from one side street to the next, in metres."""
-    wavelength_m: Range = (150.0, 600.0)
-    """Wavelength of the hills, in metres."""
+    look_alike: float = 0.12  # fraction of the stretches that are long and uniform
+    crossing_every_m: Range = (60.0, 150.0)  # distance from one side street to the next, in metres
+    wavelength_m: Range = (150.0, 600.0)  # wavelength of the hills, in metres
     steepest: float = 0.05
     """Maximum slope of the hills. A value of 0.05 is 5 %."""
 

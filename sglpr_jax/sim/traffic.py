@@ -13,8 +13,7 @@ from sglpr_jax.sim.objects import Range, Thing
 from sglpr_jax.sim.placing import CLEARANCE_M, Spot, footprint_distance
 from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
 
-KEPT_M = 8.0
-"""Minimum distance of traffic ahead of the vehicle or behind it, in metres."""
+KEPT_M = 8.0  # minimum distance of traffic ahead of the vehicle or behind it, in metres
 
 _VIEW_M = 85.0
 _PIECE_M, _PIECE_S = 7.0, (0.4, 1.0)

@@ -19,8 +19,7 @@ from sglpr_jax.sim.traffic import traffic
 
 VIEW_M = 110.0
 """Maximum distance of things from the vehicle, in metres. Standing things that never come closer are omitted."""
-_TOLERANCE_M = 0.3
-"""Depth to which things may overlap the strips of a street, in metres."""
+_TOLERANCE_M = 0.3  # depth to which things may overlap the strips of a street, in metres
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +58,7 @@ class World(NamedTuple):
 
     scene: Scene
     ground: Ground
-    levels: Levels | None = None
-    """Storeys above one another, which the scene holds side by side."""
+    levels: Levels | None = None  # storeys above one another, which the scene holds side by side
 
 
 def build_world(

@@ -24,14 +24,12 @@ from sglpr_jax.sim.sceneries.site import (
     rows,
 )
 
-ROAD_M = 3.8
-"""Half width of the carriageway, in metres."""
+ROAD_M = 3.8  # half width of the carriageway, in metres
 HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8
 """Half width of the street with its sidewalks, between row houses and between slabs, in metres."""
 TWINS = {(0, 0), (1, 0)}
 """Column and row of the two equal buildings of the campus. Both are on the left of the first path."""
-LAWN_M = 6.0
-"""Minimum distance of a building of the campus from the middle of a path, in metres."""
+LAWN_M = 6.0  # minimum distance of a building of the campus from the middle of a path, in metres
 
 
 def _street(line: Line, walk_m: float, relief: Relief) -> Ground:

@@ -14,10 +14,8 @@ from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, along, road, rolling, rounded, track
 from sglpr_jax.sim.styles import TOWN
 
-WIDE_M = 38.0
-"""Half width of the forest on both sides of the path, in metres."""
-BEND_M = 25.0
-"""Distance between two bends of the path through the forest, in metres."""
+WIDE_M = 38.0  # half width of the forest on both sides of the path, in metres
+BEND_M = 25.0  # distance between two bends of the path through the forest, in metres
 
 
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:

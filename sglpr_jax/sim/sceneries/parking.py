@@ -21,8 +21,7 @@ from sglpr_jax.sim.world import Levels
 
 CAR_M, PILLAR_M, HALF_M = 5.8, 4.2, 8.8
 """Distance from the middle of an aisle to the cars, to the pillars, and to the wall behind the cars, in metres."""
-TURN_M = 5.0
-"""Space for turning at the ends of aisles and ramps, in metres."""
+TURN_M = 5.0  # space for turning at the ends of aisles and ramps, in metres
 PITCH_M = 11.5
 """Distance from the aisle of a floor to the next ramp, and from a ramp to the aisle of the next floor, in metres."""
 WIDE_M, RAMP_M = 17.5, 12.0

@@ -26,8 +26,7 @@ LANE_M = 3.5
 
 The vehicle uses the inner lanes, other traffic the outer lanes.
 """
-TUNNEL_M, NICHE_M = 6.0, 1.3
-"""Length of a piece of a tunnel, and depth of its niches, in metres."""
+TUNNEL_M, NICHE_M = 6.0, 1.3  # length of a piece of a tunnel, and depth of its niches, in metres
 THICK_M = 2.0
 """Thickness of a tunnel's walls, in metres. It exceeds the depth of a niche, so neighbouring pieces close its sides."""
 
@@ -110,10 +109,7 @@ def _drive(thing: Thing, lane: Line, start: float, speed: float) -> list[Spot]:
     """Drive along the whole lane, as pieces of straight motion of 1.5 s."""
     times = np.arange(start, start + len(lane) * STEP_M / speed, 1.5)
     at = ((times - start) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)
-    spots = []
-    for k in range(len(times) - 1):
-        velocity = (lane[at[k + 1]] - lane[at[k]]) / 1.5
-        x, y = (lane[at[k]] - velocity * times[k]).tolist()
-        heading = float(np.arctan2(velocity[1], velocity[0]))
-        spots.append(Spot(thing, x, y, heading, 1, tuple(velocity.tolist()), times[k], times[k + 1]))
-    return spots
+    velocity = np.diff(lane[at], axis=0) / 1.5
+    begin, headings = lane[at[:-1]] - velocity * times[:-1, None], np.arctan2(*velocity.T[::-1])
+    pieces = np.column_stack([begin, headings, velocity, times[:-1], times[1:]]).tolist()
+    return [Spot(thing, x, y, heading, 1, (vx, vy), *when) for x, y, heading, vx, vy, *when in pieces]

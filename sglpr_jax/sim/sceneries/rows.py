@@ -10,12 +10,9 @@ from sglpr_jax.sim.sceneries.site import Rows, Site, grid, jittered, painted_gro
 
 APART_M = 22.0
 """Minimum distance between passes in open land, in metres. The vehicle skips rows to keep this distance."""
-LANE_M = 9.0
-"""Width of the lanes between blocks of containers, in metres."""
-LEVEL_M = 1.7
-"""Height of a level of the shelves of a warehouse, in metres."""
-FREE_M = 5.0
-"""Free length at both ends of a row in open land, in metres."""
+LANE_M = 9.0  # width of the lanes between blocks of containers, in metres
+LEVEL_M = 1.7  # height of a level of the shelves of a warehouse, in metres
+FREE_M = 5.0  # free length at both ends of a row in open land, in metres
 
 
 def _open_land(

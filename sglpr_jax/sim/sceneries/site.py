@@ -19,15 +19,12 @@ from sglpr_jax.sim.routes import Line, Revisit, resampled, travelled
 from sglpr_jax.sim.styles import TOWN
 from sglpr_jax.sim.world import Levels, World
 
-STEP_M = 0.1
-"""Distance between two points of a line, in metres."""
+STEP_M = 0.1  # distance between two points of a line, in metres
 MARGIN_M = 90.0
 """Length of a road before the first and after the last scan, in metres. It hides the ends of the road."""
-LAPS = 1.5
-"""Number of laps along a closed line for revisits in the same direction."""
+LAPS = 1.5  # number of laps along a closed line for revisits in the same direction
 FLAT = Relief(np.zeros(4), np.full((4, 2), 0.01), np.zeros(4))
-WALL_M = 0.3
-"""Thickness of walls, in metres."""
+WALL_M = 0.3  # thickness of walls, in metres
 _AROUND_M = 30.0
 
 
@@ -39,8 +36,7 @@ class Site(NamedTuple):
     ground: Ground
     levels: Levels | None = None
     """Storeys above one another. `line` lies in them, and `spots` in the world that holds them side by side."""
-    returns: bool = False
-    """Whether the line itself returns to its places, for revisits in the same direction."""
+    returns: bool = False  # whether the line itself returns to its places, for revisits in the same direction
 
 
 class Strip(NamedTuple):

@@ -1,7 +1,5 @@
 """Walled yards and halls of equal size in a row, crossed one after another, or a single one criss-cross."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT, PARKING, POLE
@@ -10,37 +8,15 @@ from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import Site, grid, painted_ground, rounded, wall
 
-GATE_M = 3.2
-"""Width of the gate between two places, in metres."""
-MARGIN_M = 2.5
-"""Minimum distance of the corners of a path from the walls, in metres."""
-BEND = 0.15
-"""Maximum distance of gates and bends from the middle of a place, as a fraction of its width."""
-
-
-class Places(NamedTuple):
-    """Places along x, each `long_m` long and `wide_m` wide. Place k is around ((k + 0.5) * long_m, 0)."""
-
-    line: Line
-    walls: Thing  # of all places, in the frame of the world
-    count: int
-    long_m: float
-    wide_m: float
-
-    def anywhere(
-        self, rng: np.random.Generator, area_m2: float, *, away_m: float = 1.0
-    ) -> list[tuple[float, float, float]]:
-        """Random x, y and heading of things in a place, about one for `area_m2`, `away_m` or more from its walls."""
-        count = round(self.long_m * self.wide_m / area_m2 * rng.uniform(0.7, 1.3))
-        half = self.wide_m / 2
-        low, high = (away_m, away_m - half, 0), (self.long_m - away_m, half - away_m, 2 * np.pi)
-        return [(x, y, heading) for x, y, heading in rng.uniform(low, high, (count, 3)).tolist()]
+GATE_M = 3.2  # width of the gate between two places, in metres
+MARGIN_M = 2.5  # minimum distance of the corners of a path from the walls, in metres
+BEND = 0.15  # maximum distance of gates and bends from the middle of a place, as a fraction of its width
 
 
 def _places(
     rng: np.random.Generator, length_m: float, closed: bool, *, long_m: float, wide_m: float, height_m: float
-) -> Places:
-    """Draws a path of about `length_m` metres through places joined by gates, or a closed one in a single place."""
+) -> tuple[Line, Thing, int]:
+    """Path, walls and number of places along x that are joined by gates. A closed path stays in a single one."""
     if closed:
         line, gates = _criss_cross(rng, length_m, long_m, wide_m), []
     else:
@@ -58,7 +34,16 @@ def _places(
     for k, y in enumerate(gates, 1):
         beside = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
         walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in beside]
-    return Places(line, tuple(walls), len(gates) + 1, long_m, wide_m)
+    return line, tuple(walls), len(gates) + 1
+
+
+def _anywhere(
+    rng: np.random.Generator, long_m: float, wide_m: float, area_m2: float, away_m: float
+) -> list[tuple[float, float, float]]:
+    """Random x, y and heading of things in a place, about one for `area_m2`, `away_m` or more from its walls."""
+    count, half = round(long_m * wide_m / area_m2 * rng.uniform(0.7, 1.3)), wide_m / 2
+    low, high = (away_m, away_m - half, 0), (long_m - away_m, half - away_m, 2 * np.pi)
+    return [(x, y, heading) for x, y, heading in rng.uniform(low, high, (count, 3)).tolist()]
 
 
 def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_m: float) -> Line:
@@ -75,16 +60,18 @@ def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_
 def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Yards of 15 to 24 m with equal walls and different things, joined by gates. A closed path stays in one yard."""
     long, wide, height = rng.uniform((15, 15, 3), (24, 24, 8)).tolist()
-    plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
-    spots = [Spot(plan.walls, 0.0, 0.0)]
-    for k in range(plan.count):
-        spots += [Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in plan.anywhere(rng, 22.0)]
+    line, walls, count = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
+    spots = [Spot(walls, 0.0, 0.0)]
+    for k in range(count):
+        spots += [
+            Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in _anywhere(rng, long, wide, 22.0, 1.0)
+        ]
         for side in (-1, 1):  # sheds, stairs and ducts at the two walls along x
             for place in rng.uniform(2.0, long - 2.0, int(rng.integers(1, 4))).tolist():
                 length, deep, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
                 annex = (block(OTHER_OBJECT, length, deep, high),)
                 spots.append(Spot(annex, k * long + place, side * (wide - deep - 0.3) / 2))
-    return Site(plan.line, spots, painted_ground(PARKING))
+    return Site(line, spots, painted_ground(PARKING))
 
 
 def _lumber(rng: np.random.Generator) -> Thing:
@@ -108,16 +95,16 @@ def _lumber(rng: np.random.Generator) -> Thing:
 def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Halls of 30 to 60 m with equal walls and columns and different things. A closed path stays in one."""
     long, wide, height, span = rng.uniform((30, 30, 5, 6), (60, 45, 9, 10)).tolist()
-    plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
-    column, along = (block(POLE, 0.4, 0.4, height),), plan.count * long
+    line, walls, count = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
+    column, along = (block(POLE, 0.4, 0.4, height),), count * long
     columns = grid(np.arange(span / 2, along, span), np.arange((span - wide) / 2, wide / 2, span), lambda: column)
     ceiling = block(BUILDING, along, wide, 0.3, along / 2, bottom=height, roughness=0.02)
-    spots = [Spot((*plan.walls, ceiling), 0.0, 0.0), *columns]
-    for k in range(plan.count):
-        for x, y, heading in plan.anywhere(rng, 40.0, away_m=2.5):
+    spots = [Spot((*walls, ceiling), 0.0, 0.0), *columns]
+    for k in range(count):
+        for x, y, heading in _anywhere(rng, long, wide, 40.0, 2.5):
             turned = heading if rng.random() < 0.3 else round(2 * heading / np.pi) * np.pi / 2
             spots.append(Spot(_machine(rng), x + k * long, y, turned))
-    return Site(plan.line, spots, painted_ground(OTHER_GROUND))
+    return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
 def _machine(rng: np.random.Generator) -> Thing:
