@@ -267,11 +267,6 @@ def _in_window(along: Array, up: Array, glass: Array) -> Bool[Array, "lasers azi
     return (beside < half_side) & (above < half_side)
 
 
-def nearer(a: Surface, b: Surface) -> Surface:
-    """Surface of `b` for each ray whose surface in `b` is nearer, otherwise that of `a`."""
-    return jax.tree.map(lambda of_a, of_b: jnp.where(b.distance < a.distance, of_b, of_a), a, b)
-
-
 def reflectivity(label: Int[Array, "lasers azimuths"]) -> Float[Array, "lasers azimuths"]:
     """Fraction of the light that a surface with this label reflects, from 0 to 1."""
     return jnp.asarray(_REFLECTIVITY)[label]

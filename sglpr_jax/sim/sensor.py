@@ -21,7 +21,6 @@ from sglpr_jax.sim.raycast import (
     echo_returns,
     find_candidates,
     mix_edges,
-    nearer,
     nearest_hit,
     reflectivity,
     sector_count,
@@ -240,7 +239,8 @@ def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
         distance = jnp.minimum(distance, sensor.max_range_m)
         ground = Surface(distance, label, facing, jnp.zeros(distance.shape, bool))
         hit, slot = nearest_hit(upright, view.candidates, distance, chance)
-        return nearer(ground, surface_of_shapes(upright, hit, slot, view.candidates))
+        shape = surface_of_shapes(upright, hit, slot, view.candidates)
+        return jax.tree.map(lambda a, b: jnp.where(shape.distance < ground.distance, b, a), ground, shape)
 
     in_blocks = (-1, math.gcd(lasers, LASERS_AT_A_TIME), azimuths)
     surface = jax.lax.map(of_block, jax.tree.map(lambda values: values.reshape(in_blocks), (rays, chance)))

@@ -200,15 +200,7 @@ TOWN = Scenery(
     {"centre": 0.33, "suburb": 0.33, "estate": 0.09, "works": 0.04, "park": 0.08, "square": 0.02, "country": 0.11}
 )
 OUTSKIRTS = Scenery(
-    {
-        "walled": 0.25,
-        "hillside": 0.25,
-        "country": 0.15,
-        "suburb": 0.15,
-        "works": 0.08,
-        "estate": 0.07,
-        "centre": 0.05,
-    },
+    {"walled": 0.25, "hillside": 0.25, "country": 0.15, "suburb": 0.15, "works": 0.08, "estate": 0.07, "centre": 0.05},
     look_alike=0.3,
     crossing_every_m=(100.0, 300.0),
     wavelength_m=(60.0, 400.0),

@@ -27,8 +27,6 @@ from sglpr_jax.sim.sceneries.site import (
 ROAD_M = 3.8  # half width of the carriageway, in metres
 HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8
 """Half width of the street with its sidewalks, between row houses and between slabs, in metres."""
-TWINS = {(0, 0), (1, 0)}
-"""Column and row of the two equal buildings of the campus. Both are on the left of the first path."""
 LAWN_M = 6.0  # minimum distance of a building of the campus from the middle of a path, in metres
 
 
@@ -118,7 +116,7 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     lines = np.arange(-2, count + 1)
     twin, spots = _building(rng, pitch), []
     for column, row in itertools.product(columns.tolist(), lines.tolist()):
-        building = twin if (column, row) in TWINS else _building(rng, pitch)
+        building = twin if row == 0 and column in (0, 1) else _building(rng, pitch)  # beside the first path
         x, y = (column + 0.5) * pitch, (row + 0.5) * pitch
         spots.append(Spot(building, x, y))
         for _ in range(int(rng.integers(4, 11))):
