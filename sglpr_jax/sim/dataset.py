@@ -21,19 +21,14 @@ from sglpr_jax.sim.sessions import plan_sessions
 from sglpr_jax.sim.styles import SCENERIES, TOWN
 
 SETTINGS_FILE = "simulation.json"
-VERSION = 3
-"""Version of the simulator's output. It changes whenever the scans of a seed change."""
-OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}
-"""Field names of a scenery in older datasets, and their current names."""
-WORKERS = 2
-"""Number of rendering threads. The compiled program leaves capacity for more than one."""
+VERSION = 3  # of the simulator's output; it changes whenever the scans of a seed change
+OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}  # of fields in older datasets
+WORKERS = 2  # rendering threads; the compiled program leaves capacity for more than one
 ROUTES = ("00", "05", "08")  # default routes in towns
-REVISITED = ("01", "06", "08")
-"""Default routes where places repeat: without revisits, in the same and in the opposite direction."""
+REVISITED = ("01", "06", "08")  # where places repeat: without revisits, in the same, in the opposite direction
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 AZIMUTH_STEPS = 900  # firings per revolution in the default datasets
-BYTES_PER_RAY = {"scans": 16, "nclt": 5}
-"""Approximate size of a scan with its labels, in bytes per ray, by layout. Most rays return."""
+BYTES_PER_RAY = {"scans": 16, "nclt": 5}  # approximate size of a scan with its labels, by layout
 BYTES_PER_IMAGE = 3500  # approximate size of an image with its label image, in bytes
 
 

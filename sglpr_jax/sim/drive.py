@@ -18,24 +18,14 @@ from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.objects import Range
 from sglpr_jax.sim.routes import ROLES, STEP_M, Line, plan_route, travelled
 
-PATH_HZ = 10.0
-"""Approximate number of poses per second along the path. The scans use some of these poses."""
-SHORTEST_S = 60.0
-"""Minimum duration of a drive, in seconds. It allows revisits after 30 s. Few scans are spread over this time."""
-LANE_M = (0.9, 1.6)
-"""Range of the vehicle's distance to the right of the middle of the street, in metres.
-
-The paths of both directions are mostly within 3 m of each other.
-"""
+PATH_HZ = 10.0  # approximate number of poses per second along the path, of which the scans use some
+SHORTEST_S = 60.0  # minimum duration of a drive, in seconds, which allows revisits after 30 s
+LANE_M = (0.9, 1.6)  # range of the vehicle's distance to the right of the middle of the street, in metres
 SWAY_WAVELENGTH_M = (60.0, 150.0)
-STEERING_M = 3.0
-"""Standard deviation of the Gaussian that smooths the path, in metres. A steering wheel does not jump."""
-LATERAL_ACCELERATION = 2.0
-ACCELERATION = 1.5
-"""Maximum lateral and longitudinal acceleration, in m/s^2. They limit speed in corners and changes of speed."""
+STEERING_M = 3.0  # standard deviation of the Gaussian that smooths the path, in metres
+LATERAL_ACCELERATION, ACCELERATION = 2.0, 1.5  # maxima in m/s^2, which limit speed in corners and its changes
 FREE_SPEED = 1.35  # speed on a free street, as a multiple of the mean speed
-TILT_DEG = 0.6
-"""Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
+TILT_DEG = 0.6  # standard deviation of pitch and of roll relative to the ground, in degrees
 TILT_S = 0.5  # approximate duration of a tilt, in seconds
 
 STEPS_HZ = 2.0  # steps of a walking person per second

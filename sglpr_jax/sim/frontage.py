@@ -18,8 +18,7 @@ from sglpr_jax.sim.styles import Side, draw_house
 Clock = tuple[float, float]
 """Start and end of a period, such as the drive, in seconds."""
 STAY_S = 600.0  # mean time that a parked car stays, in seconds
-CHANGING_BUSHES = 0.1
-"""Fraction of the bushes that are present only temporarily. They model growth and cutting between two visits."""
+CHANGING_BUSHES = 0.1  # fraction of the bushes that are present for a while: growth and cutting
 
 
 def frontage(

@@ -20,8 +20,7 @@ KERB_M = 0.12  # height of sidewalks, gardens and fields above the road, in metr
 ROAD_LEVEL = (ROAD, PARKING, OTHER_GROUND, LANE_MARKING)  # labels of ground at the level of the road
 
 _WAVES = 4
-_NEAR_M = 3.0
-"""Minimum distance of the fitted point, in metres. At smaller distances, hills bend by less than a millimetre."""
+_NEAR_M = 3.0  # minimum distance of the fitted point, in metres; closer hills bend by less than a millimetre
 
 
 class Relief(NamedTuple):

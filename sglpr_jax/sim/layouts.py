@@ -23,8 +23,7 @@ from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
 
 THINNED, FEWER_BEAMS = 0.4, 0.3
 """Fraction of the scans that lose random points, and fraction that loses whole rings. Other scans keep all points."""
-MOST_LOST = 0.95
-"""Maximum fraction of the points of a scan that are lost. The fraction is uniformly distributed."""
+MOST_LOST = 0.95  # maximum of the uniformly distributed fraction of lost points
 BEAMS = (32.0, 16.0)  # possible numbers of remaining beams
 
 

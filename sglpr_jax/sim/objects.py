@@ -10,8 +10,7 @@ Range = tuple[float, float]
 """Minimum and maximum of a uniform distribution."""
 Kind = Literal["box", "cylinder", "ellipsoid"]
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")  # kinds in the order of `shapes.Scene`
-_BELOW_M = 1.0
-"""Depth of a building below the ground, in metres. It prevents gaps under buildings on slopes."""
+_BELOW_M = 1.0  # depth of a building below the ground, in metres, against gaps on slopes
 _FACADE_M = 0.06
 """Roughness of a facade, in metres. In real scans, points within 1 m of facade are 4 cm (rms) off their plane."""
 

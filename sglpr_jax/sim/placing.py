@@ -12,8 +12,7 @@ from sglpr_jax.sim.objects import KINDS, Part, Thing
 from sglpr_jax.sim.shapes import Scene, Shapes
 
 CLEARANCE_M = 1.6  # minimum distance of standing things from the vehicle's path, in metres
-HEAD_ROOM_M = 2.0
-"""Minimum height of parts that may be above the vehicle, or overhang a street or its sidewalk, in metres."""
+HEAD_ROOM_M = 2.0  # minimum height of parts above the vehicle, a street or its sidewalk, in metres
 
 Zone = Literal["bay", "verge", "plot"]
 """Place of a thing: parked along its street, on the strips beside the road, or behind the strips."""

@@ -16,23 +16,16 @@ from sglpr_jax.sim import labels
 from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
 
 COLUMNS = 32  # number of azimuth steps in a sector
-SLOTS = 64, 48, 128
-"""Maximum numbers of boxes, cylinders and ellipsoids in a sector. If there are more, the nearest are kept.
-
-In the towns of routes 00 and 02, one sector in a hundred has too many ellipsoids. The omitted ones are 47 m away.
-"""
-UNROLL = 2
-"""Number of shapes tested between two checks of the stop condition. It must divide all numbers of slots."""
+SLOTS = 64, 48, 128  # maximum numbers of boxes, cylinders and ellipsoids in a sector; the nearest are kept
+UNROLL = 2  # shapes tested between two checks of the stop condition; it divides all numbers of slots
 _MARGIN = 1e-3
 _PORE_FACTORS = np.random.default_rng(0).integers(2**32, size=sum(SLOTS), dtype=np.uint32) | np.uint32(1)
 Nearest = tuple[Array, Array]
 """Distance and slot of the nearest hit of each ray. The slot is -1 without a hit."""
 STOREY_M, BAY_M = 3.0, 2.5  # height and width of a piece of facade with one window, in metres
 WINDOW_LOSS = 0.9  # fraction of the rays into a window that do not return
-LEAF_FACING = 0.5
-"""Mean cosine of the angle between a ray and the normal of a leaf, for all rough shapes and all directions."""
-EDGE_JUMP_M = 2.0
-"""Distance above which the sensor separates two echoes, in metres. Closer echoes are mixed."""
+LEAF_FACING = 0.5  # mean cosine of the angle between a ray and the normal of a leaf, for all rough shapes
+EDGE_JUMP_M = 2.0  # distance above which the sensor separates two echoes, in metres
 
 
 class Candidates(NamedTuple):

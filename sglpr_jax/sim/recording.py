@@ -33,8 +33,7 @@ from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import World, build_world
 
-KEPT_SCANS = 8
-"""Number of cached scans. Because of the cache, reading the points and labels of a scan renders it only once."""
+KEPT_SCANS = 8  # number of cached scans, so that reading points and labels of a scan renders it once
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from sglpr_jax.sim.sceneries.site import LAPS, Site, build, way
 from sglpr_jax.sim.sensor import HDL64E, Sensor
 from sglpr_jax.sim.world import World
 
-SHORTEST_S = 75.0
-"""Minimum duration of a drive, in seconds. Few scans are spread over this time."""
+SHORTEST_S = 75.0  # minimum duration of a drive, in seconds, over which few scans are spread
 LEAST_RANGE_M = 0.5  # highest minimum range of the sensor of a small robot, in metres
 
 

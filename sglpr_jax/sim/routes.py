@@ -16,11 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 STEP_M = 0.5  # distance between two points of a route's line, in metres
 BLOCKS_PER_LOOP = 12
 ROUNDABOUT_RADIUS_M = 10.0
-SHORTEST_LOOP = {False: 6, True: 4}
-"""Minimum number of streets between two visits in the same (False) or the opposite (True) direction.
-
-They take at least 30 s.
-"""
+SHORTEST_LOOP = {False: 6, True: 4}  # minimum number of streets between two visits, by `Role.opposite`: at least 30 s
 TRIES, TRIES_PER_LOOP = 100, 30
 
 Revisit = Literal["none", "same", "opposite"]

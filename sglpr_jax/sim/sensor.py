@@ -48,8 +48,7 @@ def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
 TURN_S = 0.1  # duration of a scan, in seconds
 STEPS = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
 """Steps of the sequence from one azimuth, laser and scan to the next: irrational numbers without a common multiple."""
-LASERS_AT_A_TIME = 16
-"""Maximum number of lasers in a block. The block size is its greatest common divisor with the number of lasers."""
+LASERS_AT_A_TIME = 16  # maximum size of a block, which divides the number of lasers
 
 
 ScanPattern = Literal["rings", "scattered", "scattered-round"]

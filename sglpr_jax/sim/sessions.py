@@ -14,8 +14,7 @@ from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import build_world
 
-PAUSE_S = 1800.0
-"""Pause between two days in the town's time, in seconds. It is three times the mean stay of a parked car."""
+PAUSE_S = 1800.0  # pause between two days, in seconds: three times the mean stay of a parked car
 START_H = 12  # hour (UTC) at which each session starts
 
 

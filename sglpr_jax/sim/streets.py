@@ -12,10 +12,8 @@ from sglpr_jax.sim.ground import CELL_M, Ground, Relief
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
-MIDDLE_M = 1.2
-"""Distance from the first pass to the middle of the street on its left, in metres. Traffic drives on the right."""
-SAME_STREET_M = 7.0
-"""Maximum distance between two passes along the same street, in metres. The passes are nearly parallel."""
+MIDDLE_M = 1.2  # distance from the first pass to the middle of the street on its left, in metres
+SAME_STREET_M = 7.0  # maximum distance between two passes along the same street, in metres
 HIGHWAY_MPS = 17.0
 ROUNDABOUT_M = (5.5, 16.0)  # minimum and maximum radius of the path around a roundabout, in metres
 
@@ -23,11 +21,9 @@ _LOOK_BACK_M = 30  # distance along the path within which points belong to the s
 _SIDE_STREET_M = (30.0, 60.0)
 _STRETCH_M = (40.0, 150.0)
 _LOOK_ALIKE_M = (300.0, 600.0)
-REACH_M = 40.0
-"""Maximum distance of painted ground from a street, in metres. Farther ground is terrain."""
+REACH_M = 40.0  # maximum distance of painted ground from a street, in metres; farther ground is terrain
 GARDEN_M = 30.0  # depth of the gardens behind the sidewalk, in metres
-BLOCK_CELLS = 2
-"""Width of a block in cells. All cells of a block use the same nearest point of a street."""
+BLOCK_CELLS = 2  # width of a block, whose cells all use the same nearest point of a street
 _CHUNK = 500_000
 _STRIPS = 5  # maximum on one side
 

@@ -17,8 +17,7 @@ from sglpr_jax.sim.streets import Island, Network, draw_streets, paint_ground, r
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.traffic import traffic
 
-VIEW_M = 110.0
-"""Maximum distance of things from the vehicle, in metres. Standing things that never come closer are omitted."""
+VIEW_M = 110.0  # distance from the vehicle above which standing things are omitted, in metres
 _TOLERANCE_M = 0.3  # depth to which things may overlap the strips of a street, in metres
 
 

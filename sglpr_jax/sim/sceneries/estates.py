@@ -25,8 +25,7 @@ from sglpr_jax.sim.sceneries.site import (
 )
 
 ROAD_M = 3.8  # half width of the carriageway, in metres
-HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8
-"""Half width of the street with its sidewalks, between row houses and between slabs, in metres."""
+HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8  # half width of the street with its sidewalks, in metres
 LAWN_M = 6.0  # minimum distance of a building of the campus from the middle of a path, in metres
 
 

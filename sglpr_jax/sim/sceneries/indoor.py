@@ -12,12 +12,9 @@ from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded
 
 WALL_M = 0.2  # thickness of the walls between rooms, in metres
-ROOMS_HALF_M = 1.0
-"""Half width of the corridor beside equal rooms, in metres. Rooms begin WALL_M farther out."""
-ROOMS_DOOR_M, ROOMS_SIDE_M = 1.4, 0.25
-"""Width of a door, and distance from its middle to the paths into the room and out of it, in metres."""
-FLOOR_DOOR_M, FLOOR_SIDE_M = 1.6, 0.15
-"""Width of a door of a floor, and distance from its middle to the paths into the room and out of it, in metres."""
+ROOMS_HALF_M = 1.0  # half width of the corridor beside equal rooms, in metres; rooms begin WALL_M farther out
+ROOMS_DOOR_M, ROOMS_SIDE_M = 1.4, 0.25  # width of a door, and distance of the paths from its middle, in metres
+FLOOR_DOOR_M, FLOOR_SIDE_M = 1.6, 0.15  # the same for the rooms of a floor
 ALIKE = 0.6  # probability that a wing has the rooms of the first wing, and that such a room has the same furniture
 FRONTS = {"closed": 0.4, "open": 0.25, "glass": 0.2, "hall": 0.15}
 """Probability of each front of a room: a door, an open door, glass with an open door, or only two pillars."""

@@ -52,11 +52,8 @@ def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     spots = [Spot(_tree(rng, thick, branches), x, y) for x, y in _scattered(rng, line, density)]
     for x, y in _scattered(rng, line, shrubs * density):
         spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
-    return Site(
-        line,
-        spots,
-        track(line, 0.6, draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))),
-    )
+    relief = draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))
+    return Site(line, spots, track(line, 0.6, relief))
 
 
 def _path(rng: np.random.Generator, length_m: float, closed: bool) -> Line:

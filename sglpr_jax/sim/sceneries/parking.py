@@ -22,10 +22,8 @@ from sglpr_jax.sim.world import Levels
 CAR_M, PILLAR_M, HALF_M = 5.8, 4.2, 8.8
 """Distance from the middle of an aisle to the cars, to the pillars, and to the wall behind the cars, in metres."""
 TURN_M = 5.0  # space for turning at the ends of aisles and ramps, in metres
-PITCH_M = 11.5
-"""Distance from the aisle of a floor to the next ramp, and from a ramp to the aisle of the next floor, in metres."""
-WIDE_M, RAMP_M = 17.5, 12.0
-"""Distance between the two aisles of a storey, and from its upper aisle to its ramp, in metres."""
+PITCH_M = 11.5  # distance between the aisle of a floor and the next ramp, in metres
+WIDE_M, RAMP_M = 17.5, 12.0  # distance between a storey's aisles, and from the upper one to the ramp, in metres
 
 
 def car_park(rng: np.random.Generator, length_m: float, closed: bool) -> Site:

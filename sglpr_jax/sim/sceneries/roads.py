@@ -19,13 +19,8 @@ from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, Strip, along, mirrored, painted_ground, road, rolling
 
-OVERLAP = 1.25
-"""Length of a piece of wall divided by the spacing. In curves, the outer wall is longer than the road."""
-LANE_M = 3.5
-"""Width of each of the four lanes of a highway, in metres.
-
-The vehicle uses the inner lanes, other traffic the outer lanes.
-"""
+OVERLAP = 1.25  # length of a piece of wall divided by the spacing, because outer walls of curves are longer
+LANE_M = 3.5  # width of the four lanes of a highway, in metres; the vehicle uses the inner ones
 TUNNEL_M, NICHE_M = 6.0, 1.3  # length of a piece of a tunnel, and depth of its niches, in metres
 THICK_M = 2.0
 """Thickness of a tunnel's walls, in metres. It exceeds the depth of a niche, so neighbouring pieces close its sides."""

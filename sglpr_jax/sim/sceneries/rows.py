@@ -8,8 +8,7 @@ from sglpr_jax.sim.objects import Thing, ball, block, post
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.sceneries.site import Rows, Site, grid, jittered, painted_ground, rolling, rows, track
 
-APART_M = 22.0
-"""Minimum distance between passes in open land, in metres. The vehicle skips rows to keep this distance."""
+APART_M = 22.0  # minimum distance between passes in open land, in metres, for which the vehicle skips rows
 LANE_M = 9.0  # width of the lanes between blocks of containers, in metres
 LEVEL_M = 1.7  # height of a level of the shelves of a warehouse, in metres
 FREE_M = 5.0  # free length at both ends of a row in open land, in metres

@@ -20,8 +20,7 @@ from sglpr_jax.sim.styles import TOWN
 from sglpr_jax.sim.world import Levels, World
 
 STEP_M = 0.1  # distance between two points of a line, in metres
-MARGIN_M = 90.0
-"""Length of a road before the first and after the last scan, in metres. It hides the ends of the road."""
+MARGIN_M = 90.0  # length of a road beyond both ends of a drive, in metres, which hides the ends of the road
 LAPS = 1.5  # number of laps along a closed line for revisits in the same direction
 FLAT = Relief(np.zeros(4), np.full((4, 2), 0.01), np.zeros(4))
 WALL_M = 0.3  # thickness of walls, in metres

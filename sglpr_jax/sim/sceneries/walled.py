@@ -77,19 +77,15 @@ def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 def _lumber(rng: np.random.Generator) -> Thing:
     """Crate, bin, barrel, pole, plant or vehicle."""
     long, wide, high = rng.uniform((0.4, 0.4, 0.6), (1.8, 1.4, 2.6)).tolist()
-    match rng.choice(6, p=[0.45, 0.15, 0.1, 0.2, 0.05, 0.05]):
-        case 0:
-            return (block(OTHER_OBJECT, long, wide, high),)
-        case 1:
-            return (post(OTHER_OBJECT, wide, 0.6 * high),)
-        case 2:
-            return (post(POLE, 0.12, 2 * high),)
-        case 3:
-            return tree(rng, (1.5, 3.5)) if rng.random() < 0.4 else bush(rng, 0.7)
-        case 4:
-            return car(rng)
-        case _:
-            return bicycle(rng)
+    kinds = (
+        lambda: (block(OTHER_OBJECT, long, wide, high),),
+        lambda: (post(OTHER_OBJECT, wide, 0.6 * high),),
+        lambda: (post(POLE, 0.12, 2 * high),),
+        lambda: tree(rng, (1.5, 3.5)) if rng.random() < 0.4 else bush(rng, 0.7),
+        lambda: car(rng),
+        lambda: bicycle(rng),
+    )
+    return kinds[rng.choice(6, p=[0.45, 0.15, 0.1, 0.2, 0.05, 0.05])]()
 
 
 def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
