@@ -49,7 +49,7 @@ class Strip(NamedTuple):
 
 
 def along(line: Line, *things: tuple[Thing, float]) -> list[Spot]:
-    """Places each thing along a line, with its x axis along the line, every so many metres."""
+    """Places each thing along a line, with its x axis along the line, at equal distances in metres."""
     spots, directions = [], np.gradient(line, axis=0)
     for thing, every_m in things:
         rows = np.arange(0, len(line) - 1, every_m / STEP_M).astype(int)
