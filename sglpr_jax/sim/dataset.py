@@ -13,7 +13,7 @@ from sglpr_jax.sim import RATE_HZ, SCANS
 from sglpr_jax.sim.drive import CARRIERS, check_drawing, name_of_path, read_path, scan_rows
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, numbered, simulate_recording, with_submaps
-from sglpr_jax.sim.repeating import default_rate, simulate_repeating
+from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import SENSORS, Sensor
@@ -21,23 +21,15 @@ from sglpr_jax.sim.sessions import plan_sessions
 from sglpr_jax.sim.styles import SCENERIES, TOWN
 
 SETTINGS_FILE = "simulation.json"
-VERSION = 3
-"""Version of the simulator's output. It changes whenever the scans of a seed change."""
-OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}
-"""Field names of a scenery in older datasets, and their current names."""
-WORKERS = 2
-"""Number of rendering threads. The compiled program leaves capacity for more than one."""
-ROUTES = ("00", "05", "08")
-"""Default routes in towns."""
-REVISITED = ("01", "06", "08")
-"""Default routes where places repeat: without revisits, in the same and in the opposite direction."""
+VERSION = 3  # of the simulator's output; it changes whenever the scans of a seed change
+OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}  # of fields in older datasets
+WORKERS = 2  # rendering threads; the compiled program leaves capacity for more than one
+ROUTES = ("00", "05", "08")  # default routes in towns
+REVISITED = ("01", "06", "08")  # where places repeat: without revisits, in the same, in the opposite direction
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
-AZIMUTH_STEPS = 900
-"""Firings per revolution in the default datasets."""
-BYTES_PER_RAY = {"scans": 16, "nclt": 5}
-"""Approximate size of a scan with its labels, in bytes per ray, by layout. Most rays return."""
-BYTES_PER_IMAGE = 3500
-"""Approximate size of an image with its label image, in bytes."""
+AZIMUTH_STEPS = 900  # firings per revolution in the default datasets
+BYTES_PER_RAY = {"scans": 16, "nclt": 5}  # approximate size of a scan with its labels, by layout
+BYTES_PER_IMAGE = 3500  # approximate size of an image with its label image, in bytes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,12 +37,9 @@ class Simulated:
     """Description of a simulated dataset, before or after it is written."""
 
     root: Path
-    names: tuple[str, ...]
-    """Names of the recordings."""
-    scans: int
-    """Maximum number of scans in each recording."""
-    layout: str
-    """Name of the layout, from `LAYOUTS`."""
+    names: tuple[str, ...]  # names of the recordings
+    scans: int  # maximum number of scans in each recording
+    layout: str  # name of the layout, from `LAYOUTS`
     sensor: Sensor
 
     @property
@@ -90,37 +79,34 @@ def simulate(
 ) -> Simulated:
     """Drives a simulated LiDAR through simulated towns and writes scans, labels and poses.
 
-    Existing files are kept: the same call completes an interrupted dataset. Recordings can be added to a dataset, but
-    not sessions, because their streets depend on the number of days.
+    Existing files are kept: the same call completes an interrupted dataset, and recordings can be added to one, but not
+    sessions, because their streets depend on the number of days.
 
     Arguments:
       out: Output folder.
-      routes: Routes "00" to "10", each with its own town, which depends on `seed` and the route. None drives 00, 05 and
-        08, or no route if there is `along`.
+      routes: Routes "00" to "10", each with its own town. None drives 00, 05 and 08, or no route if there is `along`.
       along: KITTI pose files to drive along, see `read_path`.
-      sessions: Dates such as "2012-01-15". One town is driven on each of these days, in NCLT's layout, see
-        `plan_sessions`. `routes` may then hold one route; None is 00.
+      sessions: Dates such as "2012-01-15" on which one town is driven, in NCLT's layout, see `plan_sessions`. `routes`
+        may then hold one route; None is 00.
       scans: Number of scans of each recording, at least 2. Along a pose file it is the maximum.
       sensor: LiDAR, or its name from `SENSORS`. None is hdl64e, or hdl32e-nclt with `sessions`.
       azimuth_steps: Firings per revolution. None is the sensor's own number.
       seed: Seed of the towns, at least 0.
-      rate_hz: Scans per second of a route. Not used along pose files. None is 4 in towns, elsewhere the rate of the
-        carrier or of the scenery.
-      scenery: Name from `SCENERIES` (towns), or from `REPEATING`. In the latter, a route stands only for the direction
-        of its revisits, and the drive is that of `simulate_repeating`.
+      rate_hz: Scans per second of a route. None is 4 in towns, elsewhere the rate of the carrier or of the scenery.
+      scenery: Name from `SCENERIES` (towns), or from `REPEATING`, where routes only give the direction of revisits.
       carrier: Name from `CARRIERS`. In towns, only its height and sway are used. `sessions` need a vehicle.
       submap_m: Travelled distance of submaps, in metres. 0 writes scans.
       images: Whether to write density images with label images instead of scans.
       vary: Whether the images show scans that are rotated about z, some of them with lost points. See `layouts.vary`.
-      on_start: Function that is called with the dataset's description after all arguments are checked.
-      on_progress: Function that is called with the number of completed scans, counting `scans` for each recording.
+      on_start: Called with the dataset's description after all arguments are checked.
+      on_progress: Called with the number of completed scans, counting `scans` for each recording.
 
     Returns:
       Description of the dataset.
 
     Raises:
-      ValueError: An argument is unknown or out of range, a pose file is malformed, or arguments contradict each other.
-        Or `out` holds other files, or a dataset with other settings.
+      ValueError: An argument is unknown or out of range, arguments contradict each other, a pose file is malformed, or
+        `out` holds other files or a dataset with other settings.
       OSError: A file cannot be read or written. The message names the file.
 
     Example:
@@ -132,7 +118,7 @@ def simulate(
     if routes is None:
         routes = () if along or sessions else REVISITED if repeats else ROUTES
     if rate_hz is None:
-        rate_hz = default_rate(REPEATING[scenery], CARRIERS[carrier]) if repeats else RATE_HZ
+        rate_hz = CARRIERS[carrier].rate_hz or REPEATING[scenery].rate_hz if repeats else RATE_HZ
     layout = "nclt" if sessions else "varied" if vary else "images" if images else "scans"
     options = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
     surroundings = {"repeating": scenery} if repeats else dataclasses.asdict(SCENERIES[scenery])
@@ -263,10 +249,7 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
-    """Stored settings with the current field names.
-
-    Older datasets have `TOWN`, sensors that repeat their rings, and a vehicle.
-    """
+    """Stored settings with the current field names, and with the values of fields that older datasets lack."""
     settings = read_json(path)
     scenery = settings.get("scenery", dataclasses.asdict(TOWN)) if isinstance(settings, dict) else None
     if not isinstance(scenery, dict):

@@ -18,36 +18,20 @@ from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.objects import Range
 from sglpr_jax.sim.routes import ROLES, STEP_M, Line, plan_route, travelled
 
-PATH_HZ = 10.0
-"""Approximate number of poses per second along the path. The scans use some of these poses."""
-SHORTEST_S = 60.0
-"""Minimum duration of a drive, in seconds. It allows revisits after 30 s. Few scans are spread over this time."""
-LANE_M = (0.9, 1.6)
-"""Range of the vehicle's distance to the right of the middle of the street, in metres.
-
-The paths of both directions are mostly within 3 m of each other.
-"""
+PATH_HZ = 10.0  # approximate number of poses per second along the path, of which the scans use some
+SHORTEST_S = 60.0  # minimum duration of a drive, in seconds, which allows revisits after 30 s
+LANE_M = (0.9, 1.6)  # range of the vehicle's distance to the right of the middle of the street, in metres
 SWAY_WAVELENGTH_M = (60.0, 150.0)
-STEERING_M = 3.0
-"""Standard deviation of the Gaussian that smooths the path, in metres. A steering wheel does not jump."""
-LATERAL_ACCELERATION = 2.0
-ACCELERATION = 1.5
-"""Maximum lateral and longitudinal acceleration, in m/s^2. They limit speed in corners and changes of speed."""
-FREE_SPEED = 1.35
-"""Speed on a free street, as a multiple of the mean speed."""
-TILT_DEG = 0.6
-"""Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
-TILT_S = 0.5
-"""Approximate duration of a tilt, in seconds."""
+STEERING_M = 3.0  # standard deviation of the Gaussian that smooths the path, in metres
+LATERAL_ACCELERATION, ACCELERATION = 2.0, 1.5  # maxima in m/s^2, which limit speed in corners and its changes
+FREE_SPEED = 1.35  # speed on a free street, as a multiple of the mean speed
+TILT_DEG = 0.6  # standard deviation of pitch and of roll relative to the ground, in degrees
+TILT_S = 0.5  # approximate duration of a tilt, in seconds
 
-STEPS_HZ = 2.0
-"""Steps of a walking person per second."""
-SHIFT_S = 3.0
-"""Duration of standing before and after a reversal, in seconds."""
-BRAKING_S = 1.0
-"""Standard deviation of the Gaussian that smooths starts and stops, in seconds."""
-REVERSE_SPEED = 0.5
-"""Speed in reverse, as a fraction of the speed forward."""
+STEPS_HZ = 2.0  # steps of a walking person per second
+SHIFT_S = 3.0  # duration of standing before and after a reversal, in seconds
+BRAKING_S = 1.0  # standard deviation of the Gaussian that smooths starts and stops, in seconds
+REVERSE_SPEED = 0.5  # speed in reverse, as a fraction of the speed forward
 
 
 class PlanarPath(NamedTuple):
@@ -73,11 +57,9 @@ class TimedPoses(NamedTuple):
 def plan_path(
     rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ, days: int = 1
 ) -> PlanarPath:
-    """Returns the path of a drive along route `name`, with a pose about every 0.1 s.
+    """Returns the path along route `name`, with a pose about every 0.1 s, for `scans / rate_hz` seconds or SHORTEST_S.
 
-    The drive lasts `scans / rate_hz` seconds, but at least SHORTEST_S. The vehicle keeps right with a small sway that
-    differs between visits. The path has `days` equally long parts along the same streets, each with a multiple of
-    `scans` poses.
+    It has `days` equally long parts along the same streets, each with a multiple of `scans` poses.
     """
     if name not in ROLES:
         raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
@@ -90,10 +72,7 @@ def plan_path(
 
 
 def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps: float, poses: int) -> PlanarPath:
-    """Returns the drive along `line`, with a pose about every 0.1 s. The number of poses is a multiple of `poses`.
-
-    `free_mps` is the mean speed on free streets, in m/s. The vehicle is slower in corners.
-    """
+    """Drive along `line`, with a multiple of `poses` poses. `free_mps` is the mean speed on free streets, in m/s."""
     heading = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
     clock = _clock(rng, line, heading, free_mps)
     times = _even_times(clock[-1], poses)
@@ -234,19 +213,15 @@ class Carrier:
     """Whether the sensor sways with the steps of a person. Otherwise it tilts like the body of a car."""
     tilt_deg: float = TILT_DEG
     """Standard deviation of pitch and roll, in degrees. With `walks`, their maximum."""
-    bob_m: float = 0.0
-    """Amplitude of the vertical motion with the steps, in metres."""
-    sway_m: float = 0.0
-    """Amplitude of the motion to the left and right with the steps, in metres."""
+    bob_m: float = 0.0  # amplitude of the vertical motion with the steps, in metres
+    sway_m: float = 0.0  # amplitude of the motion to the left and right with the steps, in metres
     halt_every_s: Range | None = None
     """Range of the driving time between two halts, in seconds. A halt is a stand or, every second time, a reversal.
 
     None never halts.
     """
-    stand_s: Range = (5.0, 60.0)
-    """Range of the duration of a stand, in seconds."""
-    reverse_m: Range = (5.0, 15.0)
-    """Range of the length of a reversal, in metres."""
+    stand_s: Range = (5.0, 60.0)  # range of the duration of a stand, in seconds
+    reverse_m: Range = (5.0, 15.0)  # range of the length of a reversal, in metres
 
     def motion(
         self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float

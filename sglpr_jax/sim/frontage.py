@@ -1,6 +1,6 @@
 """Things along one side of a street: on the strips beside the road, and on the plots behind the strips.
 
-Positions are in the frame of the side: s is the distance along the street, d the distance outwards from the kerb.
+Spots are in the frame of the side: x is the distance s along the street, y the distance d outwards from the kerb.
 """
 
 import itertools
@@ -11,36 +11,33 @@ import numpy as np
 
 from sglpr_jax.sim import objects
 from sglpr_jax.sim.labels import FENCE, OTHER_OBJECT, POLE, TERRAIN, TRAFFIC_SIGN
-from sglpr_jax.sim.objects import Beside, Part, Range, Thing, Zone
+from sglpr_jax.sim.objects import Part, Range, Thing
+from sglpr_jax.sim.placing import Spot, Zone
 from sglpr_jax.sim.styles import Side, draw_house
 
 Clock = tuple[float, float]
 """Start and end of a period, such as the drive, in seconds."""
-STAY_S = 600.0
-"""Mean time that a parked car stays, in seconds."""
-CHANGING_BUSHES = 0.1
-"""Fraction of the bushes that are present only temporarily. They model growth and cutting between two visits."""
+STAY_S = 600.0  # mean time that a parked car stays, in seconds
+CHANGING_BUSHES = 0.1  # fraction of the bushes that are present for a while: growth and cutting
 
 
 def frontage(
     rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock, bystanders: Iterator[Callable]
-) -> Iterator[Beside]:
-    """Yields the things along one side from s = `start` to `stop`, where no other street joins.
-
-    `bystanders` yields functions that draw people, bicycles and similar things, in the order of their use.
-    """
+) -> Iterator[Spot]:
+    """Yields the things along one side from s = `start` to `stop`. `bystanders` makes people and the like."""
     if side.bays:
         d = side.strips[0].width / 2 + 0.1
         for s in _steps(rng, start + 4, stop - 4, (5.4, 6.4)):
-            yaw = rng.choice((0.0, np.pi))
-            yield from _changing(rng, objects.parked, s, d, yaw, "bay", clock, side.occupied)
+            bay = Spot((), s, d, rng.choice((0.0, np.pi)), zone="bay")
+            yield from _changing(rng, objects.parked, bay, clock, side.occupied)
     yield from _street_furniture(rng, side, start, stop)
     yield from _tree_row(rng, side, start, stop)
     for s in _poisson(rng, side.style.bystanders, start, stop):
         d = side.verge - rng.uniform(0.3, max(side.strips[-1].width, 0.6) if side.strips else 0.6)
         make = next(bystanders)
         make = objects.people if side.style.groups and make is objects.person else make
-        yield from _changing(rng, make, s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), "verge", clock, 0.65)
+        place = Spot((), s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), zone="verge")
+        yield from _changing(rng, make, place, clock, 0.65)
     if side.wood:
         yield from _wood(rng, side, start, stop)
     elif side.bank:
@@ -66,10 +63,7 @@ def _poisson(rng: np.random.Generator, per_metre: float, start: float, stop: flo
 
 
 def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float = STAY_S) -> Iterator[Clock]:
-    """Yields the stays at a place that is occupied for the fraction `occupied` of the time.
-
-    A stay lasts `stay_s` seconds on average. A stay that exists at the start of the drive begins at -inf.
-    """
+    """Yields the stays at a place that is occupied for the fraction `occupied`. The first may begin at -inf."""
     time = clock[0]
     taken = rng.random() < occupied
     while time < clock[1]:
@@ -80,41 +74,35 @@ def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float
 
 
 def _changing(
-    rng: np.random.Generator,
-    make: Callable[[np.random.Generator], Thing],
-    s: float,
-    d: float,
-    yaw: float,
-    zone: Zone,
-    clock: Clock,
-    occupied: float,
-) -> Iterator[Beside]:
+    rng: np.random.Generator, make: Callable[[np.random.Generator], Thing], place: Spot, clock: Clock, occupied: float
+) -> Iterator[Spot]:
     """Yields the things that occupy one place one after another."""
     for since, until in stays(rng, clock, occupied):
-        shift, turn = rng.normal(0, 0.15, 2), rng.normal(0, 0.03)
-        yield Beside(make(rng), s + shift[0], d + shift[1] / 2, yaw + turn, zone, since, until)
+        (dx, dy), turn = rng.normal(0, 0.15, 2), rng.normal(0, 0.03)
+        pose = {"x": place.x + dx, "y": place.y + dy / 2, "heading": place.heading + turn}
+        yield place._replace(thing=make(rng), **pose, since=since, until=until)
 
 
-def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
+def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
     """Lamp posts, bins, benches, posts and signs at the edge of the sidewalk nearest to the road."""
     d = side.verge - side.strips[-1].width + 0.35 if side.strips else 0.7
     zone: Zone = "verge" if side.strips else "plot"
     if side.style.lamps:
         spacing = rng.uniform(20, 40)
         for s in _steps(rng, start, stop, (spacing, spacing + 3)):
-            yield Beside((objects.post(POLE, 0.18, rng.uniform(5, 8)),), s, d, zone=zone)
+            yield Spot((objects.post(POLE, 0.18, rng.uniform(5, 8)),), s, d, zone=zone)
         for s in _steps(rng, start, stop, (40.0, 120.0)):
-            yield Beside(_bin_or_bench(rng), s, d + 0.3, zone=zone)
+            yield Spot(_bin_or_bench(rng), s, d + 0.3, zone=zone)
     if side.post_spacing:
         for s in _steps(rng, start, stop, (side.post_spacing, side.post_spacing + 0.2)):
-            yield Beside((objects.post(POLE, 0.15, 1.4),), s, d, zone=zone)
+            yield Spot((objects.post(POLE, 0.15, 1.4),), s, d, zone=zone)
     for s in _poisson(rng, side.style.signs, start, stop):
         size, low = rng.uniform(0.5, 0.9), rng.uniform(1.3, 2.1)
         plate = objects.block(TRAFFIC_SIGN, 0.06, size, size, x=0.06, bottom=low)
-        yield Beside((objects.post(POLE, 0.08, low + size), plate), s, d, rng.normal(0, 0.2), zone)
+        yield Spot((objects.post(POLE, 0.08, low + size), plate), s, d, rng.normal(0, 0.2), zone=zone)
 
 
-def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
+def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
     """Street trees, on the median if the street has one. The median of a highway has a guard rail instead."""
     if side.median and side.border == "rail":
         yield from _in_pieces(rng, "rail", start, stop, side.median / 2, "verge")
@@ -127,7 +115,7 @@ def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -
     for d in rows:
         for s in _steps(rng, start + 2, stop - 2, (side.tree_spacing, side.tree_spacing + 1)):
             spread = (2.0, 4.0) if side.median or side.strips else (3.0, 7.0)
-            yield Beside(_tree(rng, side, spread), s, d, zone="verge" if side.strips else "plot")
+            yield Spot(_tree(rng, side, spread), s, d, zone="verge" if side.strips else "plot")
 
 
 def _tree(rng: np.random.Generator, side: Side, spread: Range) -> Thing:
@@ -145,10 +133,6 @@ class Border(NamedTuple):
 
 def _wall(_: np.random.Generator, length: float, thickness: float, height: float, porosity: float = 0.0) -> Thing:
     return (objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=porosity),)
-
-
-def _fence(rng: np.random.Generator, *size: float) -> Thing:
-    return _wall(rng, *size, porosity=0.45)
 
 
 def _trimmed(rng: np.random.Generator, *size: float) -> Thing:
@@ -175,7 +159,7 @@ _BORDERS = {
     "hedge": Border(1.0, (0.9, 2.6), 0.9, lambda rng, *size: objects.hedge(*size)),
     "trimmed": Border(0.8, (0.9, 2.2), 0.9, _trimmed),
     "hedgerow": Border(0.3, (1.2, 3.0), 0.95, objects.hedgerow),
-    "fence": Border(0.06, (0.9, 1.8), 0.85, _fence),
+    "fence": Border(0.06, (0.9, 1.8), 0.85, lambda rng, *size: _wall(rng, *size, porosity=0.45)),
     "lattice": Border(0.08, (0.8, 1.5), 0.9, _lattice),
     "wall": Border(0.25, (0.7, 2.2), 0.9, _wall),
     "screen": Border(0.2, (1.6, 3.5), 1.0, _wall),
@@ -185,17 +169,17 @@ _BORDERS = {
 
 def _in_pieces(
     rng: np.random.Generator, border: str, start: float, stop: float, d: float, zone: Zone
-) -> Iterator[Beside]:
+) -> Iterator[Spot]:
     """Border along the street, in short pieces that follow curves and slopes."""
     kind = _BORDERS[border]
     height = rng.uniform(*kind.height)
     count = int((stop - start) / 5) + 1
     edges = np.linspace(start, stop, count + 1).tolist()
     for low, high in itertools.pairwise(edges):
-        yield Beside(kind.make(rng, high - low + 0.1, kind.thickness, height), (low + high) / 2, d, zone=zone)
+        yield Spot(kind.make(rng, high - low + 0.1, kind.thickness, height), (low + high) / 2, d, zone=zone)
 
 
-def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
+def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
     """Border between the plots and the sidewalk, with entrances."""
     if side.border == "none":
         return
@@ -209,7 +193,7 @@ def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> 
         s = end + rng.uniform(2, 4.5)
 
 
-def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
+def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Spot]:
     """Row of houses. Gaps between houses may hold cars, a garage, a wall or a hedge."""
     style = side.style
     s = start + max(rng.uniform(*style.gap), 0) / 2
@@ -221,49 +205,49 @@ def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, cloc
             set_back = side.set_back if near else rng.uniform(*style.set_back)
             plan = objects.House(width, plan.depth, plan.height, plan.glass)
             thing = objects.house(rng, plan, porch=set_back > 2)
-            yield Beside(thing, s + width / 2, side.verge + 0.1 + set_back, rng.normal(0, 0.008))
+            yield Spot(thing, s + width / 2, side.verge + 0.1 + set_back, rng.normal(0, 0.008))
         if gap > 2.5 and s + width + gap < stop:
             yield from _between_houses(rng, s + width, side, gap, clock)
         s += width + gap
 
 
-def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock) -> Iterator[Beside]:
+def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock) -> Iterator[Spot]:
     what = rng.choice(["cars", "garage", "hedge", "wall", "nothing"], p=[0.4, 0.2, 0.15, 0.1, 0.15])
     middle, d = s + gap / 2, side.verge
     if what == "cars":
         for at in np.arange(s + 1.4, s + min(gap, 14) - 1.2, 2.6).tolist():
-            yield from _changing(rng, objects.parked, at, d + 4.5, np.pi / 2, "plot", clock, 0.6)
+            yield from _changing(rng, objects.parked, Spot((), at, d + 4.5, np.pi / 2), clock, 0.6)
     elif what == "garage":
-        yield Beside(objects.garage(rng, min(gap, rng.uniform(3, 7))), middle, d + rng.uniform(3, 9))
+        yield Spot(objects.garage(rng, min(gap, rng.uniform(3, 7))), middle, d + rng.uniform(3, 9))
     elif what == "hedge":
-        yield Beside(objects.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
+        yield Spot(objects.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
     elif what == "wall":
-        yield Beside(_wall(rng, 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
+        yield Spot(_wall(rng, 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
 
 
-def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
+def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Spot]:
     """Trees and bushes on the plots, most of them near the street."""
     for s in _poisson(rng, side.style.trees, start, stop):
         d, kind = side.verge + 1.0 + 14 * rng.random() ** 2, rng.random()
         if kind < 0.28:
-            yield Beside(_tree(rng, side, (3.0, 7.0)), s, d)
+            yield Spot(_tree(rng, side, (3.0, 7.0)), s, d)
         elif kind < 0.35:
-            yield Beside(objects.conifer(rng), s, d)
+            yield Spot(objects.conifer(rng), s, d)
         elif rng.random() < CHANGING_BUSHES:
-            yield from _changing(rng, objects.bush, s, d, 0.0, "plot", clock, 0.5)
+            yield from _changing(rng, objects.bush, Spot((), s, d), clock, 0.5)
         else:
-            yield Beside(objects.bush(rng), s, d)
+            yield Spot(objects.bush(rng), s, d)
 
 
-def _wood(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
+def _wood(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
     """Edge of a wood, three rows deep."""
     edge = side.verge + rng.uniform(2.5, 6)
     for row in range(3):
         for s in _steps(rng, start, stop, (3.0 + row, 5.5 + 2 * row)):
-            yield Beside(objects.thicket(rng), s, edge + 4.5 * row + rng.uniform(0, 2), rng.uniform(0, 2 * np.pi))
+            yield Spot(objects.thicket(rng), s, edge + 4.5 * row + rng.uniform(0, 2), rng.uniform(0, 2 * np.pi))
 
 
-def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
+def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
     """Banks beside the road, with bushes on them."""
     for s in _steps(rng, start, stop, (9.0, 14.0)):
         length, width, height = rng.uniform((16, 9, 1.5), (30, 16, 4.0)).tolist()
@@ -272,16 +256,16 @@ def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> I
             part._replace(x=part.x + rng.uniform(-0.3, 0.3) * length, bottom=part.bottom + 0.85 * height)
             for part in objects.bush(rng, 1.3)
         ]
-        yield Beside((bank, *bushes), s, side.verge + 1 + width / 2)
+        yield Spot((bank, *bushes), s, side.verge + 1 + width / 2)
 
 
-def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
+def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
     """Foot of a hill: long, overlapping mounds that are mostly below the ground."""
     length, width, height, sunk = rng.uniform((20, 16, 3.0, 0.3), (35, 50, 8.0, 0.8)).tolist()
     for s in _steps(rng, start, stop, (5.0, 7.0)):
         across = width * rng.uniform(0.95, 1.05)
         size, bottom = (length, across, 2 * height), -(1 + sunk) * height
-        yield Beside((Part("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2)
+        yield Spot((Part("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2)
 
 
 def _bin_or_bench(rng: np.random.Generator) -> Thing:
@@ -289,10 +273,7 @@ def _bin_or_bench(rng: np.random.Generator) -> Thing:
 
 
 def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generator], Thing]]:
-    """Yields functions that draw bystanders, without end.
-
-    Each block of ten contains three people, three bicycles and one of each other kind.
-    """
+    """Yields makers of bystanders, without end: in ten, three people, three bicycles and one of each other kind."""
     kinds = [*3 * [objects.person], *3 * [objects.bicycle]]
     kinds += [objects.bicyclist, objects.motorcycle, objects.motorcyclist, _bin_or_bench]
     while True:

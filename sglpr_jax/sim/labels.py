@@ -1,7 +1,6 @@
 """Raw label ids of SemanticKITTI for the classes in the simulator."""
 
-NO_RETURN = 0
-"""Ground that returns no rays, such as water. No point has this label."""
+NO_RETURN = 0  # ground that returns no rays, such as water; no point has this label
 CAR, BICYCLE, BUS, MOTORCYCLE, TRUCK, OTHER_VEHICLE = 10, 11, 13, 15, 18, 20
 PERSON, BICYCLIST, MOTORCYCLIST = 30, 31, 32
 ROAD, PARKING, SIDEWALK, OTHER_GROUND, LANE_MARKING, TERRAIN = 40, 44, 48, 49, 60, 72

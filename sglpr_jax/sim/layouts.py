@@ -1,7 +1,4 @@
-"""File layouts of simulated drives: scans as in KITTI or NCLT, or images with label images as in BEVPlace.
-
-Images may show varied scans, for training: rotated about z, some with lost points, as with other sensors and weather.
-"""
+"""File layouts of simulated drives: scans as in KITTI or NCLT, or images with label images as in BEVPlace."""
 
 import functools
 import io
@@ -26,19 +23,15 @@ from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
 
 THINNED, FEWER_BEAMS = 0.4, 0.3
 """Fraction of the scans that lose random points, and fraction that loses whole rings. Other scans keep all points."""
-MOST_LOST = 0.95
-"""Maximum fraction of the points of a scan that are lost. The fraction is uniformly distributed."""
-BEAMS = (32.0, 16.0)
-"""Possible numbers of remaining beams."""
+MOST_LOST = 0.95  # maximum of the uniformly distributed fraction of lost points
+BEAMS = (32.0, 16.0)  # possible numbers of remaining beams
 
 
 class Layout(NamedTuple):
     """Folder, file names and file contents of a drive."""
 
-    folder: str
-    """Folder of drive `{name}`, relative to the dataset's folder."""
-    scan_files: tuple[str, ...]
-    """Files of scan `{id}`, relative to the drive's folder."""
+    folder: str  # folder of drive `{name}`, relative to the dataset's folder
+    scan_files: tuple[str, ...]  # files of scan `{id}`, relative to the drive's folder
     scan_contents: Callable[[np.ndarray, np.ndarray, Mounting | None], tuple[bytes, ...]]
     """Function that returns the contents of these files from points (n, 4), labels (n,) and the sensor's mounting.
 
@@ -59,12 +52,6 @@ class Layout(NamedTuple):
     def is_finished(self, root: Path, name: str) -> bool:
         """Whether drive `name` is complete."""
         return self.file_of_drive(root, name, self.last_file).exists()
-
-
-def _points_and_labels(
-    points: Float[np.ndarray, "n 4"], labels: np.ndarray, _mounting: Mounting | None
-) -> tuple[bytes, ...]:
-    return points.astype("<f4").tobytes(), labels.astype("<u4").tobytes()
 
 
 def _image_and_labels(
@@ -92,10 +79,7 @@ def _row(matrix: Float[np.ndarray, "r 4"]) -> str:
 
 
 def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
-    """Calibration, times and poses. The simulator has no camera, so the projections are identities.
-
-    A line of poses.txt is world_from_camera. The axes of its world are those of a camera, too.
-    """
+    """Calibration with identity projections, times, and poses world_from_camera, both in a camera's axes."""
     projections = "".join(f"P{i}: {_row(np.eye(4))}" for i in range(4))
     world_from_camera = CAMERA_FROM_LIDAR @ poses.world_from_lidar @ CAMERA_FROM_LIDAR.T
     return {
@@ -106,10 +90,7 @@ def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
 
 
 def _nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting | None) -> tuple[bytes, ...]:
-    """Returns the bytes of a scan in NCLT's body frame: x forward, y right, z down, origin on the ground.
-
-    `points` are x, y, z in metres from the sensor, with z up, and reflectivities from 0 to 1.
-    """
+    """Bytes of a scan in NCLT's body frame: x forward, y right, z down, origin on the ground."""
     above_ground = np.add(points[:, :3].astype(np.float64), [0, 0, NCLT_HEIGHT_M])
     body = above_ground * Z_UP_FROM_Z_DOWN
     records = np.zeros(len(points), NCLT_RECORD)
@@ -147,7 +128,7 @@ LAYOUTS = {
     "scans": Layout(
         folder="sequences/{name}",
         scan_files=("velodyne/{id}.bin", "labels/{id}.label"),
-        scan_contents=_points_and_labels,
+        scan_contents=lambda points, labels, _: (points.astype("<f4").tobytes(), labels.astype("<u4").tobytes()),
         drive_contents=_kitti_files,
         last_file="poses.txt",
     ),
@@ -173,7 +154,7 @@ def vary(
 ) -> tuple[Float32[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
     """Removes points of some scans, levels the scan, and rotates it about z by a random angle.
 
-    The random seed is a hash of `points`, which are in the LiDAR frame. Returns the remaining points and labels.
+    The random seed is a hash of `points`, which are in the LiDAR frame.
     """
     seed = zlib.crc32(points.tobytes())
     rng = np.random.default_rng(seed)

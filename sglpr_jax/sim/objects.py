@@ -9,12 +9,8 @@ from sglpr_jax.sim import labels
 Range = tuple[float, float]
 """Minimum and maximum of a uniform distribution."""
 Kind = Literal["box", "cylinder", "ellipsoid"]
-KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")
-"""Kinds in the order of `shapes.Scene`."""
-Zone = Literal["bay", "verge", "plot"]
-"""Place of a thing: parked along its street, on the strips beside the road, or behind the strips."""
-_BELOW_M = 1.0
-"""Depth of a building below the ground, in metres. It prevents gaps under buildings on slopes."""
+KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")  # kinds in the order of `shapes.Scene`
+_BELOW_M = 1.0  # depth of a building below the ground, in metres, against gaps on slopes
 _FACADE_M = 0.06
 """Roughness of a facade, in metres. In real scans, points within 1 m of facade are 4 cm (rms) off their plane."""
 
@@ -36,18 +32,6 @@ class Part(NamedTuple):
 
 Thing = tuple[Part, ...]
 """Parts that stand, appear and disappear together."""
-
-
-class Beside(NamedTuple):
-    """Thing beside a street, s metres along the street and d metres outwards from the kerb."""
-
-    thing: Thing
-    s: float
-    d: float
-    yaw: float = 0.0  # of the thing's x axis relative to the street, positive outwards, radians
-    zone: Zone = "plot"
-    since: float = -np.inf  # seconds
-    until: float = np.inf  # seconds
 
 
 def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
@@ -238,11 +222,7 @@ def _block(width: float, depth: float, height: float, x: float, front: float, gl
 
 
 def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
-    """House with the middle of its front at the origin. The y axis points into the house.
-
-    About two of three houses have a recess or a wing: a second box at another depth. Some houses have balconies. With
-    `porch`, which needs room in front of the house, some have a porch.
-    """
+    """House with the middle of its front at the origin, and y into the house. A `porch` needs room in front of it."""
     width, depth, height = plan.width, plan.depth, plan.height
     parts = [_block(width, depth, height, 0.0, 0.0, plan.glass)]
     if width > 5 and rng.random() < 0.65:

@@ -1,7 +1,7 @@
 """Things with their poses in the world, their conversion to shapes, and distances between shapes and a path."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -11,10 +11,11 @@ from sglpr_jax.sim.ground import Ground, surface_height
 from sglpr_jax.sim.objects import KINDS, Part, Thing
 from sglpr_jax.sim.shapes import Scene, Shapes
 
-CLEARANCE_M = 1.6
-"""Minimum distance of standing things from the vehicle's path, in metres."""
-HEAD_ROOM_M = 2.0
-"""Minimum height of parts that may be above the vehicle, or overhang a street or its sidewalk, in metres."""
+CLEARANCE_M = 1.6  # minimum distance of standing things from the vehicle's path, in metres
+HEAD_ROOM_M = 2.0  # minimum height of parts above the vehicle, a street or its sidewalk, in metres
+
+Zone = Literal["bay", "verge", "plot"]
+"""Place of a thing: parked along its street, on the strips beside the road, or behind the strips."""
 
 
 class Spot(NamedTuple):
@@ -29,6 +30,7 @@ class Spot(NamedTuple):
     since: float = -np.inf  # seconds
     until: float = np.inf  # seconds
     time: float = 0.0  # seconds
+    zone: Zone = "plot"
 
 
 class Placed(NamedTuple):

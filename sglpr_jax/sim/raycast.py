@@ -1,7 +1,7 @@
 """First hit of each ray with a shape, and whether it returns: surfaces, windows, weak echoes and mixed edges.
 
-The host lists the shapes that overlap each sector of columns, nearest first. The device processes all sectors in
-parallel, one shape per sector at a time, until the remaining shapes are farther than all hits.
+The host lists the shapes in each sector of columns, nearest first. The device tests one shape per sector at a time,
+until the remaining shapes are farther than all hits.
 """
 
 from collections.abc import Sequence
@@ -15,27 +15,17 @@ from jaxtyping import Array, Bool, Float, Int
 from sglpr_jax.sim import labels
 from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
 
-COLUMNS = 32
-"""Number of azimuth steps in a sector."""
-SLOTS = 64, 48, 128
-"""Maximum numbers of boxes, cylinders and ellipsoids in a sector. If there are more, the nearest are kept.
-
-In the towns of routes 00 and 02, one sector in a hundred has too many ellipsoids. The omitted ones are 47 m away.
-"""
-UNROLL = 2
-"""Number of shapes tested between two checks of the stop condition. It must divide all numbers of slots."""
+COLUMNS = 32  # number of azimuth steps in a sector
+SLOTS = 64, 48, 128  # maximum numbers of boxes, cylinders and ellipsoids in a sector; the nearest are kept
+UNROLL = 2  # shapes tested between two checks of the stop condition; it divides all numbers of slots
 _MARGIN = 1e-3
 _PORE_FACTORS = np.random.default_rng(0).integers(2**32, size=sum(SLOTS), dtype=np.uint32) | np.uint32(1)
 Nearest = tuple[Array, Array]
 """Distance and slot of the nearest hit of each ray. The slot is -1 without a hit."""
-STOREY_M, BAY_M = 3.0, 2.5
-"""Height and width of a piece of facade with one window, in metres."""
-WINDOW_LOSS = 0.9
-"""Fraction of the rays into a window that do not return."""
-LEAF_FACING = 0.5
-"""Mean cosine of the angle between a ray and the normal of a leaf, for all rough shapes and all directions."""
-EDGE_JUMP_M = 2.0
-"""Distance above which the sensor separates two echoes, in metres. Closer echoes are mixed."""
+STOREY_M, BAY_M = 3.0, 2.5  # height and width of a piece of facade with one window, in metres
+WINDOW_LOSS = 0.9  # fraction of the rays into a window that do not return
+LEAF_FACING = 0.5  # mean cosine of the angle between a ray and the normal of a leaf, for all rough shapes
+EDGE_JUMP_M = 2.0  # distance above which the sensor separates two echoes, in metres
 
 
 class Candidates(NamedTuple):
@@ -79,10 +69,7 @@ def find_candidates(
     reach_m: float,
     slots: tuple[int, ...] = SLOTS,
 ) -> tuple[Candidates, ...]:
-    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`.
-
-    The azimuth steps divide the azimuths from the first to the second of `azimuths_deg`.
-    """
+    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`."""
     first, last = np.radians(azimuths_deg)
     step = (last - first) / azimuth_steps
     middle = first + (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
@@ -164,9 +151,8 @@ def nearest_hit(
 ) -> tuple[Float[Array, "lasers azimuths"], Int[Array, "lasers azimuths"]]:
     """Returns the distance to the first shape that each ray from the sensor hits, and its slot.
 
-    Slots count boxes, then cylinders, then ellipsoids. A ray without a hit nearer than `limit` has the distance `limit`
-    and slot -1. Shapes around the sensor are not hit. A rough shape returns a ray from a random depth, if it is not
-    thinner than that.
+    Slots count boxes, then cylinders, then ellipsoids. Without a hit nearer than `limit`, they are `limit` and -1.
+    Shapes around the sensor are not hit. A rough shape returns a ray from a random depth, if it is not thinner.
     """
     sectors = (limit.shape[0], -1, COLUMNS)
     rays, limit, chance = jax.tree.map(
@@ -274,11 +260,6 @@ def _in_window(along: Array, up: Array, glass: Array) -> Bool[Array, "lasers azi
     return (beside < half_side) & (above < half_side)
 
 
-def nearer(a: Surface, b: Surface) -> Surface:
-    """Surface of `b` for each ray whose surface in `b` is nearer, otherwise that of `a`."""
-    return jax.tree.map(lambda of_a, of_b: jnp.where(b.distance < a.distance, of_b, of_a), a, b)
-
-
 def reflectivity(label: Int[Array, "lasers azimuths"]) -> Float[Array, "lasers azimuths"]:
     """Fraction of the light that a surface with this label reflects, from 0 to 1."""
     return jnp.asarray(_REFLECTIVITY)[label]
@@ -306,8 +287,7 @@ def mix_edges(
 ) -> Float[Array, "lasers azimuths"]:
     """Replaces the fraction `share` of the ranges by random values between them and the range of the next azimuth.
 
-    This models the width of beams. It requires that both rays returned and their ranges differ by less than
-    EDGE_JUMP_M. `chance` is uniform in [0, 1).
+    Both rays must return, with ranges that differ by less than EDGE_JUMP_M. `chance` is uniform in [0, 1).
     """
     jump = jnp.roll(reach, -1, axis=1) - reach
     mixed = returned & jnp.roll(returned, -1, axis=1) & (jnp.abs(jump) < EDGE_JUMP_M) & (chance < share)

@@ -33,16 +33,14 @@ from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import World, build_world
 
-KEPT_SCANS = 8
-"""Number of cached scans. Because of the cache, reading the points and labels of a scan renders it only once."""
+KEPT_SCANS = 8  # number of cached scans, so that reading points and labels of a scan renders it once
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRecording(Recording):
     """Recording whose labelled scans are rendered on demand. `paths` and `label_paths` do not name files."""
 
-    poses: TimedPoses = field(kw_only=True)
-    """Pose of the LiDAR and time of each scan."""
+    poses: TimedPoses = field(kw_only=True)  # pose of the LiDAR and time of each scan
     render: Callable[[int], tuple[np.ndarray, np.ndarray]] = field(kw_only=True)
     """Function that returns points (n, 4) with intensities and labels (n,) of scan i.
 
@@ -140,7 +138,7 @@ def drive_through(
 
     Arguments:
       world: Town.
-      path: Path of the vehicle. Its times are those of the town.
+      path: Path of the vehicle, with the times of the town.
       rows: Rows of `path` at which scans are taken.
       name: Name of the recording.
       ids: Names of the scans. None numbers them.
@@ -148,7 +146,7 @@ def drive_through(
       sensor: LiDAR.
       key: Random key of the measurements.
       rng: Random generator of the sway of the carrier.
-      carrier: Carrier of the sensor, which follows `path`. Its height and sway are used.
+      carrier: Carrier of the sensor. Its height and sway are used.
     """
     clock = path.times[rows]
     ids, times = ids or numbered(len(rows)), clock if times is None else times

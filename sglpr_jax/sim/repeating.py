@@ -12,10 +12,8 @@ from sglpr_jax.sim.sceneries.site import LAPS, Site, build, way
 from sglpr_jax.sim.sensor import HDL64E, Sensor
 from sglpr_jax.sim.world import World
 
-SHORTEST_S = 75.0
-"""Minimum duration of a drive, in seconds. Few scans are spread over this time."""
-LEAST_RANGE_M = 0.5
-"""Highest minimum range of the sensor of a small robot, in metres."""
+SHORTEST_S = 75.0  # minimum duration of a drive, in seconds, over which few scans are spread
+LEAST_RANGE_M = 0.5  # highest minimum range of the sensor of a small robot, in metres
 
 
 def simulate_repeating(
@@ -35,12 +33,10 @@ def simulate_repeating(
       scans: Number of scans, evenly spaced over the drive.
       seed: Seed of the scenery and the drive, at least 0.
       sensor: LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of at most 0.5 m.
-      revisit: "none" never returns to a place: frames 30 s apart are more than `other_m` apart. "opposite" drives to
-        the end and returns on the same way. "same" drives one and a half laps along a closed path.
+      revisit: "none": frames 30 s apart are more than `other_m` apart. "opposite": returns on the same way.
+        "same": drives one and a half laps along a closed path.
       rate_hz: Scans per second. None uses the rate of the carrier or of the scenery.
-      carrier: Carrier of the sensor, such as one of `CARRIERS`. Halts make the drive longer, so its scans are farther
-        apart in time. With revisit "none", a carrier that stands or is slower than the scenery's may have frames 30 s
-        apart that are within `other_m`.
+      carrier: Carrier of the sensor, such as one of `CARRIERS`. Slow ones and halts bring frames 30 s apart closer.
 
     Raises:
       ValueError: The name or `revisit` is unknown, `rate_hz` is not positive, or `seed` is negative.
@@ -53,7 +49,8 @@ def simulate_repeating(
     if revisit not in REVISITS:
         raise ValueError(f"revisit: expected one of {', '.join(REVISITS)}, found {revisit!r}")
     scenery = REPEATING[name]
-    check_drawing(rate_hz := default_rate(scenery, carrier) if rate_hz is None else rate_hz, seed)
+    rate_hz = carrier.rate_hz or scenery.rate_hz if rate_hz is None else rate_hz
+    check_drawing(rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
     world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
     rows = scan_rows(path, scans)
@@ -86,11 +83,6 @@ def driven_line(rng: np.random.Generator, site: Site, scenery: Repeating, revisi
     """Path along the line of a site."""
     laps = "none" if site.returns and revisit == "same" else revisit
     return way(rng, site.line, laps, right_m=scenery.right_m, sway_m=scenery.sway_m)
-
-
-def default_rate(scenery: Repeating, carrier: Carrier) -> float:
-    """Scans per second of the carrier, or of the scenery if the carrier has no rate."""
-    return scenery.rate_hz if carrier.rate_hz is None else carrier.rate_hz
 
 
 def _mounted(sensor: Sensor, scenery: Repeating, carrier: Carrier) -> Sensor:

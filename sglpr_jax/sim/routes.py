@@ -13,15 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-STEP_M = 0.5
-"""Distance between two points of a route's line, in metres."""
+STEP_M = 0.5  # distance between two points of a route's line, in metres
 BLOCKS_PER_LOOP = 12
 ROUNDABOUT_RADIUS_M = 10.0
-SHORTEST_LOOP = {False: 6, True: 4}
-"""Minimum number of streets between two visits in the same (False) or the opposite (True) direction.
-
-They take at least 30 s.
-"""
+SHORTEST_LOOP = {False: 6, True: 4}  # minimum number of streets between two visits, by `Role.opposite`: at least 30 s
 TRIES, TRIES_PER_LOOP = 100, 30
 
 Revisit = Literal["none", "same", "opposite"]
@@ -39,22 +34,17 @@ class Role:
 
     speed_mps: float
     """Approximate mean speed, in m/s. The vehicle is faster on free streets and slower in corners."""
-    again: float = 0.0
-    """Fraction of the streets that are driven a second time."""
-    opposite: bool = False
-    """Whether the second visit is in the opposite direction."""
+    again: float = 0.0  # fraction of the streets that are driven a second time
+    opposite: bool = False  # whether the second visit is in the opposite direction
     loops: int = 1
     """Maximum number of loops. A route with one loop ends with its second visit."""
-    straight: float = 0.5
-    """Probability of driving straight ahead at a crossing."""
-    block_m: float = 60.0
-    """Distance between neighbouring crossings of the lattice, in metres."""
+    straight: float = 0.5  # probability of driving straight ahead at a crossing
+    block_m: float = 60.0  # distance between neighbouring crossings of the lattice, in metres
     winding: float = 0.2
     """Maximum shift of a crossing, and twice the maximum bend of a street, as fractions of `block_m`."""
     corner_m: float = 9.0
     """Standard deviation of the Gaussian that rounds corners, in metres. Corners have about this radius."""
-    roundabouts: float = 0.08
-    """Fraction of the crossings that are roundabouts."""
+    roundabouts: float = 0.08  # fraction of the crossings that are roundabouts
 
     @property
     def revisit(self) -> Revisit:
@@ -86,7 +76,7 @@ have more.
 def plan_route(rng: np.random.Generator, role: Role, *, blocks: int, days: int = 1) -> Float[np.ndarray, "n 2"]:
     """Returns the middle line of the streets of a drive of about `blocks` blocks a day, with a point every STEP_M."""
     walk = plan_days(rng, role, blocks=blocks, days=days)
-    corners = resampled(_Streets(rng, role, np.array(walk)).line(), STEP_M)
+    corners = resampled(_line(rng, role, np.array(walk)), STEP_M)
     return resampled(gaussian_filter1d(corners, role.corner_m / STEP_M, axis=0, mode="nearest"), STEP_M)
 
 
@@ -124,10 +114,9 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
 
 
 def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -> list[Node]:
-    """Returns a walk that is `days` times as long as one of `plan_walk`, along the same streets.
+    """Returns a walk `days` times as long as one of `plan_walk`, along the same streets.
 
-    Each later day begins with a U-turn at a roundabout. At a crossing, the walk takes the street ahead that was driven
-    least often in that direction. The later days therefore partly drive in the opposite direction.
+    Each later day begins with a U-turn at a roundabout, and takes the streets driven least often in its direction.
     """
     walk = plan_walk(rng, role, blocks=blocks)
     ahead = defaultdict(set)
@@ -157,10 +146,7 @@ def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> l
 
 
 def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: int, again: int) -> list[Node]:
-    """`nodes`, then `new` streets back to an earlier crossing, then `again` streets for the second time.
-
-    The result is an empty list if the walk reaches a dead end.
-    """
+    """`nodes`, `new` streets back to an earlier crossing, and `again` streets once more; or [] at a dead end."""
     wandering = int(rng.integers(new // 2, max(new - 1, 1) + 1))
     walk = _wandered(rng, role, nodes, wandering)
     left = new - wandering
@@ -220,46 +206,39 @@ def _moved(node: Node, step: Node, origin: Node = (0, 0)) -> Node:
     return node[0] + step[0] - origin[0], node[1] + step[1] - origin[1]
 
 
-class _Streets:
-    """Streets around a walk, with the positions of their crossings and their bends."""
-
-    def __init__(self, rng: np.random.Generator, role: Role, walk: np.ndarray):
-        low, high = walk.min(axis=0), walk.max(axis=0)
-        columns, rows = high - low + 1
-        lattice = np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1)
-        jitter = rng.uniform(-role.winding, role.winding, (columns, rows, 2))
-        self.crossing = (lattice + jitter) * role.block_m
-        self.bend = rng.uniform(-role.winding, role.winding, (2, columns, rows)) / 2  # of streets along x and along y
-        self.is_round = rng.random((columns, rows)) < role.roundabouts
-        self.walk: list[Node] = [(int(column), int(row)) for column, row in walk - low]
-        for before, node, after in zip(self.walk[:-2], self.walk[1:-1], self.walk[2:], strict=True):
-            self.is_round[node] |= before == after  # the vehicle makes a U-turn here
-
-    def line(self) -> Float[np.ndarray, "n 2"]:
-        """Line along the walk with sharp corners. Roundabouts are driven counter-clockwise."""
-        streets = [self._street(a, b) for a, b in pairwise(self.walk)]
-        parts = [streets[0]]
-        for node, street in zip(self.walk[1:-1], streets[1:], strict=True):
-            if self.is_round[node]:
-                parts.append(self._arc(node, parts[-1][-1], street[0]))
-            parts.append(street)
-        return np.concatenate(parts)
-
-    def _street(self, a: Node, b: Node) -> Float[np.ndarray, "n 2"]:
-        """Parabola from crossing `a` to its neighbour `b`, without the parts inside roundabouts."""
-        if a > b:
-            return self._street(b, a)[::-1]
-        start, end = self.crossing[a], self.crossing[b]
-        left = np.array([start[1] - end[1], end[0] - start[0]])
-        middle = (start + end) / 2 + self.bend[0 if b[0] > a[0] else 1][a] * left
-        t = np.linspace(0, 1, 60)[:, None]
-        line = (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
+def _line(rng: np.random.Generator, role: Role, walk: np.ndarray) -> Line:
+    """Line along a walk with sharp corners. Roundabouts are driven counter-clockwise."""
+    low, high = walk.min(axis=0), walk.max(axis=0)
+    columns, rows = high - low + 1
+    lattice = np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1)
+    jitter = rng.uniform(-role.winding, role.winding, (columns, rows, 2))
+    crossing = (lattice + jitter) * role.block_m
+    bend = rng.uniform(-role.winding, role.winding, (2, columns, rows)) / 2  # of streets along x and along y
+    is_round = rng.random((columns, rows)) < role.roundabouts
+    nodes: list[Node] = [(int(column), int(row)) for column, row in walk - low]
+    for before, node, after in zip(nodes[:-2], nodes[1:-1], nodes[2:], strict=True):
+        is_round[node] |= before == after  # the vehicle makes a U-turn here
+    parts = []
+    for a, b in pairwise(nodes):
+        first, last = sorted((a, b))
+        street = _parabola(crossing[first], crossing[last], bend[0 if last[0] > first[0] else 1][first])
+        street = street if a == first else street[::-1]
         for node in (a, b):
-            if self.is_round[node]:
-                line = line[np.linalg.norm(line - self.crossing[node], axis=1) > ROUNDABOUT_RADIUS_M]
-        return line
+            if is_round[node]:
+                street = street[np.linalg.norm(street - crossing[node], axis=1) > ROUNDABOUT_RADIUS_M]
+        parts += [_arc(crossing[a], parts[-1][-1], street[0])] if parts and is_round[a] else []
+        parts.append(street)
+    return np.concatenate(parts)
 
-    def _arc(self, node: Node, entry: Float[np.ndarray, "2"], exit: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
-        first, last = (np.arctan2(*(point - self.crossing[node])[::-1]) for point in (entry, exit))
-        angle = first + np.linspace(0, (last - first) % (2 * np.pi) or 2 * np.pi, 30)
-        return self.crossing[node] + ROUNDABOUT_RADIUS_M * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+def _parabola(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], bend: float) -> Line:
+    """Street from one crossing to its neighbour. Its tangents meet `bend` times its length to the left."""
+    middle = (start + end) / 2 + bend * np.array([start[1] - end[1], end[0] - start[0]])
+    t = np.linspace(0, 1, 60)[:, None]
+    return (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
+
+
+def _arc(centre: Float[np.ndarray, "2"], entry: Float[np.ndarray, "2"], exit: Float[np.ndarray, "2"]) -> Line:
+    first, last = (np.arctan2(*(point - centre)[::-1]) for point in (entry, exit))
+    angle = first + np.linspace(0, (last - first) % (2 * np.pi) or 2 * np.pi, 30)
+    return centre + ROUNDABOUT_RADIUS_M * np.stack([np.cos(angle), np.sin(angle)], axis=1)

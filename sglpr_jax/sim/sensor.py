@@ -21,7 +21,6 @@ from sglpr_jax.sim.raycast import (
     echo_returns,
     find_candidates,
     mix_edges,
-    nearer,
     nearest_hit,
     reflectivity,
     sector_count,
@@ -46,12 +45,10 @@ def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
     return tuple(((edges[:-1] + edges[1:]) / 2).tolist())
 
 
-TURN_S = 0.1
-"""Duration of a scan, in seconds."""
+TURN_S = 0.1  # duration of a scan, in seconds
 STEPS = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
 """Steps of the sequence from one azimuth, laser and scan to the next: irrational numbers without a common multiple."""
-LASERS_AT_A_TIME = 16
-"""Maximum number of lasers in a block. The block size is its greatest common divisor with the number of lasers."""
+LASERS_AT_A_TIME = 16  # maximum size of a block, which divides the number of lasers
 
 
 ScanPattern = Literal["rings", "scattered", "scattered-round"]
@@ -63,23 +60,18 @@ class Sensor:
 
     elevations_deg: tuple[float, ...] = HDL64E_DEG
     azimuth_steps: int = 1800
-    azimuths_deg: tuple[float, float] = (0.0, 360.0)
-    """First and last azimuth of a scan, counter-clockwise, in degrees."""
+    azimuths_deg: tuple[float, float] = (0.0, 360.0)  # first and last azimuth of a scan, counter-clockwise, in degrees
     pattern: ScanPattern = "rings"
     """"rings" repeats the elevations in every scan. "scattered" gives every ray another elevation in the band around
     its laser's elevation, differently in every scan. "scattered-round" also has a round field of view."""
-    height_m: float = 1.73
-    """Height above the road, in metres."""
+    height_m: float = 1.73  # height above the road, in metres
     min_range_m: float = 2.5
     max_range_m: float = 80.0
-    range_noise_m: float = 0.015
-    """Standard deviation of the range, in metres."""
-    dropout: float = 0.02
-    """Fraction of the returns that are lost, whatever the surface."""
+    range_noise_m: float = 0.015  # standard deviation of the range, in metres
+    dropout: float = 0.02  # fraction of the returns that are lost, whatever the surface
     faintest_echo: float = 6e-6
     """Strength of an echo that is detected with a probability of 63 %, see `raycast.echo_returns`."""
-    edge_share: float = 0.3
-    """Fraction of the returns at an edge with a range between those of its two sides."""
+    edge_share: float = 0.3  # fraction of the returns at an edge with a range between those of its two sides
     shadows_deg: tuple[tuple[float, float, float], ...] = ()
     """Occlusions by the vehicle: first azimuth, last azimuth (counter-clockwise) and elevation, in degrees.
 
@@ -90,10 +82,8 @@ class Sensor:
 
     def __post_init__(self):
         if not self.elevations_deg or self.azimuth_steps < 1:
-            raise ValueError(
-                "a sensor needs at least one elevation and one azimuth step, found "
-                f"{len(self.elevations_deg)} and {self.azimuth_steps}"
-            )
+            found = f"{len(self.elevations_deg)} and {self.azimuth_steps}"
+            raise ValueError(f"a sensor needs at least one elevation and one azimuth step, found {found}")
         if not 0 < self.azimuths_deg[1] - self.azimuths_deg[0] <= 360:
             raise ValueError(f"expected azimuths_deg over at most 360 degrees, found {self.azimuths_deg}")
         if not 0 <= self.min_range_m < self.max_range_m:
@@ -113,12 +103,7 @@ SENSORS = {
     "hdl64e": HDL64E,
     "hdl32e": Sensor(_even(10.67, -30.67, 32), azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
     # Mounted upside down on a Segway. Elevations and height fit a real scan of NCLT.
-    "hdl32e-nclt": Sensor(
-        tuple(-elevation for elevation in _even(10.67, -30.67, 32)),
-        azimuth_steps=2160,
-        min_range_m=1.9,
-        height_m=NCLT_HEIGHT_M,
-    ),
+    "hdl32e-nclt": Sensor(_even(-10.67, 30.67, 32), azimuth_steps=2160, min_range_m=1.9, height_m=NCLT_HEIGHT_M),
     "vlp16": Sensor(_even(15.0, -15.0, 16), min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
     "xt32": Sensor(_even(15.0, -16.0, 32), azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
     "os1-64": Sensor(_even(22.5, -22.5, 64), azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
@@ -142,10 +127,7 @@ SENSORS = {
 
 
 class View(NamedTuple):
-    """Shapes and ground that a sensor may hit from one pose.
-
-    Array shapes are the same for every pose, so views can be stacked.
-    """
+    """Shapes and ground that a sensor may hit from one pose. Array shapes are the same for every pose."""
 
     candidates: tuple[Candidates, ...]
     ground: GroundView
@@ -171,9 +153,7 @@ def scan(
     time: float = 0.0,
     velocity: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
-    """Simulates one scan of a world.
-
-    Points are in the order of KITTI's files: laser by laser, each counter-clockwise from the first azimuth.
+    """Simulates one scan of a world: points laser by laser, each counter-clockwise from the first azimuth, as in KITTI.
 
     Arguments:
       key: Random key of the measurements.
@@ -181,7 +161,7 @@ def scan(
       world_from_lidar: Pose of the LiDAR.
       sensor: LiDAR.
       time: Time in the world, in seconds.
-      velocity: Velocity of the sensor in the LiDAR frame, in m/s. Sensors with `motion_distortion` need it.
+      velocity: Velocity of the sensor in its own frame, in m/s, for sensors with `motion_distortion`.
 
     Returns:
       Points (x, y, z in metres in the LiDAR frame, intensity from 0 to 1) and their raw labels.
@@ -223,10 +203,7 @@ def view_of(
 
 @functools.partial(jax.jit, static_argnames="sensor")
 def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
-    """Casts the rays of one revolution.
-
-    This is a pure function of arrays, so `jax.vmap` over keys and views simulates many revolutions.
-    """
+    """Casts the rays of one revolution. `jax.vmap` over keys and views simulates many revolutions."""
     key_surface, key_echoes = jax.random.split(key)
     surface = first_surface(key_surface, view, sensor=sensor)
     reach, returned = _echoes(key_echoes, surface, sensor)
@@ -248,10 +225,7 @@ def returned_points(turn: Turn) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarra
 
 @functools.partial(jax.jit, static_argnames="sensor")
 def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
-    """Finds the ground or shape that each ray (lasers, azimuths) hits first within the sensor's range.
-
-    Lasers are processed in blocks. Low lasers hit the ground in front of most shapes, so their blocks finish early.
-    """
+    """Finds the ground or shape that each ray (lasers, azimuths) hits first. Blocks of low lasers finish early."""
     rays = _rays_of(view, sensor)
     lasers, azimuths = rays.x.shape
     key_depth, key_pores = jax.random.split(key)
@@ -264,7 +238,8 @@ def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
         distance = jnp.minimum(distance, sensor.max_range_m)
         ground = Surface(distance, label, facing, jnp.zeros(distance.shape, bool))
         hit, slot = nearest_hit(upright, view.candidates, distance, chance)
-        return nearer(ground, surface_of_shapes(upright, hit, slot, view.candidates))
+        shape = surface_of_shapes(upright, hit, slot, view.candidates)
+        return jax.tree.map(lambda a, b: jnp.where(shape.distance < ground.distance, b, a), ground, shape)
 
     in_blocks = (-1, math.gcd(lasers, LASERS_AT_A_TIME), azimuths)
     surface = jax.lax.map(of_block, jax.tree.map(lambda values: values.reshape(in_blocks), (rays, chance)))
@@ -316,10 +291,9 @@ def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
 
 
 def scattered(elevations_deg: Sequence[float], azimuths: int, *, time: float) -> Float[np.ndarray, "lasers {azimuths}"]:
-    """Elevation of each ray of a scan that does not repeat its pattern, as those of Livox, in degrees.
+    """Elevation of each ray in degrees, for a sensor that, like those of Livox, does not repeat its pattern.
 
-    A low-discrepancy sequence fills the bands of elevations around `elevations_deg` evenly in space and, scan after
-    scan, in time. It does not follow the curves of the prisms of a real sensor.
+    A low-discrepancy sequence fills the bands around `elevations_deg` evenly in space and, scan after scan, in time.
     """
     middle = np.array(elevations_deg)
     height = abs(middle[1] - middle[0])

@@ -1,7 +1,4 @@
-"""One town on several days: the same streets, houses and trees, with different parked cars, traffic and paths.
-
-The days are equal parts of one long drive, with a pause between consecutive days.
-"""
+"""One town on several days, the parts of one long drive: other parked cars, traffic and paths each day."""
 
 import datetime
 import functools
@@ -17,10 +14,8 @@ from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import build_world
 
-PAUSE_S = 1800.0
-"""Pause between two days in the town's time, in seconds. It is three times the mean stay of a parked car."""
-START_H = 12
-"""Hour (UTC) at which each session starts."""
+PAUSE_S = 1800.0  # pause between two days, in seconds: three times the mean stay of a parked car
+START_H = 12  # hour (UTC) at which each session starts
 
 
 def plan_sessions(
@@ -35,21 +30,12 @@ def plan_sessions(
 ) -> tuple[PlannedRecording, ...]:
     """Plans one session for each date. The town is built when the first session is simulated.
 
-    The first session drives `route`. The others drive the same streets in another order, partly in the opposite
-    direction. As in NCLT, times are seconds since 1970, and ids are these times in microseconds.
-
-    Arguments:
-      dates: Dates of the sessions, such as "2012-01-15".
-      route: Route of the first session, from `ROLES`.
-      scans: Number of scans of each session.
-      sensor: LiDAR.
-      seed: Seed of the town, at least 0.
-      rate_hz: Scans per second.
-      scenery: Scenery of the town.
+    The first session drives `route`, the others the same streets in another order, partly in the opposite direction. As
+    in NCLT, times are seconds since 1970, and ids are these times in microseconds. Other arguments and errors are as in
+    `simulate_recording`.
 
     Raises:
-      ValueError: The route is unknown, a date is invalid or repeated, or there are no dates. Or `scans` is below 2,
-        `rate_hz` is not positive, or `seed` is negative.
+      ValueError: A date is invalid or repeated, or there are no dates. Or `scans` is below 2.
     """
     check_drawing(rate_hz, seed)
     starts = [_start_of(date) for date in dates]

@@ -1,9 +1,7 @@
 """Standing and moving shapes of a world: boxes, cylinders and ellipsoids, rotated only about z.
 
 A shape is a unit solid (cube, cylinder or ball), scaled by its half sizes, rotated by its yaw and moved to its centre.
-All solids are convex, so the part of a ray inside a solid is one interval. The hit is the start of this interval. The
-interval of a cube is the intersection of three slab intervals. The interval of a cylinder is the intersection of a disc
-interval and a slab interval.
+Solids are convex, so a ray is inside for one interval. Its start is the hit.
 """
 
 from collections.abc import Callable
@@ -42,10 +40,7 @@ class Scene(NamedTuple):
 
 
 class Vectors(NamedTuple):
-    """Vectors as one array per axis. The arrays broadcast against each other.
-
-    This is several times faster than one (n, 3) array, because no operation has an axis of length 3.
-    """
+    """Vectors as one array per axis, which broadcast. This is several times faster than one (n, 3) array."""
 
     x: AnyArray
     y: AnyArray
@@ -103,5 +98,4 @@ def ball(o: Vectors, d: Vectors) -> Interval:
     return _round(square, towards, towards**2 - square * (o.x**2 + o.y**2 + o.z**2 - 1))
 
 
-SOLIDS: tuple[Solid, Solid, Solid] = (cube, cylinder, ball)
-"""Solids of boxes, cylinders and ellipsoids, in this order."""
+SOLIDS: tuple[Solid, Solid, Solid] = (cube, cylinder, ball)  # solids of boxes, cylinders and ellipsoids, in this order

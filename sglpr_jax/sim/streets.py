@@ -12,28 +12,20 @@ from sglpr_jax.sim.ground import CELL_M, Ground, Relief
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
-MIDDLE_M = 1.2
-"""Distance from the first pass to the middle of the street on its left, in metres. Traffic drives on the right."""
-SAME_STREET_M = 7.0
-"""Maximum distance between two passes along the same street, in metres. The passes are nearly parallel."""
+MIDDLE_M = 1.2  # distance from the first pass to the middle of the street on its left, in metres
+SAME_STREET_M = 7.0  # maximum distance between two passes along the same street, in metres
 HIGHWAY_MPS = 17.0
-ROUNDABOUT_M = (5.5, 16.0)
-"""Minimum and maximum radius of the path around a roundabout, in metres."""
+ROUNDABOUT_M = (5.5, 16.0)  # minimum and maximum radius of the path around a roundabout, in metres
 
 _LOOK_BACK_M = 30  # distance along the path within which points belong to the same pass
 _SIDE_STREET_M = (30.0, 60.0)
 _STRETCH_M = (40.0, 150.0)
 _LOOK_ALIKE_M = (300.0, 600.0)
-REACH_M = 40.0
-"""Maximum distance of painted ground from a street, in metres. Farther ground is terrain."""
-GARDEN_M = 30.0
-"""Depth of the gardens behind the sidewalk, in metres."""
-BLOCK_CELLS = 2
-"""Width of a block in cells. All cells of a block use the same nearest point of a street."""
+REACH_M = 40.0  # maximum distance of painted ground from a street, in metres; farther ground is terrain
+GARDEN_M = 30.0  # depth of the gardens behind the sidewalk, in metres
+BLOCK_CELLS = 2  # width of a block, whose cells all use the same nearest point of a street
 _CHUNK = 500_000
 _STRIPS = 5  # maximum on one side
-Profiles = tuple[np.ndarray, np.ndarray]
-"""Bounds (2 n, strips) and labels (2 n, strips + 1) across both sides of n stretches."""
 
 
 class Stretch(NamedTuple):
@@ -42,8 +34,7 @@ class Stretch(NamedTuple):
     start: int
     stop: int
     half_width: float  # half width of the carriageway, metres
-    left: Side
-    right: Side
+    sides: tuple[Side, Side]  # left and right
 
 
 class Street(NamedTuple):
@@ -111,10 +102,9 @@ def revisits(path: Path) -> Bool[np.ndarray, " n"]:
 def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
     """Yields the first index of each run of True, and one past the last. Gaps shorter than `gap` are closed."""
     indices = np.flatnonzero(keep)
-    breaks = np.flatnonzero(np.diff(indices) > gap)
-    firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(indices) - 1]])
-    for first, last in zip(indices[firsts].tolist(), indices[lasts].tolist(), strict=True):
-        yield first, last + 1
+    for run in np.split(indices, np.flatnonzero(np.diff(indices) > gap) + 1):
+        if len(run):
+            yield int(run[0]), int(run[-1]) + 1
 
 
 def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) -> tuple[Street, ...]:
@@ -162,17 +152,14 @@ def _draw_stretches(
         other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
         left = draw_side(rng, here, median=median, look_alike=look_alike)
         right = draw_side(rng, other, median=False, look_alike=look_alike)
-        yield Stretch(start, stop, half_width, left, right)
+        yield Stretch(start, stop, half_width, (left, right))
         start = stop
 
 
 def _branch_starts(
     rng: np.random.Generator, street: Street, scenery: Scenery
 ) -> list[tuple[Float[np.ndarray, "2"], float]]:
-    """Start points and headings of possible side streets.
-
-    They lead straight ahead at sharp bends of the street, and sideways at random points.
-    """
+    """Start points and headings of possible side streets: ahead at sharp bends, and sideways at random points."""
     starts = []
     for turn in _sharp_turns(street.heading):
         before, after = max(turn - 10, 0), min(turn + 10, len(street.heading) - 1)
@@ -195,7 +182,7 @@ def _sharp_turns(heading: Float[np.ndarray, " n"]) -> Iterator[int]:
     if len(heading) <= 60:
         return
     turned = np.abs(heading[20:] - heading[:-20])
-    for first, last in runs(turned > np.radians(50), gap=5) if np.any(turned > np.radians(50)) else ():
+    for first, last in runs(turned > np.radians(50), gap=5):
         peak = first + int(turned[first:last].argmax())
         if turned[peak] < np.radians(120):
             yield peak + 10
@@ -222,7 +209,7 @@ def roundabouts(path: Path) -> tuple[Island, ...]:
     turning = gaussian_filter1d(np.gradient(path.heading), 2.0)
     round_it = (turning > 1 / ROUNDABOUT_M[1]) & (turning < 1 / ROUNDABOUT_M[0])
     islands = []
-    for first, last in runs(round_it, gap=3) if round_it.any() else ():
+    for first, last in runs(round_it, gap=3):
         if path.heading[last - 1] - path.heading[first] > np.radians(150):
             radius = (last - first) / (path.heading[last - 1] - path.heading[first])
             centre = (path.xy[first:last] + radius * path.left[first:last]).mean(axis=0)
@@ -243,7 +230,7 @@ class Network:
         self.stretches = tuple(stretch for street in streets for stretch in street.stretches)
         self.stretch = np.repeat(np.arange(len(self.stretches)), [part.stop - part.start for part in self.stretches])
         self.half_width = np.array([part.half_width for part in self.stretches])[self.stretch]
-        verges = np.array([(part.left.verge, part.right.verge) for part in self.stretches])
+        verges = np.array([[side.verge for side in part.sides] for part in self.stretches])
         self.verge = verges[self.stretch]  # (n, 2): left and right
         self._tree = KDTree(self.middle)
 
@@ -252,10 +239,7 @@ class Network:
         return np.asarray(self._tree.query(xy)[1])
 
     def offset(self, xy: Float[np.ndarray, "m 2"], index: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Distance of each position to the left of the street at point `index`, negative to the right.
-
-        Beyond the end of a street it is the distance from the end, so that a dead end is round.
-        """
+        """Distance to the left of the street at point `index`, negative to the right. Dead ends are round."""
         away, cos, sin = xy - self.middle[index], np.cos(self.heading[index]), np.sin(self.heading[index])
         left, ahead = cos * away[:, 1] - sin * away[:, 0], np.abs(cos * away[:, 0] + sin * away[:, 1])
         return np.copysign(np.hypot(left, np.maximum(ahead - 1, 0)), left)
@@ -289,14 +273,15 @@ def _near_streets(points: Float[np.ndarray, "n 2"], size: tuple[int, int], reach
     near = np.zeros([-(-axis // coarse) for axis in size], bool)
     near[tuple((points // coarse).astype(int).T)] = True
     near = binary_dilation(near, np.ones((3, 3)), iterations=4)
-    corners = coarse * np.argwhere(near)
-    inside = np.stack(np.meshgrid(np.arange(coarse), np.arange(coarse), indexing="ij"), axis=-1).reshape(-1, 2)
-    blocks = (corners[:, None] + inside[None]).reshape(-1, 2)
-    return blocks[np.all(blocks < size, axis=1)]
+    near = near.repeat(coarse, axis=0).repeat(coarse, axis=1)
+    return np.argwhere(near[: size[0], : size[1]])
 
 
 def _labels(
-    network: Network, profiles: Profiles, xy: Float[np.ndarray, "m 2"], nearest: Int[np.ndarray, " m"]
+    network: Network,
+    profiles: tuple[np.ndarray, np.ndarray],
+    xy: Float[np.ndarray, "m 2"],
+    nearest: Int[np.ndarray, " m"],
 ) -> UInt8[np.ndarray, " m"]:
     """Label at each position, from the nearest point of a street."""
     bounds, names = profiles
@@ -310,12 +295,12 @@ def _labels(
     return np.where(dash, LANE_MARKING, label).astype(np.uint8)
 
 
-def _profiles(stretches: tuple[Stretch, ...]) -> Profiles:
+def _profiles(stretches: tuple[Stretch, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the strips on both sides of each stretch, in metres from the middle, and the labels between them."""
     bounds = np.full((2 * len(stretches), _STRIPS + 1), np.inf)
     names = np.full((2 * len(stretches), _STRIPS + 2), TERRAIN)
     for i, stretch in enumerate(stretches):
-        for row, side in ((2 * i, stretch.left), (2 * i + 1, stretch.right)):
+        for row, side in enumerate(stretch.sides, 2 * i):
             widths = [stretch.half_width, *(strip.width for strip in side.strips), GARDEN_M]
             labels = [ROAD, *(strip.label for strip in side.strips), side.style.garden]
             bounds[row, : len(widths)] = np.cumsum(widths)

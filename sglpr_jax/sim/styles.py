@@ -9,10 +9,8 @@ import numpy as np
 from sglpr_jax.sim.labels import OTHER_GROUND, PARKING, ROAD, SIDEWALK, TERRAIN
 from sglpr_jax.sim.objects import House, Range
 
-BAY_M = 2.3
-"""Depth of a row of parked cars, in metres."""
-CARRIAGEWAY_M = 7.0
-"""Width of the second carriageway of a street with a median, in metres."""
+BAY_M = 2.3  # depth of a row of parked cars, in metres
+CARRIAGEWAY_M = 7.0  # width of the second carriageway of a street with a median, in metres
 
 
 class Style(NamedTuple):
@@ -78,7 +76,7 @@ _PLOTS = {
     "highway":  (0.0,  (3.0, 11.0),  (3.0, 8.0),   (6.0, 30.0),   "rail"),
 }
 _SIZES = {
-    # garden, width, depth, height, glass
+    # garden, width, depth, height, glass; styles that are not listed are those of the suburb
     "centre":   (SIDEWALK,     (7.0, 18.0),  (8.0, 13.0),  (7.0, 16.0), (0.15, 0.4)),
     "suburb":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
     "estate":   (TERRAIN,      (18.0, 38.0), (10.0, 13.0), (8.0, 13.0), (0.1, 0.35)),
@@ -86,11 +84,7 @@ _SIZES = {
     "park":     (TERRAIN,      (6.0, 9.0),   (4.0, 6.0),   (3.0, 4.0),  (0.1, 0.35)),
     "square":   (OTHER_GROUND, (10.0, 22.0), (8.0, 14.0),  (9.0, 16.0), (0.15, 0.4)),
     "country":  (TERRAIN,      (10.0, 20.0), (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
-    "walled":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
-    "hillside": (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
-    "hedged":   (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
     "gardens":  (TERRAIN,      (8.0, 16.0),  (7.0, 11.0),  (5.0, 9.0),  (0.1, 0.35)),
-    "highway":  (TERRAIN,      (8.0, 14.0),  (7.0, 11.0),  (4.0, 8.0),  (0.1, 0.35)),
 }
 _PLANTS = {
     # street_trees, trees, wood, banks, slopes, old_trees, bystanders, groups
@@ -108,7 +102,10 @@ _PLANTS = {
     "highway":  (0.0,  0.2,  0.25, 0.6,  0.0, False, 0.0,   False),
 }
 # fmt: on
-STYLES = {name: Style(*_STREETS[name], *_PLOTS[name], *_SIZES[name], *_PLANTS[name]) for name in _STREETS}
+STYLES = {
+    name: Style(*_STREETS[name], *_PLOTS[name], *_SIZES.get(name, _SIZES["suburb"]), *_PLANTS[name])
+    for name in _STREETS
+}
 
 
 class Strip(NamedTuple):
@@ -187,12 +184,9 @@ class Scenery:
 
     styles: Mapping[str, float]
     """Relative frequencies of `STYLES` in new neighbourhoods. Where the vehicle drives fast, there is a highway."""
-    look_alike: float = 0.12
-    """Fraction of the stretches that are long and uniform."""
-    crossing_every_m: Range = (60.0, 150.0)
-    """Distance from one side street to the next, in metres."""
-    wavelength_m: Range = (150.0, 600.0)
-    """Wavelength of the hills, in metres."""
+    look_alike: float = 0.12  # fraction of the stretches that are long and uniform
+    crossing_every_m: Range = (60.0, 150.0)  # distance from one side street to the next, in metres
+    wavelength_m: Range = (150.0, 600.0)  # wavelength of the hills, in metres
     steepest: float = 0.05
     """Maximum slope of the hills. A value of 0.05 is 5 %."""
 
@@ -206,15 +200,7 @@ TOWN = Scenery(
     {"centre": 0.33, "suburb": 0.33, "estate": 0.09, "works": 0.04, "park": 0.08, "square": 0.02, "country": 0.11}
 )
 OUTSKIRTS = Scenery(
-    {
-        "walled": 0.25,
-        "hillside": 0.25,
-        "country": 0.15,
-        "suburb": 0.15,
-        "works": 0.08,
-        "estate": 0.07,
-        "centre": 0.05,
-    },
+    {"walled": 0.25, "hillside": 0.25, "country": 0.15, "suburb": 0.15, "works": 0.08, "estate": 0.07, "centre": 0.05},
     look_alike=0.3,
     crossing_every_m=(100.0, 300.0),
     wavelength_m=(60.0, 400.0),

@@ -13,8 +13,7 @@ from sglpr_jax.sim.objects import Range, Thing
 from sglpr_jax.sim.placing import CLEARANCE_M, Spot, footprint_distance
 from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
 
-KEPT_M = 8.0
-"""Minimum distance of traffic ahead of the vehicle or behind it, in metres."""
+KEPT_M = 8.0  # minimum distance of traffic ahead of the vehicle or behind it, in metres
 
 _VIEW_M = 85.0
 _PIECE_M, _PIECE_S = 7.0, (0.4, 1.0)
@@ -57,7 +56,7 @@ def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
     same_way = np.cos(path.heading - network.heading[nearest])
     to_middle = -network.offset(path.xy, nearest) * np.sign(same_way)
     to_middle = np.where(np.abs(same_way) > 0.9, to_middle.clip(-3, 4), MIDDLE_M)
-    pairs = [(part.left, part.right) for part in network.stretches]
+    pairs = [part.sides for part in network.stretches]
     half_width, stretch = network.half_width[nearest], network.stretch[nearest]
     away = {}
     for name, turned in (("left walk", same_way < 0), ("right walk", same_way > 0)):
@@ -120,23 +119,16 @@ def _pieces(
     middle = (along[:-1] + along[1:]) / 2
     heading = np.interp(middle, index, path.heading) + (np.pi if direction < 0 else 0.0)
     pieces = (xy[:-1][inside], xy[1:][inside], heading[inside], times[:-1][inside], times[1:][inside])
-    clear = _clear(thing, *pieces, path)
+    clear = _clear(thing, pieces, path)
     begin, end, heading, since, until = (leaf[clear] for leaf in pieces)
     velocity = (end - begin) / (until - since)[:, None]
     rows = np.column_stack([(begin + end) / 2, heading, velocity, since, until, (since + until) / 2]).tolist()
     return [Spot(thing, x, y, turn, 1, (vx, vy), *when) for x, y, turn, vx, vy, *when in rows]
 
 
-def _clear(
-    thing: Thing,
-    begin: np.ndarray,
-    end: np.ndarray,
-    heading: np.ndarray,
-    since: np.ndarray,
-    until: np.ndarray,
-    path: Path,
-) -> Bool[np.ndarray, " k"]:
+def _clear(thing: Thing, pieces: tuple[np.ndarray, ...], path: Path) -> Bool[np.ndarray, " k"]:
     """Whether each piece stays clear of the vehicle: CLEARANCE_M beside it, KEPT_M ahead of it and behind."""
+    begin, end, heading, since, until = pieces
     half = np.max([(abs(part.x) + part.size[0] / 2, part.size[1] / 2, 0.0) for part in thing], axis=0)
     half = np.tile(half, (len(heading), 1))
     clear = np.ones(len(heading), bool)

@@ -1,7 +1,7 @@
 """Town around a drive: streets, things along them, and traffic, clear of the vehicle. Storeys above one another."""
 
 import dataclasses
-from collections.abc import Iterator
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.sim.frontage import Clock, bystanders, frontage
 from sglpr_jax.sim.ground import Ground, draw_relief
-from sglpr_jax.sim.objects import Beside, bush
+from sglpr_jax.sim.objects import bush
 from sglpr_jax.sim.placing import CLEARANCE_M, HEAD_ROOM_M, Placed, Spot, distances, place, to_scene
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.shapes import Scene
@@ -17,19 +17,16 @@ from sglpr_jax.sim.streets import Island, Network, draw_streets, paint_ground, r
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.traffic import traffic
 
-VIEW_M = 110.0
-"""Maximum distance of things from the vehicle, in metres. Standing things that never come closer are omitted."""
-_TOLERANCE_M = 0.3
-"""Depth to which things may overlap the strips of a street, in metres."""
+VIEW_M = 110.0  # distance from the vehicle above which standing things are omitted, in metres
+_TOLERANCE_M = 0.3  # depth to which things may overlap the strips of a street, in metres
 
 
 @dataclasses.dataclass(frozen=True)
 class Levels:
     """Equal storeys above one another, joined by ramps above one another that descend along x. All are in metres.
 
-    In the world, storey k is shifted by k * `pitch_m` along y, with a level copy of the ramp. In the middle of the
-    ramp, a path changes to the next storey. A scan on a ramp therefore shows a level ramp that is parallel to the
-    sensor. Its true pose follows the slope, whose change over 1 m is at most about 1.5 degrees.
+    In the world, storey k is shifted by k * `pitch_m` along y, with a level copy of the ramp. A path changes to the
+    next storey in the middle of the ramp. Scans there show a level ramp. True poses follow the slope.
     """
 
     rise_m: float  # height of a storey
@@ -60,8 +57,7 @@ class World(NamedTuple):
 
     scene: Scene
     ground: Ground
-    levels: Levels | None = None
-    """Storeys above one another, which the scene holds side by side."""
+    levels: Levels | None = None  # storeys above one another, which the scene holds side by side
 
 
 def build_world(
@@ -108,18 +104,19 @@ def _furnish(
     clock: Clock,
 ) -> list[Spot]:
     """Things along the streets of `network`, clear of the streets and of `path`."""
-    items, place_of = [], []
-    makers = bystanders(rng)
-    for stretch, side_index, first, start, stop in _spans(network):
-        side = (stretch.left, stretch.right)[side_index]
-        for item in frontage(rng, side, start, stop, clock, makers):
-            items.append(item)
-            along = first + np.clip(item.s, 0, stretch.stop - 0.01)
-            place_of.append((along, 1 - 2 * side_index, stretch.half_width + item.d))
-    along, side, across = np.array(place_of, dtype=np.float64).reshape(-1, 3).T
-    spots = _in_world(network, along, side, across, items)
+    spots, makers, free, first = [], bystanders(rng), _free(network), 0
+    for street in network.streets:
+        for stretch, k in itertools.product(street.stretches, (0, 1)):
+            for low, high in runs(free[first + stretch.start : first + stretch.stop, k], gap=1):
+                bounds = float(stretch.start + low), float(stretch.start + high)
+                for spot in frontage(rng, stretch.sides[k], *bounds, clock, makers) if high - low > 3 else ():
+                    along, side = first + min(max(spot.x, 0), stretch.stop - 0.01), 1 - 2 * k
+                    spots.append(spot._replace(x=along, y=side * (stretch.half_width + spot.y), side=side))
+        first += len(street.middle)
+    point = np.array([spot.x for spot in spots]).astype(int)
+    spots = _bent(network, point, spots)
     placed = place(spots, ground)
-    street, zone = network.street[along.astype(int)], np.array([item.zone for item in items])
+    street, zone = network.street[point], np.array([spot.zone for spot in spots])
     bad = _on_a_street(network, placed, street[placed.owner], zone[placed.owner])
     dense = np.concatenate([path, (path[1:] + path[:-1]) / 2])
     bad |= distances(placed.shapes, dense, reach_m=CLEARANCE_M) < CLEARANCE_M + 0.05
@@ -128,21 +125,6 @@ def _furnish(
         bad |= away < island.radius + 2 + np.hypot(placed.shapes.half[:, 0], placed.shapes.half[:, 1])
     gone = set(placed.owner[bad].tolist())
     return [spot for i, spot in enumerate(spots) if i not in gone]
-
-
-def _spans(network: Network) -> Iterator[tuple]:
-    """Yields stretch, side (0 left, 1 right), first point of the street, and the bounds in s of each free interval."""
-    free = _free(network)
-    first, index = 0, 0
-    for street in network.streets:
-        for stretch in street.stretches:
-            for side in (0, 1):
-                here = free[index : index + stretch.stop - stretch.start, side]
-                for low, high in runs(here, gap=1) if here.any() else ():
-                    if high - low > 3:
-                        yield stretch, side, first, float(stretch.start + low), float(stretch.start + high)
-            index += stretch.stop - stretch.start
-        first += len(street.middle)
 
 
 def _free(network: Network) -> Bool[np.ndarray, "n 2"]:
@@ -163,20 +145,15 @@ def _margin(network: Network, xy: np.ndarray, whole_street: np.ndarray) -> np.nd
     return np.abs(offset) - network.half_width[nearest] - verge * whole_street
 
 
-def _in_world(
-    network: Network, along: np.ndarray, side: np.ndarray, across: np.ndarray, items: list[Beside]
-) -> list[Spot]:
-    """Converts things beside streets to spots, given their distances along all streets and from the middle."""
-    whole = along.astype(int).clip(0, len(network.middle) - 1)
-    rest, heading = along - whole, network.heading[whole]
+def _bent(network: Network, point: np.ndarray, spots: list[Spot]) -> list[Spot]:
+    """Moves spots with x along all streets and y to the left of their middle to the world. `point` is the whole x."""
+    x, y, turn, side = np.array([spot[1:5] for spot in spots], dtype=np.float64).reshape(-1, 4).T
+    rest, heading = x - point, network.heading[point]
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-    xy = network.middle[whole] + rest[:, None] * ahead + (side * across)[:, None] * left
-    headings = heading + side * np.array([item.yaw for item in items])
-    return [
-        Spot(item.thing, *place, since=item.since, until=item.until)
-        for item, place in zip(items, zip(*xy.T.tolist(), headings.tolist(), side.tolist(), strict=True), strict=True)
-    ]
+    xy = network.middle[point] + rest[:, None] * ahead + y[:, None] * left
+    poses = np.column_stack([xy, heading + side * turn]).tolist()
+    return [spot._replace(x=x, y=y, heading=turn) for spot, (x, y, turn) in zip(spots, poses, strict=True)]
 
 
 def _on_a_street(network: Network, placed: Placed, street: np.ndarray, zone: np.ndarray) -> Bool[np.ndarray, " n"]:

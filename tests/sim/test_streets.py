@@ -91,7 +91,7 @@ def test_side_streets_branch_off_and_do_not_run_along_driven_ones(seed):
 def test_a_fast_drive_is_on_a_highway_and_a_slow_one_is_not():
     for speed, expected in ((HIGHWAY_MPS + 3, True), (10.0, False)):
         _, streets = streets_of(((0, 0), (900, 0)), speed=speed)
-        styles = [part.right.style for part in streets[0].stretches]
+        styles = [part.sides[1].style for part in streets[0].stretches]
         assert [style is STYLES["highway"] for style in styles] == [expected] * len(styles)
         assert expected == (len(streets) == 1)  # nothing branches off a highway
 

@@ -24,19 +24,15 @@ class Repeating:
 
     site: Callable[[np.random.Generator, float, bool], Site]
     """Function of a random generator, the line's length in metres, and whether it is closed. It draws the scenery."""
-    speed_mps: Range
-    """Range of the speed, in m/s."""
-    rate_hz: float = 4.0
-    """Scans per second."""
+    speed_mps: Range  # range of the speed, in m/s
+    rate_hz: float = 4.0  # scans per second
     other_m: float = 20.0
     """Distance above which two frames show different places, in metres.
 
     Without revisits, all frames 30 s apart are farther apart than this.
     """
-    clearance_m: float = 1.2
-    """Minimum horizontal distance of standing things from the path, in metres."""
-    right_m: float = 0.4
-    """Distance of the path to the right of the middle of the road or aisle, in metres."""
+    clearance_m: float = 1.2  # minimum horizontal distance of standing things from the path, in metres
+    right_m: float = 0.4  # distance of the path to the right of the middle of the road or aisle, in metres
     sway_m: float = 0.3
     """Maximum deviation from `right_m`, in metres. The deviation varies along the path."""
     height_m: float | None = None

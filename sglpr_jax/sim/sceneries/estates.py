@@ -17,28 +17,16 @@ from sglpr_jax.sim.sceneries.site import (
     along,
     grid,
     jittered,
+    on_both_sides,
     painted_ground,
     rolling,
     rounded,
     rows,
 )
 
-ROAD_M = 3.8
-"""Half width of the carriageway, in metres."""
-HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8
-"""Half width of the street with its sidewalks, between row houses and between slabs, in metres."""
-HOUSES_FREE_M, SLABS_FREE_M = 12.0, 10.0
-"""Length of a crossing at both ends of a street, in metres."""
-TREE_M = 14.0
-"""Mean distance between two trees along one side of a street of slabs, in metres."""
-CAMPUS_ROW = 2
-"""Number of buildings along a path of the campus before it turns."""
-CAMPUS_MORE = 1
-"""Number of buildings beyond the driven paths, on each side."""
-TWINS = {(0, 0), (1, 0)}
-"""Column and row of the two equal buildings of the campus. Both are on the left of the first path."""
-LAWN_M = 6.0
-"""Minimum distance of a building of the campus from the middle of a path, in metres."""
+ROAD_M = 3.8  # half width of the carriageway, in metres
+HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8  # half width of the street with its sidewalks, in metres
+LAWN_M = 6.0  # minimum distance of a building of the campus from the middle of a path, in metres
 
 
 def _street(line: Line, walk_m: float, relief: Relief) -> Ground:
@@ -51,19 +39,16 @@ def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     pitch, wide = rng.uniform(46, 56), rng.uniform(5.5, 9)
     plan = rows(length_m, run_m=rng.uniform(110, 160), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
     streets = pitch * np.arange(-1, plan.count + 1)
-    module, xs = _module(rng, wide), np.arange(HOUSES_FREE_M + wide / 2, plan.run_m - HOUSES_FREE_M, wide)
-    houses = [spot for side in (1, -1) for spot in grid(xs, streets, lambda: module, side=side)]
-    bays = [spot for side in (1, -1) for spot in grid(xs, streets + side * (ROAD_M - 0.9), lambda: parked(rng))]
+    module, xs = _module(rng, wide), np.arange(12.0 + wide / 2, plan.run_m - 12.0, wide)
+    houses = on_both_sides(xs, streets, 0.0, lambda: module)
+    bays = on_both_sides(xs, streets, ROAD_M - 0.9, lambda: parked(rng))
     lamps = grid(xs[:: max(1, round(30 / wide))] + wide / 2, streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 6.0),))
     ground = _street(plan.line, HOUSES_WALK_M, rolling(rng))
     return Site(plan.line, [*houses, *jittered(rng, bays, 0.2, keep=rng.uniform(0.2, 0.5)), *lamps], ground)
 
 
 def _module(rng: np.random.Generator, wide: float) -> Thing:
-    """House with wing, porch, shed, and a front garden with fences and a tree.
-
-    The y axis points from the middle of the street to the house.
-    """
+    """House with its front garden. The y axis points from the middle of the street to the house."""
     garden, deep, high, recess = rng.uniform((3, 8, 5.5, 0.5), (7, 11, 9, 2.5)).tolist()
     front, main = HOUSES_WALK_M + garden, rng.choice((1.0, 0.7)) * wide
     body = block(BUILDING, main, deep, high + 1, 0.0, front + deep / 2, bottom=-1.0, roughness=0.06, glass=0.2)
@@ -90,12 +75,12 @@ def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     streets = pitch * np.arange(-1, plan.count + 1)
     slab, middles = _slab(long, deep, high), np.arange(gap / 2 + long / 2, plan.run_m, long + gap)
     buildings = grid(middles, streets + pitch / 2, lambda: slab)
-    xs, aside = np.arange(SLABS_FREE_M, plan.run_m - SLABS_FREE_M, 6.0), ROAD_M - 0.9
+    xs, aside = np.arange(10.0, plan.run_m - 10.0, 6.0), ROAD_M - 0.9
     bays = grid(xs, np.concatenate([streets - aside, streets + aside]), lambda: parked(rng))
     lamps = grid(xs[::5], streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 7.0),))
     spots = [*buildings, *jittered(rng, bays, 0.2, keep=rng.uniform(0.3, 0.6)), *lamps]
     low, high = (0, SLABS_WALK_M + 1.0), (plan.run_m, (pitch - deep) / 2 - 2.0)  # between sidewalks and slabs
-    for street, side, _ in itertools.product(streets.tolist(), (-1, 1), range(round(plan.run_m / TREE_M))):
+    for street, side, _ in itertools.product(streets.tolist(), (-1, 1), range(round(plan.run_m / 14.0))):
         x, away = rng.uniform(low, high).tolist()
         spots.append(Spot(_plant(rng, 5.0), x, street + side * away, rng.uniform(0, 2 * np.pi)))
     return Site(plan.line, spots, _street(plan.line, SLABS_WALK_M, rolling(rng)))
@@ -116,21 +101,21 @@ def _slab(long: float, deep: float, high: float) -> Thing:
 
 
 def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Large separate buildings on lawns, 42 to 52 m apart, with trees and bicycle stands. Two buildings are equal.
+    """Large separate buildings on lawns, 42 to 52 m apart, with paths between them. Two buildings are equal.
 
-    There is a path between each two buildings. A closed path leads around one building.
+    A closed path leads around one building.
     """
     pitch = rng.uniform(42, 52)
     if closed:
         line, count = rounded(pitch * np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), corner_m=1.5, closed=True), 2
     else:
-        plan = rows(length_m, run_m=CAMPUS_ROW * pitch, pitch_m=pitch, closed=False, back_m=0.0, corner_m=1.5)
+        plan = rows(length_m, run_m=2 * pitch, pitch_m=pitch, closed=False, back_m=0.0, corner_m=1.5)
         line, count = plan.line, plan.count
-    columns = np.arange(-CAMPUS_MORE, CAMPUS_ROW + CAMPUS_MORE)
-    lines = np.arange(-CAMPUS_MORE - 1, count + CAMPUS_MORE)
+    columns = np.arange(-1, 3)
+    lines = np.arange(-2, count + 1)
     twin, spots = _building(rng, pitch), []
     for column, row in itertools.product(columns.tolist(), lines.tolist()):
-        building = twin if (column, row) in TWINS else _building(rng, pitch)
+        building = twin if row == 0 and column in (0, 1) else _building(rng, pitch)  # beside the first path
         x, y = (column + 0.5) * pitch, (row + 0.5) * pitch
         spots.append(Spot(building, x, y))
         for _ in range(int(rng.integers(4, 11))):
@@ -138,8 +123,8 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
             away = rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
             dx, dy = ((beside, away), (away, beside))[rng.integers(2)]
             spots.append(Spot(_plant(rng, 6.0), x + dx, y + dy, rng.uniform(0, 2 * np.pi)))
-    spots += along(shifted(line, 2.5), lambda: (post(POLE, 0.15, 4.5),), rng.uniform(18, 26))
-    spots += along(shifted(line, -2.6), lambda: (block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40))
+    spots += along(shifted(line, 2.5), ((post(POLE, 0.15, 4.5),), rng.uniform(18, 26)))
+    spots += along(shifted(line, -2.6), ((block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40)))
     left, right, low, high = (pitch * np.array([columns[0], columns[-1] + 1, lines[0], lines[-1] + 1])).tolist()
     along_x, along_y = np.arange(left, right, STEP_M), np.arange(low, high, STEP_M)
     middles = [np.stack([along_x, np.full(len(along_x), y)], axis=1) for y in np.arange(low, high + 1, pitch)]

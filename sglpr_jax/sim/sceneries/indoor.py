@@ -1,6 +1,6 @@
 """Inside of buildings: a corridor with doors, equal rooms along a corridor, and a floor of an office or a hospital."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -11,32 +11,13 @@ from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded
 
-DOOR_M = 1.0
-BEYOND_M = 40.0
-"""Length of the corridor before the first and after the last scan, in metres."""
-CORRIDOR_WALL_M = 0.6
-WALL_M = 0.2
-"""Thickness of the walls between rooms, in metres."""
-ROOMS_HALF_M = 1.0
-"""Half width of the corridor beside equal rooms, in metres. Rooms begin WALL_M farther out."""
-ROOMS_DOOR_M, ROOMS_SIDE_M = 1.4, 0.25
-"""Width of a door, and distance from its middle to the paths into the room and out of it, in metres."""
-ROOMS_MORE = 2
-"""Number of equal rooms before the first and after the last visited room."""
-FLOOR_DOOR_M, FLOOR_SIDE_M = 1.6, 0.15
-"""Width of a door of a floor, and distance from its middle to the paths into the room and out of it, in metres."""
-INSIDE_M = 2.5
-"""Distance that the path goes into a room of a floor, in metres."""
-VISITED = 0
-"""Number of the room of each wing that the path visits. It is on the left."""
-WINGS_MORE = 1
-"""Number of wings before the first and after the last driven wing."""
-ALIKE = 0.6
-"""Probability that a wing has the rooms of the first wing, and that such a room has the same furniture."""
-Front = Literal["closed", "open", "glass", "hall"]
-"""Front of a room: a closed door, an open door, glass with an open door, or only two pillars."""
-FRONTS: dict[Front, float] = {"closed": 0.4, "open": 0.25, "glass": 0.2, "hall": 0.15}
-"""Probability of each front."""
+WALL_M = 0.2  # thickness of the walls between rooms, in metres
+ROOMS_HALF_M = 1.0  # half width of the corridor beside equal rooms, in metres; rooms begin WALL_M farther out
+ROOMS_DOOR_M, ROOMS_SIDE_M = 1.4, 0.25  # width of a door, and distance of the paths from its middle, in metres
+FLOOR_DOOR_M, FLOOR_SIDE_M = 1.6, 0.15  # the same for the rooms of a floor
+ALIKE = 0.6  # probability that a wing has the rooms of the first wing, and that such a room has the same furniture
+FRONTS = {"closed": 0.4, "open": 0.25, "glass": 0.2, "hall": 0.15}
+"""Probability of each front of a room: a door, an open door, glass with an open door, or only two pillars."""
 
 Place = Float[np.ndarray, "2"]
 
@@ -50,7 +31,7 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
         corners = np.array([(0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide)])
         line = rounded(corners, corner_m=0.5, closed=True)
     else:
-        corners = np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
+        corners = np.array([(-40.0, 0.0), (length_m + 40.0, 0.0)])
         x = np.arange(0, length_m, STEP_M)
         line = np.stack([x, np.zeros(len(x))], axis=1)
     starts = corners if closed else corners[:1]
@@ -69,16 +50,16 @@ def _corridor_walls(
     """Walls along one straight corridor. If `closed`, the left wall belongs to the core and is shorter."""
     length, ahead = float(np.linalg.norm(stop - start)), (stop - start) / np.linalg.norm(stop - start)
     heading = float(np.arctan2(ahead[1], ahead[0]))
-    spots = []
+    spots, thick, door = [], 0.6, 1.0
     for side in (1, -1):
         first = (half if side > 0 else -half) if closed else 0.0
         pieces = max(1, round((length - 2 * first) / pitch))
         each = (length - 2 * first) / pieces
-        away, part = half + CORRIDOR_WALL_M / 2, (each - DOOR_M) / 2
+        away, part = half + thick / 2, (each - door) / 2
         thing = (
-            block(BUILDING, part, CORRIDOR_WALL_M, height, part / 2, side * away),
-            block(BUILDING, DOOR_M, CORRIDOR_WALL_M, height, each / 2, side * (away + recess)),  # door in the middle
-            block(BUILDING, part, CORRIDOR_WALL_M, height, each - part / 2, side * away),
+            block(BUILDING, part, thick, height, part / 2, side * away),
+            block(BUILDING, door, thick, height, each / 2, side * (away + recess)),  # door in the middle
+            block(BUILDING, part, thick, height, each - part / 2, side * away),
         )
         for k in range(pieces):
             x, y = (start + (first + k * each) * ahead).tolist()
@@ -102,8 +83,8 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
         corners += _visit(k * pitch, ROOMS_SIDE_M, into)
     if closed:  # back on the other side of the corridor
         corners += [(corners[-1][0] + 1.0, 0.0), (corners[-1][0] + 1.0, -0.4), (-pitch / 2, -0.4)]
-    line = rounded(np.array(corners), corner_m=0.15, closed=closed)
-    middles = pitch * np.arange(-ROOMS_MORE, count + ROOMS_MORE)
+    line = rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
+    middles = pitch * np.arange(-2, count + 2)
     same = _room_furniture(rng, size, deep)
     inside = grid(middles, (ROOMS_HALF_M + WALL_M,), lambda: same if equal else _room_furniture(rng, size, deep))
     shell = grid(middles, (0.0,), lambda: _room_walls(pitch, size, deep, height))
@@ -112,7 +93,7 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
     wall = block(BUILDING, length, 0.3, height, y=-ROOMS_HALF_M - 0.15)
     ceiling = block(BUILDING, length, 2 * ROOMS_HALF_M + 2 * deep + 2, 0.3, bottom=height)
     spots = [*inside, *shell, Spot((*ends, wall, ceiling), middle, 0.0)]
-    return Site(line if closed else line[: round(length_m / STEP_M)], spots, painted_ground(OTHER_GROUND))
+    return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
 def _room_walls(pitch: float, size: float, deep: float, height: float) -> Thing:
@@ -160,24 +141,32 @@ class Room(NamedTuple):
     x_m: float
     wide_m: float
     side: int
-    front: Front
+    front: str  # of `FRONTS`
     furniture: list[Part]
 
 
 def indoor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Wings of 22 to 30 m with rooms of 3 to 8 m, halls, glass fronts, and a branch in the middle of each wing.
 
-    Six of ten wings have the rooms of the first wing, partly with the same furniture. The path visits one room in each
-    wing. A closed path leads through two wings.
+    Six of ten wings look like the first one. The path visits a room in each wing, and two wings if it is closed.
     """
     floor = Floor(*rng.uniform((22, 1.0, 4.2, 2.5), (30, 1.4, 6.0, 3.2)).tolist())
     count = 2 if closed else int(np.ceil(length_m / (floor.run_m + floor.pitch_m))) + 1
-    first, more = _wing(rng, floor), range(count + 2 * WINGS_MORE)
-    wings = [[_like(rng, room, floor) for room in first] if rng.random() < ALIKE else _wing(rng, floor) for _ in more]
-    line = _tour(floor, [wing[VISITED] for wing in wings[WINGS_MORE : WINGS_MORE + count]], closed)
-    spots = [spot for k, wing in enumerate(wings, -WINGS_MORE) for room in wing for spot in _spots(floor, room, k)]
-    spots += _shell(floor, count)
-    return Site(line if closed else line[: round(length_m / STEP_M)], spots, painted_ground(OTHER_GROUND))
+    first = _wing(rng, floor)
+
+    def like(room: Room) -> Room:  # perhaps with other furniture
+        return room if rng.random() < ALIKE else room._replace(furniture=_furniture(rng, room.wide_m, floor.deep_m))
+
+    wings = [[*map(like, first)] if rng.random() < ALIKE else _wing(rng, floor) for _ in range(count + 2)]
+    line = _tour(floor, [wing[0] for wing in wings[1:-1]], length_m, closed)
+    spots = []
+    for k, wing in enumerate(wings, -1):
+        for room in wing:
+            inside = [(part._replace(y=part.y + (floor.half_m + WALL_M)),) for part in room.furniture]
+            spots += [
+                Spot(thing, room.x_m, k * floor.pitch_m, side=room.side) for thing in (_walls(floor, room), *inside)
+            ]
+    return Site(line, [*spots, *_shell(floor, count)], painted_ground(OTHER_GROUND))
 
 
 def _wing(rng: np.random.Generator, floor: Floor) -> list[Room]:
@@ -191,20 +180,12 @@ def _wing(rng: np.random.Generator, floor: Floor) -> list[Room]:
             for x, wide in zip(start + np.cumsum(widths) - widths / 2, widths.tolist(), strict=True):
                 front = list(FRONTS)[rng.choice(len(FRONTS), p=list(FRONTS.values()))]
                 wing.append(Room(float(x), wide, side, front, _furniture(rng, wide, floor.deep_m)))
-    wing[VISITED] = wing[VISITED]._replace(front="open")
+    wing[0] = wing[0]._replace(front="open")
     return wing
 
 
-def _like(rng: np.random.Generator, room: Room, floor: Floor) -> Room:
-    """The same room, perhaps with other furniture."""
-    return room if rng.random() < ALIKE else room._replace(furniture=_furniture(rng, room.wide_m, floor.deep_m))
-
-
 def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Part]:
-    """Cupboards, shelves or beds along the side walls and at the back, and a desk, in the frame of a room.
-
-    The room begins at y = 0, and its door is at x = 0.
-    """
+    """Furniture along the walls, and a desk, in a room that begins at y = 0 with its door at x = 0."""
     parts = []
     for side in (-1, 1):
         for low in np.arange(0.2, deep - 1.8, rng.uniform(1.6, 2.4)):
@@ -220,21 +201,15 @@ def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Part]
     return parts
 
 
-def _tour(floor: Floor, visited: list[Room], closed: bool) -> Line:
+def _tour(floor: Floor, visited: list[Room], length_m: float, closed: bool) -> Line:
     """Path back and forth through the wings, into one room of each, and back along the cross corridor if closed."""
     corners = []
     for k, room in enumerate(visited):
         ahead = (1, -1)[k % 2]
         ends = [(0.0, 0.0), (floor.run_m, 0.0)][::ahead]
-        way = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + INSIDE_M, ahead)
+        way = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + 2.5, ahead)
         corners += [(x, y + k * floor.pitch_m) for x, y in (ends[0], *way, ends[1])]
-    return rounded(np.array(corners), corner_m=0.15, closed=closed)
-
-
-def _spots(floor: Floor, room: Room, wing: int) -> list[Spot]:
-    """Walls and furniture of a room. Each piece of furniture is left out by itself if the path passes there."""
-    inside = [(part._replace(y=part.y + (floor.half_m + WALL_M)),) for part in room.furniture]
-    return [Spot(thing, room.x_m, wing * floor.pitch_m, side=room.side) for thing in (_walls(floor, room), *inside)]
+    return rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
 
 
 def _walls(floor: Floor, room: Room) -> Thing:
@@ -254,7 +229,7 @@ def _walls(floor: Floor, room: Room) -> Thing:
 
 def _shell(floor: Floor, count: int) -> list[Spot]:
     """Outer walls and ceiling of the floor. The wall at x = 0 is partly glass."""
-    low, high = -(WINGS_MORE + 0.5) * floor.pitch_m, (count + WINGS_MORE - 0.5) * floor.pitch_m
+    low, high = -1.5 * floor.pitch_m, (count + 0.5) * floor.pitch_m
     x, y, wide, half = floor.run_m / 2, (low + high) / 2, high - low, floor.half_m
     long, away = floor.run_m + 2 * half, floor.run_m / 2 + half + WALL_M / 2
     walls = [

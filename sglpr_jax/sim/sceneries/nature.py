@@ -5,30 +5,30 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from sglpr_jax.sim import objects
 from sglpr_jax.sim.drive import shifted
 from sglpr_jax.sim.ground import draw_relief
 from sglpr_jax.sim.labels import POLE, TRUNK, VEGETATION
-from sglpr_jax.sim.objects import Range, Thing, ball, bush, post, tree
+from sglpr_jax.sim.objects import Range, Thing, ball, bush, garage, post, tree
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, along, road, rolling, rounded, track
 from sglpr_jax.sim.styles import TOWN
 
-WIDE_M = 38.0
-"""Half width of the forest on both sides of the path, in metres."""
-BEND_M = 25.0
-"""Distance between two bends of the path through the forest, in metres."""
-_HILLS = dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0))
+WIDE_M = 38.0  # half width of the forest on both sides of the path, in metres
+BEND_M = 25.0  # distance between two bends of the path through the forest, in metres
 
 
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Track through fields, with posts or poles along it, some bushes, and single trees and sheds far away."""
     whole, driven = road(rng, length_m, closed)
     (every, thick, high), beside = ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)], rng.choice((-1, 1)) * 5.0
-    posts = along(shifted(whole, beside), lambda: (post(POLE, thick, high),), every)
+    posts = along(shifted(whole, beside), ((post(POLE, thick, high),), every))
     bushes = _beside(rng, whole, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
-    far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), lambda: _tree_or_shed(rng))
+
+    def tree_or_shed() -> Thing:
+        return garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
+
+    far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), tree_or_shed)
     ground = track(whole, 1.5, rolling(rng))
     return Site(driven, [*posts, *bushes, *far], ground)
 
@@ -44,22 +44,16 @@ def _beside(
         yield Spot(make(), x, y, rng.uniform(0, 2 * np.pi))
 
 
-def _tree_or_shed(rng: np.random.Generator) -> Thing:
-    return objects.garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
-
-
 def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Trees of one stand on slopes: 250 to 900 trunks a hectare, 0.1 to 0.6 m thick.
-
-    There is a bush for every 3 to 30 trunks. All positions are random.
-    """
+    """Trees of one stand on slopes, 250 to 900 a hectare, with a bush for every 3 to 30 trunks."""
     line = _path(rng, length_m, closed)
     density, thick = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
     branches, shrubs = rng.uniform(3.0, 7.0), 1 / rng.uniform(3, 30)
     spots = [Spot(_tree(rng, thick, branches), x, y) for x, y in _scattered(rng, line, density)]
     for x, y in _scattered(rng, line, shrubs * density):
         spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
-    return Site(line, spots, track(line, 0.6, draw_relief(rng, _HILLS)))
+    relief = draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))
+    return Site(line, spots, track(line, 0.6, relief))
 
 
 def _path(rng: np.random.Generator, length_m: float, closed: bool) -> Line:

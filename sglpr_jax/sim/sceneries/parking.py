@@ -1,75 +1,59 @@
 """Places to park: an open car park, a garage with floors side by side, and one with storeys above one another."""
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.sim.labels import BUILDING, PARKING, POLE
 from sglpr_jax.sim.objects import Thing, block, car, parked, post
 from sglpr_jax.sim.placing import Spot
-from sglpr_jax.sim.sceneries.site import Site, closed_box, grid, jittered, painted_ground, rounded, rows, wall
+from sglpr_jax.sim.sceneries.site import (
+    Site,
+    closed_box,
+    grid,
+    jittered,
+    on_both_sides,
+    painted_ground,
+    rounded,
+    rows,
+    wall,
+)
 from sglpr_jax.sim.world import Levels
 
-FREE_M = 6.0
-"""Free length at both ends of an aisle of an open car park, in metres."""
-MORE = 2
-"""Number of aisles of an open car park before the first and after the last driven aisle."""
 CAR_M, PILLAR_M, HALF_M = 5.8, 4.2, 8.8
 """Distance from the middle of an aisle to the cars, to the pillars, and to the wall behind the cars, in metres."""
-TURN_M = 5.0
-"""Space for turning at the ends of aisles and ramps, in metres."""
-PITCH_M = 11.5
-"""Distance from the aisle of a floor to the next ramp, and from a ramp to the aisle of the next floor, in metres."""
-WIDE_M = 17.5
-"""Distance between the two aisles of a storey, in metres."""
-RAMP_M = 12.0
-"""Distance from the upper aisle of a storey to its ramp, in metres."""
-LONGER = 2.0
-"""Maximum length of the path through storeys, as a multiple of the length asked for."""
-STOREY_PITCH_M = 45.0
-"""Distance between two storeys in the world that holds them side by side, in metres."""
-
-Places = Float[np.ndarray, " _"]
+TURN_M = 5.0  # space for turning at the ends of aisles and ramps, in metres
+PITCH_M = 11.5  # distance between the aisle of a floor and the next ramp, in metres
+WIDE_M, RAMP_M = 17.5, 12.0  # distance between a storey's aisles, and from the upper one to the ramp, in metres
 
 
 def car_park(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Equal aisles, 22 to 28 m apart, with parked cars on both sides and lamps between the aisles."""
     pitch, stall, full = rng.uniform(22, 28), rng.uniform(2.5, 2.8), rng.uniform(0.8, 0.92)
     plan = rows(length_m, run_m=rng.uniform(60, 100), pitch_m=pitch, closed=closed, back_m=7.0, corner_m=2.5)
-    aisles = pitch * np.arange(-MORE, plan.count + MORE)
-    stalls, away = np.arange(FREE_M, plan.run_m - FREE_M, stall), rng.uniform(5.8, 6.5)
-    cars = _on_both_sides(stalls, aisles, away, lambda: parked(rng))
-    lamp = (post(POLE, 0.25, 7.0),)
-    lamps = grid(np.arange(FREE_M, plan.run_m, rng.uniform(20, 30)), aisles + pitch / 2, lambda: lamp)
+    aisles = pitch * np.arange(-2, plan.count + 2)  # two more than driven on each side
+    stalls, away = np.arange(6.0, plan.run_m - 6.0, stall), rng.uniform(5.8, 6.5)
+    cars = on_both_sides(stalls, aisles, away, lambda: parked(rng), np.pi / 2)
+    xs = np.arange(6.0, plan.run_m, rng.uniform(20, 30))
+    lamps = grid(xs, aisles + pitch / 2, lambda: (post(POLE, 0.25, 7.0),))
     return Site(plan.line, [*jittered(rng, cars, 0.15, keep=full), *lamps], painted_ground(PARKING))
 
 
 def garage(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Floors side by side, each followed by a ramp. Rows 0, 2, 4, ... are floors, and the other rows are ramps.
-
-    Walls hide each floor from the others.
-    """
+    """Floors side by side, hidden from each other by walls. Rows 0, 2, 4, ... are floors, the others ramps."""
     run, height, full = rng.uniform(30, 40), rng.uniform(2.4, 3.0), rng.uniform(0.75, 0.92)
     plan = rows(length_m, run_m=run, pitch_m=PITCH_M, closed=closed, back_m=9.0, corner_m=1.5)
-    aisles, stall = PITCH_M * np.arange(0, plan.count, 2), rng.uniform(2.5, 2.7)
-    spots = _floor(rng, plan.run_m, aisles, stall=stall, height=height, full=full)
-    shell = Spot(_shell(plan.count, plan.run_m, height, closed), 0.0, 0.0)
-    return Site(plan.line, [*spots, shell], painted_ground(PARKING))
-
-
-def _on_both_sides(xs: Places, aisles: Places, away: float, make: Callable[[], Thing]) -> list[Spot]:
-    """Cars across both sides of each aisle."""
-    left = grid(xs, aisles + away, make, heading=np.pi / 2)
-    return left + grid(xs, aisles - away, make, heading=-np.pi / 2)
+    aisles = PITCH_M * np.arange(0, plan.count, 2)
+    spots = _floor(rng, plan.run_m, aisles, stall=rng.uniform(2.5, 2.7), height=height, full=full)
+    spots.append(Spot(_shell(plan.count, plan.run_m, height, closed), 0.0, 0.0))
+    return Site(plan.line, spots, painted_ground(PARKING))
 
 
 def _floor(
-    rng: np.random.Generator, run_m: float, aisles: Places, *, stall: float, height: float, full: float
+    rng: np.random.Generator, run_m: float, aisles: Float[np.ndarray, " _"], *, stall: float, height: float, full: float
 ) -> list[Spot]:
     """Parked cars and pillars along the aisles of one floor."""
     xs, pillar = np.arange(TURN_M, run_m - TURN_M, stall), (block(BUILDING, 0.4, 0.6, height),)
-    cars = jittered(rng, _on_both_sides(xs, aisles, CAR_M, lambda: car(rng)), 0.12, keep=full)
+    cars = jittered(rng, on_both_sides(xs, aisles, CAR_M, lambda: car(rng), np.pi / 2), 0.12, keep=full)
     return cars + grid(xs[::3] - stall / 2, np.concatenate([aisles - PILLAR_M, aisles + PILLAR_M]), lambda: pillar)
 
 
@@ -91,24 +75,23 @@ def _shell(count: int, run_m: float, height: float, closed: bool) -> Thing:
 def storeys(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Three to six storeys with the same walls and pillars, and with different cars, joined by ramps.
 
-    The path laps each storey once on its way up. A closed path laps the lowest storey twice. The length of the path is
-    between `length_m` and LONGER times this length if this gives three to six storeys.
+    The path laps each storey once on its way up, a closed one the lowest twice, for up to twice `length_m`.
     """
     run, rise, stall, full = rng.uniform((34, 3.0, 2.5, 0.7), (44, 3.6, 2.7, 0.9)).tolist()
     lap_m = 2 * (run + WIDE_M + RAMP_M)
-    fewest, most = (int(np.clip(np.ceil(far / lap_m), 3, 6)) for far in (length_m, LONGER * length_m))
+    fewest, most = (int(np.clip(np.ceil(far / lap_m), 3, 6)) for far in (length_m, 2 * length_m))
     count, height = int(rng.integers(fewest, most + 1)), rise - 0.3
     inner = WIDE_M + HALF_M
     between = wall((TURN_M, inner), (run - TURN_M, inner), height)  # storey and ramp, open at both ends
     *outer, ceiling = closed_box(-TURN_M, run + TURN_M, -HALF_M, WIDE_M + RAMP_M + 3.0, height)
     shell = *outer, between, ceiling
-    spots = []
-    for y in STOREY_PITCH_M * np.arange(count):
+    spots, pitch = [], 45.0
+    for y in pitch * np.arange(count):
         spots += _floor(rng, run, np.array([y, y + WIDE_M]), stall=stall, height=height, full=full)
         spots.append(Spot(shell, 0.0, float(y)))
     lap = [(0.0, WIDE_M), (0.0, 0.0), (run, 0.0), (run, WIDE_M)]
     ramp = [(run, WIDE_M + RAMP_M), (0.0, WIDE_M + RAMP_M)]
     corners = [*lap * closed, *(lap + ramp) * count]
-    line = rounded(np.array(corners[: -len(ramp)]), corner_m=1.5)
-    levels = Levels(rise, STOREY_PITCH_M, inner, TURN_M, run - TURN_M)
+    line = rounded(corners[: -len(ramp)], corner_m=1.5)
+    levels = Levels(rise, pitch, inner, TURN_M, run - TURN_M)
     return Site(line, spots, painted_ground(PARKING), levels, returns=closed)

@@ -14,46 +14,34 @@ from sglpr_jax.sim.labels import (
     TERRAIN,
     TRAFFIC_SIGN,
 )
-from sglpr_jax.sim.objects import Part, Thing, block, car, moving, post, truck, van
+from sglpr_jax.sim.objects import Thing, block, car, moving, post, truck, van
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
-from sglpr_jax.sim.sceneries.site import STEP_M, Site, Strip, along, painted_ground, road, rolling
+from sglpr_jax.sim.sceneries.site import STEP_M, Site, Strip, along, mirrored, painted_ground, road, rolling
 
-OVERLAP = 1.25
-"""Length of a piece of wall divided by the spacing. In curves, the outer wall is longer than the road."""
-LANE_M = 3.5
-"""Width of each of the four lanes of a highway, in metres.
-
-The vehicle uses the inner lanes, other traffic the outer lanes.
-"""
-WALL_M = 4.0
-"""Length of a piece of wall, in metres."""
-TUNNEL_M, NICHE_M = 6.0, 1.3
-"""Length of a piece of a tunnel, and depth of its niches, in metres."""
+OVERLAP = 1.25  # length of a piece of wall divided by the spacing, because outer walls of curves are longer
+LANE_M = 3.5  # width of the four lanes of a highway, in metres; the vehicle uses the inner ones
+TUNNEL_M, NICHE_M = 6.0, 1.3  # length of a piece of a tunnel, and depth of its niches, in metres
 THICK_M = 2.0
 """Thickness of a tunnel's walls, in metres. It exceeds the depth of a niche, so neighbouring pieces close its sides."""
-RAILING_M = 2.0
-"""Distance between two posts of a railing, in metres."""
-PIECE_S = 1.5
-"""Duration of a straight piece of a vehicle's motion, in seconds."""
 
 
 def walls(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Road between two walls without features."""
     whole, driven = road(rng, length_m, closed)
     left, right, height = rng.uniform(3.5, 8), rng.uniform(3, 7), rng.uniform(1.8, 4)
-    pair = tuple(block(FENCE, OVERLAP * WALL_M, 0.4, height, y=y, roughness=0.02) for y in (left + 0.2, -right - 0.2))
-    return Site(driven, _every(whole, (pair, WALL_M)), painted_ground(ROAD))
+    pair = tuple(block(FENCE, OVERLAP * 4.0, 0.4, height, y=y, roughness=0.02) for y in (left + 0.2, -right - 0.2))
+    return Site(driven, along(whole, (pair, 4.0)), painted_ground(ROAD))
 
 
 def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Tunnel of equal pieces of length TUNNEL_M with lamps. Every n-th piece has an emergency niche on the right."""
     whole, driven = road(rng, length_m, closed)
     half, height, every = rng.uniform(3.8, 5.5), rng.uniform(4.8, 6.5), int(rng.integers(7, 16))
-    pieces = _every(whole, (_tube(half, height, 0.0), TUNNEL_M))
-    pieces[::every] = _every(whole, (_tube(half, height, NICHE_M), every * TUNNEL_M))
+    pieces = along(whole, (_tube(half, height, 0.0), TUNNEL_M))
+    pieces[::every] = along(whole, (_tube(half, height, NICHE_M), every * TUNNEL_M))
     lamp = (block(OTHER_OBJECT, 1.2, 0.4, 0.25, y=rng.choice((0.0, half - 1)), bottom=height - 0.3),)
-    return Site(driven, [*pieces, *_every(whole, (lamp, rng.uniform(8, 14)))], painted_ground(ROAD))
+    return Site(driven, [*pieces, *along(whole, (lamp, rng.uniform(8, 14)))], painted_ground(ROAD))
 
 
 def _tube(half: float, height: float, niche: float) -> Thing:
@@ -64,51 +52,40 @@ def _tube(half: float, height: float, niche: float) -> Thing:
 
 
 def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Deck above water or a valley, with railings, lamps and pylons, half of the time with hangers.
-
-    Rays beyond the deck do not return.
-    """
+    """Deck that rays beyond it do not hit, with railings, lamps and pylons, half of the time with hangers."""
     whole, driven = road(rng, length_m, closed)
     half, rail, hang, lit, span = rng.uniform((5, 0.9, 8, 25, 120), (8, 1.3, 15, 45, 260)).tolist()
-    bars = [block(FENCE, OVERLAP * RAILING_M, 0.06, 0.08, y=half, bottom=z * rail) for z in (0.5, 0.95)]
-    kerb = block(FENCE, OVERLAP * RAILING_M, 0.3, 0.25, y=half)
-    things = [(_both(*bars, kerb, post(FENCE, 0.1, rail, y=half)), RAILING_M)]
+    bars = [block(FENCE, OVERLAP * 2.0, 0.06, 0.08, y=half, bottom=z * rail) for z in (0.5, 0.95)]
+    kerb = block(FENCE, OVERLAP * 2.0, 0.3, 0.25, y=half)
+    things = [(mirrored(*bars, kerb, post(FENCE, 0.1, rail, y=half)), 2.0)]
     if rng.random() < 0.5:
-        things.append((_both(post(POLE, 0.16, 14.0, y=half + 0.6)), hang))
+        things.append((mirrored(post(POLE, 0.16, 14.0, y=half + 0.6)), hang))
     lamp = post(POLE, 0.2, 8.0, y=half + 0.3)
-    things.append((_both(lamp) if rng.random() < 0.5 else (lamp,), lit))
-    legs = _both(block(BUILDING, 2.5, 2.0, 30.0, y=half + 1.8))
+    things.append((mirrored(lamp) if rng.random() < 0.5 else (lamp,), lit))
+    legs = mirrored(block(BUILDING, 2.5, 2.0, 30.0, y=half + 1.8))
     things.append(((*legs, block(BUILDING, 1.5, 2 * half + 2, 2.0, bottom=6.5)), span))
     lines = [Strip(whole, 0.0, 0.2, LANE_MARKING, 4.0), *(Strip(whole, y, y + 0.2, LANE_MARKING) for y in (-3.6, 3.4))]
     deck = Strip(whole, -half - 0.3, half + 0.3, ROAD)
-    return Site(driven, _every(whole, *things), painted_ground(NO_RETURN, [deck, *lines]))
+    return Site(driven, along(whole, *things), painted_ground(NO_RETURN, [deck, *lines]))
 
 
 def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Four lanes between rails with posts, walls of equal panels, lamps and gantries. Slopes are at most 1.5 %."""
     whole, driven = road(rng, length_m, closed)
     rail, wall, panel = rng.uniform(8, 9.5), rng.uniform(11, 17), rng.uniform(4, 5)
-    fence = _both(block(FENCE, OVERLAP * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1))
+    fence = mirrored(
+        block(FENCE, OVERLAP * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1)
+    )
     beam = block(FENCE, OVERLAP * 4.0, 0.1, 0.32, y=rail, bottom=0.5)
-    rails = _both(beam, post(POLE, 0.12, 0.8, y=rail + 0.12))
-    lamps = _both(post(POLE, 0.2, 9.0, y=rail + 1))
-    gantry = (*_both(post(POLE, 0.4, 6.5, y=rail + 0.8)), block(TRAFFIC_SIGN, 0.4, 2 * rail + 2, 1.5, bottom=5.5))
+    rails = mirrored(beam, post(POLE, 0.12, 0.8, y=rail + 0.12))
+    lamps = mirrored(post(POLE, 0.2, 9.0, y=rail + 1))
+    gantry = (*mirrored(post(POLE, 0.4, 6.5, y=rail + 0.8)), block(TRAFFIC_SIGN, 0.4, 2 * rail + 2, 1.5, bottom=5.5))
     lamps_m, gantries_m = rng.uniform(30, 60), rng.uniform(120, 250)
-    spots = _every(whole, (fence, panel), (rails, 4.0), (lamps, lamps_m), (gantry, gantries_m))
+    spots = along(whole, (fence, panel), (rails, 4.0), (lamps, lamps_m), (gantry, gantries_m))
     lines = [Strip(whole, y, y + 0.2, LANE_MARKING, 4.0) for y in (-LANE_M, 0.0, LANE_M)]
     edges = [Strip(whole, y, y + 0.2, LANE_MARKING) for y in (-2 * LANE_M, 2 * LANE_M)]
     ground = painted_ground(TERRAIN, [Strip(whole, -rail, rail, ROAD), *lines, *edges], rolling(rng))
     return Site(driven, [*spots, *_traffic(rng, whole, 1), *_traffic(rng, whole, -1)], ground)
-
-
-def _both(*parts: Part) -> Thing:
-    """Parts and their mirror images."""
-    return *parts, *(part._replace(y=-part.y) for part in parts)
-
-
-def _every(line: Line, *things: tuple[Thing, float]) -> list[Spot]:
-    """Places each thing along a line, at equal distances in metres."""
-    return [spot for thing, every_m in things for spot in along(line, lambda thing=thing: thing, every_m)]
 
 
 def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]:
@@ -124,13 +101,10 @@ def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]
 
 
 def _drive(thing: Thing, lane: Line, start: float, speed: float) -> list[Spot]:
-    """Drive along the whole lane, as pieces of straight motion."""
-    times = np.arange(start, start + len(lane) * STEP_M / speed, PIECE_S)
+    """Drive along the whole lane, as pieces of straight motion of 1.5 s."""
+    times = np.arange(start, start + len(lane) * STEP_M / speed, 1.5)
     at = ((times - start) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)
-    spots = []
-    for k in range(len(times) - 1):
-        velocity = (lane[at[k + 1]] - lane[at[k]]) / PIECE_S
-        x, y = (lane[at[k]] - velocity * times[k]).tolist()
-        heading = float(np.arctan2(velocity[1], velocity[0]))
-        spots.append(Spot(thing, x, y, heading, 1, tuple(velocity.tolist()), times[k], times[k + 1]))
-    return spots
+    velocity = np.diff(lane[at], axis=0) / 1.5
+    begin, headings = lane[at[:-1]] - velocity * times[:-1, None], np.arctan2(*velocity.T[::-1])
+    pieces = np.column_stack([begin, headings, velocity, times[:-1], times[1:]]).tolist()
+    return [Spot(thing, x, y, heading, 1, (vx, vy), *when) for x, y, heading, vx, vy, *when in pieces]

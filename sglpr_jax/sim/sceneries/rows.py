@@ -8,20 +8,10 @@ from sglpr_jax.sim.objects import Thing, ball, block, post
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.sceneries.site import Rows, Site, grid, jittered, painted_ground, rolling, rows, track
 
-APART_M = 22.0
-"""Minimum distance between passes in open land, in metres. The vehicle skips rows to keep this distance."""
-FREE_M = 5.0
-"""Free length at both ends of a row in open land, in metres."""
-SLATS = 8
-"""Number of level slats along the slope of a panel. Shapes have no tilt, so the slats imitate it."""
-SHELF_FREE_M, LEVEL_M = 2.5, 1.7
-"""Free length at both ends of an aisle of a warehouse, and height of a level of its shelves, in metres."""
-CONTAINER_M = 2.44, 2.59
-"""Width and height of a container, in metres."""
-GAP_M, LANE_M, BLOCK_M = 0.35, 9.0, 55.0
-"""Gap between two stacks, width of the lanes between blocks, and approximate length of a block, in metres."""
-MORE = 1
-"""Number of aisles or blocks before the first and after the last driven one."""
+APART_M = 22.0  # minimum distance between passes in open land, in metres, for which the vehicle skips rows
+LANE_M = 9.0  # width of the lanes between blocks of containers, in metres
+LEVEL_M = 1.7  # height of a level of the shelves of a warehouse, in metres
+FREE_M = 5.0  # free length at both ends of a row in open land, in metres
 
 
 def _open_land(
@@ -66,12 +56,11 @@ def solar(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Rows of equal panels 7 to 10 m apart. The panels are 8 to 16 m long and tilted by 15 to 30 degrees."""
     pitch, long, deep, tilt, low = rng.uniform((7, 8, 2.2, 15, 0.6), (10, 16, 3.8, 30, 1.0)).tolist()
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(80, 130))
-    tilt = np.radians(tilt)
-    wide, step = np.cos(tilt) * deep / SLATS, np.sin(tilt) * deep / SLATS
-    places = ((np.arange(SLATS) - (SLATS - 1) / 2) * wide).tolist()
+    wide, step = (of(np.radians(tilt)) * deep / 8 for of in (np.cos, np.sin))
+    places = ((np.arange(8) - 3.5) * wide).tolist()  # of eight level slats, because shapes have no tilt
     slats = [block(OTHER_OBJECT, long, wide, step + 0.02, y=y, bottom=low + k * step) for k, y in enumerate(places)]
     xs = np.linspace(-long / 2 + 1, long / 2 - 1, 4).tolist()
-    panel = *slats, *(post(POLE, 0.12, low + k * step, x, places[k]) for k in (1, SLATS - 2) for x in xs)
+    panel = *slats, *(post(POLE, 0.12, low + k * step, x, places[k]) for k in (1, 6) for x in xs)
     panels = grid(np.arange(FREE_M + long / 2, plan.run_m - FREE_M - long / 2, long + 0.4), across, lambda: panel)
     return Site(plan.line, panels, track(plan.line, 1.5, rolling(rng)))
 
@@ -80,8 +69,8 @@ def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Aisles 5 to 6 m apart, between shelves with three levels that are 85 to 95 % full."""
     pitch, aisle, bay, full = rng.uniform(5, 6), rng.uniform(2.6, 3.0), rng.uniform(2.4, 3.0), rng.uniform(0.85, 0.95)
     plan = rows(length_m, run_m=rng.uniform(25, 40), pitch_m=pitch, closed=closed, back_m=2.5, corner_m=0.6)
-    lanes = pitch * np.arange(-MORE, plan.count + MORE + 1)
-    bays = np.arange(SHELF_FREE_M, plan.run_m - SHELF_FREE_M - bay, bay) + bay / 2
+    lanes = pitch * np.arange(-1, plan.count + 2)
+    bays = np.arange(2.5, plan.run_m - 2.5 - bay, bay) + bay / 2
     spots = grid(bays, lanes - pitch / 2, lambda: _shelf(rng, bay, pitch - aisle, full))
     low, high, height = lanes[0] - pitch / 2, lanes[-1] - pitch / 2, rng.uniform(6, 9)
     x, y, long, wide = plan.run_m / 2, (low + high) / 2, plan.run_m + 14.0, high - low + 6.0
@@ -107,14 +96,14 @@ def _shelf(rng: np.random.Generator, bay: float, deep: float, full: float) -> Th
 def terminal(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Blocks five or six containers wide, with stacks of one to five containers, between lanes along x and along y."""
     wide, long, run = int(rng.integers(5, 7)), float(rng.choice((6.06, 12.19))), rng.uniform(95, 125)
-    across, high = CONTAINER_M
-    pitch, bay = wide * (across + GAP_M) + LANE_M, long + GAP_M
+    across, high, gap = 2.44, 2.59, 0.35  # of a container, in metres
+    pitch, bay = wide * (across + gap) + LANE_M, long + gap
     plan = rows(length_m, run_m=run, pitch_m=pitch, closed=closed, back_m=LANE_M / 2, corner_m=2.5)
-    lanes = pitch * np.arange(-MORE - 1, plan.count + MORE)
-    first, each = np.linspace(0, plan.run_m, 1 + max(1, round(plan.run_m / BLOCK_M)), retstep=True)
+    lanes = pitch * np.arange(-2, plan.count + 1)
+    first, each = np.linspace(0, plan.run_m, 1 + max(1, round(plan.run_m / 55.0)), retstep=True)
     middles = (np.arange((each - LANE_M) // bay) + 0.5) * bay
     xs = (first[:-1, None] + LANE_M / 2 + middles).ravel()
-    ys = (lanes[:, None] + LANE_M / 2 + (np.arange(wide) + 0.5) * (across + GAP_M)).ravel()
+    ys = (lanes[:, None] + LANE_M / 2 + (np.arange(wide) + 0.5) * (across + gap)).ravel()
     stacks = grid(xs, ys, lambda: (block(OTHER_OBJECT, long, across, high * int(rng.integers(1, 6))),))
     masts = grid(first[:-1] + LANE_M / 2 - 1.0, lanes + LANE_M / 2 + 0.5, lambda: (post(POLE, 0.5, 20.0),))
     return Site(plan.line, [*jittered(rng, stacks, 0.04), *masts], painted_ground(PARKING))

@@ -1,11 +1,13 @@
 """Elements of a scenery: lines, things along them and in rows, walls and ground, and construction of the world."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.sim.drive import shifted, waves
@@ -17,17 +19,11 @@ from sglpr_jax.sim.routes import Line, Revisit, resampled, travelled
 from sglpr_jax.sim.styles import TOWN
 from sglpr_jax.sim.world import Levels, World
 
-STEP_M = 0.1
-"""Distance between two points of a line, in metres."""
-MARGIN_M = 90.0
-"""Length of a road before the first and after the last scan, in metres. It hides the ends of the road."""
-LAPS = 1.5
-"""Number of laps along a closed line for revisits in the same direction."""
-SWAY_WAVELENGTH_M = (15.0, 60.0)
+STEP_M = 0.1  # distance between two points of a line, in metres
+MARGIN_M = 90.0  # length of a road beyond both ends of a drive, in metres, which hides the ends of the road
+LAPS = 1.5  # number of laps along a closed line for revisits in the same direction
 FLAT = Relief(np.zeros(4), np.full((4, 2), 0.01), np.zeros(4))
-_ROLLING = dataclasses.replace(TOWN, steepest=0.015)
-WALL_M = 0.3
-"""Thickness of walls, in metres."""
+WALL_M = 0.3  # thickness of walls, in metres
 _AROUND_M = 30.0
 
 
@@ -39,8 +35,7 @@ class Site(NamedTuple):
     ground: Ground
     levels: Levels | None = None
     """Storeys above one another. `line` lies in them, and `spots` in the world that holds them side by side."""
-    returns: bool = False
-    """Whether the line itself returns to its places, for revisits in the same direction."""
+    returns: bool = False  # whether the line itself returns to its places, for revisits in the same direction
 
 
 class Strip(NamedTuple):
@@ -53,27 +48,39 @@ class Strip(NamedTuple):
     dash_m: float | None = None  # length of dashes and gaps
 
 
-def along(line: Line, make: Callable[[], Thing], every_m: float) -> list[Spot]:
-    """Places things every `every_m` metres along a line, with their x axes along the line."""
-    rows = np.arange(0, len(line) - 1, every_m / STEP_M).astype(int)
-    ahead = np.gradient(line, axis=0)[rows]
-    places = zip(*line[rows].T.tolist(), np.arctan2(ahead[:, 1], ahead[:, 0]).tolist(), strict=True)
-    return [Spot(make(), x, y, heading) for x, y, heading in places]
+def along(line: Line, *things: tuple[Thing, float]) -> list[Spot]:
+    """Places each thing along a line, with its x axis along the line, at equal distances in metres."""
+    spots, directions = [], np.gradient(line, axis=0)
+    for thing, every_m in things:
+        rows = np.arange(0, len(line) - 1, every_m / STEP_M).astype(int)
+        headings = np.arctan2(*directions[rows].T[::-1])
+        spots += [Spot(thing, *place) for place in np.column_stack([line[rows], headings]).tolist()]
+    return spots
 
 
-def grid(
-    xs: Iterable[float], ys: Iterable[float], make: Callable[[], Thing], *, heading: float = 0.0, side: int = 1
-) -> list[Spot]:
+def grid(xs: Iterable[float], ys: Iterable[float], make: Callable[[], Thing]) -> list[Spot]:
     """Places a thing at each combination of x and y."""
-    ys = list(ys)
-    return [Spot(make(), float(x), float(y), heading, side) for x in xs for y in ys]
+    return [Spot(make(), float(x), float(y)) for x, y in itertools.product(xs, ys)]
+
+
+def on_both_sides(
+    xs: Iterable[float], lines: Float[np.ndarray, " _"], away_m: float, make: Callable[[], Thing], heading: float = 0.0
+) -> list[Spot]:
+    """Places things on the left of all lines along x, at their y, then mirrored things on the right."""
+    return [
+        spot._replace(heading=0.0 + side * heading, side=side)  # never -0.0
+        for side in (1, -1)
+        for spot in grid(xs, lines + side * away_m, make)
+    ]
+
+
+def mirrored(*parts: Part) -> Thing:
+    """Parts and their mirror images on the other side of the x axis."""
+    return *parts, *(part._replace(y=-part.y) for part in parts)
 
 
 def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep: float = 1.0) -> list[Spot]:
-    """Keeps the fraction `keep` of the spots, and shifts and rotates them at random.
-
-    The standard deviation of a shift is `metres` along x and y. Rotations are at most 3 degrees.
-    """
+    """Keeps the fraction `keep` of the spots, shifts them by about `metres`, and turns them by up to 3 degrees."""
     kept = [spot for spot in spots if rng.random() < keep]
     moves = rng.normal(scale=metres, size=(len(kept), 2)).tolist()
     turns = np.radians(rng.uniform(-3, 3, len(kept))).tolist()
@@ -85,7 +92,7 @@ def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep
 
 def rolling(rng: np.random.Generator) -> Relief:
     """Gentle hills with slopes of at most 1.5 %."""
-    return draw_relief(rng, _ROLLING)
+    return draw_relief(rng, dataclasses.replace(TOWN, steepest=0.015))
 
 
 def painted_ground(base: int, strips: Sequence[Strip] = (), relief: Relief = FLAT) -> Ground:
@@ -161,36 +168,30 @@ def _integrated(curvature: Float[np.ndarray, " n"]) -> Line:
     return np.cumsum(STEP_M * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
 
 
-def rounded(corners: Line, *, corner_m: float, closed: bool = False) -> Line:
-    """Polygon through `corners`, rounded by a Gaussian with standard deviation `corner_m`."""
-    polygon = resampled(np.concatenate([corners, corners[:1]]) if closed else corners, STEP_M)
-    polygon = polygon[:-1] if closed else polygon
+def rounded(corners: ArrayLike, *, corner_m: float, closed: bool = False, length_m: float | None = None) -> Line:
+    """Polygon through `corners`, rounded by a Gaussian of `corner_m`. An open one ends after `length_m` metres."""
+    polygon = np.asarray(corners)
+    polygon = resampled(np.concatenate([polygon, polygon[:1]]), STEP_M)[:-1] if closed else resampled(polygon, STEP_M)
     line = gaussian_filter1d(polygon, corner_m / STEP_M, axis=0, mode="wrap" if closed else "nearest")
-    return resampled(line, STEP_M)
+    return resampled(line, STEP_M)[: None if closed or length_m is None else round(length_m / STEP_M)]
 
 
 def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m: float, corner_m: float) -> Rows:
-    """Path of about `length_m` metres back and forth through rows of about `run_m` metres.
-
-    A closed path returns from the last row to the first at x = -`back_m`.
-    """
+    """Path of about `length_m` metres through rows of about `run_m` metres. If closed, it returns at x = -`back_m`."""
     if closed:
         count = 2 * max(1, round((length_m - 2 * back_m) / (run_m + 2 * pitch_m) / 2))
         run_m = (length_m - 2 * back_m - 2 * (count - 1) * pitch_m) / count
     else:
         count = int(np.ceil(length_m / (run_m + pitch_m))) + 1
     ends = [(x, k * pitch_m) for k in range(count) for x in ((0.0, run_m), (run_m, 0.0))[k % 2]]
-    if closed:
-        line = rounded(np.array([*ends, (-back_m, ends[-1][1]), (-back_m, 0.0)]), corner_m=corner_m, closed=True)
-        return Rows(line, count, run_m)
-    return Rows(rounded(np.array(ends), corner_m=corner_m)[: round(length_m / STEP_M)], count, run_m)
+    back = [(-back_m, ends[-1][1]), (-back_m, 0.0)] * closed
+    return Rows(rounded([*ends, *back], corner_m=corner_m, closed=closed, length_m=length_m), count, run_m)
 
 
 def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
     """Path of a vehicle `right_m` metres to the right of `line`, with a sway of up to `sway_m` metres.
 
-    With revisit "opposite", the vehicle turns at the end and returns. With "same", it drives LAPS laps, and `line`
-    must be closed.
+    Revisits are on the way back ("opposite"), or in LAPS laps of a closed line ("same").
     """
     if revisit == "same":
         line = np.concatenate([line, line[: round((LAPS - 1) * len(line))]])
@@ -201,4 +202,4 @@ def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: floa
         turn = line[-1] + right_m * (np.cos(angle) * ahead + np.sin(angle) * np.array([-ahead[1], ahead[0]]))
         out = np.concatenate([out, turn, shifted(line[::-1], -right_m)])
     out = resampled(out, STEP_M)
-    return resampled(shifted(out, sway_m * waves(rng, travelled(out), SWAY_WAVELENGTH_M)), STEP_M)
+    return resampled(shifted(out, sway_m * waves(rng, travelled(out), (15.0, 60.0))), STEP_M)

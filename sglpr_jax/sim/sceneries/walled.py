@@ -1,9 +1,4 @@
-"""Walled places of equal size in a row: yards and halls. A scan shows all of a place.
-
-The path leads from one place to the next, or criss-cross through a single one.
-"""
-
-from typing import NamedTuple
+"""Walled yards and halls of equal size in a row, crossed one after another, or a single one criss-cross."""
 
 import numpy as np
 
@@ -11,71 +6,44 @@ from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT, PARKING, 
 from sglpr_jax.sim.objects import Thing, bicycle, block, bush, car, post, tree
 from sglpr_jax.sim.placing import Spot
 from sglpr_jax.sim.routes import Line
-from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded, wall
+from sglpr_jax.sim.sceneries.site import Site, grid, painted_ground, rounded, wall
 
-GATE_M = 3.2
-"""Width of the gate between two places, in metres."""
-MARGIN_M = 2.5
-"""Minimum distance of the corners of a path from the walls, in metres."""
-BEND = 0.15
-"""Maximum distance of gates and bends from the middle of a place, as a fraction of its width."""
-CORNER_M = 0.6
-STRAIGHT_M = 1.5
-"""Length of the straight path on each side of a gate, in metres."""
-YARD_M2, HALL_M2 = 22.0, 40.0
-"""Area for each thing in a yard and in a hall, in square metres."""
-
-
-class Places(NamedTuple):
-    """Places along x, each `long_m` long and `wide_m` wide. Place k is around ((k + 0.5) * long_m, 0)."""
-
-    line: Line
-    walls: Thing  # of all places, in the frame of the world
-    count: int
-    long_m: float
-    wide_m: float
-
-    def anywhere(
-        self, rng: np.random.Generator, area_m2: float, *, away_m: float = 1.0
-    ) -> list[tuple[float, float, float]]:
-        """Random x, y and heading of things in a place, about one for `area_m2`, `away_m` or more from its walls."""
-        count = round(self.long_m * self.wide_m / area_m2 * rng.uniform(0.7, 1.3))
-        half = self.wide_m / 2
-        low, high = (away_m, away_m - half, 0), (self.long_m - away_m, half - away_m, 2 * np.pi)
-        return [(x, y, heading) for x, y, heading in rng.uniform(low, high, (count, 3)).tolist()]
+GATE_M = 3.2  # width of the gate between two places, in metres
+MARGIN_M = 2.5  # minimum distance of the corners of a path from the walls, in metres
+BEND = 0.15  # maximum distance of gates and bends from the middle of a place, as a fraction of its width
 
 
 def _places(
     rng: np.random.Generator, length_m: float, closed: bool, *, long_m: float, wide_m: float, height_m: float
-) -> Places:
-    """Draws a path of about `length_m` metres through one place after another, joined by gates.
-
-    A closed path stays in a single place, and crosses itself.
-    """
+) -> tuple[Line, Thing, int]:
+    """Path, walls and number of places along x that are joined by gates. A closed path stays in a single one."""
     if closed:
         line, gates = _criss_cross(rng, length_m, long_m, wide_m), []
     else:
         count = int(np.ceil(length_m / long_m)) + 1
         gates = (wide_m * rng.uniform(-BEND, BEND, count - 1)).tolist()
-        line = _onward(rng, gates, long_m, wide_m)[: round(length_m / STEP_M)]
+        bends = (wide_m * rng.uniform(-BEND, BEND, count)).tolist()
+        corners = [(MARGIN_M, bends[0])]
+        for k, (gate, bend) in enumerate(zip(gates, bends, strict=False)):
+            x = (k + 1) * long_m
+            corners += [((k + 0.5) * long_m, bend), (x - 1.5, gate), (x + 1.5, gate)]  # straight through the gate
+        line = rounded([*corners, (count * long_m - MARGIN_M, bends[-1])], corner_m=0.6, length_m=length_m)
     ends, half = (len(gates) + 1) * long_m, wide_m / 2
     walls = [wall((0.0, side * half), (ends, side * half), height_m) for side in (-1, 1)]
     walls += [wall((x, -half), (x, half), height_m) for x in (0.0, ends)]
     for k, y in enumerate(gates, 1):
-        walls.append(wall((k * long_m, -half), (k * long_m, y - GATE_M / 2), height_m))
-        walls.append(wall((k * long_m, y + GATE_M / 2), (k * long_m, half), height_m))
-    return Places(line, tuple(walls), len(gates) + 1, long_m, wide_m)
+        beside = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
+        walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in beside]
+    return line, tuple(walls), len(gates) + 1
 
 
-def _onward(rng: np.random.Generator, gates: list[float], long_m: float, wide_m: float) -> Line:
-    """Path along x through all gates, with a bend in the middle of each place."""
-    bends = (wide_m * rng.uniform(-BEND, BEND, len(gates) + 1)).tolist()
-    corners = [(MARGIN_M, bends[0])]
-    for k, gate in enumerate(gates):
-        x = (k + 1) * long_m
-        corners += [((k + 0.5) * long_m, bends[k]), (x - STRAIGHT_M, gate), (x + STRAIGHT_M, gate)]
-    corners.append(((len(gates) + 1) * long_m - MARGIN_M, bends[-1]))
-    return rounded(np.array(corners), corner_m=CORNER_M)
+def _anywhere(
+    rng: np.random.Generator, long_m: float, wide_m: float, area_m2: float, away_m: float
+) -> list[tuple[float, float, float]]:
+    """Random x, y and heading of things in a place, about one for `area_m2`, `away_m` or more from its walls."""
+    count, half = round(long_m * wide_m / area_m2 * rng.uniform(0.7, 1.3)), wide_m / 2
+    low, high = (away_m, away_m - half, 0), (long_m - away_m, half - away_m, 2 * np.pi)
+    return [(x, y, heading) for x, y, heading in rng.uniform(low, high, (count, 3)).tolist()]
 
 
 def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_m: float) -> Line:
@@ -86,58 +54,53 @@ def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_
         corner = rng.uniform(low, high)
         if np.linalg.norm(corner - corners[-1]) > min(long_m, wide_m) / 2:
             corners.append(corner)
-    return rounded(np.array(corners), corner_m=CORNER_M, closed=True)
+    return rounded(corners, corner_m=0.6, closed=True)
 
 
 def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Yards of 15 to 24 m with equal walls and different things, joined by gates. A closed path stays in one yard."""
     long, wide, height = rng.uniform((15, 15, 3), (24, 24, 8)).tolist()
-    plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
-    spots = [Spot(plan.walls, 0.0, 0.0)]
-    for k in range(plan.count):
-        spots += [Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in plan.anywhere(rng, YARD_M2)]
+    line, walls, count = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
+    spots = [Spot(walls, 0.0, 0.0)]
+    for k in range(count):
+        spots += [
+            Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in _anywhere(rng, long, wide, 22.0, 1.0)
+        ]
         for side in (-1, 1):  # sheds, stairs and ducts at the two walls along x
             for place in rng.uniform(2.0, long - 2.0, int(rng.integers(1, 4))).tolist():
                 length, deep, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
                 annex = (block(OTHER_OBJECT, length, deep, high),)
                 spots.append(Spot(annex, k * long + place, side * (wide - deep - 0.3) / 2))
-    return Site(plan.line, spots, painted_ground(PARKING))
+    return Site(line, spots, painted_ground(PARKING))
 
 
 def _lumber(rng: np.random.Generator) -> Thing:
     """Crate, bin, barrel, pole, plant or vehicle."""
     long, wide, high = rng.uniform((0.4, 0.4, 0.6), (1.8, 1.4, 2.6)).tolist()
-    match rng.choice(6, p=[0.45, 0.15, 0.1, 0.2, 0.05, 0.05]):
-        case 0:
-            return (block(OTHER_OBJECT, long, wide, high),)
-        case 1:
-            return (post(OTHER_OBJECT, wide, 0.6 * high),)
-        case 2:
-            return (post(POLE, 0.12, 2 * high),)
-        case 3:
-            return tree(rng, (1.5, 3.5)) if rng.random() < 0.4 else bush(rng, 0.7)
-        case 4:
-            return car(rng)
-        case _:
-            return bicycle(rng)
+    kinds = (
+        lambda: (block(OTHER_OBJECT, long, wide, high),),
+        lambda: (post(OTHER_OBJECT, wide, 0.6 * high),),
+        lambda: (post(POLE, 0.12, 2 * high),),
+        lambda: tree(rng, (1.5, 3.5)) if rng.random() < 0.4 else bush(rng, 0.7),
+        lambda: car(rng),
+        lambda: bicycle(rng),
+    )
+    return kinds[rng.choice(6, p=[0.45, 0.15, 0.1, 0.2, 0.05, 0.05])]()
 
 
 def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Halls of 30 to 60 m with equal walls and columns and different things, joined by gates.
-
-    A closed path stays in one hall.
-    """
+    """Halls of 30 to 60 m with equal walls and columns and different things. A closed path stays in one."""
     long, wide, height, span = rng.uniform((30, 30, 5, 6), (60, 45, 9, 10)).tolist()
-    plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
-    column, along = (block(POLE, 0.4, 0.4, height),), plan.count * long
+    line, walls, count = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
+    column, along = (block(POLE, 0.4, 0.4, height),), count * long
     columns = grid(np.arange(span / 2, along, span), np.arange((span - wide) / 2, wide / 2, span), lambda: column)
     ceiling = block(BUILDING, along, wide, 0.3, along / 2, bottom=height, roughness=0.02)
-    spots = [Spot((*plan.walls, ceiling), 0.0, 0.0), *columns]
-    for k in range(plan.count):
-        for x, y, heading in plan.anywhere(rng, HALL_M2, away_m=2.5):
+    spots = [Spot((*walls, ceiling), 0.0, 0.0), *columns]
+    for k in range(count):
+        for x, y, heading in _anywhere(rng, long, wide, 40.0, 2.5):
             turned = heading if rng.random() < 0.3 else round(2 * heading / np.pi) * np.pi / 2
             spots.append(Spot(_machine(rng), x + k * long, y, turned))
-    return Site(plan.line, spots, painted_ground(OTHER_GROUND))
+    return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
 def _machine(rng: np.random.Generator) -> Thing:
