@@ -8,7 +8,7 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
-from sglpr_jax.cli.runtime import console, parse_command, run
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import PoseFormat
 
 
@@ -61,8 +61,8 @@ class EvaluateCommand:
     heat maps."""
 
 
-def evaluate_file(command: EvaluateCommand) -> Path:
-    """Run the command. Returns the output folder."""
+def evaluate_file(command: EvaluateCommand) -> None:
+    """Run the command."""
     from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_sessions  # slow imports, not needed for --help
     from sglpr_jax.evaluation.sessions import evaluate_session_files
     from sglpr_jax.files import check_writable
@@ -79,7 +79,6 @@ def evaluate_file(command: EvaluateCommand) -> Path:
         written = _evaluate_recording(command, folder)
     for path in (*written, record_command(command, folder)):
         print(f"written: {path}")
-    return folder
 
 
 def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
@@ -140,12 +139,3 @@ def _check_options(command: EvaluateCommand) -> None:
 def _folder(file: Path) -> Path:
     """Return the file without its suffix. If it has no suffix, append "-results"."""
     return file.with_suffix("") if file.suffix else file.with_name(f"{file.name}-results")
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(EvaluateCommand, "evaluate"), evaluate_file)
-
-
-if __name__ == "__main__":
-    main()

@@ -7,7 +7,7 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
-from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
+from sglpr_jax.cli.runtime import console, progress_bar
 from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -38,8 +38,8 @@ class SegmentCommand:
     """Minimum probability of the most likely class. Cells below it stay unlabelled and are not scored."""
 
 
-def segment_recording(command: SegmentCommand) -> Path:
-    """Run the command. Returns the output folder."""
+def segment_recording(command: SegmentCommand) -> None:
+    """Run the command."""
     import numpy as np  # slow imports, not needed for --help
 
     from sglpr_jax.evaluation.segmentation import confusion_matrix, draw_segmentation, score_confusion, title_of
@@ -68,13 +68,3 @@ def segment_recording(command: SegmentCommand) -> Path:
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())
     record_command(command, command.out)
-    return command.out
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(SegmentCommand, "segment"), segment_recording)
-
-
-if __name__ == "__main__":
-    main()

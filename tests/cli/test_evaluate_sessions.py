@@ -68,12 +68,3 @@ def test_wrong_sessions_are_refused(embedded, command, tmp_path):
     ended = refused(embedded / f"{DAYS[0]}.npz", "--database", database, "--seq", "00")
     assert_one_line_error(ended, "only descriptor files with --database", "--seq")
     assert not (tmp_path / "out").exists()
-
-
-def test_wrong_days_are_refused_before_anything_is_written(command, tmp_path):
-    out = ("--out", tmp_path / "town")
-    assert_one_line_error(command("simulate", *out, "--sessions", "2012-1-32"), "dates such as", "'2012-1-32'")
-    ended = command("simulate", *out, "--sessions", MAP, "--seq", "00", "05")
-    assert_one_line_error(ended, "at most one route")
-    assert_one_line_error(command("simulate", *out, "--sessions", MAP, "--images"), "no images, found", "images True")
-    assert not (tmp_path / "town").exists()
