@@ -209,7 +209,7 @@ def open_with_odometry(
     elif odometry:
         files = zip(paths, odometry, strict=True)
         both = [open_with_poses(command.source, path, file, format=format) for path, file in files]
-        opened, poses = zip(*both, strict=True)
+        opened, poses = map(list, zip(*both, strict=True))
     else:
         opened = [command.source.open(path) for path in paths]
     recordings = [command.submap.prepared(*one) for one in zip(opened, poses or [None] * len(opened), strict=True)]
