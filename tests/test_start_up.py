@@ -2,15 +2,10 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 
-import sglpr_jax
-
 SLOW = ("jax", "flax", "numpy", "jaxtyping")
-CLI = Path(sglpr_jax.__file__).parent / "cli"
-COMMANDS = sorted(path.stem for path in CLI.glob("*.py") if (CLI.parents[1] / "bin" / path.stem).exists())
 
 
 def imported_by(program: str, *, of: tuple[str, ...] = SLOW) -> set[str]:
@@ -31,10 +26,10 @@ def check(after):
 for module in "sglpr_jax", "sglpr_jax.data", "sglpr_jax.sim":
     importlib.import_module(module)
     check(module)
-for command in {COMMANDS}:
-    main = importlib.import_module(f"sglpr_jax.cli.{{command}}").main
+from sglpr_jax.cli.__main__ import COMMANDS, main
+for command in COMMANDS:
     for flag, status in ("--help", 0), ("--no-such-flag", 2):
-        sys.argv = [command, flag]
+        sys.argv = ["sglpr_jax.cli", command, flag]
         try:
             main()
         except SystemExit as ended:
@@ -51,7 +46,7 @@ def test_a_folder_of_scans_is_opened_without_scipy_and_without_the_simulator(tmp
     points.astype("<f4").tofile(tmp_path / "000000.bin")
     program = f"""
 from pathlib import Path
-from sglpr_jax.cli.datasets import open_recording
-assert len(open_recording(Path({str(tmp_path)!r}), None, sensor_height=1.7)) == 1
+from sglpr_jax.cli.recording import RecordingOptions
+assert len(RecordingOptions(sensor_height=1.7).open(Path({str(tmp_path)!r}))) == 1
 """
     assert imported_by(program, of=("scipy", "sglpr_jax.sim.dataset")) == set()

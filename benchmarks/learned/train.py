@@ -83,7 +83,7 @@ def _train_method(method: str, data: Path, run: Path, flags: Mapping[str, float]
     command += [text for name, value in flags.items() for text in (f"--{name}", value)]
     command += ["--resume"] if run.exists() else []
     print(f"{run}", file=sys.stderr, flush=True)
-    program = [sys.executable, "-m", "sglpr_jax.cli.peers", *map(str, command)]
+    program = [sys.executable, "-m", "sglpr_jax.cli", "peers", *map(str, command)]
     subprocess.run(program, check=True, env={**os.environ, **ONE_CORE})
 
 

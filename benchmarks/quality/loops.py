@@ -117,7 +117,7 @@ def _bin_loops(drive: Drive, *, weights: str, **_: Any) -> Found:
     mounting = drive.recording.mounting or Mounting(MODEL_HEIGHT_M)
     flags = ["--format", "kitti", "--odometry", "auto", "--optimize", "--out", out, "--weights", weights]
     flags += ["--sensor-height", str(mounting.height_m)]
-    taken = run_command([sys.executable, "-m", "sglpr_jax.cli.loops", drive.files(), *flags])
+    taken = run_command([sys.executable, "-m", "sglpr_jax.cli", "loops", drive.files(), *flags])
     loops = read_loops_jsonl(out / "loops.jsonl")
     return Found(closures_of(loops), read_tum(out / "trajectory-optimized.tum")[0], *taken, loops)
 

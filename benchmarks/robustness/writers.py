@@ -133,18 +133,19 @@ def start(
         "JAX_COMPILATION_CACHE_DIR": str(cache / "xla"),
     }
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
-    module = importlib.import_module(f"sglpr_jax.cli.{command}")
+    cli = importlib.import_module("sglpr_jax.cli.__main__")
+    cli.load_command(command)  # imported once, for all processes
 
     def work() -> None:
         os.chdir(folder)
-        sys.argv = [f"bin/{command}", *arguments]
+        sys.argv = ["sglpr_jax.cli", command, *arguments]
         for stream, path in ((1, os.devnull), (2, errors)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
         if file_bytes is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
         if humble:  # without any capability, as capset(2) has it
             assert ctypes.CDLL(None).capset(struct.pack("Ii", 0x20080522, 0), bytes(24)) == 0
-        module.main()
+        cli.main()
 
     process = multiprocessing.get_context("fork").Process(target=work)
     process.start()

@@ -153,7 +153,7 @@ def _measured(source: str, rate: float, count: int, warm_s: float, scans: int, w
         where = str(folder / "scans") if name == "folder" else where
         text = f"{name}:{where}" if where else name
         publisher = PUBLISHERS[name](where)
-        command = ["-m", "sglpr_jax.cli.live", text, "--out", str(folder / "map"), "--weights", weights]
+        command = ["-m", "sglpr_jax.cli", "live", text, "--out", str(folder / "map"), "--weights", weights]
         with (folder / "errors.txt").open("w") as errors:
             node = subprocess.Popen(
                 [sys.executable, *command, *publisher.flags], stdout=subprocess.PIPE, stderr=errors, text=True

@@ -53,4 +53,4 @@ def start_up(*, commands: tuple[str, ...] = COMMANDS, weights: str = "sglpr", re
 
 
 def _command(command: str, *arguments: str) -> tuple[str, ...]:
-    return sys.executable, "-m", f"sglpr_jax.cli.{command}", *arguments
+    return sys.executable, "-m", "sglpr_jax.cli", command, *arguments

@@ -18,7 +18,7 @@ from licences import licences_page  # noqa: E402
 
 def main() -> None:
     """Write the pages."""
-    pages = {"api": api_page(), "commands": commands_page(ROOT), "configuration": configuration_page(ROOT)}
+    pages = {"api": api_page(), "commands": commands_page(), "configuration": configuration_page(ROOT)}
     pages |= {"labels": labels_page(), "licences": licences_page()}
     for name, text in pages.items():
         (ROOT / "docs" / "reference" / f"{name}.md").write_text(text)

@@ -1,13 +1,12 @@
 """The page of the commands: what each does, its examples and its flags, from the dataclass that its parser reads."""
 
 import dataclasses
-import importlib
 import inspect
 import re
-from pathlib import Path
 
 from fields import Field, fields_of, paragraph, table
 
+from sglpr_jax.cli.__main__ import COMMANDS, load_command
 from sglpr_jax.cli.config_file import ConfigFlags
 
 HEAD = """# Commands
@@ -23,28 +22,10 @@ Every command also has these flags:
 COLUMNS = ("flag", "default", "meaning")
 
 
-def commands_page(root: Path) -> str:
-    """All commands of `bin/` that are a module of `sglpr_jax.cli`, by name."""
+def commands_page() -> str:
+    """All commands, by name."""
     head = HEAD.format(common=table(COLUMNS, [_row(field) for field in fields_of(ConfigFlags)]))
-    return "\n".join([head, *(_section(script.name, _command_of(script)) for script in _scripts(root))])
-
-
-def _scripts(root: Path) -> list[Path]:
-    return sorted(script for script in (root / "bin").iterdir() if _module(script))
-
-
-def _module(script: Path) -> str | None:
-    found = re.search(r"-m (sglpr_jax\.cli\.\w+)", script.read_text())
-    return found and found.group(1)
-
-
-def _command_of(script: Path) -> type:
-    """The dataclass that the command's parser reads."""
-    module = importlib.import_module(_module(script))
-    members = vars(module).values()
-    return next(
-        m for m in members if inspect.isclass(m) and m.__module__ == module.__name__ and "Command" in m.__name__
-    )
+    return "\n".join([head, *(_section(name, load_command(name)[0]) for name in COMMANDS)])
 
 
 def _section(name: str, command: type) -> str:

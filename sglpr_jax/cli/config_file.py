@@ -54,15 +54,14 @@ def record_command(command: Any, folder: Path) -> Path:
     return folder / COMMAND_FILE
 
 
-def with_defaults(
-    command: type[T], arguments: Sequence[str] | None = None, *, load_preset: Callable[[str], Any] | None = None
-) -> tuple[T, list[str]]:
+def with_defaults(command: type[T], arguments: Sequence[str] | None = None) -> tuple[T, list[str]]:
     """Return a command with its defaults, and the command line without the settings that are not listed by the help.
+
+    The default of a field `config` is the preset that --preset names.
 
     Arguments:
       command: Dataclass of the command.
       arguments: Command line without the name. None: that of this process.
-      load_preset: Loads the default of the field `config`, given the value of --preset. None: no presets.
 
     Returns:
       A command, with `tyro.MISSING` for required fields that the file does not contain, and the other arguments.
@@ -80,7 +79,9 @@ def with_defaults(
     values = {} if file is None else read_json(file)
     require(values, isinstance(values, dict), "an object with a value for each flag", str(file))
     fields = {field.name: _default(field) for field in dataclasses.fields(command)}  # type: ignore[arg-type]
-    if load_preset is not None:
+    if "config" in fields:
+        from sglpr_jax.training.presets import load_preset  # slow import, not needed by most commands
+
         in_file = early.preset is None and "preset" in values
         with naming(f"{file}: preset") if in_file else contextlib.nullcontext():
             preset = read_value(values["preset"], str, "") if in_file else early.preset or fields["preset"]

@@ -6,8 +6,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.runtime import parse_command, run
-
 
 @dataclasses.dataclass(frozen=True)
 class ConvertCommand:
@@ -33,8 +31,8 @@ class ConvertCommand:
     """Seed of the weights that the file does not contain."""
 
 
-def convert(command: ConvertCommand) -> Path:
-    """Run the command. Returns the output folder. Raises FileExistsError if it exists."""
+def convert(command: ConvertCommand) -> None:
+    """Run the command. Raises FileExistsError if the output folder exists."""
     import jax  # slow imports, not needed for --help
 
     from sglpr_jax.models.sglpr import init
@@ -58,13 +56,3 @@ def convert(command: ConvertCommand) -> Path:
     print(f"{command.out}: {share} of {command.checkpoint.name}, the rest random (seed {command.seed})")
     if unused:
         print(f"not used by {command.preset}: {', '.join(unused[:5])}{', ...' if len(unused) > 5 else ''}")
-    return command.out
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(ConvertCommand, "convert"), convert)
-
-
-if __name__ == "__main__":
-    main()

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
-from sglpr_jax.data import readers
 from sglpr_jax.data import training_recordings as split
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import readable
@@ -16,35 +15,22 @@ if TYPE_CHECKING:
     from sglpr_jax.sim.dataset import Simulated
 
 
-def dataset_root(data: Path | None, *, write: bool = True) -> Path:
-    """Return the dataset's folder. Without one, the simulated recordings are created in the user's cache on first
-    use. Raises FileNotFoundError if they do not exist and `write` is false."""
+def dataset_root(data: Path | None, *, sessions: bool = False, write: bool = True) -> Path:
+    """Return the dataset's folder. Without one, the simulated recordings, or sessions in NCLT's layout, are created in
+    the user's cache on first use. Raises FileNotFoundError if they do not exist and `write` is false."""
     if data is not None:
         return data
     from sglpr_jax.sim.dataset import default_dataset  # imports the simulator, not needed for real data
 
-    root, options = default_dataset(cache_folder())
+    root, options = default_dataset(cache_folder(), sessions=sessions)
     if not write and not root.is_dir():
         raise FileNotFoundError(
             f"{root}: expected the simulated recordings, found none; the command without --plan writes them first, "
             "--data states another dataset"
         )
-    print(
-        f"no --data: using the simulated recordings in {root} "
-        "(for real KITTI: --data FOLDER that contains sequences/NN/velodyne)",
-        file=sys.stderr,
-    )
-    simulate(root, **options)
-    return root
-
-
-def cached_sessions() -> Path:
-    """Return the folder of the simulated sessions in NCLT's layout. They are created in the user's cache on first
-    use."""
-    from sglpr_jax.sim.dataset import default_dataset
-
-    root, options = default_dataset(cache_folder(), sessions=True)
-    print(f"no --nclt: using the simulated sessions in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
+    flag, what = ("--nclt", "sessions") if sessions else ("--data", "recordings")
+    real = "NCLT: --nclt FOLDER" if sessions else "KITTI: --data FOLDER that contains sequences/NN/velodyne"
+    print(f"no {flag}: using the simulated {what} in {root} (for real {real})", file=sys.stderr)
     simulate(root, **options)
     return root
 
@@ -64,13 +50,6 @@ def simulate(root: Path, **options: Any) -> "Simulated":
             bars.append(opened.enter_context(progress_bar("simulate", dataset.scans * len(dataset.names))))
 
         return simulation.simulate(root, **options, on_start=start, on_progress=lambda done: bars[0](done))
-
-
-def open_recording(root: Path, name: str | None, **options: Any) -> Recording:
-    """Run `data.open_recording` and describe the recording on stderr."""
-    recording = readers.open_recording(root, name, **options)
-    print("\n".join(recording.description), file=sys.stderr)
-    return recording
 
 
 def leave_one_out(

@@ -9,7 +9,7 @@ from sglpr_jax.cli.embed import EmbedCommand, embed_recording
 from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
 from sglpr_jax.cli.loops import LoopsCommand, loops_of_recording
 from sglpr_jax.cli.recording import PosedRecordingOptions
-from sglpr_jax.cli.runtime import own_names, parse_command, run
+from sglpr_jax.cli.runtime import own_names
 from sglpr_jax.methods.names import SHIPPED, UNTRAINED
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -37,8 +37,8 @@ class DemoCommand:
     """Scans of each recording."""
 
 
-def demo(command: DemoCommand) -> Path:
-    """Run the command. Returns the output folder."""
+def demo(command: DemoCommand) -> None:
+    """Run the command."""
     from sglpr_jax.cli.datasets import simulate  # slow imports, not needed for --help
     from sglpr_jax.cli.train import TrainCommand, train_and_test
     from sglpr_jax.evaluation.evaluation_page import PAGE
@@ -62,17 +62,7 @@ def demo(command: DemoCommand) -> Path:
     train = TrainCommand(seq=TESTED, data=town, preset=PRESET, method=BESIDE, out=out / "run", config=config)
     train_and_test(train, go_on="the next demo restarts its training")
     print(f"\npages: {out / 'loops' / LOOPS_PAGE}, {out / TESTED / PAGE}")
-    return out
 
 
 def _title(text: str) -> None:
     print(own_names(f"\n{text}"), file=sys.stderr)
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(DemoCommand, "demo"), demo)
-
-
-if __name__ == "__main__":
-    main()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions, report_bad_scan, resolved_scale
-from sglpr_jax.cli.runtime import parse_command, progress_bar, run
+from sglpr_jax.cli.runtime import progress_bar
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.methods.names import LEARNED_NAMES, NETWORK, AnyMethodName
@@ -65,8 +65,8 @@ class EmbedCommand:
     """Maximum number of images that are described at a time."""
 
 
-def embed_recording(command: EmbedCommand) -> str:
-    """Run the command. Returns the path of the descriptor file, or the address of the file in the store."""
+def embed_recording(command: EmbedCommand) -> None:
+    """Run the command."""
     from sglpr_jax.data.corruption import ROTATION, corrupted, corruption_named  # slow imports, not needed for --help
     from sglpr_jax.data.scaled import scaled
     from sglpr_jax.retrieval.embed import embed
@@ -99,11 +99,10 @@ def embed_recording(command: EmbedCommand) -> str:
             file = embed(method, recording, **options)
     if in_store:
         print(f"{stored.address}: {'already there' if stored.added is None else f'{stored.added} places'}")
-        return stored.address
+        return
     file.save(Path(command.out))
     skipped = len(recording) - len(file)
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
-    return command.out
 
 
 def _check_weights(command: EmbedCommand) -> None:
@@ -144,12 +143,3 @@ def _check_file(command: EmbedCommand) -> None:
     if not out.parent.is_dir():
         raise FileNotFoundError(f"{out}: its folder {out.parent} does not exist")
     check_writable(out)
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(EmbedCommand, "embed"), embed_recording)
-
-
-if __name__ == "__main__":
-    main()

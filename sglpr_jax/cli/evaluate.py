@@ -9,7 +9,7 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
-from sglpr_jax.cli.runtime import console, parse_command, run
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import PoseFormat
 
 if TYPE_CHECKING:
@@ -66,8 +66,8 @@ class EvaluateCommand:
     heat maps."""
 
 
-def evaluate_file(command: EvaluateCommand) -> Path:
-    """Run the command. Returns the output folder."""
+def evaluate_file(command: EvaluateCommand) -> None:
+    """Run the command."""
     from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_evaluation  # slow imports, not needed for --help
     from sglpr_jax.evaluation.sessions import evaluate_sessions
     from sglpr_jax.files import check_writable
@@ -83,7 +83,6 @@ def evaluate_file(command: EvaluateCommand) -> Path:
         found, pictures = _evaluate_recording(command)
     for path in (*write_evaluation(found, folder, pictures), record_command(command, folder)):
         print(f"written: {path}")
-    return folder
 
 
 def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures | None]":
@@ -143,12 +142,3 @@ def _check_options(command: EvaluateCommand) -> None:
 def _folder(file: Path) -> Path:
     """Return the file without its suffix. If it has no suffix, append "-results"."""
     return file.with_suffix("") if file.suffix else file.with_name(f"{file.name}-results")
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(EvaluateCommand, "evaluate"), evaluate_file)
-
-
-if __name__ == "__main__":
-    main()

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from sglpr_jax.cli.runtime import parse_command, progress_bar, run
+from sglpr_jax.cli.runtime import progress_bar
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.models.config import WHITENING_POWER
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -48,8 +48,8 @@ class ExportCommand:
     components."""
 
 
-def export(command: ExportCommand) -> Path:
-    """Run the command. Returns the output folder. Raises FileExistsError if it exists."""
+def export(command: ExportCommand) -> None:
+    """Run the command. Raises FileExistsError if the output folder exists."""
     from sglpr_jax.data.readers import open_recording, recording_names
     from sglpr_jax.models.export import save_program
     from sglpr_jax.models.params import Params
@@ -79,13 +79,3 @@ def export(command: ExportCommand) -> Path:
         save_program(params, command.out, format=command.format)
     size = sum(file.stat().st_size for file in command.out.iterdir())
     print(f"{command.out}: {size / 1e6:.1f} MB of {'weights' if command.format == 'weights' else command.format}")
-    return command.out
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(ExportCommand, "export"), export)
-
-
-if __name__ == "__main__":
-    main()

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +10,7 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import DetectorFlags
-from sglpr_jax.cli.runtime import parse_command, print_error, run, stop_on_signal
+from sglpr_jax.cli.runtime import print_error, stop_on_signal
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -150,12 +149,3 @@ def _close(sink: "Sink", report: "Report") -> None:
         sink.close()
     except Exception as error:  # a sink may use any library
         report("close", f"{type(sink).__name__}: {error}")
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(LiveCommand, "live"), lambda command: sys.exit(live(command)))
-
-
-if __name__ == "__main__":
-    main()

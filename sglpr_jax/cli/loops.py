@@ -10,7 +10,7 @@ import tyro
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.detector_config import DetectorFlags
 from sglpr_jax.cli.recording import AUTO, PosedRecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
-from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.config import Degenerate
@@ -18,7 +18,7 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 
 if TYPE_CHECKING:
-    from sglpr_jax.data.recording import Recording
+    pass
 
 UNFINISHED = "unfinished"
 """Checkpoint directory of a running command, inside the output folder."""
@@ -150,7 +150,9 @@ def _search(command: LoopsCommand) -> int:
     register = command.register and all(map(can_register, recordings))
     if command.register and not register:
         left_out = next(one for one in recordings if not can_register(one))
-        print(f"{left_out.name}: loops are not registered, {_why_not(left_out)}", file=sys.stderr)
+        missing = "small-gicp is not installed: pip install 'sglpr-jax[slam]'"
+        reason = "they are ready-made images" if left_out.has_images else missing
+        print(f"{left_out.name}: loops are not registered, because {reason}", file=sys.stderr)
     name = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"
     steps = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
     with stop_on_signal() as stop, progress_bar(f"loops {name}", steps) as show:
@@ -192,19 +194,3 @@ def _search(command: LoopsCommand) -> int:
 def _odometry_kept_in(out: Path, number: int) -> Path:
     """Checkpoint file of --odometry auto of a recording."""
     return out / f"unfinished-{number}.odometry.log"
-
-
-def _why_not(recording: "Recording") -> str:
-    """Why the scans of a recording cannot be registered."""
-    if recording.has_images:
-        return "because they are ready-made images"
-    return "because small-gicp is not installed: pip install 'sglpr-jax[slam]'"
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(LoopsCommand, "loops"), lambda command: sys.exit(loops_of_recording(command)))
-
-
-if __name__ == "__main__":
-    main()

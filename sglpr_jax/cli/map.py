@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
-from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.files import exclusive_lock, naming
@@ -172,12 +172,3 @@ def _holds_more(path: Path, places: int) -> bool:
         return len(PlaceMap.load(path)) > places
     except (OSError, ValueError):
         return False
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(MapCommand, "map"), lambda command: sys.exit(write_map(command)))
-
-
-if __name__ == "__main__":
-    main()

@@ -6,18 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
+from rich.table import Table
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import (
-    StopRequest,
-    cache_folder,
-    console,
-    parse_command,
-    print_error,
-    progress_bar,
-    run,
-    stop_on_signal,
-)
+from sglpr_jax.cli.runtime import StopRequest, cache_folder, console, print_error, progress_bar, stop_on_signal
 from sglpr_jax.fields import CountOrNone, NotNegative, Positive
 from sglpr_jax.methods.names import LearnedName
 
@@ -72,15 +64,16 @@ class PeersCommand:
 
 
 def run_peers(command: PeersCommand) -> None:
-    """Run the command."""
-    _print_methods() if command.action == "list" else print(f"run: {train_peer(command)}")
-
-
-def train_peer(command: PeersCommand) -> Path:
-    """Train a method. Returns the folder of the run. If the training is asked to stop, saves its state and exits."""
+    """Run the command. If the training is asked to stop, saves its state and exits."""
     from sglpr_jax.methods.learned import LEARNED  # slow imports, not needed for --help
     from sglpr_jax.training.peers import RunSettings, train_learned
 
+    if command.action == "list":
+        table = Table("method", "publication", "licence", "input", "weights")
+        for method in LEARNED.values():
+            table.add_row(method.name, method.source, method.licence, method.takes, f"{method.weights:,}")
+        console().print(table)
+        return
     if command.method is None or not command.data or command.out is None:
         raise ValueError("expected bin/peers train METHOD DATA... --out RUN, found no METHOD, DATA or --out")
     method, out = LEARNED[command.method], command.out
@@ -95,7 +88,7 @@ def train_peer(command: PeersCommand) -> Path:
     print(f"{out}: {found.images} images in {found.seconds:.0f} s", file=sys.stderr)
     if stopped():
         stopped.exit("stopped; continue with --resume")
-    return out
+    print(f"run: {out}")
 
 
 def _has_run(out: Path, *, resume: bool) -> bool:
@@ -151,23 +144,3 @@ def _learning_rate(
     except Stopped:
         stopped.exit("stopped; continue with --resume")
         raise
-
-
-def _print_methods() -> None:
-    from rich.table import Table
-
-    from sglpr_jax.methods.learned import LEARNED
-
-    table = Table("method", "publication", "licence", "input", "weights")
-    for method in LEARNED.values():
-        table.add_row(method.name, method.source, method.licence, method.takes, f"{method.weights:,}")
-    console().print(table)
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(PeersCommand, "peers"), run_peers)
-
-
-if __name__ == "__main__":
-    main()

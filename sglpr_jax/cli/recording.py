@@ -57,14 +57,13 @@ class RecordingOptions:
     contradict this, and ignores row numbers (0, 1, 2, ...)."""
 
     def open(self, root: Path, **more: Any) -> "Recording":
-        """Open the recording, with `more` options, and describe it on stderr.
-
-        Raises the errors of `data.open_recording`.
-        """
-        from sglpr_jax.cli.datasets import open_recording  # slow import, not needed for --help
+        """Open the recording, with `more` options, and describe it on stderr."""
+        from sglpr_jax.data.readers import open_recording  # slow import, not needed for --help
 
         options: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "seq"} | more
-        return open_recording(root, self.seq, **options)
+        recording = open_recording(root, self.seq, **options)
+        print("\n".join(recording.description), file=sys.stderr)
+        return recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,10 +96,7 @@ class SubmapOptions:
         return "--submap-m" if self.submap_m else "--deskew" if self.deskew else None
 
     def prepared(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
-        """Return the recording deskewed and with submaps, as selected, by the poses or else by the poses of its bag.
-
-        Raises ValueError without poses.
-        """
+        """Return the recording deskewed and with submaps, as selected, by the poses or else by the poses of its bag."""
         if self.flag is None:
             return recording
         from sglpr_jax.data.deskew import deskewed  # slow imports, not needed for --help
@@ -185,9 +181,7 @@ def open_with_odometry(
     format: OdometryFormat,
     kept_in: "Callable[[int], Path]",
 ) -> "tuple[Any, list[Recording], list[Float[np.ndarray, 'n 4 4']]]":
-    """Open the recordings of a `LoopsCommand` or `MapCommand`, with odometry.
-
-    If the command is interrupted before all odometry of scans is complete, it ends.
+    """Open the recordings of a `LoopsCommand` or `MapCommand`, deskewed and with submaps, with odometry.
 
     Arguments:
       command: Command with its flags.
@@ -197,7 +191,7 @@ def open_with_odometry(
       kept_in: Checkpoint file of the odometry of a recording, given its number.
 
     Returns:
-      The command with the settings in effect, the recordings, deskewed and with submaps, and their odometry (or none).
+      The command with the settings in effect, the recordings, and their odometry (or none).
     """
     from sglpr_jax.data.deskew import has_point_times  # slow imports, not needed for --help
     from sglpr_jax.odometry.kiss_icp import check_installed
@@ -215,7 +209,7 @@ def open_with_odometry(
     elif odometry:
         files = zip(paths, odometry, strict=True)
         both = [open_with_poses(command.source, path, file, format=format) for path, file in files]
-        opened, poses = [one for one, _ in both], [one for _, one in both]
+        opened, poses = map(list, zip(*both, strict=True))
     else:
         opened = [command.source.open(path) for path in paths]
     recordings = [command.submap.prepared(*one) for one in zip(opened, poses or [None] * len(opened), strict=True)]

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sglpr_jax.cli.recording import OdometrySubmapOptions, RecordingOptions
-from sglpr_jax.cli.runtime import console, parse_command, run
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import Scale, ScanFormat, SensorHeight
 from sglpr_jax.fields import CountOrNone
 from sglpr_jax.loops.config import CANDIDATES, PlaceCount
@@ -60,8 +60,8 @@ class RelocalizeCommand:
     submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
 
 
-def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
-    """Run the command. Returns the answers, the most probable first."""
+def relocalize(command: RelocalizeCommand) -> None:
+    """Run the command."""
     from sglpr_jax.files import check_writable, naming, write_json  # slow imports, not needed for --help
     from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.maps.query import query_of, read_query
@@ -88,14 +88,17 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     if not found:
         raise ValueError(f"{name}: expected a scan that shows a place, found an almost empty one")
     if command.out is not None:
-        write_json(command.out, [_as_json(one) for one in found])
+        answers = [
+            {
+                "place": one.place,
+                "probability": one.probability,
+                "world_from_query": one.world_from_query.tolist(),
+                "covariance": one.loop.covariance.tolist(),
+            }
+            for one in found
+        ]
+        write_json(command.out, answers)
     console().print(_table(name, found))
-    return found
-
-
-def _as_json(found: "Relocated") -> dict:
-    about = {"place": found.place, "probability": found.probability}
-    return {**about, "world_from_query": found.world_from_query.tolist(), "covariance": found.loop.covariance.tolist()}
 
 
 def _table(name: str, found: "list[Relocated]") -> Table:
@@ -109,12 +112,3 @@ def _table(name: str, found: "list[Relocated]") -> Table:
         place = escape(one.place)
         table.add_row(place, f"{one.probability:.4f}", *(f"{value:.2f}" for value in pose[:3, 3]), f"{yaw:.1f}")
     return table
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(RelocalizeCommand, "relocalize"), relocalize)
-
-
-if __name__ == "__main__":
-    main()

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import console, progress_bar, stop_on_signal
 from sglpr_jax.cli.train import exit_unless_finished
 from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.reproduce.experiments import EXPERIMENTS
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.presets import load_preset
 
 if TYPE_CHECKING:
     from sglpr_jax.reproduce.plan import Plan
@@ -68,13 +67,8 @@ class ReproduceCommand:
     )
 
 
-def parse(arguments: list[str] | None = None) -> ReproduceCommand:
-    """Parse the command line."""
-    return parse_command(ReproduceCommand, "reproduce", arguments, load_preset=load_preset)
-
-
-def reproduce(command: ReproduceCommand) -> Path:
-    """Run the command. Returns the output folder."""
+def reproduce(command: ReproduceCommand) -> None:
+    """Run the command."""
     from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
     from sglpr_jax.data.readers import recording_names
     from sglpr_jax.reproduce.plan import check, make_plan, time_a_step
@@ -87,13 +81,12 @@ def reproduce(command: ReproduceCommand) -> Path:
     check(runs, names, seqs, command.method, command.nclt, weights=command.weights, trained=command.train)
     if not command.train and not command.plan:
         _write(command, names, runs, seqs)
-        return command.out
+        return
     plan = make_plan(runs, names if command.train else [], seqs)
     print(plan.text(time_a_step(runs, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
     if not command.plan:
         _train(runs, plan)
         _write(command, names, runs, seqs)
-    return command.out
 
 
 def _train(runs: "Runs", plan: "Plan") -> None:
@@ -108,13 +101,13 @@ def _train(runs: "Runs", plan: "Plan") -> None:
 
 def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tuple[str, ...]) -> None:
     """Compute, write and print the tables and figures of finished runs."""
-    from sglpr_jax.cli.datasets import cached_sessions
+    from sglpr_jax.cli.datasets import dataset_root
     from sglpr_jax.reproduce.figures import write_figures
     from sglpr_jax.reproduce.tables import Reproduction, write_tables
 
     record_command(command, command.out)
     compared = (*command.weights, *command.method)
-    found = Reproduction(runs, seqs, compared, lambda: command.nclt or cached_sessions(), trained=command.train)
+    found = Reproduction(runs, seqs, compared, lambda: dataset_root(command.nclt, sessions=True), trained=command.train)
     for name in names:
         if EXPERIMENTS[name].kind == "figure":
             for path in write_figures(name, found, command.out):
@@ -122,12 +115,3 @@ def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tupl
         else:
             for table in write_tables(name, found, command.out):
                 console().print(table)
-
-
-def main() -> None:
-    """The entry point."""
-    run(parse, reproduce)
-
-
-if __name__ == "__main__":
-    main()

@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import distribution
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import tyro
 from rich.console import Console
@@ -29,7 +29,7 @@ from sglpr_jax.fields import check_value, field_types, has_bounds
 from sglpr_jax.files import in_short, printable
 
 _TABLE_WIDTH = 140
-_INSTALLED_AS = "sglpr-"
+INSTALLED_AS = "sglpr-"
 """Prefix of the commands that `pip install` creates."""
 _OBJECTS_BETWEEN_COLLECTIONS = 100_000
 """Allocations between garbage collections. Imports and tracing create permanent objects; with Python's default of 700,
@@ -52,9 +52,7 @@ def cache_folder() -> Path:
         return Path(_temporary_folder().name)
 
 
-@functools.cache
-def _temporary_folder() -> tempfile.TemporaryDirectory:
-    return tempfile.TemporaryDirectory(prefix="sglpr-jax-")
+_temporary_folder = functools.cache(functools.partial(tempfile.TemporaryDirectory, prefix="sglpr-jax-"))
 
 
 def own_names(text: str) -> str:
@@ -62,21 +60,14 @@ def own_names(text: str) -> str:
 
     Paths stay unchanged: /home/me/bin/embed, bin/08.npz, bin/map/08.npz.
     """
-    if not Path(sys.argv[0]).name.startswith(_INSTALLED_AS):
+    if not Path(sys.argv[0]).name.startswith(INSTALLED_AS):
         return text
     scripts = distribution("sglpr-jax").entry_points.select(group="console_scripts")
-    names = "|".join(re.escape(script.name.removeprefix(_INSTALLED_AS)) for script in scripts)
-    return re.sub(rf"(?<![\w/.~-])bin/({names})(?![\w/-]|\.\w)", rf"{_INSTALLED_AS}\1", text)
+    names = "|".join(re.escape(script.name.removeprefix(INSTALLED_AS)) for script in scripts)
+    return re.sub(rf"(?<![\w/.~-])bin/({names})(?![\w/-]|\.\w)", rf"{INSTALLED_AS}\1", text)
 
 
-def parse_command(
-    command: type[T],
-    name: str,
-    arguments: list[str] | None = None,
-    *,
-    load_preset: Callable[[str], Any] | None = None,
-    description: str | None = None,
-) -> T:
+def parse_command(command: type[T], name: str, arguments: list[str] | None = None) -> T:
     """Parse the flags of a command. With --dump-config, print their values and exit.
 
     Flags override the file of --config, the file overrides the preset, and the preset overrides the defaults.
@@ -85,8 +76,6 @@ def parse_command(
       command: Dataclass of the command.
       name: Name of the command in `bin/`.
       arguments: Command line without the name. None: that of this process.
-      load_preset: Loads the default of the field `config`, given the value of --preset. None: no presets.
-      description: Text of --help. None: the docstring of the command.
 
     Raises:
       ValueError: If a number is outside the bounds of its annotation (`fields.py`), or if the file of --config is
@@ -96,28 +85,32 @@ def parse_command(
         "Line",
         [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
     )
-    about = own_names(description or inspect.getdoc(command) or "")
-    made, arguments = with_defaults(command, arguments, load_preset=load_preset)
+    about = inspect.getdoc(command) or ""
+    made, arguments = with_defaults(command, arguments)
+    if hasattr(made, "config"):
+        from sglpr_jax.training.presets import preset_names  # slow import, not needed by most commands
+
+        about += f"\nPresets: {', '.join(preset_names())}"
     hide_nested(made)
     default = line_type(made, ConfigFlags())
-    line = tyro.cli(line_type, args=arguments, prog=own_names(f"bin/{name}"), description=about, default=default)
-    _check_numbers(line.command)
+    line = tyro.cli(
+        line_type, args=arguments, prog=own_names(f"bin/{name}"), description=own_names(about), default=default
+    )
+    for field, annotation in field_types(command).items():
+        if has_bounds(annotation):
+            check_value(getattr(line.command, field), annotation, f"--{field.replace('_', '-')}")
     if line.common.dump_config:
         print(json.dumps(flag_values(line.command), indent=2))
         sys.exit(0)
     return line.command
 
 
-def _check_numbers(command: Any) -> None:
-    """Raise ValueError, which begins with the flag, if a number is outside the bounds of its annotation."""
-    for name, annotation in field_types(type(command)).items():
-        if has_bounds(annotation):
-            check_value(getattr(command, name), annotation, f"--{name.replace('_', '-')}")
-
-
 def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
-    """Parse a command line and run the command. Invalid input gives one line on stderr and exit status 1, Ctrl-C gives
-    130. If the reader of the output ends early, as `head` does, the command ends without a message."""
+    """Parse a command line and run the command, which may return its exit status.
+
+    Invalid input gives one line on stderr and exit status 1, Ctrl-C gives 130. If the reader of the output ends early,
+    as `head` does, the command ends without a message.
+    """
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     for chatty in ("absl", "asyncio"):  # they log pages about a failed checkpoint, which orbax also raises
         logging.getLogger(chatty).setLevel(logging.CRITICAL)
@@ -132,8 +125,14 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
     try:
         command = parse()
-        _keep_compiled_programs()
-        work(command)
+        if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # keep compiled programs for the next start
+            import jax  # slow import, not needed for --help or a wrong flag
+
+            jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        ended = work(command)
+        if isinstance(ended, int):
+            sys.exit(ended)
     except BrokenPipeError:
         sys.exit(_ENDED_BY_READER)
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
@@ -144,7 +143,10 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     finally:
-        _flush_stdout()
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:  # Python would report it at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _one_line(error: Exception) -> str:
@@ -163,23 +165,6 @@ def _check_devices() -> None:
     except (RuntimeError, AssertionError) as error:
         reason = f"expected a device that JAX finds, found none ({in_short(error)})"
         sys.exit(_one_line(ValueError(f"JAX_PLATFORMS={asked}: {reason}")))
-
-
-def _flush_stdout() -> None:
-    """Flush stdout. If its reader has ended, discard the rest, because Python would report it at exit."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _keep_compiled_programs() -> None:
-    """Cache compiled programs for the next start, unless the user has set JAX's own cache folder."""
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        import jax  # slow import, not needed for --help or a wrong flag
-
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:

@@ -8,7 +8,7 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
-from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
+from sglpr_jax.cli.runtime import console, progress_bar
 from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -43,8 +43,8 @@ class SegmentCommand:
     """Minimum probability of the most likely class. Cells below it stay unlabelled and are not scored."""
 
 
-def segment(command: SegmentCommand) -> Path:
-    """Run the command. Returns the output folder."""
+def segment(command: SegmentCommand) -> None:
+    """Run the command."""
     from sglpr_jax.evaluation.segmentation import segment_recording  # slow imports, not needed for --help
     from sglpr_jax.files import check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
@@ -70,13 +70,3 @@ def segment(command: SegmentCommand) -> Path:
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())
     record_command(command, command.out)
-    return command.out
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(SegmentCommand, "segment"), segment)
-
-
-if __name__ == "__main__":
-    main()

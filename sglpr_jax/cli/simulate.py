@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-from sglpr_jax.cli.runtime import parse_command, run
 from sglpr_jax.sim import SCANS
 
 
@@ -56,19 +55,9 @@ class SimulateCommand:
     """Seed of the towns and drives."""
 
 
-def write_simulation(command: SimulateCommand) -> Path:
-    """Run the command. Returns the folder of the dataset."""
+def write_simulation(command: SimulateCommand) -> None:
+    """Run the command."""
     from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
 
     options = {field.name: getattr(command, field.name) for field in dataclasses.fields(command)}
     print(simulate(options.pop("out"), routes=options.pop("seq"), **options))
-    return command.out
-
-
-def main() -> None:
-    """The entry point."""
-    run(lambda: parse_command(SimulateCommand, "simulate"), write_simulation)
-
-
-if __name__ == "__main__":
-    main()

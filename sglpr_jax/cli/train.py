@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.recording import report_bad_scan
-from sglpr_jax.cli.runtime import StopRequest, console, parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import StopRequest, console, progress_bar, stop_on_signal
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.files import file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
-from sglpr_jax.training.presets import load_preset, preset_names
 
 if TYPE_CHECKING:
     from sglpr_jax.data.recording import Recording
@@ -24,8 +23,6 @@ SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_
 """Flags that must be equal in a resumed run, beside its configuration."""
 SETTINGS_SINCE = ("format", "sensor_height", "skip_bad")
 """More flags of this kind, which older runs do not know. They are stored only if they differ from their defaults."""
-GO_ON = "continue with --resume"
-"""Advice for continuing a stopped run."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,15 +87,8 @@ class TrainCommand:
     )
 
 
-def parse(arguments: list[str] | None = None) -> TrainCommand:
-    """Parse the command line."""
-    description = f"{TrainCommand.__doc__}\nPresets: {', '.join(preset_names())}"
-    command = parse_command(TrainCommand, "train", arguments, load_preset=load_preset, description=description)
-    return dataclasses.replace(command, config=without_untrained_head(command.config))
-
-
-def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
-    """Run the command. Returns the folder of the run. `go_on` is printed as advice if the training is stopped."""
+def train_and_test(command: TrainCommand, *, go_on: str = "continue with --resume") -> None:
+    """Run the command. `go_on` is printed as advice if the training is stopped."""
     from sglpr_jax.evaluation.final_test import final_test  # slow imports, not needed for --help
     from sglpr_jax.training.devices import connected, is_first_host
 
@@ -111,7 +101,7 @@ def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
         found = final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar)
         console().print(found)
         print(f"written to {out}")
-    return folder
+    print(f"run: {folder}")
 
 
 def run_folder(command: TrainCommand) -> Path:
@@ -184,7 +174,7 @@ def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[R
         *read, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
         recordings, also = read[: len(recordings)], read[len(recordings) :]
     if command.pseudo_labels is not None:
-        recordings = _pseudo_labelled(recordings, command.pseudo_labels, command.config)
+        recordings = _pseudo_labelled(recordings, command.pseudo_labels, without_untrained_head(command.config))
     return recordings, also, test
 
 
@@ -199,12 +189,3 @@ def _pseudo_labelled(recordings: "Sequence[Recording]", folder: Path, config: Tr
     images = sum(sum(recording.labelled) for recording in labelled)
     print(f"{images} of {sum(map(len, labelled))} images have labels, including those of {folder}", file=sys.stderr)
     return labelled
-
-
-def main() -> None:
-    """The entry point."""
-    run(parse, lambda command: print(f"run: {train_and_test(command)}"))
-
-
-if __name__ == "__main__":
-    main()

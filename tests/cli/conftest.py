@@ -1,7 +1,6 @@
 """Command lines run in this process, on datasets and with a model that take seconds."""
 
 import contextlib
-import importlib
 import io
 import json
 import os
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sglpr_jax.cli.__main__ import main
 from sglpr_jax.data.formats.pose_files import read_kitti
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.sim.dataset import simulate
@@ -35,12 +35,11 @@ class Ended(NamedTuple):
 
 def run_command(name: str, *arguments: object) -> Ended:
     """Run `bin/<name> <arguments>` in this process."""
-    module = importlib.import_module(f"sglpr_jax.cli.{name}")
     out, error = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
-        patch.setattr(sys, "argv", [name, *map(str, arguments)])
+        patch.setattr(sys, "argv", ["sglpr_jax.cli", name, *map(str, arguments)])
         try:
-            module.main()
+            main()
             status = 0
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else 1

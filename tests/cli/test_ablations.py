@@ -1,4 +1,4 @@
-"""Every setting of tables 4 to 7 and figure 9 is a few flags: it trains, its weights load and say what they are."""
+"""Settings of tables 4 to 7 and figure 9 are a few flags: they train, and their weights say what they are."""
 
 import json
 import shutil
@@ -7,77 +7,64 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.cli.train import parse
+from sglpr_jax.cli.runtime import parse_command
+from sglpr_jax.cli.train import TrainCommand
 from sglpr_jax.evaluation import final_test
 from sglpr_jax.training import recipe
+from sglpr_jax.training.config import without_untrained_head
 from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import assert_one_line_error, run_command
 
-BACKBONE = {"backbone", "expand", "place_head"}
-SETTINGS = {  # flags, the parts that have weights, the loss terms beside the triplet's
-    "nor NetVLAD, 25, Dice, not turned": (
-        "--model.head.cbam False --model.head.pooling mean --model.categories 25 --loss.ce-weight 0 --rotate False",
-        {*BACKBONE, "segmentation_head"},
-        {"dice"},
-    ),
-    "triplet alone": ("--loss.ce-weight 0 --loss.dice-weight 0", BACKBONE, set()),
-    "RB+RS, 15": ("--model.head.input counts+labels --model.categories 15", {"place_head"}, set()),
-}
+WITHOUT = "--model.head.cbam False --model.head.pooling mean --model.categories 25 --loss.ce-weight 0 --rotate False"
+TRIPLET = "--loss.ce-weight 0 --loss.dice-weight 0"
+LABELS = "--model.head.input counts+labels --model.categories 15"
 
 
-def flags_of(name: str) -> list[str]:
-    return SETTINGS[name][0].split()
+@pytest.fixture
+def run(town, preset, tmp_path, monkeypatch):
+    """Two steps of a setting; returns the folder of the run."""
 
-
-@pytest.fixture(scope="module")
-def runs(town, preset, tmp_path_factory):
-    """Two steps of each setting, made when first asked for; nobody changes them."""
-    made = {}
-
-    def run(name: str):
-        if name not in made:
-            folder = made[name] = tmp_path_factory.mktemp("ablation") / "run"
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(final_test, "final_test", lambda *_, **__: None)
-                patch.setattr(recipe, "training_recall", lambda *_: lambda _: {"score": 0.0})
-                patch.setattr(final_test.LearningCurves, "on_end", lambda *_: None)
-                flags = ("--data", town, "--preset", preset, "--out", folder, "--steps", 2, *flags_of(name))
-                ended = run_command("train", "--seq", "08", *flags)
-            assert ended.status == 0, ended.error
-        return made[name]
+    def run(flags: str):
+        with monkeypatch.context() as patch:
+            patch.setattr(final_test, "final_test", lambda *_, **__: None)
+            patch.setattr(recipe, "training_recall", lambda *_: lambda _: {"score": 0.0})
+            patch.setattr(final_test.LearningCurves, "on_end", lambda *_: None)
+            options = ("--data", town, "--preset", preset, "--out", tmp_path / "run", "--steps", 2, *flags.split())
+            ended = run_command("train", "--seq", "08", *options)
+        assert ended.status == 0, ended.error
+        return tmp_path / "run"
 
     return run
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_setting_trains_and_says_what_it_is(runs, name):
-    folder, flags, (_, parts, terms) = runs(name), flags_of(name), SETTINGS[name]
+def test_a_setting_trains_and_says_what_it_is(run):
+    folder = run(WITHOUT)
     params = sglpr_jax.load(folder)
-    assert set(params.weights) == parts
+    assert set(params.weights) == {"backbone", "expand", "place_head", "segmentation_head"}
     lines = read_metrics(folder / "metrics.jsonl")
     assert [line["step"] for line in lines if "loss" in line] == [1, 2]
-    assert lines[0].keys() & {"cross_entropy", "dice"} == terms
+    assert lines[0].keys() & {"cross_entropy", "dice"} == {"dice"}
     told = json.loads((folder / "config.json").read_text())["config"]["model"]
-    assert told == json.loads((folder / "weights" / "config.json").read_text())
-    asked = dict(zip(flags[::2], flags[1::2], strict=True)).get("--model.categories", "20")
-    assert told["categories"] == (int(asked) if terms or params.config.head.reads_labels else 0)
-    has = params.weights["place_head"].keys()
-    assert ("cbam" in has, "netvlad" in has) == ("no" not in name, "nor" not in name)
+    assert told == json.loads((folder / "weights" / "config.json").read_text()) and told["categories"] == 25
+    assert not {"cbam", "netvlad"} & params.weights["place_head"].keys()
 
 
 def test_no_categories_are_the_triplet_alone():
     """Figure 9's 0, table 5's #1 and table 7's #1 are one network."""
-    none, alone = (parse(flags.split()).config for flags in ("--model.categories 0", SETTINGS["triplet alone"][0]))
+    none, alone = (
+        without_untrained_head(parse_command(TrainCommand, "train", flags.split()).config)
+        for flags in ("--model.categories 0", TRIPLET)
+    )
     assert none.model == alone.model and none.model.classes == 0 and not none.model.segments
 
 
 @pytest.mark.slow
-def test_a_head_that_reads_labels_resumes_and_embeds_a_drive_with_labels_only(runs, command, town, preset, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(runs("RB+RS, 15"), folder)
-    flags = ("--data", town, "--preset", preset, "--out", folder, "--resume", *flags_of("RB+RS, 15"))
+def test_a_head_that_reads_labels_resumes_and_embeds_a_drive_with_labels_only(run, command, town, preset, tmp_path):
+    folder = run(LABELS)
+    assert set(sglpr_jax.load(folder).weights) == {"place_head"}
+    flags = ("--data", town, "--preset", preset, "--out", folder, "--resume", *LABELS.split())
     resumed = command("train", "--seq", "08", *flags, "--steps", 3)  # to the end: the test recording has labels
     assert resumed.status == 0, resumed.error
     report = json.loads((folder / "test" / "results.json").read_text())
@@ -95,8 +82,8 @@ def test_a_head_that_reads_labels_resumes_and_embeds_a_drive_with_labels_only(ru
     shutil.copytree(town, bare)
     shutil.rmtree(bare / "sequences" / "08" / "labels")
     ended = command("embed", *options[:2], "--data", bare, *options[4:], "--skip-bad")
-    assert_one_line_error(ended, "needs labels", "found none in sequence 08")
-    flags = ("--data", bare, "--preset", preset, "--out", tmp_path / "other", *flags_of("RB+RS, 15"))
+    assert_one_line_error(ended, "sglpr needs labels beside the scans, found none in sequence 08")
+    flags = ("--data", bare, "--preset", preset, "--out", tmp_path / "other", *LABELS.split())
     ended = command("train", "--seq", "08", *flags)
     assert_one_line_error(ended, "model.head.input", "sequence 08", "found 0 of 40")
     assert not (tmp_path / "other").exists()

@@ -10,8 +10,6 @@ from sglpr_jax.models.torch_import import torch_name
 from sglpr_jax.models.weights import by_name
 from sglpr_jax.training.presets import load_preset
 
-from .conftest import assert_one_line_error
-
 MODEL = """
 import dataclasses
 
@@ -71,21 +69,3 @@ def test_swin_t_fills_what_it_fits_and_says_what_it_does_not(command, preset, st
     expected = state["layers.0.blocks.0.mlp.fc1.weight"].reshape(-1)[0]
     for place in ("encoder_0", "decoder_1"):
         assert (values[f"backbone/{place}/block_0/mlp_in/kernel"] == expected).all()
-
-
-@pytest.mark.slow
-def test_what_cannot_be_converted_is_one_line(command, preset, state, tmp_path):
-    (tmp_path / "swin.pth").write_bytes(b"a pickle")
-    file = written(tmp_path / "unet.safetensors", {**state, "more.weight": np.zeros(3, np.float32)})
-    for given, message in (
-        ((tmp_path / "swin.pth", "--preset", preset), "found a pickle of PyTorch's"),
-        ((tmp_path / "none.safetensors", "--preset", preset), "expected a checkpoint, found no file"),
-        ((file, "--network", "swin-unet", "--preset", preset), "not a weight of Swin-Unet: more.weight"),
-        ((file, "--preset", "circular"), "expected a model with the backbone 'swin', found 'circular'"),
-    ):
-        ended = command("convert", *given, "--out", tmp_path / "start")
-        assert_one_line_error(ended, message)
-        assert not (tmp_path / "start").exists()
-    (tmp_path / "start").mkdir()
-    ended = command("convert", file, "--out", tmp_path / "start")
-    assert_one_line_error(ended, "expected a folder that does not exist yet")

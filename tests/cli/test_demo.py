@@ -3,8 +3,6 @@ from pathlib import Path
 import pytest
 
 from sglpr_jax.cli import datasets, demo
-from sglpr_jax.training import recipe
-from sglpr_jax.training.recipe import TrainResult
 
 
 @pytest.fixture
@@ -38,15 +36,3 @@ def test_the_demo_finds_loops_scores_descriptors_and_trains(command, tiny_demo, 
     assert pages == [out / "loops" / "index.html", out / "00" / "report.html"]
     assert all(page.stat().st_size > 50_000 for page in pages)
     assert (out / "run" / "checkpoints" / "2").is_dir()
-
-
-def test_a_demo_that_is_stopped_says_what_it_does_next(command, tiny_demo, random_params, tmp_path, monkeypatch):
-    def train(config, recordings, *, out, **_):
-        return TrainResult(random_params(config.model), out, 1, config, None)
-
-    monkeypatch.setattr(recipe, "train", train)
-    for part in ("loops_of_recording", "embed_recording", "evaluate_file"):
-        monkeypatch.setattr(demo, part, lambda command: None)
-    ended = command("demo", "--out", tmp_path / "demo")
-    assert "stopped at step 1 of 2; the next demo restarts its training" in ended.error
-    assert "--resume" not in ended.error

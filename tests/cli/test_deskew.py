@@ -6,8 +6,6 @@ import pytest
 import sglpr_jax
 from sglpr_jax.pose_graph.files import write_tum
 
-from .conftest import assert_one_line_error
-
 SCANS, SPEED_MPS, RATE_S = 4, 30.0, 0.1
 HEAD = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n"
 
@@ -48,13 +46,3 @@ def test_deskewed_scans_are_described_like_those_without_motion(command, drive, 
     assert "deskewed" in found[2].config and "deskewed" not in found[1].config
     apart = [np.abs(one.descriptors - found[0].descriptors).max(axis=1) for one in found[1:]]
     assert (apart[0] > 0.1).all() and np.median(apart[1]) < 1e-3
-
-
-def test_deskew_without_times_of_points_or_poses_is_one_clear_error(command, drive, tmp_path):
-    skewed, _, poses = drive
-    run = ("embed", "--method", "scan-context", "--out", tmp_path / "out.npz", "--data")
-    assert_one_line_error(command(*run, skewed, "--deskew"), "expected poses with rotations for --deskew, found none")
-    for path in skewed.glob("*.ply"):
-        path.write_bytes(path.read_bytes().replace(b"uint t\n", b"uint u\n"))
-    ended = command(*run, skewed, "--deskew", "--odometry", poses)
-    assert_one_line_error(ended, "sequence skewed: expected times of the points to remove the motion within scans")

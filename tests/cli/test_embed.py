@@ -77,47 +77,6 @@ def test_a_bad_scan_is_named_and_left_out_only_when_asked(embed, scans, tmp_path
     np.testing.assert_array_equal(file.descriptors, np.delete(whole.descriptors, 4, axis=0))
 
 
-def test_poses_that_are_missing_or_not_numbers_are_named(embed, town, tmp_path):
-    root = tmp_path / "town"
-    shutil.copytree(town, root)
-    poses = root / "sequences" / "08" / "poses.txt"
-    lines = poses.read_text().splitlines()
-    poses.write_text("\n".join([*lines[:2], "nan " + lines[2].split(maxsplit=1)[1], *lines[3:]]))
-    options = ("--method", "polar-fft", "--data", root, "--seq", "08")
-    assert_one_line_error(embed(*options)[0], f"{poses}, line 3", "finite numbers", "nan")
-    poses.write_text("\n".join(lines[:30]))
-    assert_one_line_error(embed(*options)[0], poses, "at least 40 rows", "found 30")
-    poses.unlink()  # KITTI's test sequences have none, unless they are asked for
-    assert_one_line_error(
-        embed(*options, "--pose-source", "semantickitti")[0], root, "sequences/08/poses.txt", "found none"
-    )
-    ended, out = embed(*options)
-    assert ended.status == 0 and load(out).positions is None
-
-
-def test_a_sequence_or_dataset_that_does_not_exist_is_named(embed, town, tmp_path):
-    options = ("--method", "polar-fft", "--data")
-    assert_one_line_error(embed(*options, town, "--seq", "8")[0], town, "'8'", "00, 05, 08")
-    assert_one_line_error(embed(*options, town)[0], town, "the name of one sequence", "00, 05, 08")
-    assert_one_line_error(embed(*options, tmp_path / "no")[0], tmp_path / "no", "no such folder")
-
-
-def test_an_output_that_cannot_be_written_is_refused_before_the_work(embed, town):
-    options = ("--method", "polar-fft", "--data", town, "--seq", "08")
-    assert_one_line_error(embed(*options, out="no/out.npz")[0], "no/out.npz", "does not exist")
-    assert_one_line_error(embed(*options, out="out")[0], ".npz")
-
-
-def test_what_a_method_needs_is_one_line(embed, images, scans, town):
-    ended, out = embed("--method", "m2dp", "--data", images, "--seq", "06", "--skip-bad")
-    assert_one_line_error(ended, "m2dp needs points", "only images in sequence 06", "polar-fft")
-    ended, _ = embed("--method", "ssc", "--data", scans, "--skip-bad")
-    assert_one_line_error(ended, "ssc needs labels", "found none in sequence my_scans")
-    ended, _ = embed("--method", "solid", "--weights", "sglpr", "--data", town, "--seq", "08")
-    assert_one_line_error(ended, "sglpr: expected --method sglpr or one of bin/peers with --weights, found solid")
-    assert not out.exists()
-
-
 @pytest.mark.slow
 def test_corrupted_scans_have_other_descriptors_and_the_same_poses(embed, command, town, images, tmp_path):
     options = ("--data", town, "--seq", "08", "--method", "solid", "--seed", 3)
@@ -139,11 +98,3 @@ def test_corrupted_scans_have_other_descriptors_and_the_same_poses(embed, comman
     assert_one_line_error(in_store, "expected a descriptor file with --corruption")
     of_images = ("--data", images, "--seq", "06", "--method", "polar-fft", "--corruption", "beams-16")
     assert_one_line_error(embed(*of_images)[0], "beams-16 needs points, found only images in sequence 06")
-
-
-def test_what_was_found_is_said(embed, scans):
-    ended, _ = embed("--method", "polar-fft", "--data", scans)
-    said = ended.error.splitlines()
-    assert said[0] == "my_scans: 12 scans" and said[-1] == "times: none; poses: none"
-    assert said[1].startswith("format: kitti (16 bytes a point), found from 5 of 12 scans")
-    assert said[2].startswith("sensor: ")

@@ -64,10 +64,3 @@ def test_wrong_sessions_are_refused(embedded, command, tmp_path):
     ended = refused(embedded / f"{DAYS[0]}.npz", "--database", database, "--seq", "00")
     assert_one_line_error(ended, "only descriptor files with --database", "--seq")
     assert not (tmp_path / "out").exists()
-
-
-def test_two_routes_of_a_day_are_refused_before_anything_is_written(command, tmp_path):
-    out = ("--out", tmp_path / "town")
-    ended = command("simulate", *out, "--sessions", MAP, "--seq", "00", "05")
-    assert_one_line_error(ended, "at most one route")
-    assert not (tmp_path / "town").exists()

@@ -11,8 +11,6 @@ import pytest
 import sglpr_jax
 from sglpr_jax.models import shipped
 
-from .conftest import assert_one_line_error
-
 load = sglpr_jax.DescriptorFile.load
 
 
@@ -52,21 +50,6 @@ def test_float32_weights_with_the_head_are_those_of_before(command, weights, tmp
     assert ended.status == 0, ended.error
     for file in ("model.safetensors", "config.json"):
         assert (tmp_path / "out" / file).read_bytes() == (weights / file).read_bytes()
-
-
-def test_a_folder_that_is_there_is_left_alone(command, exported, weights):
-    (exported / "README.md").write_text("a card")
-    ended = command("export", "--weights", weights, "--out", exported)
-    assert_one_line_error(ended, exported, "expected a folder that does not exist yet")
-    assert (exported / "README.md").read_text() == "a card"
-
-
-@pytest.mark.parametrize("tool", ["embed", "segment", "evaluate", "export"])
-def test_an_unknown_name_lists_those_there_are(command, exported, town, tmp_path, tool):
-    file = (tmp_path / "08.npy",) if tool == "evaluate" else ()
-    data = () if tool == "export" else ("--data", town, "--seq", "08")
-    ended = command(tool, *file, "--weights", "circularr", *data, "--out", tmp_path / "out.npz")
-    assert_one_line_error(ended, "circularr: expected a folder", "(circular), found neither")
 
 
 @pytest.mark.slow

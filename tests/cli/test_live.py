@@ -14,7 +14,7 @@ from sglpr_jax.data.readers import open_recording
 from sglpr_jax.files import half_written
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl, write_tum
 
-from .conftest import SCANS, assert_one_line_error, run_command
+from .conftest import SCANS, run_command
 
 HALF, BEGIN, TIMEOUT_S = SCANS // 2, 1_700_000_000.25, 120
 
@@ -52,13 +52,3 @@ def test_a_stopped_node_goes_on_with_its_map(town, tmp_path):
     out = tmp_path / "map"
     assert len(read_loops_jsonl(out / "loops.jsonl")) == sum(one["type"] == "loop" for one in found())
     assert len(read_g2o(out / "loops.g2o").poses) == SCANS and not half_written(out)
-
-
-def test_wrong_sources_and_folders_are_one_line(tmp_path):
-    (tmp_path / "scans").mkdir()
-    out = ("--out", tmp_path / "map", "--weights", "circular")
-    ended = run_command("live", "ros:1", *out)
-    assert_one_line_error(ended, "ros:1: expected one of the sources folder, bag, dds, zenoh, found ros")
-    own = tmp_path / "map" / "trajectory.tum"
-    ended = run_command("live", f"folder:{tmp_path / 'scans'}", *out, "--poses", own)
-    assert_one_line_error(ended, "trajectory.tum: expected odometry that this run does not overwrite")

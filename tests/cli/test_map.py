@@ -11,7 +11,6 @@ import sglpr_jax
 from sglpr_jax.cli.relocalize import _table
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.maps import build
 from sglpr_jax.maps.build import map_recording
@@ -81,19 +80,6 @@ def test_a_scan_of_the_map_finds_itself_in_it(command, scans, poses, run, tmp_pa
 
 
 @pytest.mark.slow
-def test_bad_scans_are_told_and_skipped(command, scans, run, tmp_path):
-    (scans / "000003.bin").write_bytes(b"half")
-    out = tmp_path / "town.safetensors"
-    assert_one_line_error(command(*run, "--out", out), "000003.bin")
-    assert not out.exists()
-    ended = command(*run, "--out", out, "--skip-bad")
-    assert ended.status == 0, ended.error
-    assert ended.out == f"{out}: 7 places, 7 of them from 8 scans of 08, 1 scans skipped\n"
-    assert [line[:14] for line in ended.error.splitlines() if "skipped" in line] == ["skipped 000003"]
-    assert not out.with_suffix(".unfinished").exists()
-
-
-@pytest.mark.slow
 def test_a_stopped_map_of_a_name_that_is_taken_goes_on_and_ends_as_if_not_stopped(
     command, poses, run, tmp_path, monkeypatch
 ):
@@ -142,14 +128,6 @@ def test_a_map_of_another_frame_is_aligned_or_rejected(command, poses, run, town
     assert_one_line_error(command(*add, "--frame", "align"), "expected places in common with", "found too few")
 
 
-def test_two_processes_do_not_make_one_map(command, run, tmp_path):
-    out = tmp_path / "town.safetensors"
-    with exclusive_lock(out.with_suffix(".unfinished")):
-        ended = command(*run, "--out", out)
-    assert_one_line_error(ended, "town.unfinished: expected exclusive use, found another process at work")
-    assert {path.name for path in tmp_path.iterdir()} == {"08", "poses.tum"}
-
-
 @pytest.fixture
 def places_file(tmp_path):
     """A map of one place, made without describing a scan."""
@@ -183,34 +161,15 @@ def test_a_full_disk_leaves_the_map_as_it_was_and_what_was_seen(command, run, pl
     assert len(PlaceMap.load(places_file)) > 1 and not (tmp_path / "one.unfinished").exists()
 
 
-def test_wrong_input_of_a_map_is_one_clear_error(command, poses, run, tmp_path):
-    out = ("--out", tmp_path / "a.safetensors")
-    assert_one_line_error(command(*run, "--out", tmp_path / "town.npz"), "--out", ".safetensors", "town.npz")
-    assert_one_line_error(command(*run, "--out", poses / "a.safetensors"), "expected a folder to write into")
-    assert_one_line_error(command(*run, *out, "--add-to", tmp_path / "none"), "none")
-    assert_one_line_error(command(*run, *out, "--add-to", tmp_path), "expected an index, found a folder")
-    (tmp_path / "late.tum").write_text("0 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
-    run = (*run[:3], tmp_path / "late.tum", *out)
-    assert_one_line_error(command(*run), "late.tum, row 3: expected a time >= 2.0, found 1.0")
-    assert list(tmp_path.glob("a.safetensors")) == []
-
-
 def test_wrong_queries_and_maps_are_one_clear_error(command, scans, places_file, tmp_path):
-    def ask(scan, *, places=places_file):
-        return command("relocalize", scan, "--map", places, "--out", tmp_path / "pose.json")
+    def ask(scan):
+        return command("relocalize", scan, "--map", places_file, "--out", tmp_path / "pose.json")
 
-    rng = np.random.default_rng(0)
-    rng.normal(scale=9, size=(200, 4)).astype(np.float32).tofile(tmp_path / "sky.bin")
     np.array([5, 0, 0, 1], np.float32).tofile(tmp_path / "dot.bin")
-    ended = command("relocalize", tmp_path / "sky.bin", "--map", places_file, "--sensor-height", "estimate")
-    assert_one_line_error(ended, "sky.bin", "expected ground to estimate the sensor's height")
     assert_one_line_error(ask(tmp_path / "dot.bin"), "dot.bin: expected a scan that shows a place")
     assert_one_line_error(ask(scans), "08: expected one scan or image, found a folder; name a file in it")
-    assert_one_line_error(ask(scans / "000002.bin", places=tmp_path / "none"), "none", "expected an index")
     ended = command("relocalize", tmp_path / "dot.bin", "--map", places_file, "--weights", "circular")
     assert_one_line_error(ended, "one.safetensors: expected descriptors of the weights")
-    ended = command("relocalize", "scan.bin", "--map", places_file, "--candidates", "1000000000")
-    assert_one_line_error(ended, "--candidates: expected a number from 1 up to 1000, found 1000000000")
     content = places_file.read_bytes()
     places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
     assert_one_line_error(ask(tmp_path / "dot.bin"), "expected an index with a valid checksum, found a damaged one")

@@ -7,8 +7,6 @@ import pytest
 
 from sglpr_jax.data.readers import open_recording
 
-from .conftest import assert_one_line_error
-
 START = np.array([300.0, -50.0, 10.0])
 
 
@@ -52,10 +50,3 @@ def test_a_scan_is_located_in_the_frame_of_the_cloud(command, town, tmp_path):
     best = json.loads(answer.read_text())[0]
     assert best["place"] == "town/000003"
     np.testing.assert_allclose(np.array(best["world_from_query"])[:3, 3], START + np.array([15, 0, 1.73]), atol=0.3)
-
-
-def test_poses_of_a_graph_have_no_trajectory(command, town, tmp_path):
-    cloud, way = town
-    ended = command("map", cloud, "--poses", way, "--pose-format", "g2o", "--out", tmp_path / "town.safetensors")
-    assert_one_line_error(ended, "format", "g2o")
-    assert not (tmp_path / "town.safetensors").exists()

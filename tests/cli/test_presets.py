@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 import sglpr_jax
-from sglpr_jax.cli.train import parse
+from sglpr_jax.cli.runtime import parse_command
+from sglpr_jax.cli.train import TrainCommand
 from sglpr_jax.models.config import MODELS
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.presets import load_preset, preset_names
@@ -31,7 +32,7 @@ def test_a_preset_loads_and_says_what_to_expect_and_how_to_run_it(path):
 def test_the_flags_of_the_guide_train_the_semantic_map_of_the_shipped_network():
     guide = (CONFIGS[0].parents[1] / "docs/guides/semantics.md").read_text().replace("\\\n", " ")
     command = next(line for line in guide.splitlines() if "--weights sglpr" in line)
-    config = parse(shlex.split(command)[1:]).config
+    config = parse_command(TrainCommand, "train", shlex.split(command)[1:]).config
     assert config.model == sglpr_jax.load("sglpr").config
     assert config.loss.segmentation_alone and not load_preset("sglpr").loss.segmentation_alone
 

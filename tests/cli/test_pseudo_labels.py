@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sglpr_jax.evaluation import final_test
 from sglpr_jax.training import batches as training_batches
@@ -57,18 +56,3 @@ def test_maps_that_a_model_made_teach_beside_those_of_a_second_dataset(
     assert main.any() and not main.all() and also.all()
     assert json.loads((out / "config.json").read_text())["pseudo_labels"] == str(pseudo)
     assert_one_line_error(command("train", *options[:4], *options[6:], "--resume"), "pseudo_labels")
-
-
-def test_pseudo_labels_that_cannot_be_used_are_refused_before_the_run(command, images, town, preset, tmp_path):
-    options = ("--seq", "06", "--preset", preset, "--out", tmp_path / "run", "--pseudo-labels", tmp_path)
-    assert_one_line_error(command("train", *options, "--data", images), tmp_path, "NN/<id>.png", "(00), found none")
-    off = ("--loss.ce-weight", 0, "--loss.dice-weight", 0)
-    assert_one_line_error(command("train", *options, "--data", images, *off), "--pseudo-labels", "segmentation head")
-    assert_one_line_error(
-        command("train", *options, "--seq", "08", "--data", town), tmp_path, "no image recording without labels"
-    )
-    (tmp_path / "00").mkdir()
-    for frame in range(30):
-        Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "00" / f"{frame:06d}.png")
-    ended = command("train", *options, "--data", images)
-    assert_one_line_error(ended, f"{tmp_path}/00/0000", "expected 20 rows of 22 pixels", "found 4 rows")

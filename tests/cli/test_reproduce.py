@@ -6,7 +6,6 @@ import pytest
 
 from sglpr_jax.methods.learned.disco import DISCO
 from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
-from sglpr_jax.reproduce import plan
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
 from sglpr_jax.reproduce.plan import make_plan
 from sglpr_jax.reproduce.runs import Runs
@@ -14,7 +13,6 @@ from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
-from sglpr_jax.training.recipe import TrainResult
 
 from .conftest import SENSOR, assert_one_line_error
 
@@ -91,30 +89,6 @@ def test_other_settings_are_refused_and_more_steps_go_on(reproduced, command):
     assert read_metrics(folder / "full" / "08" / "metrics.jsonl")[-1]["step"] == 4  # only said, not done
 
 
-def test_a_stopped_reproduction_says_how_it_goes_on(town, preset, random_params, tmp_path, command, monkeypatch):
-    config = load_preset(str(preset))
-    stopped = TrainResult(random_params(config.model), tmp_path / "run", 1, config, None)
-    monkeypatch.setattr(plan, "time_a_step", lambda *_: 1.0)
-    monkeypatch.setattr(Runs, "train", lambda *_, **__: stopped)
-    ended = command("reproduce", "table5", *OPTIONS, "--data", town, "--preset", preset, "--out", tmp_path / "out")
-    assert "stopped at step 1 of 4; run the same command again to continue" in ended.error
-    assert "--resume" not in ended.error
-
-
-def test_bad_input_is_refused_before_anything_is_trained(town, images, preset, tmp_path, command):
-    def refused(*arguments):
-        return command("reproduce", *arguments, "--preset", preset, "--out", tmp_path / "out")
-
-    options = ("--data", town, "--seq", "08", "--method", "polar-fft", "--nclt")
-    simulate(tmp_path / "one", sessions=DAYS[:1], scans=2, sensor=SENSOR)
-    assert_one_line_error(refused("figure8", *options, tmp_path / "one"), "one", "two sessions", DAYS[0])
-    assert_one_line_error(refused("table1", "--data", town, "--method", "bow"), "'bow'", "scan-context")
-    assert_one_line_error(refused("table1", "--data", images, "--method", "m2dp"), "m2dp needs points", "00")
-    assert_one_line_error(refused("table5", "--data", images), "table5 is about semantics", "expected labels")
-    assert_one_line_error(refused("table5", "--data", town, "--no-train"), "--no-train", "table5")
-    assert not (tmp_path / "out").exists()
-
-
 def test_every_variant_differs_from_the_preset_and_from_every_other():
     config = load_preset("paper")
     configs = {name: variant_config(config, name) for name in VARIANTS}
@@ -147,11 +121,11 @@ def test_a_plan_writes_no_simulated_recordings(command, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_weights_are_compared_without_training_by_both_protocols(town, tmp_path, command):
+def test_weights_are_compared_without_training_by_both_protocols(town, trained, tmp_path, command):
     out, peer = tmp_path / "out", tmp_path / "disco"
     save_variables(peer, DISCO, random_variables(DISCO, seed=0), {})
     options = ("--data", town, "--seq", "08", "--out", out, "--method", "polar-fft", "--no-train")
-    ended = command("reproduce", "table1", "table2", *options, "--weights", "circular", peer)
+    ended = command("reproduce", "table1", "table2", *options, "--weights", trained.folder, peer)
     assert ended.status == 0, ended.error
     for file, absent, present in (
         ("", "SSC (RINet's paper)", "DiSCO (its own paper)"),
@@ -161,7 +135,7 @@ def test_weights_are_compared_without_training_by_both_protocols(town, tmp_path,
             {row["method"]: row for row in json.loads((out / f"table{n}{file}.json").read_text())} for n in (1, 2)
         )
         ours = [name for name, row in raw.items() if row["source"] == OURS]
-        assert ours == ["circular", str(peer), "polar-fft"]
+        assert ours == [str(trained.folder), str(peer), "polar-fft"]
         assert absent not in raw and present in raw
         for name in ours:  # no pair of the pairs protocol is positive: no mean and no change
             means = [table[name]["mean"] for table in (turned, raw)]

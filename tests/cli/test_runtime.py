@@ -23,34 +23,18 @@ class Example:
     seed: int = 0
 
 
-@pytest.fixture
-def installed(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["/home/me/.local/bin/sglpr-evaluate", "08.npz"])
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("bin/embed, then bin/evaluate.", "sglpr-embed, then sglpr-evaluate."),
         ("(of bin/map: --pose-format)", "(of sglpr-map: --pose-format)"),
+        *((path, path) for path in ("/me/bin/scans/08.npz", "bin/scans/08.npz", "bin/map.safetensors", "my-bin/embed")),
+        ("bin/test", "bin/test"),
     ],
 )
-def test_commands_have_the_names_that_are_installed(installed, text, expected):
+def test_commands_have_the_names_that_are_installed_and_paths_stay(text, expected, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/home/me/.local/bin/sglpr-evaluate", "08.npz"])
     assert own_names(text) == expected
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/home/me/bin/scans/08.npz",
-        "bin/scans/08.npz",
-        "bin/map.safetensors",
-        "my-bin/embed",
-        "bin/test",
-    ],
-)
-def test_paths_and_other_names_stay(installed, path):
-    assert own_names(f"error: {path}: expected a descriptor file") == f"error: {path}: expected a descriptor file"
 
 
 @pytest.mark.parametrize(

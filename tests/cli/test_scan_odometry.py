@@ -8,8 +8,6 @@ import pytest
 from drives import simulated_drive
 
 from sglpr_jax.data.formats.pose_files import read_tum
-from sglpr_jax.loops import search
-from sglpr_jax.loops.result import FoundLoops, Session
 from sglpr_jax.odometry import kiss_icp
 
 from .conftest import assert_one_line_error
@@ -50,21 +48,6 @@ def test_loops_of_scans_alone_end_with_a_trajectory(command, run, tmp_path):
     values = json.loads((out / "command.json").read_text())
     assert (values["odometry"], values["scan-odometry.voxel-m"]) == ("auto", 0.8)
     assert not [path for path in out.iterdir() if path.name.startswith("unfinished")]
-
-
-@pytest.mark.slow
-def test_several_recordings_have_their_own_odometry(command, run, street, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        search,
-        "find_loops",
-        lambda recordings, params, *, odometry, **_: FoundLoops(
-            tuple(Session(one, SCANS, poses) for one, poses in zip(recordings, odometry, strict=True))
-        ),
-    )
-    ended = command("loops", street, *run, "--odometry", "auto", "--no-register", "--out", tmp_path / "found")
-    assert ended.status == 0, ended.error
-    assert {"trajectory-street.tum", "trajectory-street~2.tum"} < {path.name for path in (tmp_path / "found").iterdir()}
-    assert not list((tmp_path / "found").glob("unfinished*"))
 
 
 @pytest.mark.slow

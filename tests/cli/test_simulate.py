@@ -28,23 +28,3 @@ def test_drives_are_written_completed_and_kept(command, tmp_path):
 
     other = command("simulate", "--out", out, "--scans", 4, "--azimuth-steps", 40, "--seed", 5, "--seq", "08")
     assert_one_line_error(other, "simulation.json", "scans 4", "found 3")
-
-
-def test_wrong_input_is_refused_before_anything_is_written(command, tmp_path):
-    out = ("--out", tmp_path / "town")
-    unknown = command("simulate", *out, "--seq", "11")
-    assert_one_line_error(unknown, "00, 01,", "'11'")
-    assert "simulating" not in unknown.error
-    assert_one_line_error(
-        command("simulate", *out, "--sensor", "hdl16"), "hdl64e, hdl32e, hdl32e-nclt, vlp16", "'hdl16'"
-    )
-    (tmp_path / "bad.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4 + "1 0 0 nan 0 1 0 0 0 0 1 0\n")
-    ended = command("simulate", *out, "--along", tmp_path / "bad.txt")
-    assert_one_line_error(ended, "bad.txt, line 5", "expected finite numbers", "nan")
-    assert not (tmp_path / "town").exists()
-
-
-def test_a_folder_that_cannot_be_written_is_named(command, tmp_path):
-    (tmp_path / "file").write_text("")
-    ended = command("simulate", "--out", tmp_path / "file" / "town", *THIN, "--seq", "08")
-    assert_one_line_error(ended, "simulation.json", "cannot be written")

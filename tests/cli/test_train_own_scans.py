@@ -6,12 +6,12 @@ import shutil
 import numpy as np
 import pytest
 
-from sglpr_jax.cli.train import SETTINGS, parse, settings
+from sglpr_jax.cli.train import SETTINGS, TrainCommand, settings
 
 
 def test_flags_that_older_runs_do_not_know_are_noted_only_where_they_are_set():
-    assert tuple(settings(parse([]))) == SETTINGS
-    said = settings(parse(["--sensor-height", "0.6", "--skip-bad", "--format", "float32x4"]))
+    assert tuple(settings(TrainCommand())) == SETTINGS
+    said = settings(TrainCommand(sensor_height=0.6, skip_bad=True, format="float32x4"))
     assert {name: said[name] for name in said if name not in SETTINGS} == {
         "format": "float32x4",
         "sensor_height": 0.6,
@@ -32,10 +32,11 @@ def damaged(town, tmp_path):
 @pytest.mark.slow
 def test_bad_scans_are_left_out_before_the_training(damaged, preset, command, tmp_path):
     options = ("--seq", "08", "--data", damaged, "--preset", preset, "--method", "polar-fft")
-    ended = command("train", *options, "--out", tmp_path / "run", "--skip-bad", "--sensor-height", "1.73")
+    options += ("--out", tmp_path / "run", "--cache", tmp_path / "cache")
+    ended = command("train", *options, "--skip-bad", "--sensor-height", "1.73")
     assert ended.status == 0, ended.error
     assert "skipped 000003: " in ended.error and "skipped 000005: scan 000005 of sequence 08" in ended.error
-    assert "as given" in ended.error
+    assert "as given" in ended.error and len(list((tmp_path / "cache").iterdir())) == 2
     assert json.loads((tmp_path / "run/config.json").read_text())["skip_bad"] is True
     with np.load(tmp_path / "run/test/polar-fft-raw.npz") as file:
         assert len(file["ids"]) == 39 and "000005" not in file["ids"]

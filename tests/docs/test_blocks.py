@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib
-import inspect
 import shlex
 import sys
 
@@ -11,6 +10,8 @@ import pytest
 import tyro
 
 import sglpr_jax
+from sglpr_jax.cli.__main__ import load_command, main
+from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.models.config import model_preset
 
 from .pages import PAGES, ROOT, blocks, command_lines, name_of
@@ -30,15 +31,6 @@ def lines_of(*, start: str) -> list[str]:
     return list(dict.fromkeys(line for _, line in COMMANDS if line.startswith(start)))
 
 
-def parse(name: str, arguments: list[str]) -> object:
-    """What the parser of `bin/<name>` makes of these arguments."""
-    module = importlib.import_module(f"sglpr_jax.cli.{name}")
-    if hasattr(module, "parse"):
-        return module.parse(arguments)
-    members = [m for m in vars(module).values() if inspect.isclass(m) and m.__module__ == module.__name__]
-    return tyro.cli(next(m for m in members if m.__name__.endswith("Command")), args=arguments)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(script.name for script in (ROOT / "bin").iterdir() if script.name[0] != "_"))
 def test_command_lines_are_parsed(name, capsys):
@@ -47,7 +39,7 @@ def test_command_lines_are_parsed(name, capsys):
     wrong = []
     for line in lines if name not in ("docs", "test") else []:
         try:
-            parse(name, shlex.split(line)[1:])
+            parse_command(load_command(name)[0], name, shlex.split(line)[1:])
         except SystemExit:
             wrong.append(f"{line}\n{capsys.readouterr().err}")
     assert not wrong, "\n".join(wrong)
@@ -73,10 +65,11 @@ def test_nothing_else_is_unknown():
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
 def test_python_runs(page, in_examples, monkeypatch):
-    """All blocks of a page, one after another, in a folder with a small dataset, with the cheaper weights; what is
-    trained is a tiny model."""
-    model, load, preset = model_preset("tiny"), sglpr_jax.load, sglpr_jax.preset
+    """All blocks of a page, one after another, in a folder with a small dataset, with the cheaper weights; loops
+    are not registered, and what is trained is a tiny model."""
+    model, load, preset, find = model_preset("tiny"), sglpr_jax.load, sglpr_jax.preset, sglpr_jax.find_loops
     monkeypatch.setattr(sglpr_jax, "load", lambda name: load("circular"))
+    monkeypatch.setattr(sglpr_jax, "find_loops", functools.partial(find, registered=False))
     monkeypatch.setattr(sglpr_jax, "preset", lambda name: dataclasses.replace(preset(name), model=model))
     found = {"__name__": "page"}
     for block in blocks(page):
@@ -89,5 +82,5 @@ def test_python_runs(page, in_examples, monkeypatch):
 def test_quick_commands_run(line, in_examples, own_cache, monkeypatch):
     assert line in {shown for _, shown in COMMANDS}
     script, *arguments = shlex.split(line)
-    monkeypatch.setattr(sys, "argv", [script, *arguments])
-    importlib.import_module(f"sglpr_jax.cli.{script.removeprefix('bin/')}").main()
+    monkeypatch.setattr(sys, "argv", ["sglpr_jax.cli", script.removeprefix("bin/"), *arguments])
+    main()
