@@ -82,9 +82,8 @@ def density_label_image(
 ) -> Int32[np.ndarray, "151 151"]:
     """Compute the class of the last point in each cell of the density image, or 0 for cells without points.
 
-    Only points within the crop count. A label belongs to the cell of its point, but a count belongs to the cell of the
-    voxel's centroid. At the edges of objects, a cell may therefore have a label without a count, or a count without a
-    label.
+    A label belongs to the cell of its point, but a count belongs to the cell of the voxel's centroid. At the edges of
+    objects, a cell may therefore have one without the other.
     """
     counted = _in_crop(points)
     labels = np.zeros(DENSITY_SIZE**2, np.int32)
@@ -112,7 +111,6 @@ def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
 
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
-    """Return the mean x and y of the points in each voxel."""
     voxels = _fewest_voxels(points)
     if not len(voxels):
         return np.zeros((2, 0))

@@ -88,15 +88,13 @@ LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
     """Return the same recording, read from its pack in `folder`. If there is no pack, it is created first.
 
-    Points, labels and images are bitwise equal to those of the files. Points and images are read-only. Lasers, and the
-    labels of images, still come from the files.
+    Points, labels and images are bitwise equal to those of the files, and read-only. Lasers, and the labels of images,
+    still come from the files. Raises ValueError if the pack is damaged or `recording` is not read from its own files.
 
     Arguments:
       recording: Recording as opened by a reader.
       folder: Folder of the packs.
       on_progress: Called with the number of packed scans.
-
-    Raises ValueError if the pack is damaged, `recording` is not read from its own files, or its images differ in width.
     """
     if not recording.on_disk:
         raise ValueError(
@@ -121,10 +119,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
 
 
 def _source(recording: Recording) -> dict[str, Any]:
-    """Identify the pack of a recording by its files and their read options.
-
-    A reader whose points depend on other files adds a hash of these files as an option.
-    """
+    """Identify the pack of a recording by its files and their read options, which include hashes of other files."""
     paths = recording.paths if recording.has_images else (*recording.paths, *recording.label_paths)
     files = [(str(path.absolute()), path.stat()) for path in paths if path is not None]
     return {
@@ -191,10 +186,7 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
 
 
 def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
-    """Return the arrays of a pack by name.
-
-    Raises ValueError, with the folder, if the pack is damaged, has other arrays than a pack, or not as many `scans`.
-    """
+    """Return the arrays of a pack by name. Raises ValueError, with the folder, if the pack is damaged."""
     try:
         lie = read_json(folder / ABOUT_FILE)["arrays"]
         for name, about in lie.items():
@@ -210,7 +202,6 @@ def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
 
 
 def _check_layout(name: str, about: dict[str, Any], scans: int | None) -> None:
-    """Raise ValueError if a pack has no array of this name, type and shape of its rows."""
     dtype, row = LAYOUT.get(name, (None, None))
     if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
         raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")

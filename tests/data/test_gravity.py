@@ -11,7 +11,7 @@ from recordings import of_scans
 from scipy.spatial.transform import Rotation
 
 import sglpr_jax
-from sglpr_jax.data.gravity import GROUND_TILT_DEG, ODOMETRY_TILT_DEG, GroundFilter, mounted, tilts, with_odometry
+from sglpr_jax.data.gravity import GROUND_TILT_DEG, ODOMETRY_TILT_DEG, GroundFilter, mounted, with_odometry
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
@@ -87,7 +87,6 @@ def test_a_vehicle_keeps_one_mounting():
     found = mounted(recording, "auto", known=False)
     assert found.mountings is None and found.found[-1].startswith("sensor: 1.4")
     assert found.record(3).mounting is found.mounting
-    assert not tilts([None], None)
 
 
 def test_odometry_averages_gravity_over_the_path_and_keeps_the_height(hand, opened):

@@ -16,8 +16,7 @@ NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 def array_record(path: Path) -> Record:
     """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields.
 
-    In an .npz file, they are the first array of `NAMES`, or the only one. Pickled objects are not read. Raises
-    ValueError if the file contains something else; numpy and zlib raise many types for broken files.
+    In an .npz file, they are the first array of `NAMES`, or the only one. Pickled objects are not read.
     """
     array = _archived(path) if path.suffix.lower() == ".npz" else _lone(path)
     if {"x", "y", "z"} <= set(array.dtype.names or ()):

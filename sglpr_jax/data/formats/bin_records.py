@@ -78,10 +78,7 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
 
 
 def record_of_scan(path: Path) -> RecordFormat:
-    """Detect the format of one headerless scan: KITTI's if the scan fits it or has too few points, or else another.
-
-    Raises ValueError if no format fits, or several others do, like `find_record`.
-    """
+    """Detect the format of one headerless scan: KITTI's if the scan fits it or has too few points, or else another."""
     return "kitti" if _fits_kitti([path]) else find_record([path])[0] or "kitti"
 
 
@@ -109,7 +106,6 @@ def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
 
 
 def _enough(paths: Sequence[Path], format: RecordFormat) -> bool:
-    """Whether the files have enough points to judge a format."""
     return sum(path.stat().st_size for path in paths) >= FEWEST * record_type(format).itemsize
 
 
@@ -120,7 +116,7 @@ def _some(paths: Sequence[Path]) -> list[Path]:
 
 
 def _misfit(paths: Sequence[Path], format: RecordFormat) -> str:
-    """Return "" if most files look like scans in this format, or else a description of the difference."""
+    """Why most files do not look like scans in this format, or ""."""
     width, clouds, reasons = record_type(format).itemsize, [], []
     for path in paths:
         try:
@@ -208,10 +204,7 @@ def described(format: RecordFormat) -> str:
 
 
 def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Record:
-    """Read a file of records. With `last_is_time`, the last column is the time of the point.
-
-    Raises ValueError if the file is empty or too large, or its size is not a multiple of the record size.
-    """
+    """Read a file of records. With `last_is_time`, the last column is the time of the point."""
     dtype = record_type(format)
     size = path.stat().st_size
     if size == 0 or size % dtype.itemsize:

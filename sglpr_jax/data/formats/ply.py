@@ -59,7 +59,7 @@ class _Header(NamedTuple):
 
 
 def ply_record(path: Path) -> Record:
-    """Decode the vertices of a file. Raises ValueError if the header, the properties or the points are invalid."""
+    """Decode the vertices of a file."""
     header, body = _split(path.read_bytes())
     properties = [name for name, _ in header.vertices.properties]
     time = time_field_of([name for name in properties if properties.count(name) == 1])
@@ -71,7 +71,7 @@ def ply_record(path: Path) -> Record:
 
 
 def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the vertices in parts. The file may have any size if it is binary. Raises ValueError as above."""
+    """Yield the vertices in parts. The file may have any size if it is binary."""
     header, body = _split(mapped(path))
     if header.order:
         yield from blocks_of(_binary_records(header, body, "xyz"))

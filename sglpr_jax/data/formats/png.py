@@ -19,10 +19,7 @@ LARGEST_SIDE = 1 << 13
 
 
 def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
-    """Return a greyscale image of 8 or 16 bits per pixel in the orientation of eq. 1.
-
-    Raises FileNotFoundError, or ValueError if the file is not a complete greyscale image with this number of bits.
-    """
+    """Return a greyscale image of 8 or 16 bits per pixel in the orientation of eq. 1."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an image, found none")
     expected = f"{'an 8' if bits == 8 else 'a 16'}-bit grey PNG"
