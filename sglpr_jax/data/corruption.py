@@ -113,10 +113,7 @@ def add_noise(points: Cloud, metres: float, rng: np.random.Generator, lasers: ob
 
 
 def offset(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
-    """Move the sensor by the given distance, in metres, to the left or to the right at random.
-
-    Only the points move. A sensor at the new place would see other occlusions, which one scan does not show.
-    """
+    """Move the sensor to the left or to the right at random, by some metres. Occlusions stay as they are."""
     return points - np.array([0, rng.choice((-1, 1)) * metres, 0], np.float32)
 
 

@@ -52,10 +52,7 @@ def density_label_bev(
 
 
 def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
-    """Raise ValueError, which begins with `name`, if a float image has grey values or point counts instead of 0 to 10.
-
-    A model would describe a wrong image without an error.
-    """
+    """Raise ValueError, which begins with `name`, if a float image has grey values or point counts."""
     least, most = image.min(initial=0), image.max(initial=0)
     within = least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS  # False for NaN
     if np.issubdtype(image.dtype, np.floating) and not within:
@@ -140,10 +137,7 @@ def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
 
 
 def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
-    """Mark the numbers between the smallest and the largest that occur. This is faster than sorting with np.unique.
-
-    Returns None if the range exceeds `MOST_SPREAD`, for example because of a point high in the air.
-    """
+    """Mark the numbers that occur, from the smallest, without sorting. None beyond a range of `MOST_SPREAD`."""
     if not len(numbers):
         return np.zeros(0, bool)
     least = int(numbers.min())

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Gravity, SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
@@ -102,7 +101,11 @@ def _estimated(recording: Recording, gravity: Gravity) -> Recording:
     recording = dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
     common = mounting or Mounting(MODEL_HEIGHT_M)
     same_side = [scan.up for scan in each if scan is not None and np.dot(scan.up, common.up) > 0]
-    tilts = mounting is not None and len(same_side) > 0 and _spread_deg(same_side, common.up) > TILTS_DEG
+    tilts = (
+        mounting is not None
+        and len(same_side) > 0
+        and _spread_deg(np.array(same_side), np.array(common.up)) > TILTS_DEG
+    )
     return with_gravity(recording, common) if gravity == "scan" or (gravity == "auto" and tilts) else recording
 
 
@@ -140,10 +143,7 @@ class GroundFilter:
     """
 
     def __init__(self, mean: Mounting, *, spread_deg: float = SPREAD_DEG, spread_m: float = SPREAD_M):
-        """Start a filter with the mean mounting.
-
-        The spreads are standard deviations of up about each horizontal axis, in degrees, and of the height, in metres.
-        """
+        """Start at the mean mounting, with standard deviations of up about each horizontal axis and of the height."""
         self.mean = mean
         self.followed = 0
         """Number of scans whose ground was used."""
@@ -198,7 +198,7 @@ def with_gravity(recording: Recording, common: Mounting) -> Recording:
     )
     ups, source = _ups_by_imu(recording, ground)
     mountings = tuple(filtered.update(scan, up=up) for scan, up in zip(ground, ups, strict=True))
-    spread_deg = _spread_deg([scan.up for scan in seen], mean.up)
+    spread_deg = _spread_deg(np.array([scan.up for scan in seen]), np.array(mean.up))
     found = (
         f"gravity: the sensor tilts by {spread_deg:.0f} degrees about its mean; height and tilt of each scan from the "
         f"ground in {filtered.followed} of {len(ground)} scans{source}"
@@ -281,10 +281,10 @@ def _averaged(
     return mean / np.linalg.norm(mean, axis=1, keepdims=True)
 
 
-def _spread_deg(ups: ArrayLike, mean: ArrayLike) -> float:
+def _spread_deg(ups: Float[np.ndarray, "n 3"], mean: Float[np.ndarray, "*n 3"]) -> float:
     """90 % quantile of the angle between directions and their mean, in degrees."""
     return float(np.quantile(_angles_deg(ups, mean), 0.9))
 
 
-def _angles_deg(ups: ArrayLike, others: ArrayLike) -> Float[np.ndarray, " n"]:
-    return np.degrees(np.arccos(np.clip((np.asarray(ups) * np.asarray(others)).sum(axis=1), -1, 1)))
+def _angles_deg(ups: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, " n"]:
+    return np.degrees(np.arccos(np.clip((ups * others).sum(axis=1), -1, 1)))

@@ -190,7 +190,11 @@ def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
     try:
         lie = read_json(folder / ABOUT_FILE)["arrays"]
         for name, about in lie.items():
-            _check_layout(name, about, scans)
+            dtype, row = LAYOUT.get(name, (None, None))
+            if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
+                raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")
+            if scans is not None and len(about["offsets"]) != scans + 1:
+                raise ValueError(f"expected {scans} scans, found {len(about['offsets']) - 1}")
         if "images" not in lie and "points" not in lie:
             raise ValueError(f"expected arrays of points or images, found {', '.join(lie) or 'none'}")
         return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
@@ -199,11 +203,3 @@ def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
             f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); delete the "
             "folder to pack the recording again"
         ) from error
-
-
-def _check_layout(name: str, about: dict[str, Any], scans: int | None) -> None:
-    dtype, row = LAYOUT.get(name, (None, None))
-    if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
-        raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")
-    if scans is not None and len(about["offsets"]) != scans + 1:
-        raise ValueError(f"expected {scans} scans, found {len(about['offsets']) - 1}")

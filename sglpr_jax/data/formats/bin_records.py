@@ -55,10 +55,8 @@ scans."""
 def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
-    Empty and unreadable files are ignored. Fewer than half of the files may be broken. A format whose record consists
-    of several records of another one that fits does not count. With too few points, the function returns None.
-
-    Raises ValueError, with all formats that were tried, if no format fits, or several do.
+    Fewer than half of the files may be broken. A format whose record consists of several records of another one that
+    fits does not count. With too few points, the format is None. Raises ValueError if no format fits, or several do.
     """
     chosen = _some(paths)
     if not _enough(chosen, "kitti"):
@@ -83,10 +81,7 @@ def record_of_scan(path: Path) -> RecordFormat:
 
 
 def unusual_record(paths: Sequence[Path]) -> RecordFormat | None:
-    """Detect scans in KITTI's layout whose format differs from KITTI's, as users' own scans may have.
-
-    Returns None if the scans fit KITTI's format or no single format is detected.
-    """
+    """Return the format of scans in KITTI's layout if it is clearly another one, as of users' own scans."""
     with contextlib.suppress(ValueError):
         return None if _fits_kitti(paths) else find_record(paths)[0]
     return None

@@ -54,10 +54,7 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
 
 
 def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Convert quaternions qx qy qz qw to rotation matrices.
-
-    Raises ValueError if a quaternion does not have length 1. The message names its row in `path`.
-    """
+    """Convert quaternions qx qy qz qw of length 1 to rotation matrices. An error names the row in `path`."""
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))

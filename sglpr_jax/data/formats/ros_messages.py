@@ -93,8 +93,7 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Record:
     """Return the points in the axes of a sensor_msgs/PointCloud2, and their lasers and times if it has such fields.
 
     Some drivers set `is_bigendian` for little-endian data. If only the little-endian numbers are metres, they are
-    returned, with a warning that begins with `name`. Raises ValueError if x, y or z is missing or the data is too
-    short.
+    returned, with a warning that begins with `name`.
     """
     data = _point_bytes(message)
     records = data.view(_record(message, ">" if message.is_bigendian else "<"))

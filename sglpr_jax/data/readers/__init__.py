@@ -29,8 +29,7 @@ def readers() -> tuple[Reader, ...]:
 def recording_names(root: Path | str) -> tuple[str, ...]:
     """Return the names of the sequences in `root`, in order.
 
-    Raises FileNotFoundError, with the supported layouts, if `root` has no such layout, and ValueError if a table or bag
-    is malformed. Bags without the extra `ros` raise ImportError.
+    Raises FileNotFoundError, with the supported layouts, for another folder, and ValueError if a table is malformed.
     """
     return _reader_of(Path(root))[1]
 

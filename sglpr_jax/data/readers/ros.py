@@ -45,11 +45,8 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the point clouds of one topic, with poses if the bag has them. Scans without a pose are skipped then.
 
-    The bag is read once for the times and once for each topic of poses and of tf. By default, the pose topic is the one
-    that covers most scans, and the IMU is the one whose name has most in common with that of the LiDAR.
-
-    Raises ValueError if the bag is broken, the topic has no messages, or a given topic does not exist or does not cover
-    half of the scans; ImportError without the extra `ros`.
+    The bag is read once for the times and once for each topic of poses and of tf. Raises ValueError if the bag is
+    broken, the topic has no messages, or a given topic does not exist or does not cover half of the scans.
     """
     bag, topic = _recordings(root)[name]
     stamps = bag.read(topic, lambda messages: Stamps.of((time, one.header().time) for time, one in messages))
@@ -124,10 +121,7 @@ def _drives(bag: RosBag) -> list[RosBag]:
 
 
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
-    """Add the poses of `topic`, or else of the topic that covers the largest number of scans, to the recording.
-
-    `lidar` is the frame of the scans. The unused topics are listed in `found`.
-    """
+    """Add the poses of `topic`, or of the topic that covers most scans. `lidar` is the frame of the scans."""
     transforms = _transforms(bag)
     tracks = {one: _track(bag, one) for one in bag.topics_of(POSES)} | {
         f"/tf/{track.frame}/{track.child}": track
