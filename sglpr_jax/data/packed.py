@@ -105,7 +105,12 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     identity = hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
     target = folder / f"{file_name(recording.name)}-{identity}"
     if not target.is_dir():
-        _make(target, recording, source, on_progress)
+        with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
+            temporary.mkdir()
+            about = _write_arrays(temporary, recording, on_progress)
+            with (temporary / ABOUT_FILE).open("w") as stream:
+                json.dump({**source, "arrays": about}, stream)
+                sync(stream)
     arrays = open_pack(target, scans=len(recording))
 
     def read(row: int, label_path: Path | None, lasers: bool) -> Record:
@@ -127,16 +132,6 @@ def _source(recording: Recording) -> dict[str, Any]:
         "options": recording.read_options,
         "files": [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files],
     }
-
-
-def _make(target: Path, recording: Recording, source: dict[str, Any], on_progress: Callable[[int], None]) -> None:
-    """Write a pack atomically."""
-    with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
-        temporary.mkdir()
-        arrays = _write_arrays(temporary, recording, on_progress)
-        with (temporary / ABOUT_FILE).open("w") as stream:
-            json.dump({**source, "arrays": arrays}, stream)
-            sync(stream)
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
