@@ -121,3 +121,11 @@ def stream_of(save: Callable[..., object], *arguments: object, **named: object) 
     stream = io.BytesIO()
     save(stream, *arguments, **named)
     return stream.getvalue()
+
+
+def street(seed: int, *, height_m: float) -> np.ndarray:
+    """Ground and walls around an upright sensor."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack([rng.uniform(-15, 15, (1500, 2)), rng.normal(scale=0.02, size=1500)])
+    walls = np.column_stack([rng.uniform(-20, 20, 700), rng.choice([-9.0, 8.0], 700), rng.uniform(0, 9, 700)])
+    return np.concatenate([ground, walls])[rng.permutation(2200)] - [0, 0, height_m]

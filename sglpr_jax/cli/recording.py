@@ -143,15 +143,15 @@ def open_with_poses(
     cloud map, the scans are those that its LiDAR would measure at the poses.
     """
     from sglpr_jax.data.formats.scan_files import is_cloud_file
-    from sglpr_jax.pose_graph.odometry_files import at_scans, is_own, own_odometry, read_odometry
+    from sglpr_jax.pose_graph.odometry_files import at_scans, is_own, own_odometry, read_stamped
 
     if is_cloud_file(root):
         return own_odometry(source.open(root, poses=path, pose_format=format), root)
     if is_own(path, root):
         return own_odometry(source.open(root), root)
-    odometry = read_odometry(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly
+    odometry = read_stamped(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly
     opened = source.open(root)
-    recording, poses = at_scans(opened, odometry, path, format=format, time_unit=source.time_unit)
+    recording, poses = at_scans(opened, *odometry, path)
     if recording is not opened:
         print(recording.found[-1], file=sys.stderr)
     return recording, poses

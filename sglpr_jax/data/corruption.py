@@ -40,20 +40,25 @@ def ring_numbers(
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     told = lasers is not None and lasers.min() < lasers.max()
     groups = lasers if told else _by_elevation(elevation)
-    groups = groups if groups is not None else _by_order(points, elevation)
+    if groups is None:
+        azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+        groups = np.cumsum(np.diff(azimuth, prepend=0) < -np.pi)  # revolutions
+        if groups[-1] == 0 or abs(np.corrcoef(groups, elevation)[0, 1]) < IN_ORDER:
+            groups = None
     if groups is None:
         raise ValueError(
             "expected a scan with rings (laser numbers in its file, separate elevations, or points ring after ring "
             f"from straight ahead), found {len(points)} points without rings"
         )
-    return _from_the_lowest(groups, elevation)
+    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
+    mean = np.bincount(group, weights=elevation) / count
+    return np.argsort(np.argsort(mean)).astype(np.int32)[group]
 
 
 def keep_rings(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
     """Whether each point remains if the sensor has only `beams` lasers: every 2nd of 64 for 32, every 4th for 16.
 
-    The number of found rings is rounded up to a power of two, because some lasers may have no returns. A sensor with at
-    most `beams` lasers keeps all points.
+    The number of found rings is rounded up to a power of two, because some lasers may have no returns.
     """
     found = int(rings.max(initial=0)) + 1
     sensor = 2 ** math.ceil(math.log2(found))
@@ -70,20 +75,6 @@ def _by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] |
     groups = np.empty(len(order), np.int64)
     groups[order] = np.repeat(np.arange(len(starts)), ends - starts + 1)
     return groups
-
-
-def _by_order(points: Float[np.ndarray, "n 3"], elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | None:
-    azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
-    turn = np.cumsum(np.diff(azimuth, prepend=0) < -np.pi)
-    if turn[-1] == 0 or abs(np.corrcoef(turn, elevation)[0, 1]) < IN_ORDER:
-        return None
-    return turn
-
-
-def _from_the_lowest(groups: Int[np.ndarray, " n"], elevation: Float[np.ndarray, " n"]) -> Int32[np.ndarray, " n"]:
-    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
-    mean = np.bincount(group, weights=elevation) / count
-    return np.argsort(np.argsort(mean)).astype(np.int32)[group]
 
 
 Cloud = Float32[np.ndarray, "n 3"]
@@ -122,10 +113,7 @@ def add_noise(points: Cloud, metres: float, rng: np.random.Generator, lasers: ob
 
 
 def offset(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
-    """Move the sensor by the given distance, in metres, to the left or to the right at random.
-
-    Only the points move. A sensor at the new place would see other occlusions, which one scan does not show.
-    """
+    """Move the sensor to the left or to the right at random, by some metres. Occlusions stay as they are."""
     return points - np.array([0, rng.choice((-1, 1)) * metres, 0], np.float32)
 
 
@@ -155,10 +143,7 @@ KINDS: dict[str, Kind] = {
 
 @dataclasses.dataclass(frozen=True)
 class Corruption:
-    """Corruption of every scan of a recording: a kind of `KINDS` and a strength in its unit.
-
-    Raises ValueError if the kind is unknown or the strength is outside its limits.
-    """
+    """Corruption of every scan of a recording: a kind of `KINDS` and a strength in its unit."""
 
     kind: str
     strength: float = 0.0
@@ -183,10 +168,7 @@ CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() f
 
 
 def corruption_named(name: str) -> Corruption:
-    """Return the corruption of this name: a kind and, except for rotation, any strength, such as "occlusion-60".
-
-    Raises ValueError if the name is unknown or the strength is outside its limits.
-    """
+    """Return the corruption of this name: a kind and, except for rotation, any strength, such as "occlusion-60"."""
     kind, _, strength = name.partition("-")
     if kind not in KINDS or bool(strength) != any(KINDS[kind].strengths):
         known = [corruption.name for corruption in CORRUPTIONS]
@@ -227,7 +209,8 @@ def corrupt(
 def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:
     """Return the recording with every scan corrupted on reading, as a function of `seed` and its row.
 
-    Labels stay with their points. Points that are not finite are removed. Raises ValueError for a recording of images.
+    Labels and lasers stay with their points. Points that are not finite and the times of points are removed. Raises
+    ValueError for a recording of images.
     """
     if recording.has_images:
         raise ValueError(
@@ -238,13 +221,9 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
     def read(row: int, label_path: Path | None, lasers: bool) -> Record:
         record = recording.read_row(row, label_path, lasers or KINDS[corruption.kind].needs_lasers)
         with naming(record.name), naming(corruption.name):
-            return corrupt_record(record, corruption, rng=np.random.default_rng((seed, row)))
+            finite = record.only(np.flatnonzero(np.isfinite(record.cloud).all(axis=1)))
+            rng = np.random.default_rng((seed, row))
+            points, kept = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
+            return dataclasses.replace(finite.only(kept), points=points)
 
     return recording.derived(read)
-
-
-def corrupt_record(record: Record, corruption: Corruption, *, rng: np.random.Generator) -> Record:
-    """Corrupt the finite points of a scan, and keep the labels and lasers of the remaining points, but no times."""
-    finite = record.only(np.flatnonzero(np.isfinite(record.cloud).all(axis=1)))
-    points, kept = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
-    return dataclasses.replace(finite.only(kept), points=points)

@@ -52,10 +52,7 @@ def density_label_bev(
 
 
 def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
-    """Raise ValueError, which begins with `name`, if a float image has grey values or point counts instead of 0 to 10.
-
-    A model would describe a wrong image without an error.
-    """
+    """Raise ValueError, which begins with `name`, if a float image has grey values or point counts."""
     least, most = image.min(initial=0), image.max(initial=0)
     within = least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS  # False for NaN
     if np.issubdtype(image.dtype, np.floating) and not within:
@@ -82,9 +79,8 @@ def density_label_image(
 ) -> Int32[np.ndarray, "151 151"]:
     """Compute the class of the last point in each cell of the density image, or 0 for cells without points.
 
-    Only points within the crop count. A label belongs to the cell of its point, but a count belongs to the cell of the
-    voxel's centroid. At the edges of objects, a cell may therefore have a label without a count, or a count without a
-    label.
+    A label belongs to the cell of its point, but a count belongs to the cell of the voxel's centroid. At the edges of
+    objects, a cell may therefore have one without the other.
     """
     counted = _in_crop(points)
     labels = np.zeros(DENSITY_SIZE**2, np.int32)
@@ -112,7 +108,6 @@ def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
 
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
-    """Return the mean x and y of the points in each voxel."""
     voxels = _fewest_voxels(points)
     if not len(voxels):
         return np.zeros((2, 0))
@@ -142,10 +137,7 @@ def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
 
 
 def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
-    """Mark the numbers between the smallest and the largest that occur. This is faster than sorting with np.unique.
-
-    Returns None if the range exceeds `MOST_SPREAD`, for example because of a point high in the air.
-    """
+    """Mark the numbers that occur, from the smallest, without sorting. None beyond a range of `MOST_SPREAD`."""
     if not len(numbers):
         return np.zeros(0, bool)
     least = int(numbers.min())

@@ -58,14 +58,13 @@ def mounted(recording: Recording, height: SensorHeight, *, gravity: Gravity = "a
     """Return the recording with its sensor mounting, and a description of the mounting in `Recording.found`.
 
     If the ground does not show the mounting, it stays unknown, and models assume a sensor 1.73 m above the ground.
-    Recordings of images are returned unchanged.
 
     Arguments:
-      recording: Recording of scans or images.
+      recording: Recording of scans. A recording of images is returned unchanged.
       height: Height above the ground in metres, "estimate" or "auto". "auto" estimates the mounting only if the layout
         does not define it.
       gravity: "recording" uses one mounting for all scans, "scan" estimates height and up of each scan. "auto" does so
-        if the mounting is estimated and the sensor tilts (`tilts`).
+        if the mounting is estimated and the sensor tilts by more than `TILTS_DEG`.
       known: Whether the layout defines the mounting. If the scans contradict it, "auto" issues a `DataWarning`.
     """
     if recording.has_images:
@@ -100,9 +99,14 @@ def _estimated(recording: Recording, gravity: Gravity) -> Recording:
         agreed = hanging.count(mounting.up[2] < 0)
         found = f"sensor: {mounting}, estimated from the ground in {agreed} of {len(each)} scans"
     recording = dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
-    if gravity == "scan" or (gravity == "auto" and tilts(each, mounting)):
-        return with_gravity(recording, mounting or Mounting(MODEL_HEIGHT_M))
-    return recording
+    common = mounting or Mounting(MODEL_HEIGHT_M)
+    same_side = [scan.up for scan in each if scan is not None and np.dot(scan.up, common.up) > 0]
+    tilts = (
+        mounting is not None
+        and len(same_side) > 0
+        and _spread_deg(np.array(same_side), np.array(common.up)) > TILTS_DEG
+    )
+    return with_gravity(recording, common) if gravity == "scan" or (gravity == "auto" and tilts) else recording
 
 
 def _check_layout(recording: Recording) -> None:
@@ -139,10 +143,7 @@ class GroundFilter:
     """
 
     def __init__(self, mean: Mounting, *, spread_deg: float = SPREAD_DEG, spread_m: float = SPREAD_M):
-        """Start a filter with the mean mounting.
-
-        The spreads are standard deviations of up about each horizontal axis, in degrees, and of the height, in metres.
-        """
+        """Start at the mean mounting, with standard deviations of up about each horizontal axis and of the height."""
         self.mean = mean
         self.followed = 0
         """Number of scans whose ground was used."""
@@ -157,8 +158,7 @@ class GroundFilter:
     def update(self, ground: Mounting | None, *, up: Float[np.ndarray, "3"] | None = None) -> Mounting:
         """Add the mounting by the ground of the next scan, or None for a scan without ground.
 
-        `up` is the direction of up in the LiDAR frame by an IMU, which replaces the mean. Use it for all scans or for
-        none.
+        `up` is up in the LiDAR frame by an IMU, which replaces the mean. Use it for all scans or for none.
         """
         mean, spread, noise = self.mean, self._spread, self._noise
         if up is not None:
@@ -175,17 +175,6 @@ class GroundFilter:
         self._state, self._variance = predicted, variance
         tilt_deg = float(np.degrees(np.sqrt(variance[:2].mean())))
         return _beside(mean, predicted, float(np.sqrt(variance[2])), tilt_deg)
-
-
-def tilts(scans: Sequence[Mounting | None], common: Mounting | None) -> bool:
-    """Whether the mountings of some scans show a sensor that tilts, relative to their median `common`.
-
-    Scans that show the sensor upside down relative to it are errors and do not count.
-    """
-    if common is None:
-        return False
-    seen = [scan for scan in scans if scan is not None and np.dot(scan.up, common.up) > 0]
-    return len(seen) > 0 and _spread_deg(seen, common) > TILTS_DEG
 
 
 def with_gravity(recording: Recording, common: Mounting) -> Recording:
@@ -209,9 +198,10 @@ def with_gravity(recording: Recording, common: Mounting) -> Recording:
     )
     ups, source = _ups_by_imu(recording, ground)
     mountings = tuple(filtered.update(scan, up=up) for scan, up in zip(ground, ups, strict=True))
+    spread_deg = _spread_deg(np.array([scan.up for scan in seen]), np.array(mean.up))
     found = (
-        f"gravity: the sensor tilts by {_spread_deg(seen, mean):.0f} degrees about its mean; height and tilt of each "
-        f"scan from the ground in {filtered.followed} of {len(ground)} scans{source}"
+        f"gravity: the sensor tilts by {spread_deg:.0f} degrees about its mean; height and tilt of each scan from the "
+        f"ground in {filtered.followed} of {len(ground)} scans{source}"
     )
     return dataclasses.replace(recording, mountings=mountings, read_ups=None, found=(*recording.found, found))
 
@@ -246,13 +236,13 @@ def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4
     """
     if recording.mountings is None:
         return recording
-    turn = world_from_lidar[:, :3, :3]
-    up = np.einsum("nij,nj->ni", turn, np.array([one.up for one in recording.mountings]))
+    turn, each = world_from_lidar[:, :3, :3], np.array([one.up for one in recording.mountings])
+    up = np.einsum("nij,nj->ni", turn, each)
     weight = np.array([1 / (one.tilt_deviation_deg or GROUND_TILT_DEG) ** 2 for one in recording.mountings])
     mean = _averaged(up, weight, travelled(world_from_lidar))
-    left = np.quantile(_angles_deg(up, mean), 0.9)
-    whole = np.quantile(_angles_deg(np.array([one.up for one in recording.mountings]), None), 0.9)
-    if left > EXPLAINED * whole:
+    middle = np.median(each, axis=0)
+    left = _spread_deg(up, mean)
+    if left > EXPLAINED * _spread_deg(each, middle / np.linalg.norm(middle)):
         found = "gravity: the odometry does not show the tilt of the scans; their ground is used"
         return dataclasses.replace(recording, found=(*recording.found, found))
     ups = np.einsum("nji,nj->ni", turn, mean).tolist()
@@ -291,14 +281,10 @@ def _averaged(
     return mean / np.linalg.norm(mean, axis=1, keepdims=True)
 
 
-def _spread_deg(scans: Sequence[Mounting], mean: Mounting) -> float:
-    """90 % quantile of the angle between up of some scans and its mean, in degrees."""
-    return float(np.quantile(_angles_deg(np.array([one.up for one in scans]), np.array(mean.up)), 0.9))
+def _spread_deg(ups: Float[np.ndarray, "n 3"], mean: Float[np.ndarray, "*n 3"]) -> float:
+    """90 % quantile of the angle between directions and their mean, in degrees."""
+    return float(np.quantile(_angles_deg(ups, mean), 0.9))
 
 
-def _angles_deg(ups: Float[np.ndarray, "n 3"], mean: Float[np.ndarray, "*n 3"] | None) -> Float[np.ndarray, " n"]:
-    """Angle between each direction and the mean, by default the median of all, in degrees."""
-    if mean is None:
-        mean = np.median(ups, axis=0)
-        mean = mean / np.linalg.norm(mean)
-    return np.degrees(np.arccos(np.clip((ups * mean).sum(axis=1), -1, 1)))
+def _angles_deg(ups: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, " n"]:
+    return np.degrees(np.arccos(np.clip((ups * others).sum(axis=1), -1, 1)))

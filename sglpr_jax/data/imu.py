@@ -57,7 +57,9 @@ class Imu:
         by_gravity = self._ups_by_gravity(times) if with_gravity else None
         if self.quaternions is not None:
             by_orientation = self._ups_by_orientation(times)
-            if by_gravity is None or _median_angle_deg(by_orientation, by_gravity) <= SAME_UP_DEG:
+            cosines = np.ones(1) if by_gravity is None else np.sum(by_orientation * by_gravity, axis=1)
+            angles = np.arccos(cosines[np.isfinite(cosines)].clip(-1, 1))
+            if not len(angles) or np.degrees(np.median(angles)) <= SAME_UP_DEG:
                 return by_orientation, "its orientation"
         if by_gravity is None:
             raise ValueError(f"expected accelerations with gravity, of 9.8 m/s^2 or 1 g, found a median of {size:.3g}")
@@ -119,10 +121,3 @@ def averaged_up(
     since = Rotation.from_rotvec(rates[sample] * (times - stamps[sample])[:, None]).as_matrix()
     found = np.einsum("nji,nj->ni", start_from_imu[sample] @ since, up)
     return found / np.linalg.norm(found, axis=1, keepdims=True)
-
-
-def _median_angle_deg(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> float:
-    """Median angle between directions, without those that are NaN."""
-    cosines = np.sum(one * other, axis=1)
-    cosines = cosines[np.isfinite(cosines)]
-    return float(np.degrees(np.median(np.arccos(cosines.clip(-1, 1))))) if cosines.size else 0.0

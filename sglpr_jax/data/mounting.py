@@ -144,8 +144,8 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"], *, near: Mounting | No
 def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
     """Median of the mountings that were estimated from the scans of a recording. A tilt below 2 degrees is set to zero.
 
-    If some scans show an upright sensor and others an upside-down one, only the majority counts. Returns None if fewer
-    than half of the scans have a mounting, or if there is no majority.
+    Only the side of the ground that most scans show counts. Returns None if fewer than half of the scans have a
+    mounting, or without a majority.
     """
     scans = list(found)
     hanging = [one for one in scans if one is not None and one.up[2] < 0]

@@ -88,15 +88,13 @@ LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
     """Return the same recording, read from its pack in `folder`. If there is no pack, it is created first.
 
-    Points, labels and images are bitwise equal to those of the files. Points and images are read-only. Lasers, and the
-    labels of images, still come from the files.
+    Points, labels and images are bitwise equal to those of the files, and read-only. Lasers, and the labels of images,
+    still come from the files. Raises ValueError if the pack is damaged or `recording` is not read from its own files.
 
     Arguments:
       recording: Recording as opened by a reader.
       folder: Folder of the packs.
       on_progress: Called with the number of packed scans.
-
-    Raises ValueError if the pack is damaged, `recording` is not read from its own files, or its images differ in width.
     """
     if not recording.on_disk:
         raise ValueError(
@@ -107,7 +105,12 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     identity = hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
     target = folder / f"{file_name(recording.name)}-{identity}"
     if not target.is_dir():
-        _make(target, recording, source, on_progress)
+        with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
+            temporary.mkdir()
+            about = _write_arrays(temporary, recording, on_progress)
+            with (temporary / ABOUT_FILE).open("w") as stream:
+                json.dump({**source, "arrays": about}, stream)
+                sync(stream)
     arrays = open_pack(target, scans=len(recording))
 
     def read(row: int, label_path: Path | None, lasers: bool) -> Record:
@@ -121,10 +124,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
 
 
 def _source(recording: Recording) -> dict[str, Any]:
-    """Identify the pack of a recording by its files and their read options.
-
-    A reader whose points depend on other files adds a hash of these files as an option.
-    """
+    """Identify the pack of a recording by its files and their read options, which include hashes of other files."""
     paths = recording.paths if recording.has_images else (*recording.paths, *recording.label_paths)
     files = [(str(path.absolute()), path.stat()) for path in paths if path is not None]
     return {
@@ -132,16 +132,6 @@ def _source(recording: Recording) -> dict[str, Any]:
         "options": recording.read_options,
         "files": [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files],
     }
-
-
-def _make(target: Path, recording: Recording, source: dict[str, Any], on_progress: Callable[[int], None]) -> None:
-    """Write a pack atomically."""
-    with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
-        temporary.mkdir()
-        arrays = _write_arrays(temporary, recording, on_progress)
-        with (temporary / ABOUT_FILE).open("w") as stream:
-            json.dump({**source, "arrays": arrays}, stream)
-            sync(stream)
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
@@ -191,14 +181,15 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
 
 
 def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
-    """Return the arrays of a pack by name.
-
-    Raises ValueError, with the folder, if the pack is damaged, has other arrays than a pack, or not as many `scans`.
-    """
+    """Return the arrays of a pack by name. Raises ValueError, with the folder, if the pack is damaged."""
     try:
         lie = read_json(folder / ABOUT_FILE)["arrays"]
         for name, about in lie.items():
-            _check_layout(name, about, scans)
+            dtype, row = LAYOUT.get(name, (None, None))
+            if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
+                raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")
+            if scans is not None and len(about["offsets"]) != scans + 1:
+                raise ValueError(f"expected {scans} scans, found {len(about['offsets']) - 1}")
         if "images" not in lie and "points" not in lie:
             raise ValueError(f"expected arrays of points or images, found {', '.join(lie) or 'none'}")
         return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
@@ -207,12 +198,3 @@ def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
             f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); delete the "
             "folder to pack the recording again"
         ) from error
-
-
-def _check_layout(name: str, about: dict[str, Any], scans: int | None) -> None:
-    """Raise ValueError if a pack has no array of this name, type and shape of its rows."""
-    dtype, row = LAYOUT.get(name, (None, None))
-    if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
-        raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")
-    if scans is not None and len(about["offsets"]) != scans + 1:
-        raise ValueError(f"expected {scans} scans, found {len(about['offsets']) - 1}")

@@ -37,7 +37,7 @@ def poses_of_scans(
 ) -> Float[np.ndarray, "n 4 4"]:
     """Return the poses that a caller gives for the scans of a recording, as float64. `use` names their use in messages.
 
-    Raises ValueError if the recording has ready-made images, or if the poses have another length or no rotations.
+    Raises ValueError for ready-made images, another number of poses, or poses without rotations.
     """
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans for {use}, found ready-made images")
@@ -60,10 +60,7 @@ def turned_poses(poses: Float[np.ndarray, "n 4 4"], *, use: str) -> Float[np.nda
 
 
 def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
-    """Maximum time between two poses for interpolation, in seconds. It follows from the rate of ordered `stamps`.
-
-    It is 1.5 s for poses at 1 Hz, to allow for jitter, and from 1 s to 2 s for other rates.
-    """
+    """Maximum time between two poses for interpolation, in seconds: 1.5 s at 1 Hz, from 1 s to 2 s at other rates."""
     return float(np.clip(JITTER * usual_step(stamps), *WIDEST_S))
 
 
@@ -82,7 +79,7 @@ def interpolate_poses(
 ) -> Float[np.ndarray, "q 4 4"]:
     """Interpolate poses linearly and with constant angular velocity. They are valid where `have_poses` is true.
 
-    `stamps` and `times` are in seconds and in any order. The first and the last pose hold beyond them.
+    `stamps` and `times` are in seconds and in any order.
     """
     from scipy.spatial.transform import Rotation, Slerp  # imported here because the import is slow
 

@@ -132,10 +132,7 @@ class Record:
 
     @property
     def point_times(self) -> Float32[np.ndarray, " n"] | None:
-        """Time of each point relative to `time`, in seconds, or None if the file has no times of points.
-
-        Raises ValueError if the times of the points cannot be those of a scan (`TimeField.seconds`).
-        """
+        """Time of each point relative to `time`, in seconds (`TimeField.seconds`), or None without times of points."""
         if self.time_field is None or self.points is None:
             return None
         valid = np.isfinite(self.points).all(axis=1) & (self.points != 0).any(axis=1)
@@ -149,10 +146,7 @@ class Record:
         return replace(self, points=self.cloud[rows], labels=labels, lasers=lasers, time_field=None)
 
     def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
-        """Return the class (docs/reference/labels.md) of every point or pixel, or None without labels.
-
-        Raises ValueError if a label id does not exist. The message names the label file if it is known.
-        """
+        """Return the class (docs/reference/labels.md) of every point or pixel, or None without labels."""
         if self.labels is None:
             return None
         with naming(self.labels_file or self.name):

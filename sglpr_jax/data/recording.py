@@ -30,7 +30,7 @@ def scan_record(
 ) -> Record:
     """Read a scan and its labels, each file once. `lasers` is ignored: the laser numbers are in the file of the points.
 
-    `format` and `records` are those of `read_scan_record`. Raises the errors of `read_scan` and `read_labels`.
+    `format` and `records` are those of `read_scan_record`.
     """
     found = read_scan_record(path, format=format, records=records)
     if labels is None:
@@ -96,7 +96,7 @@ class Recording:
     """Files that contain all scans, such as those of a bag. Empty if each scan is a file."""
 
     def __post_init__(self):
-        """Raise ValueError if two scans have the same id, or if a field does not have one entry per scan."""
+        """Check that ids are unique and that fields have one entry per scan."""
         if len(set(self.ids)) < len(self.ids):
             twice = next(name for name in self.ids if self.ids.count(name) > 1)
             raise ValueError(f"sequence {self.name}: expected a unique id for each scan, found {twice!r} twice")
@@ -148,14 +148,11 @@ class Recording:
         return {name: value for name, value in options.items() if isinstance(value, str)}
 
     def record(self, i: int, *, labels: bool = True, lasers: bool = False) -> Record:
-        """Read scan or image `i`, each of its files once, with or without labels and laser numbers.
-
-        Raises FileNotFoundError, or ValueError if a file is malformed or the labels do not fit.
-        """
+        """Read scan or image `i`, each of its files once, with or without labels and laser numbers."""
         return self.read_row(i, self.label_paths[i] if labels and self.label_paths else None, lasers)
 
     def read_row(self, i: int, label_path: Path | None, lasers: bool) -> Record:
-        """Read scan or image `i` with the labels of a file, or without labels. Raises what `record` raises."""
+        """Read scan or image `i` with the labels of a file, or without labels."""
         record = self.read(self.paths[i], label_path, lasers)
         return dataclasses.replace(
             record,

@@ -22,7 +22,7 @@ SCALE = "scale"
 SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0
-"""Minimum range of scans that are not scaled, in metres (`typical_range_m`). Simulated corridors and rooms
+"""Minimum range of scans that are not scaled, in metres. Simulated corridors and rooms
 have 5 to 6 m, warehouses 9 to 13 m, and garages and streets 12 m or more (`benchmarks/quality/sensors.py`)."""
 NEAR_SCALE: Scale = 4
 """Scale of recordings with shorter ranges."""
@@ -31,8 +31,7 @@ NEAR_SCALE: Scale = 4
 def scaled(recording: Recording, scale: Scale) -> Recording:
     """Return a recording whose points and sensor heights are multiplied by `scale` when scans are read.
 
-    Positions, times and poses are those of the recording. Raises ValueError if the factor is not 1, 2 or 4, or if a
-    recording of ready-made images has a factor other than 1.
+    Raises ValueError if the factor is not 1, 2 or 4, or if a recording of ready-made images has a factor other than 1.
     """
     check_value(scale, Scale, "scale")
     if scale == 1:
@@ -49,25 +48,19 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
 
 
 def chosen_scale(recording: Recording) -> Scale:
-    """Choose the scale of a recording by `typical_range_m`: `NEAR_SCALE` below `FAR_M`, otherwise 1.
+    """Choose the scale of a recording: `NEAR_SCALE` if the sensor sees less than `FAR_M`, otherwise 1.
 
-    Recordings of images have scale 1.
-    """
-    return 1 if recording.has_images or typical_range_m(recording) >= FAR_M else NEAR_SCALE
-
-
-def typical_range_m(recording: Recording) -> float:
-    """How far the sensor sees: the 90 % quantile of the horizontal distances in a scan, and its median over some scans.
-
-    Returns infinity if no scan can be read.
+    A scan sees as far as the 90 % quantile of its horizontal distances, and the sensor as far as the median of some
+    scans. Recordings of images and unreadable recordings have scale 1.
     """
     ranges = []
-    for row in np.unique(np.linspace(0, len(recording) - 1, SCANS).astype(int)).tolist() if len(recording) else ():
+    rows = [] if recording.has_images or not len(recording) else np.linspace(0, len(recording) - 1, SCANS).astype(int)
+    for row in np.unique(rows).tolist():
         with contextlib.suppress(ValueError, OSError):  # an unreadable scan
             points = recording.points(row)
             distances = np.hypot(*points[np.isfinite(points).all(axis=1), :2].T)
             ranges += [np.quantile(distances, 0.9)] if len(distances) else []
-    return float(np.median(ranges)) if ranges else float("inf")
+    return NEAR_SCALE if ranges and np.median(ranges) < FAR_M else 1
 
 
 def scale_of(recording: Recording) -> int:
@@ -76,10 +69,7 @@ def scale_of(recording: Recording) -> int:
 
 
 def scaled_record(record: Record, scale: Scale) -> Record:
-    """Return a scan with its points and the height of its sensor multiplied by `scale`.
-
-    Raises ValueError if the record is a ready-made image and the factor is not 1.
-    """
+    """Return a scan with its points and the height of its sensor multiplied by `scale`."""
     if scale == 1:
         return record
     if record.points is None:

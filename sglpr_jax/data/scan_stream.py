@@ -102,8 +102,7 @@ def readable(
 ) -> Recording:
     """Read every scan or image with its labels, and return the recording without invalid scans (`scan_stream`).
 
-    `on_bad_scan` is called with the id and the error of each invalid scan, and `on_progress` with the number of scans
-    read. Raises ValueError if all scans are invalid.
+    Raises ValueError if all scans are invalid.
     """
     options = {"labels": True, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
     good = [row for row, read in scan_stream(recording, lambda row, record: True, **options) if read]

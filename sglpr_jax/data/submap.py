@@ -53,12 +53,7 @@ class SubmapBuilder:
     """
 
     def __init__(self, *, length_m: float = LENGTH_M, keyframe_m: float = KEYFRAME_M):
-        """Create a builder without scans. Raises ValueError if a length is not positive or not finite.
-
-        Arguments:
-          length_m: Travelled distance that a submap covers, in metres.
-          keyframe_m: Minimum distance between the scans of a submap, in metres. The newest scan is always included.
-        """
+        """Create a builder of submaps of `length_m` metres of path, of scans at least `keyframe_m` metres apart."""
         self._window = _Window(length_m, keyframe_m)
         self._clouds: dict[int, Record] = {}
         self._poses: dict[int, Float[np.ndarray, "4 4"]] = {}

@@ -33,7 +33,7 @@ def times_of(
 ) -> Float[np.ndarray, " n"] | None:
     """Convert times of a file `source` to seconds. "auto" expects seconds and returns None for row numbers.
 
-    Raises ValueError if a time is smaller than the previous one, or if the steps contradict the unit.
+    Raises ValueError if times decrease or their steps contradict the unit.
     """
     seconds = values / PER_SECOND[unit]
     check_order(seconds, source=source)
@@ -49,7 +49,7 @@ def times_of(
 def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
     """Describe why times cannot be seconds of scans or poses: an empty text if they can, or are too few to judge.
 
-    With `numbers`, whole numbers count as numbers of frames. Headers of bags have a unit and may have whole seconds.
+    With `numbers`, whole numbers count as numbers of frames.
     """
     if changed := unit_change(times):
         return changed[1]
@@ -75,12 +75,9 @@ def usual_step(times: Float[np.ndarray, " n"]) -> float:
 
 
 def unit_change(times: Float[np.ndarray, " n"]) -> tuple[int, str] | None:
-    """Find a row from which both the times and their steps are about 1e3, 1e6 or 1e9 times as large as before.
+    """Return the row from which times and steps are about 1e3, 1e6 or 1e9 times as large, with a description, or None.
 
     A pause or another rate alone is no change of the unit. Two steps on either side are required.
-
-    Returns:
-      The row, from 0, and a description for messages; or None.
     """
     before = np.where(times[:-1] > 0, times[:-1], np.inf)
     if not len(before):
@@ -101,8 +98,7 @@ def counts_rows(times: Float[np.ndarray, " n"]) -> bool:
 
 
 def check_order(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
-    """Raise ValueError if a time in seconds exceeds `LATEST_S`, is smaller than the previous one, or if the unit
-    changes."""
+    """Raise ValueError if times decrease, change their unit or exceed `LATEST_S`."""
     check_unit(times, source=source)
     late = np.flatnonzero(np.abs(times) > LATEST_S)
     if late.size:

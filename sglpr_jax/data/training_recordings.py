@@ -47,8 +47,8 @@ def _with_positions(root: Path, recording: Recording) -> Recording:
 def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:
     """Return the recordings, with label images from `folder` added to recordings of images without labels.
 
-    The folder has a label image `06/000000.png` for image 000000 of recording 06, as written by `bin/segment`. An image
-    without a label image stays unlabelled. Raises FileNotFoundError if no recording has a label image.
+    The folder has a label image `06/000000.png` for image 000000 of recording 06, as written by `bin/segment`. Raises
+    FileNotFoundError if no recording has a label image.
     """
     labelled = [_labelled(recording, folder / file_name(recording.name)) for recording in recordings]
     if not any(new is not old for new, old in zip(labelled, recordings, strict=True)):

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import TimeUnit
-from sglpr_jax.data.formats.pose_files import columns_of, read_kitti, read_tum
+from sglpr_jax.data.formats.pose_files import FORMATS, format_of
 from sglpr_jax.data.poses import poses_at_scans
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
@@ -33,40 +33,41 @@ def read_odometry(
       FileNotFoundError: If the file does not exist.
       ValueError: If the file has another format or time unit, no poses or invalid poses.
     """
-    path = Path(path)
+    return read_stamped(Path(path), format=format, time_unit=time_unit)[0]
+
+
+def read_stamped(
+    path: Path, *, format: OdometryFormat = "auto", time_unit: TimeUnit = "auto"
+) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
+    """Read the poses of `read_odometry`, and their times in seconds. Only tum files have times."""
     check_value(format, OdometryFormat, f"{path}, format")
     check_value(time_unit, TimeUnit, f"{path}, time_unit")
-    format = _format_of(path) if format == "auto" else format
-    if format == "tum":
-        poses = read_tum(path, time_unit=time_unit)[0]
-    else:
-        poses = _vertices(path) if format == "g2o" else read_kitti(path, camera=format == "kitti")
+    if path.suffix in BAGS:
+        raise ValueError(f"{path}: expected a file of odometry, or the bag of the scans, found another bag")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected odometry, found {'a folder' if path.is_dir() else 'no file'}")
+    known = format if format != "auto" else "g2o" if path.suffix == ".g2o" else format_of(path)
+    if known == "csv":
+        raise ValueError(f"{path}: expected odometry with rotations, as tum, found csv")
+    poses, times = (_vertices(path), None) if known == "g2o" else FORMATS[known][1](path, time_unit)
     if not len(poses):
         raise ValueError(f"{path}: expected at least one pose, found none")
-    return poses
+    return poses, times
 
 
 def at_scans(
-    recording: Recording,
-    odometry: Float[np.ndarray, "n 4 4"],
-    path: Path,
-    *,
-    format: OdometryFormat,
-    time_unit: TimeUnit = "auto",
+    recording: Recording, odometry: Float[np.ndarray, "n 4 4"], stamps: Float[np.ndarray, " n"] | None, path: Path
 ) -> tuple[Recording, Float[np.ndarray, "q 4 4"]]:
-    """Match odometry to the scans of a recording.
+    """Match odometry to the scans of a recording, row by row or, if its times differ, interpolated (`poses_at_scans`).
 
-    Poses are matched row by row. If a tum file has other times than the scans, poses are interpolated at the times of
-    the scans (`poses_at_scans`). Scans without a pose are removed from the recording, and `Recording.found` says so.
-    The other scans keep their numbers (`Recording.numbers`). If the scans have no times, they get the times of a tum
-    file.
+    Scans without a pose are removed from the recording, and `Recording.found` says so. The other scans keep their
+    numbers (`Recording.numbers`). Scans without times get those of the poses.
 
     Arguments:
       recording: The scans.
-      odometry: Poses that `read_odometry` read from `path`.
-      path: File of the odometry.
-      format: Format of the file.
-      time_unit: Unit of the times of a tum file (`times_of`).
+      odometry: Poses that `read_stamped` read from `path`.
+      stamps: Times of the poses in seconds, or None.
+      path: File of the odometry, for messages.
 
     Returns:
       The recording, and a pose for each of its scans.
@@ -74,8 +75,6 @@ def at_scans(
     Raises:
       ValueError: If most scans have no pose, or if the numbers of poses and scans differ and times are missing.
     """
-    tum = (_format_of(path) if format == "auto" else format) == "tum"
-    stamps = read_tum(path, time_unit=time_unit)[1] if tum else None
     found = poses_at_scans(
         str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
     )
@@ -109,23 +108,6 @@ def own_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.
             f"found {recording.pose_source or 'no poses'}"
         )
     return dataclasses.replace(recording, positions=None, pose_source=None), recording.world_from_lidar
-
-
-def _format_of(path: Path) -> OdometryFormat:
-    if path.suffix in BAGS:
-        raise ValueError(f"{path}: expected a file of odometry, or the bag of the scans, found another bag")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected odometry, found {'a folder' if path.is_dir() else 'no file'}")
-    if path.suffix == ".g2o":
-        return "g2o"
-    columns = columns_of(path)
-    if columns == 8:
-        return "tum"
-    found = "an empty file" if not columns else f"{columns} numbers a line"
-    raise ValueError(
-        f"{path}: expected odometry as tum (8 numbers a line) or g2o, found {found}; for 12 numbers a line, "
-        "name the axes with --odometry-format (bin/map: --pose-format): kitti (camera axes) or lidar (z up)"
-    )
 
 
 def _vertices(path: Path) -> Float[np.ndarray, "n 4 4"]:

@@ -62,20 +62,6 @@ def test_corruptions_are_those_of_a_plain_loop(kind, most, points, seed, share):
     np.testing.assert_allclose(left, moved[kept], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["clean", "occlusion", "noise", "dropout", "offset"])
-@any_cloud
-@given(points=clouds, seed=seeds)
-def test_no_strength_is_no_corruption(kind, points, seed):
-    left, kept = corrupted(points, kind, 0.0, seed)
-    np.testing.assert_array_equal(left, points)
-    assert kept.all() and left.dtype == np.float32
-
-
-def test_rotation_is_left_to_embedding():
-    with pytest.raises(ValueError, match="rotation_seed"):
-        corrupt(np.zeros((1, 3), np.float32), ROTATION, rng=np.random.default_rng(0))
-
-
 def test_names_say_kind_and_strength():
     assert [corruption_named(corruption.name) for corruption in CORRUPTIONS] == list(CORRUPTIONS)
     assert corruption_named("occlusion-60") == Corruption("occlusion", 60.0)

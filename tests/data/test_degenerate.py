@@ -11,7 +11,6 @@ from recordings import of_images, of_scans
 
 import sglpr_jax
 from sglpr_jax.grid import Grid
-from sglpr_jax.methods.registry import handcrafted
 from sglpr_jax.models.config import model_preset
 
 GOOD = np.random.default_rng(0).uniform(-15, 15, (400, 3)).astype(np.float32)
@@ -27,16 +26,6 @@ def test_nothing_in_the_window_is_refused(kind):
 
 def recording(*clouds):
     return of_scans({Path(f"{i}.bin"): cloud for i, cloud in enumerate(clouds)}, positions=np.zeros((len(clouds), 3)))
-
-
-def test_embedding_refuses_or_skips_them():
-    scans = recording(GOOD, GOOD * 5000, GOOD + 1)
-    method = handcrafted("scan-context", scans, CONFIG.grid)
-    with pytest.raises(ValueError, match=r"scan 1 of sequence 08: expected metres, .*millimetres"):
-        sglpr_jax.embed(method, scans)
-    skipped = []
-    file = sglpr_jax.embed(method, scans, on_bad_scan=lambda scan, error: skipped.append(scan))
-    assert file.ids == ("0", "2") and skipped == ["1"]
 
 
 def test_embedding_refuses_an_empty_window_and_an_empty_image(random_params):
@@ -73,10 +62,3 @@ def test_integers_are_no_density_image_but_its_bytes_are(random_params):
     for other in (np.int32, np.int16, np.uint16):
         with pytest.raises(ValueError, match=f"expected counts 0 to 10 as floats, .* found {other.__name__}"):
             sglpr_jax.describe(params, counts.astype(other))
-
-
-def test_counts_of_points_may_be_any_number(random_params):
-    params = random_params(CONFIG)
-    counts = np.random.default_rng(0).integers(0, 99, (CONFIG.grid.height, CONFIG.grid.width)).astype(np.int32)
-    expected = sglpr_jax.describe(params, counts.astype(np.float32))
-    np.testing.assert_array_equal(sglpr_jax.describe(params, counts), expected)

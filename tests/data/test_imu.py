@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from bags import CLOUD, FILES, TRANSFORMS, cloud, header, transforms, typestore, write_bag
+from clouds import street
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
@@ -93,12 +94,9 @@ TILTED = Rotation.from_euler("xyz", [0, 0, 90], degrees=True)
 """Rotation from the IMU to the LiDAR."""
 
 
-def ground(i: int, time: float, *, height_m: float = 1.4) -> np.ndarray:
+def ground(i: int, time: float) -> np.ndarray:
     """A street around the LiDAR."""
-    rng = np.random.default_rng(i)
-    floor = np.column_stack([rng.uniform(-15, 15, (1500, 2)), rng.normal(scale=0.02, size=1500)])
-    walls = np.column_stack([rng.uniform(-20, 20, 700), rng.choice([-9.0, 8.0], 700), rng.uniform(0, 9, 700)])
-    world = np.concatenate([floor, walls]) - [0, 0, height_m]
+    world = street(i, height_m=1.4)
     world = world[world[:, 2] > 0.5] if i % 4 == 3 else world  # a scan that does not see the ground
     return TILTED.apply(turned_at(np.array([time])).inv().apply(world))
 

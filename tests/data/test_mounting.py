@@ -13,8 +13,6 @@ from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.recording import Record
-from sglpr_jax.data.views import view
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
@@ -130,22 +128,6 @@ def low_robot(tmp_path):
     for i in range(4):
         np.column_stack([street(i, height=0.5), np.zeros(10500)]).astype("<f4").tofile(tmp_path / f"{i}.bin")
     return tmp_path, [street(i) for i in range(4)]
-
-
-@pytest.mark.slow
-def test_a_plain_folder_is_levelled_before_a_model_sees_it(low_robot):
-    folder, expected = low_robot
-    recording = open_recording(folder)
-    assert recording.mounting is not None and abs(recording.mounting.height_m - 0.5) < 0.1
-    assert "estimated from the ground in 4 of 4 scans" in recording.description[-2]
-    np.testing.assert_array_equal(recording.points(0), street(0, height=0.5))  # what lies in the file
-    said = open_recording(folder, sensor_height=0.5)
-    assert said.mounting == Mounting(0.5) and said.found[-1] == "sensor: 0.50 m above the ground, as given"
-    grid = Grid(0.4, 128, 128)
-    wanted = view(Record(points=expected[0]), grid, image="density").image
-    seen = view(said.record(0), grid, image="density").image
-    unlevelled = view(Record(points=street(0, height=0.5)), grid, image="density").image
-    assert np.abs(seen - wanted).mean() < 0.05 * np.abs(unlevelled - wanted).mean()
 
 
 def test_every_road_levels(low_robot):

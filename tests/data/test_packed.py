@@ -45,7 +45,7 @@ def test_points_and_labels_are_those_of_the_files_and_packed_once(recording, tmp
     assert told == [1, 2, 3]
     require_same_scans(found, recording)
     np.testing.assert_array_equal(found.positions, recording.positions)
-    monkeypatch.setattr(packing, "_make", lambda *_: pytest.fail("packed again"))
+    monkeypatch.setattr(packing, "_write_arrays", lambda *_: pytest.fail("packed again"))
     require_same_scans(packed(recording, tmp_path / "cache"), recording)
     assert not found.points(0).flags.writeable
     shutil.rmtree(recording.paths[0].parents[1])

@@ -7,7 +7,7 @@ from clouds import DRIVERS, cloud, points_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.formats.ros_messages import RosMessage, described_fields, read_custom_msg, read_point_cloud2
+from sglpr_jax.data.formats.ros_messages import RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.warning import DataWarning
 
@@ -45,7 +45,6 @@ def test_fields_of_other_types_are_refused():
     broken.fields[0].datatype = 9
     with pytest.raises(ValueError, match=r"expected numbers of types 1 to 8, found \[9, 7, 7, 4\]"):
         read_point_cloud2(broken)
-    assert described_fields(broken) == "x y z intensity ring (22 bytes a point)"
 
 
 @pytest.mark.parametrize("driver", ["velodyne", "turned about"])

@@ -11,7 +11,6 @@ from recordings import of_images, of_scans
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Record
 from sglpr_jax.data.scaled import chosen_scale, scale_of, scaled, scaled_poses, scaled_record
-from sglpr_jax.retrieval.reuse import fingerprint
 
 POINTS = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)
 MOUNTINGS = (None, Mounting(0.5), Mounting(0.9, (0.6, 0.0, 0.8), 0.02, 0.3))
@@ -38,25 +37,11 @@ def test_a_scaled_recording_keeps_positions_and_times():
     assert found.positions is positions and found.times is times and scale_of(found) == 4
 
 
-def test_recordings_of_other_scales_are_other_recordings_and_scale_1_changes_nothing():
-    one = recording()
-    assert scaled(one, 1) is one and scale_of(one) == 1
-    assert len({fingerprint(scaled(one, scale)) for scale in (1, 2, 4)}) == 3
-
-
 def test_poses_keep_their_rotations():
     pose = np.eye(4)
     pose[:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     found = scaled_poses(pose, 2.0)
     assert found[:3, 3].tolist() == [2, 4, 6] and found[:3, :3].tolist() == pose[:3, :3].tolist()
-
-
-def test_images_are_one_clear_error():
-    images = of_images({Path("0.png"): np.zeros((4, 4), np.float32)})
-    with pytest.raises(ValueError, match="expected scans to scale by 2, found ready-made images"):
-        scaled(images, 2)
-    with pytest.raises(ValueError, match="expected points to scale by 2, found an image"):
-        scaled_record(Record(image=np.zeros((4, 4), np.float32)), 2)
 
 
 @pytest.mark.parametrize(("metres", "expected"), [(5.0, 4), (20.0, 1)])

@@ -16,21 +16,19 @@ NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 def array_record(path: Path) -> Record:
     """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields.
 
-    In an .npz file, they are the first array of `NAMES`, or the only one. Pickled objects are not read. Raises
-    ValueError if the file contains something else; numpy and zlib raise many types for broken files.
+    In an .npz file, they are the first array of `NAMES`, or the only one. Pickled objects are not read.
     """
-    array = _archived(path) if path.suffix.lower() == ".npz" else _lone(path)
+    if path.suffix.lower() == ".npz":
+        array = _archived(path)
+    else:
+        with path.open("rb") as stream:
+            array = read_array(stream, size=path.stat().st_size)
     if {"x", "y", "z"} <= set(array.dtype.names or ()):
         array = np.stack([array[axis].reshape(-1) for axis in "xyz"], axis=1)
     numbers = array.dtype.kind in "fiu"
     if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not 0 < len(array) <= MOST_POINTS:
         raise ValueError(f"expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}")
     return cloud_record(dict(zip("xyz", array.T, strict=False)))
-
-
-def _lone(path: Path) -> np.ndarray:
-    with path.open("rb") as stream:
-        return read_array(stream, size=path.stat().st_size)
 
 
 def _archived(path: Path) -> np.ndarray:

@@ -55,10 +55,8 @@ scans."""
 def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
-    Empty and unreadable files are ignored. Fewer than half of the files may be broken. A format whose record consists
-    of several records of another one that fits does not count. With too few points, the function returns None.
-
-    Raises ValueError, with all formats that were tried, if no format fits, or several do.
+    Fewer than half of the files may be broken. A format whose record consists of several records of another one that
+    fits does not count. With too few points, the format is None. Raises ValueError if no format fits, or several do.
     """
     chosen = _some(paths)
     if not _enough(chosen, "kitti"):
@@ -78,18 +76,12 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
 
 
 def record_of_scan(path: Path) -> RecordFormat:
-    """Detect the format of one headerless scan: KITTI's if the scan fits it or has too few points, or else another.
-
-    Raises ValueError if no format fits, or several others do, like `find_record`.
-    """
+    """Detect the format of one headerless scan: KITTI's if the scan fits it or has too few points, or else another."""
     return "kitti" if _fits_kitti([path]) else find_record([path])[0] or "kitti"
 
 
 def unusual_record(paths: Sequence[Path]) -> RecordFormat | None:
-    """Detect scans in KITTI's layout whose format differs from KITTI's, as users' own scans may have.
-
-    Returns None if the scans fit KITTI's format or no single format is detected.
-    """
+    """Return the format of scans in KITTI's layout if it is clearly another one, as of users' own scans."""
     with contextlib.suppress(ValueError):
         return None if _fits_kitti(paths) else find_record(paths)[0]
     return None
@@ -109,7 +101,6 @@ def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
 
 
 def _enough(paths: Sequence[Path], format: RecordFormat) -> bool:
-    """Whether the files have enough points to judge a format."""
     return sum(path.stat().st_size for path in paths) >= FEWEST * record_type(format).itemsize
 
 
@@ -120,7 +111,7 @@ def _some(paths: Sequence[Path]) -> list[Path]:
 
 
 def _misfit(paths: Sequence[Path], format: RecordFormat) -> str:
-    """Return "" if most files look like scans in this format, or else a description of the difference."""
+    """Why most files do not look like scans in this format, or ""."""
     width, clouds, reasons = record_type(format).itemsize, [], []
     for path in paths:
         try:
@@ -208,10 +199,7 @@ def described(format: RecordFormat) -> str:
 
 
 def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Record:
-    """Read a file of records. With `last_is_time`, the last column is the time of the point.
-
-    Raises ValueError if the file is empty or too large, or its size is not a multiple of the record size.
-    """
+    """Read a file of records. With `last_is_time`, the last column is the time of the point."""
     dtype = record_type(format)
     size = path.stat().st_size
     if size == 0 or size % dtype.itemsize:

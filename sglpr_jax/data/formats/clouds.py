@@ -34,7 +34,7 @@ def cloud_record(
 def check_points(points: int, *, bytes_each: int = 1) -> None:
     """Raise ValueError if a header declares no points, or more points or bytes than a scan has.
 
-    Headers may declare any size, so call this before memory is allocated.
+    Call this before memory is allocated.
     """
     if points < 1:
         raise ValueError(f"expected at least one point, found {points or 'none'}")

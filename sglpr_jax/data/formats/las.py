@@ -18,10 +18,7 @@ _COMPRESSED = 0x80
 
 
 def las_record(path: Path) -> Record:
-    """Read the points of a .las file in metres, scaled by the header, and their times. The axes are not changed.
-
-    Raises ImportError without the extra `las`. laspy raises many types of errors for damaged files.
-    """
+    """Read the points of a .las file in metres, scaled by the header, and their times. The axes are not changed."""
     with _laspy(path, one_scan=True).open(path) as stream:
         found = stream.read()
     time = time_field_of(list(found.point_format.dimension_names))

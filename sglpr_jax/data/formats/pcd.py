@@ -55,7 +55,7 @@ class _Header(NamedTuple):
 
 
 def pcd_record(path: Path) -> Record:
-    """Decode a file with `DATA binary`, `binary_compressed` or `ascii`. Raises ValueError if it is invalid."""
+    """Decode a file with `DATA binary`, `binary_compressed` or `ascii`."""
     header, body = _split(path.read_bytes())
     decode = {"binary": _binary_records, "binary_compressed": _compressed_columns, "ascii": _text_columns}
     if header.encoding not in decode:
@@ -67,7 +67,7 @@ def pcd_record(path: Path) -> Record:
 
 
 def pcd_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the points in parts. The file may have any size if it has `DATA binary`. Raises ValueError as above."""
+    """Yield the points in parts. The file may have any size if it has `DATA binary`."""
     header, body = _split(mapped(path))
     if header.encoding == "binary":
         yield from blocks_of(_binary_records(header, body, AXES))
@@ -168,10 +168,7 @@ def _text_columns(header: _Header, body: bytes | memoryview, names: Sequence[str
 
 
 def decompress_lzf(data: bytes, *, size: int) -> bytes:
-    """Decompress LZF data, which consists of literal runs and back references.
-
-    Raises ValueError if `data` is truncated, malformed or does not have `size` bytes when decompressed.
-    """
+    """Decompress LZF data, which consists of literal runs and back references, to `size` bytes."""
     out, at, end = bytearray(), 0, len(data)
     try:
         while at < end and len(out) <= size:

@@ -59,19 +59,22 @@ class _Header(NamedTuple):
 
 
 def ply_record(path: Path) -> Record:
-    """Decode the vertices of a file. Raises ValueError if the header, the properties or the points are invalid."""
+    """Decode the vertices of a file."""
     header, body = _split(path.read_bytes())
     properties = [name for name, _ in header.vertices.properties]
     time = time_field_of([name for name in properties if properties.count(name) == 1])
     check_points(header.vertices.count, bytes_each=sum(size for _, _, size in header.vertices.fields("<")))
     if header.order:
         return cloud_record(_binary_records(header, body, ("x", "y", "z", *([time] if time else []))), time=time)
-    rows = _text_rows(header, bytes(body))
+    first, count = sum(element.count for element in header.before), header.vertices.count
+    lines = text_lines(bytes(body))  # one for each instance of an element
+    _check_end(len(lines), first + count + sum(element.count for element in header.behind), unit="lines")
+    rows = number_rows(lines[first : first + count], rows=count, columns=len(properties))
     return cloud_record({name: rows[:, properties.index(name)] for name in properties}, time=time)
 
 
 def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the vertices in parts. The file may have any size if it is binary. Raises ValueError as above."""
+    """Yield the vertices in parts. The file may have any size if it is binary."""
     header, body = _split(mapped(path))
     if header.order:
         yield from blocks_of(_binary_records(header, body, "xyz"))
@@ -126,14 +129,6 @@ def _binary_records(header: _Header, body: bytes | memoryview, names: Sequence[s
     if not lists:  # their size is not known
         _check_end(len(body), header.vertices.bytes + sum(element.bytes for element in header.behind), unit="bytes")
     return np.frombuffer(body, record, count=header.vertices.count)
-
-
-def _text_rows(header: _Header, body: bytes) -> Float64[np.ndarray, "n columns"]:
-    """All properties of the vertices. Each instance of an element is a line."""
-    first, count = sum(element.count for element in header.before), header.vertices.count
-    lines = text_lines(body)
-    _check_end(len(lines), first + count + sum(element.count for element in header.behind), unit="lines")
-    return number_rows(lines[first : first + count], rows=count, columns=len(header.vertices.properties))
 
 
 def _check_end(found: int, most: int, *, unit: str) -> None:

@@ -19,10 +19,7 @@ LARGEST_SIDE = 1 << 13
 
 
 def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
-    """Return a greyscale image of 8 or 16 bits per pixel in the orientation of eq. 1.
-
-    Raises FileNotFoundError, or ValueError if the file is not a complete greyscale image with this number of bits.
-    """
+    """Return a greyscale image of 8 or 16 bits per pixel in the orientation of eq. 1."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an image, found none")
     expected = f"{'an 8' if bits == 8 else 'a 16'}-bit grey PNG"
@@ -43,10 +40,7 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
 
 
 def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
-    """Return the raw ids (h, w) of a 16-bit label image in the orientation of eq. 1.
-
-    Raises the errors of `read_grey_png`, and ValueError if the image has another shape (h, w) or unknown ids.
-    """
+    """Return the raw ids (h, w) of a 16-bit label image in the orientation of eq. 1, checked."""
     raw = read_grey_png(path, bits=16).astype(np.int32)
     if raw.shape != shape:
         expected, found = (f"{rows} rows of {columns} pixels" for columns, rows in (shape, raw.shape))

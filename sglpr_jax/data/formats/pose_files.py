@@ -34,7 +34,7 @@ KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
     """Return the poses (n, 3, 4) of a file with 12 numbers a line: rotation and translation in metres, row-major.
 
-    Raises FileNotFoundError, or ValueError, with the line or row, if a line does not have 12 finite numbers or a pose.
+    Raises FileNotFoundError, or ValueError, with the line or row, for other numbers.
     """
     poses = read_rows(path, columns=12).reshape(-1, 3, 4)
     wrong = np.flatnonzero(~are_rotations(poses[:, :, :3]))
@@ -46,7 +46,7 @@ def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
 
 
 def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
-    """Raise ValueError if a coordinate exceeds `FARTHEST_M`. The message names its row in `path`."""
+    """Raise ValueError, with the row in `path`, if a coordinate exceeds `FARTHEST_M`."""
     far = np.flatnonzero(np.abs(positions).max(axis=1, initial=0) > FARTHEST_M)
     if far.size:
         found = f"{positions[far[0]].tolist()} in row {far[0] + 1}"
@@ -54,10 +54,7 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
 
 
 def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Convert quaternions qx qy qz qw to rotation matrices.
-
-    Raises ValueError if a quaternion does not have length 1. The message names its row in `path`.
-    """
+    """Convert quaternions qx qy qz qw of length 1 to rotation matrices. An error names the row in `path`."""
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
@@ -68,10 +65,7 @@ def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.
 
 
 def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
-    """Return the times in seconds of a file with one number a line. Warns and returns None for row numbers.
-
-    Raises FileNotFoundError, or ValueError, with the line or row, if a line is not a number or `times_of` fails.
-    """
+    """Return the times in seconds of a file with one number a line. Warns and returns None for row numbers."""
     times = times_of(read_rows(path, columns=1)[:, 0], source=path, unit=unit)
     if times is None:
         warn(f"{path}: expected times, found row numbers (0, 1, 2, ...), not used; {ADVICE}")
@@ -81,10 +75,7 @@ def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"
 def read_tum(
     path: Path, *, time_unit: TimeUnit = "auto"
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
-    """Read the poses of a TUM file (`time x y z qx qy qz qw`), and their times in seconds or None (`times_of`).
-
-    Raises FileNotFoundError, or ValueError, with the line or row, if a line is invalid.
-    """
+    """Read the poses of a TUM file (`time x y z qx qy qz qw`), and their times in seconds or None (`times_of`)."""
     rows = read_rows(path, columns=8)
     times = times_of(rows[:, 0], source=path, unit=time_unit)
     check_positions(path, rows[:, 1:4])
@@ -92,10 +83,7 @@ def read_tum(
 
 
 def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
-    """Read poses with z up from 12 numbers a line, in KITTI's camera axes or, with `camera=False`, with z up.
-
-    Raises the errors of `read_poses`.
-    """
+    """Read poses with z up from 12 numbers a line, in KITTI's camera axes or, with `camera=False`, with z up."""
     rows = read_poses(path)
     poses = poses_of(rows[:, :, 3], rows[:, :, :3])
     return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
@@ -118,10 +106,9 @@ def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
 def read_rows(
     path: Path, *, columns: int, header_lines: int = 0, separator: str | None = None
 ) -> Float[np.ndarray, "n {columns}"]:
-    """Return the numbers (n, columns) of a text file with one row a line. Lines that start with # are skipped.
+    """Return the numbers of a text file with one row a line. Lines that start with # are skipped.
 
-    The first `header_lines` are skipped, too. Columns are separated by white space or by `separator`. Raises
-    FileNotFoundError, or ValueError for the first line that does not have `columns` finite numbers.
+    Columns are separated by white space or by `separator`. Raises FileNotFoundError, or ValueError, with the line.
     """
     if not path.is_file():
         raise FileNotFoundError(
@@ -133,12 +120,6 @@ def read_rows(
     for row, i in enumerate(numbers):
         values[row] = numbers_of(lines[i].split(separator), columns=columns, where=f"{path}, line {i + 1}")
     return values
-
-
-def columns_of(path: Path) -> int:
-    """Return the number of columns in the first line that is not empty or a comment, or 0 for an empty file."""
-    lines = path.read_text(errors="replace").splitlines()
-    return len(next((line.split() for line in lines if line.strip() and not line.startswith("#")), []))
 
 
 def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.ndarray, " {columns}"]:
@@ -204,15 +185,13 @@ def read_trajectory(
       times: File of timestamps, one number a line. They replace the times of the pose file.
       time_unit: Unit of the times in both files (`times_of`).
       twelve_numbers: Format of files with 12 numbers a line, for "auto". It cannot be detected.
-
-    Raises FileNotFoundError, or ValueError if a file is malformed, or "auto" cannot determine the format.
     """
     check_value(format, PoseFormat, f"{path}, format")
     check_value(time_unit, TimeUnit, f"{path}, time_unit")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     unit = "s" if times is not None and time_unit == "auto" else time_unit  # times that are replaced are not judged
-    known = _format_of(path, twelve_numbers) if format == "auto" else format
+    known = format_of(path, twelve_numbers=twelve_numbers) if format == "auto" else format
     said, read = FORMATS[known]
     poses, clock = read(path, unit)
     positions = poses[:, :3, 3]
@@ -257,20 +236,20 @@ def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path
     )
 
 
-def _format_of(path: Path, twelve_numbers: str | None) -> str:
-    """Return the format by the ending or the first line."""
+def format_of(path: Path, *, twelve_numbers: Literal["kitti", "lidar"] | None = None) -> PoseFormat:
+    """Return the format of a pose file by its ending or its first line. 12 numbers a line are `twelve_numbers`."""
     if path.suffix == ".csv":
         return "csv"
-    columns = columns_of(path)
+    lines = path.read_text(errors="replace").splitlines()
+    columns = len(next((line.split() for line in lines if line.strip() and not line.startswith("#")), []))
     if columns == 12 and twelve_numbers is not None:
         return twelve_numbers
-    if columns == 12:
-        raise ValueError(
-            f"{path}: expected --pose-format kitti (camera frame: KITTI, SemanticKITTI) or lidar (z up) for poses of"
-            " 12 numbers a line, found neither"
-        )
     if columns != 8:
-        raise ValueError(f"{path}: expected 12 numbers a line (kitti, lidar), 8 (tum) or a .csv, found {columns}")
+        found = f"{columns} numbers a line" if columns else "an empty file"
+        raise ValueError(
+            f"{path}: expected poses as tum (8 numbers a line) or csv, found {found}; for 12 numbers a line, name the"
+            " axes with --pose-format or --odometry-format: kitti (camera axes) or lidar (z up)"
+        )
     return "tum"
 
 

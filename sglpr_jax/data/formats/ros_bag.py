@@ -8,24 +8,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
-from sglpr_jax.data.formats.ros_messages import (
-    CUSTOM_MSG,
-    POINT,
-    POSES,
-    TRANSFORMS,
-    RosMessage,
-    Stamps,
-    Track,
-    described_fields,
-    read_custom_msg,
-    read_imu,
-    read_point_cloud2,
-    read_transforms,
-    tracks_of,
-)
-from sglpr_jax.data.imu import Imu
+from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, POINT, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.data.record import Record
 from sglpr_jax.files import in_short
 
@@ -83,79 +66,46 @@ class RosBag:
             )
         return clouds
 
-    def imu(self, topic: str) -> tuple[Stamps, str, Imu]:
-        """Read the messages of an IMU topic in one pass over the bag (`read_imu`)."""
-        return self._read(topic, read_imu)
-
-    def stamps(self, topic: str) -> Stamps:
-        """Read the timestamps of a topic in one pass over the bag."""
-        found = self._read(topic, lambda messages: [(time, message.header().time) for time, message in messages])
-        return Stamps(np.array([time for time, _ in found], np.int64), np.array([time for _, time in found], float))
-
-    def track(self, topic: str) -> Track:
-        """Read the poses of a pose topic in one pass over the bag."""
-        read = POSES[self.topics[topic]]
-        return self._read(topic, lambda messages: Track.of((time, read(message)) for time, message in messages))
-
-    def transforms(self) -> list[Track]:
-        """Read the tf transforms: the poses of each frame in its parent frame. Needs one pass for each tf topic."""
-        return tracks_of(
-            (time, pose)
-            for topic in self.topics_of(TRANSFORMS)
-            for time, poses in self._read(topic, lambda found: [(t, [*read_transforms(one)]) for t, one in found])
-            for pose in poses
-        )
-
-    def frame(self, topic: str, time: int) -> str:
-        """Return the frame in the header of the message recorded at `time` (ns)."""
-        return self._read(topic, lambda messages: next(messages)[1].header().frame, time)
-
     def cloud(self, topic: str, time: int, nth: int) -> Record:
         """Return the `nth` cloud among those of a topic recorded at `time` (ns). Raises ValueError if it is empty."""
-        livox = self.topics[topic] in CUSTOM_MSG
-        if livox:
-            message = self._read(topic, lambda found: next(itertools.islice(found, nth, None))[1], time)
-        else:
-            message = self._point_cloud2(topic, time, nth)
+        kind, message = self.topics[topic], self.message(topic, time, nth)
         try:
-            return read_custom_msg(message) if livox else read_point_cloud2(message, name=str(self.paths[0]))
+            if kind in CUSTOM_MSG:
+                return read_custom_msg(message)
+            return read_point_cloud2(self._reader.deserialize(message.raw, kind), name=str(self.paths[0]))
         except Exception as error:  # the bag defines the types and names of the fields
             raise ValueError(
                 f"{self.paths[0]}: expected a cloud with points on {topic}, found an invalid one ({in_short(error)})"
             ) from error
 
     def fields(self, topic: str, time: int) -> str:
-        """Return a description of the fields of a cloud."""
+        """Return a description of the fields of a cloud: "x y z intensity ring (22 bytes a point)"."""
         if self.topics[topic] in CUSTOM_MSG:
             return f"Livox, {' '.join(POINT)}"
-        return described_fields(self._point_cloud2(topic, time, 0))
+        with _broken(self.paths[0]):
+            cloud = self._reader.deserialize(self.message(topic, time).raw, self.topics[topic])
+        return f"{' '.join(field.name for field in cloud.fields)} ({cloud.point_step} bytes a point)"
 
-    def _read(self, topic: str, decode: Callable[[Iterator[tuple[int, RosMessage]]], T], time: int | None = None) -> T:
+    def message(self, topic: str, time: int, nth: int = 0) -> RosMessage:
+        """Return the `nth` message among those of a topic recorded at `time` (ns)."""
+        return self.read(topic, lambda messages: next(itertools.islice(messages, nth, None))[1], time)
+
+    def read(self, topic: str, decode: Callable[[Iterator[tuple[int, RosMessage]]], T], time: int | None = None) -> T:
         """Decode the messages of a topic with their times (ns), or only those recorded at one time."""
         with self._lock, _broken(self.paths[0]):
             return decode(self._messages(topic, time))
 
     def _messages(self, topic: str, time: int | None) -> Iterator[tuple[int, RosMessage]]:
         """Messages with their times. Raises ValueError after the last message if the bag declares more."""
+        connections = [connection for connection in self._reader.connections if connection.topic == topic]
+        stop = None if time is None else time + 1
         found = 0
-        for _, recorded, raw in self._raw(topic, time):
+        for _, recorded, raw in self._reader.messages(connections=connections, start=time, stop=stop):
             found += 1
             yield recorded, RosMessage(raw, cdr=self._reader.is2)
-        declared = sum(connection.msgcount for connection in self._connections(topic))
+        declared = sum(connection.msgcount for connection in connections)
         if time is None and found < declared:
             raise ValueError(f"expected {declared} messages on {topic} by its statistics, found {found}")
-
-    def _raw(self, topic: str, time: int | None) -> Any:
-        stop = None if time is None else time + 1
-        return self._reader.messages(connections=self._connections(topic), start=time, stop=stop)
-
-    def _connections(self, topic: str) -> list[Any]:
-        return [connection for connection in self._reader.connections if connection.topic == topic]
-
-    def _point_cloud2(self, topic: str, time: int, nth: int) -> Any:
-        with self._lock, _broken(self.paths[0]):
-            connection, _, raw = next(itertools.islice(self._raw(topic, time), nth, None))
-            return self._reader.deserialize(raw, connection.msgtype)
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int64, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.clouds import check_points, cloud_record, packed_type
@@ -47,7 +47,7 @@ class RosMessage:
     """A message and a read position. Reading beyond the end raises ValueError."""
 
     def __init__(self, raw: bytes, *, cdr: bool):
-        self._raw = raw
+        self.raw = raw
         self._cdr = cdr
         self._order = ">" if cdr and not raw[1] & 1 else "<"
         self._at = 4 if cdr else 0
@@ -82,9 +82,9 @@ class RosMessage:
         size = 1 if kind.names else kind.itemsize
         self._at += -(self._at - 4) % size if self._cdr else 0
         end = self._at + count * kind.itemsize
-        if end > len(self._raw):
-            raise ValueError(f"expected {count} times {kind.itemsize} bytes, found {len(self._raw) - self._at}")
-        found = np.frombuffer(self._raw, kind, count, self._at) if count else np.zeros(0, kind)
+        if end > len(self.raw):
+            raise ValueError(f"expected {count} times {kind.itemsize} bytes, found {len(self.raw) - self._at}")
+        found = np.frombuffer(self.raw, kind, count, self._at) if count else np.zeros(0, kind)
         self._at = end
         return found
 
@@ -93,8 +93,7 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Record:
     """Return the points in the axes of a sensor_msgs/PointCloud2, and their lasers and times if it has such fields.
 
     Some drivers set `is_bigendian` for little-endian data. If only the little-endian numbers are metres, they are
-    returned, with a warning that begins with `name`. Raises ValueError if x, y or z is missing or the data is too
-    short.
+    returned, with a warning that begins with `name`.
     """
     data = _point_bytes(message)
     records = data.view(_record(message, ">" if message.is_bigendian else "<"))
@@ -106,11 +105,6 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Record:
     names = records.dtype.names or ()
     laser = next((field for field in _LASERS if field in names), None)
     return cloud_record(records, time=time_field_of(names), laser=laser)
-
-
-def described_fields(message: Any) -> str:
-    """Return a description of the fields of a cloud: "x y z intensity ring (22 bytes a point)"."""
-    return f"{' '.join(field.name for field in message.fields)} ({message.point_step} bytes a point)"
 
 
 def _point_bytes(message: Any) -> UInt8[np.ndarray, " n"]:
@@ -148,10 +142,7 @@ def _record(message: Any, order: str) -> np.dtype:
 
 
 def read_custom_msg(message: RosMessage) -> Record:
-    """Return the points in the axes of the message, their line numbers and their times.
-
-    Raises ValueError if the message is truncated or has no points.
-    """
+    """Return the points in the axes of a Livox message, their line numbers and their times."""
     message.header()
     for kind, count in (("u8", 1), ("u4", 1), ("u1", 4)):  # time base, number of points, LiDAR and reserved bytes
         message.numbers(kind, count)
@@ -202,9 +193,11 @@ class Stamps(NamedTuple):
     own: Float[np.ndarray, " n"]
     """Times in the headers of the messages, in seconds."""
 
-    def of(self, rows: Int[np.ndarray, " m"]) -> "Stamps":
-        """Stamps of some messages."""
-        return Stamps(self.recorded[rows], self.own[rows])
+    @classmethod
+    def of(cls, found: Iterable[tuple[int, float]]) -> "Stamps":
+        """Stamps of messages from recorder times (ns) and header times (s)."""
+        both = np.array(list(found), [("recorded", np.int64), ("own", np.float64)])
+        return cls(both["recorded"].copy(), both["own"].copy())
 
     @property
     def orderly(self) -> bool:
@@ -236,7 +229,7 @@ class Track:
 
     @classmethod
     def of(cls, found: Iterable[tuple[int, StampedPose]]) -> "Track":
-        """Create a track from recorder times (ns) and poses. Poses with non-finite positions are dropped.
+        """Create a track from recorder times (ns) and poses, without poses with non-finite positions.
 
         If most poses have a rotation, those without one are dropped, too.
         """
@@ -246,7 +239,7 @@ class Track:
         turned = [one for one, fits in zip(placed, valid, strict=True) if fits]
         kept = turned if 2 * len(turned) > len(placed) else placed
         numbers = np.array([pose.numbers for _, pose in kept], np.float64).reshape(-1, 7)
-        stamps = Stamps(np.array([t for t, _ in kept], np.int64), np.array([pose.time for _, pose in kept], float))
+        stamps = Stamps.of((time, pose.time) for time, pose in kept)
         child, frame = (kept[0][1].child, kept[0][1].frame) if kept else ("", "")
         return cls(stamps, numbers[:, :3], numbers[:, 3:], child, frame, len(given) - len(kept))
 
@@ -255,7 +248,7 @@ class Track:
 
     @property
     def turned(self) -> bool:
-        """Whether the quaternions are valid rotations that change. A GPS receiver writes zeros or a constant."""
+        """Whether the messages contain rotations (`_turn`). A GPS receiver writes zeros or a constant."""
         return _turn(self.quaternions)
 
     @property
@@ -321,19 +314,11 @@ def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np
 
 
 def read_imu(messages: Iterable[tuple[int, RosMessage]]) -> tuple[Stamps, str, Imu]:
-    """Decode timestamps, frame and samples of an IMU from its messages and the times (ns) of their recorder.
-
-    The times of the samples are those of the headers.
-    """
-    recorded, own, numbers, frame = [], [], [], ""
-    for time, message in messages:
-        header = message.header()
-        recorded.append(time)
-        own.append(header.time)
-        frame = frame or header.frame
-        numbers.append(message.numbers("f8", 37))
-    found = np.array(numbers, np.float64).reshape(-1, 37)
+    """Decode timestamps, frame and samples of an IMU from its messages and the times (ns) of their recorder."""
+    samples = [(time, message.header(), message.numbers("f8", 37)) for time, message in messages]
+    found = np.array([numbers for _, _, numbers in samples], np.float64).reshape(-1, 37)
     turned, covariance, rates, accelerations = found[:, :4], found[:, 4], found[:, 13:16], found[:, 25:28]
     known = _turn(turned) and covariance[0] != -1
-    stamps = Stamps(np.array(recorded, np.int64), np.array(own, float))
+    stamps = Stamps.of((time, header.time) for time, header, _ in samples)
+    frame = next((header.frame for _, header, _ in samples if header.frame), "")
     return stamps, frame, Imu(stamps.own, rates, accelerations, turned if known else None)

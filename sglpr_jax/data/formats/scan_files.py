@@ -58,7 +58,7 @@ def named_format(path: Path) -> ScanFormat | None:
 
 
 def found_format(path: Path) -> ScanFormat:
-    """Return the format of one scan by its name or its content. Raises ValueError if the content fits no format."""
+    """Return the format of one scan by its name or its content."""
     return named_format(path) or record_of_scan(path)
 
 
@@ -90,8 +90,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
 def read_scan_record(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Record:
     """Read the points of a scan, with the laser numbers and times that the file contains.
 
-    Unlike in `read_scan`, the format "auto" does not use the content: `records` is the format of .bin files whose name
-    does not define it.
+    The format "auto" does not use the content: `records` is the format of .bin files whose name does not define it.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a scan, found none")
@@ -110,7 +109,7 @@ def is_cloud_file(path: Path) -> bool:
 
 
 def cloud_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the points of a map in parts, in metres. Raises the errors of `read_scan`."""
+    """Yield the points of a map in parts, in metres."""
     with _naming(path, path.suffix.lower()[1:]):
         yield from BLOCKS[path.suffix.lower()](path)
 
@@ -128,10 +127,7 @@ def _naming(path: Path, format: str) -> Iterator[None]:
 
 
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:
-    """Return the raw SemanticKITTI ids (n,) of a .label file. The instance number in the upper 16 bits is dropped.
-
-    Raises FileNotFoundError, or ValueError if the file does not have 4 bytes for each of the `points` of the scan.
-    """
+    """Return the raw SemanticKITTI ids (n,) of a .label file. The instance number in the upper 16 bits is dropped."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected labels, found none")
     size = path.stat().st_size

@@ -29,8 +29,7 @@ def readers() -> tuple[Reader, ...]:
 def recording_names(root: Path | str) -> tuple[str, ...]:
     """Return the names of the sequences in `root`, in order.
 
-    Raises FileNotFoundError, with the supported layouts, if `root` has no such layout, and ValueError if a table or bag
-    is malformed. Bags without the extra `ros` raise ImportError.
+    Raises FileNotFoundError, with the supported layouts, for another folder, and ValueError if a table is malformed.
     """
     return _reader_of(Path(root))[1]
 
@@ -55,8 +54,8 @@ def open_recording(
     Arguments:
       root: Folder of a dataset or of scans, a bag, or a point cloud map with `poses`.
       name: Name of the sequence. It may be omitted if `root` has only one sequence.
-      pose_source: Choice between the two pose files of KITTI's layout. Other layouts ignore it.
-      format: Format of the scan files, for a plain folder and for KITTI's layout. "auto" detects it.
+      pose_source: Choice between the two pose files of KITTI's layout.
+      format: Format of the scan files of a plain folder or of KITTI's layout. "auto" detects it.
       sensor_height: Height of the sensor above the ground, in metres. "estimate" estimates the height and the tilt from
         some scans. "auto" estimates them only if the layout does not define the mounting.
       gravity: "recording" uses one mounting for all scans, and "scan" estimates height and up of each scan, which reads
@@ -64,7 +63,7 @@ def open_recording(
       poses: Pose file of a point cloud map, or of a plain folder if it is not beside the scans.
       pose_format: Format of the pose file.
       times: File of timestamps of a plain folder, if it is not beside the scans.
-      time_unit: Unit of the times in text files of a plain folder or of KITTI's layout. "auto" expects seconds.
+      time_unit: Unit of the times in text files. "auto" expects seconds.
       pose_topic: Pose topic of a bag, by default the topic that covers the largest number of scans.
       imu_topic: IMU topic of a bag, for the gravity of each scan, by default the one beside the LiDAR's topic.
 

@@ -21,10 +21,7 @@ from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open `root/<name>`. Without the file of poses, `positions` is `None`.
-
-    Raises FileNotFoundError without images, and ValueError if an image is not named by the number of a valid pose.
-    """
+    """Open `root/<name>`. Raises FileNotFoundError without images, and ValueError if an image has no valid pose."""
     folder = root / name
     image_paths = scans_in(folder / "imgs", ".png", kind="images")
     ids = tuple(path.stem for path in image_paths)
@@ -47,7 +44,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Return an 8-bit image in the orientation of eq. 1, in counts 0..10. Raises what `read_grey_png` raises."""
+    """Return an 8-bit image in the orientation of eq. 1, in counts 0..10."""
     return as_counts(read_grey_png(path, bits=8))
 
 

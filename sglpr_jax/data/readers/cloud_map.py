@@ -34,15 +34,14 @@ LOWEST_M = 0.25
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the name of the map without its ending, or an empty tuple if `root` is another file or a folder."""
+    """Return the name of the map without its ending, or an empty tuple if `root` is no map."""
     return (root.stem,) if is_cloud_file(root) else ()
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Read a map, and open the scans that its LiDAR would measure at each pose. Warns if the poses look wrong.
 
-    Raises FileNotFoundError, ValueError if there are no poses, a file is malformed, no pose has points around it, or
-    the map is too large, and ImportError without the extra `las` for .las and .laz files.
+    Raises ValueError without poses, or if no pose has points around it or the map is too large.
     """
     poses = options.poses
     if poses is None:
@@ -52,8 +51,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         )
     path = read_trajectory(poses, format=options.pose_format, times=options.times, time_unit=options.time_unit)
     cloud = tiled_cloud(cloud_blocks(root), positions=path.positions, reach_m=REACH_M, source=root)
-    kept = _has_points(cloud, path.positions)
-    _check_kept(kept, cloud, path.positions, root, poses)
+    kept = _with_points(cloud, path.positions, root, poses)
     world_from_lidar = _raised(cloud, path.poses, np.flatnonzero(kept), poses)
     ids = tuple(f"{row:06d}" for row in range(len(kept)))
     used = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
@@ -85,34 +83,29 @@ def _points_at(cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "4 4"]) ->
     return cloud.near(world_from_lidar[:3, 3], REACH_M) @ world_from_lidar[:3, :3].astype(np.float32)
 
 
-def _has_points(cloud: TiledCloud, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Whether the map has points around each position."""
+def _with_points(
+    cloud: TiledCloud, positions: Float[np.ndarray, "n 3"], root: Path, poses: Path
+) -> Bool[np.ndarray, " n"]:
+    """Whether the map has points around each position. Warns if it has none around some, raises ValueError if all."""
     from scipy.spatial import KDTree  # imported here because the import is slow
 
     cells = np.unique(np.round(cloud.points / AROUND_M).astype(np.int32), axis=0)
-    if not len(cells):
-        return np.zeros(len(positions), bool)
-    return KDTree(cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
-
-
-def _check_kept(
-    kept: Bool[np.ndarray, " n"], cloud: TiledCloud, positions: Float[np.ndarray, "n 3"], root: Path, poses: Path
-) -> None:
-    """Raise ValueError if no pose has points around it. Warn if some have none."""
-    if kept.all():
-        return
-    lost = np.flatnonzero(~kept)
-    box = _box(cloud.lowest, cloud.highest)
+    kept = np.zeros(len(positions), bool)
+    if len(cells):
+        kept = KDTree(cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
+    lost, box = np.flatnonzero(~kept), _box(cloud.lowest, cloud.highest)
     if len(lost) == len(kept):
         found = _box(positions.min(axis=0), positions.max(axis=0))
         raise ValueError(
             f"{poses}: expected poses in the frame of {root.name}, which covers {box}, found poses at {found}"
         )
-    first = ", ".join(f"{value:.1f}" for value in positions[lost[0]])
-    warn(
-        f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at {len(lost)} of"
-        f" {len(kept)} poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers {box}"
-    )
+    if len(lost):
+        first = ", ".join(f"{value:.1f}" for value in positions[lost[0]])
+        warn(
+            f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at {len(lost)} of"
+            f" {len(kept)} poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers {box}"
+        )
+    return kept
 
 
 def _box(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, "3"]) -> str:

@@ -27,11 +27,9 @@ SIMULATION = "simulation.json"
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open `root/sequences/<name>`. Without poses, `positions` is `None`.
+    """Open `root/sequences/<name>`. Scans that do not fit KITTI's record but clearly another one are read as that one.
 
-    With the format "auto", scans that do not fit KITTI's record but clearly fit another record are read as the other
-    one (`unusual_record`). Raises FileNotFoundError without scans or the named pose file, and ValueError if a file is
-    malformed, has too few rows, or a scan is not named by its row.
+    Raises FileNotFoundError without scans or the named pose file, and ValueError if a scan is not named by its row.
     """
     folder = root / "sequences" / name
     scan_paths = scans_in(folder / "velodyne", ".bin")

@@ -32,12 +32,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open a drive.
-
-    Scans, GPS positions and timestamps are matched by number. Without the file of timestamps, `times` is `None`. If a
-    GPS file is missing, `positions` is `None`. Raises FileNotFoundError without scans, and ValueError if the timestamps
-    or GPS positions are invalid.
-    """
+    """Open a drive: scans, GPS positions (if none is missing) and timestamps (if any), matched by number."""
     folder = next(folder for folder in _drives(root) if folder.name == name)
     paths = scans_in(folder / "velodyne_points" / "data", ".bin")
     oxts = [folder / "oxts" / "data" / f"{path.stem}.txt" for path in paths]
@@ -95,7 +90,6 @@ def _times(file: Path, paths: tuple[Path, ...]) -> Float[np.ndarray, " n"] | Non
 
 
 def _seconds(line: str) -> float:
-    """Convert a date and time to seconds since 1970. Raises ValueError if the line is malformed."""
     stamp = np.datetime64(line.strip().replace(" ", "T"), "ns")
     if np.isnat(stamp):  # numpy converts a blank line to NaT
         raise ValueError(f"the line of a scan is {line.strip()!r}")

@@ -13,8 +13,7 @@ _DECIMAL = re.compile(r"(\d+\.\d+)(\.[A-Za-z]\w*)*$")
 def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
     """Return the files of a folder with one of some extensions in lower case, in natural order. Case is ignored.
 
-    A missing folder has no files. Hidden files are skipped: macOS writes a `._000003.bin` beside each scan that it
-    copies.
+    Hidden files are skipped: macOS writes a `._000003.bin` beside each scan that it copies.
     """
     if not folder.is_dir():
         return ()
@@ -37,7 +36,7 @@ def names_of(root: Path, *, pattern: str) -> tuple[str, ...]:
 
 
 def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
-    """Sort paths by name, with numbers in names compared as numbers: full2 before full10.
+    """Sort paths by name, with numbers compared as numbers: full2 before full10.
 
     If all names are decimal numbers, such as timestamps, they are compared as decimals: 1.25 before 1.5.
     """
@@ -54,10 +53,7 @@ def hidden(path: Path) -> bool:
 
 
 def left_aside(folder: Path, taken: Iterable[Path]) -> str:
-    """Return a summary of the other contents of a folder: numbers of files by extension, and subfolders.
-
-    The summary is empty if the folder contains nothing else.
-    """
+    """Return a summary of the other contents of a folder: numbers of files by extension, and subfolders."""
     known = set(taken)
     others = [path for path in folder.iterdir() if path not in known and not hidden(path)]
     folders = in_order(path for path in others if path.is_dir())

@@ -22,23 +22,20 @@ from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, read_records
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.listing import names_of
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.readers.stamped import stamped_recording
+from sglpr_jax.data.readers.stamped import read_table, stamped_recording
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import check_order
 
 MAX_GAP_S = 0.5
 """Maximum time between a scan and its pose, in seconds. A Segway moves half a metre in this time."""
 
-LATEST_US = 1e17
-"""Maximum valid time in microseconds, after the year 5000."""
-
 BODY = Mounting(0.0)
 """Mounting of the body frame: the origin of the points is on the ground, not at the sensor."""
 _DATE = "[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]"
-_COLUMNS = ("utime", "x", "y", "z", "roll", "pitch", "yaw")
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open the session `root/<name>`. Raises what `stamped_recording` and `read_ground_truth` raise."""
+    """Open the session `root/<name>`."""
     file = f"groundtruth_{name}.csv"
     places = (root / file, root / name / file, root / "ground_truth" / file)
     truth = next((path for path in places if path.is_file()), None)
@@ -60,30 +57,13 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Read times in microseconds, in order, and positions in metres (north, west, up). Rows with NaN are dropped.
-
-    Raises ValueError if the table is malformed, all rows are NaN, or a time is smaller than the previous one.
-    """
-    if not path.read_bytes().strip():
-        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found an empty file")
-    try:
-        rows = np.loadtxt(path, delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found malformed ones ({error})") from error
-    if rows.shape[1] != len(_COLUMNS):
-        raise ValueError(f"{path}: expected {len(_COLUMNS)} columns, {', '.join(_COLUMNS)}, found {rows.shape[1]}")
-    known = np.isfinite(rows).all(axis=1)
+    """Read times in microseconds and positions in metres (north, west, up). Rows with NaN are dropped."""
+    stamps, numbers = read_table(path, columns=7, finite=False)
+    known = np.isfinite(numbers).all(axis=1)
     if not known.any():
-        raise ValueError(f"{path}: expected poses, found NaN in all {len(rows)} rows")
-    late = np.flatnonzero(known & (np.abs(rows[:, 0]) > LATEST_US))
-    if late.size:
-        raise ValueError(f"{path}: expected times in microseconds, found {rows[late[0], 0]:g} in row {late[0] + 1}")
-    stamps = rows[known, 0].astype(np.int64)
-    backwards = np.flatnonzero(np.diff(stamps) < 0)
-    if backwards.size:
-        first = int(backwards[0])
-        raise ValueError(f"{path}: expected a time >= {stamps[first]}, found {stamps[first + 1]} in the next row")
-    return stamps, rows[known, 1:4] * Z_UP_FROM_Z_DOWN
+        raise ValueError(f"{path}: expected poses, found NaN in all {len(numbers)} rows")
+    check_order(stamps[known] * 1e-6, source=path)
+    return stamps[known], numbers[known, :3] * Z_UP_FROM_Z_DOWN
 
 
 READER = Reader(

@@ -33,10 +33,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open a scene: its key frames and sweeps in order of time. Listed scans without a file are skipped.
-
-    Raises FileNotFoundError without a table or scans, and ValueError if a table is malformed.
-    """
+    """Open a scene: its key frames and sweeps in order of time. Listed scans without a file are skipped."""
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
     samples = set(_texts(tables / "sample.json", _rows(tables / "sample.json", "scene_token", {scene}), "token"))
@@ -109,10 +106,7 @@ def _poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> Float[np.
 
 
 def _rows(path: Path, column: str = "", among: Container[Any] = ()) -> list[dict[str, Any]]:
-    """Return the rows of a table. With `column`, only the rows whose value in this column is in `among`.
-
-    Other rows are dropped while the file is parsed, because some tables have millions of rows.
-    """
+    """Return the rows of a table, or those whose value of `column` is in `among`: some tables have millions of rows."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table, found none")
 
@@ -130,7 +124,6 @@ def _rows(path: Path, column: str = "", among: Container[Any] = ()) -> list[dict
 
 
 def _column(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
-    """Return the values of a column. Raises ValueError if a row does not have this column."""
     lacking = next((row for row in rows if name not in row), None)
     if lacking is not None:
         raise ValueError(f"{path}: expected {name!r} in every row, found a row with {', '.join(lacking) or 'nothing'}")
@@ -138,7 +131,7 @@ def _column(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
 
 
 def _texts(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[str]:
-    """Return a column of names or tokens. Raises ValueError if a value is missing, empty or no text."""
+    """Return a column of names or tokens."""
     values = _column(path, rows, name)
     for value in values:
         if not isinstance(value, str) or not value:
@@ -147,7 +140,7 @@ def _texts(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[str]:
 
 
 def _numbers(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int) -> Float[np.ndarray, "n {size}"]:
-    """Return a column with `size` finite numbers in each row. Raises ValueError if a value is malformed."""
+    """Return a column with `size` finite numbers in each row."""
     values = _column(path, rows, name)
     try:
         numbers = np.array(values, np.float64).reshape(len(rows), size)

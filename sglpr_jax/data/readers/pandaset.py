@@ -38,11 +38,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open a sequence.
-
-    Raises FileNotFoundError without scans or timestamps, and ValueError if the scans are not converted, or the poses or
-    timestamps are malformed or too few.
-    """
+    """Open a sequence. Raises ValueError if its scans are not converted."""
     folder = root / "lidar" if (root / POSES).is_file() else root / name / "lidar"
     pickles = files_in(folder, PICKLES)
     if pickles and not files_in(folder, ".npy"):
@@ -72,7 +68,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 4 4"]:
-    """Read a file of poses (world from LiDAR). Raises ValueError if the poses are malformed."""
+    """Read a file of poses (world from LiDAR)."""
     rows = read_json(path)
     try:
         turned = np.array([[pose["heading"][axis] for axis in "xyzw"] for pose in rows], np.float64).reshape(-1, 4)
@@ -89,7 +85,6 @@ def read_poses(path: Path) -> Float[np.ndarray, "n 4 4"]:
 
 
 def _times(path: Path) -> Float[np.ndarray, " n"]:
-    """Timestamps in seconds, one for each scan."""
     values = read_json(path)
     try:
         times = np.array(values, np.float64)

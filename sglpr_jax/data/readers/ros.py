@@ -10,7 +10,18 @@ from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import check_height, check_order
 from sglpr_jax.data.formats.ros_bag import CLOUDS, COMPRESSED, METADATA, RosBag
-from sglpr_jax.data.formats.ros_messages import IMU, POSES, Stamps, Track, fixed_transform, times_on_one_clock
+from sglpr_jax.data.formats.ros_messages import (
+    IMU,
+    POSES,
+    TRANSFORMS,
+    Stamps,
+    Track,
+    fixed_transform,
+    read_imu,
+    read_transforms,
+    times_on_one_clock,
+    tracks_of,
+)
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, interpolate_poses, left_out
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -27,24 +38,18 @@ PAUSE_NS = 60 * 10**9
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return a name for each point cloud topic, or an empty tuple if `root` is not a bag.
-
-    Raises ValueError if a bag has no point cloud topic or is broken, and ImportError without the extra `ros`.
-    """
+    """Return a name for each point cloud topic, or an empty tuple if `root` is not a bag."""
     return tuple(_recordings(root)) if bag_files(root) else ()
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the point clouds of one topic, with poses if the bag has them. Scans without a pose are skipped then.
 
-    The bag is read once for the times and once for each topic of poses and of tf. By default, the pose topic is the one
-    that covers most scans, and the IMU is the one whose name has most in common with that of the LiDAR.
-
-    Raises ValueError if the bag is broken, the topic has no messages, or a given topic does not exist or does not cover
-    half of the scans; ImportError without the extra `ros`.
+    The bag is read once for the times and once for each topic of poses and of tf. Raises ValueError if the bag is
+    broken, the topic has no messages, or a given topic does not exist or does not cover half of the scans.
     """
     bag, topic = _recordings(root)[name]
-    stamps = bag.stamps(topic)
+    stamps = bag.read(topic, lambda messages: Stamps.of((time, one.header().time) for time, one in messages))
     recorded = stamps.recorded
     if not len(recorded):
         raise ValueError(f"{root}: expected point clouds on {topic}, found no message")
@@ -61,12 +66,13 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         containers=bag.files,
         found=(f"format: {topic} of {bag.name}, {bag.fields(topic, int(recorded[0]))}",),
     )
-    lidar = bag.frame(topic, int(recorded[0])).strip("/")
+    lidar = bag.message(topic, int(recorded[0])).header().frame.strip("/")
     posed = _with_poses(recording, bag, stamps, options.pose_topic, lidar)
     imu = _imu_topic(bag, topic, options.imu_topic)
     if imu is None:
         return posed
-    scans, required = stamps.of(posed.numbers), options.imu_topic is not None
+    scans = Stamps(*(times[posed.numbers] for times in stamps))
+    required = options.imu_topic is not None
     return dataclasses.replace(posed, read_ups=partial(_ups, bag, imu, scans=scans, lidar=lidar, required=required))
 
 
@@ -115,12 +121,9 @@ def _drives(bag: RosBag) -> list[RosBag]:
 
 
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
-    """Add the poses of `topic`, or else of the topic that covers the largest number of scans, to the recording.
-
-    `lidar` is the frame of the scans. The unused topics are listed in `found`.
-    """
-    transforms = bag.transforms()
-    tracks = {one: bag.track(one) for one in bag.topics_of(POSES)} | {
+    """Add the poses of `topic`, or of the topic that covers most scans. `lidar` is the frame of the scans."""
+    transforms = _transforms(bag)
+    tracks = {one: _track(bag, one) for one in bag.topics_of(POSES)} | {
         f"/tf/{track.frame}/{track.child}": track
         for track in transforms
         if track.moves and fixed_transform(transforms, track.child, lidar) is not None
@@ -152,11 +155,23 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     )
 
 
-def _chosen(shares: dict[str, float], topic: str | None, bag: Path) -> str:
-    """Return `topic`, or else the topic that covers most scans; "" if it covers less than half of them.
+def _track(bag: RosBag, topic: str) -> Track:
+    """Poses of a topic. This reads the topic once."""
+    read = POSES[bag.topics[topic]]
+    return bag.read(topic, lambda messages: Track.of((time, read(message)) for time, message in messages))
 
-    Raises ValueError if `topic` does not exist or does not cover enough scans.
-    """
+
+def _transforms(bag: RosBag) -> list[Track]:
+    """Poses of each frame of tf in its parent frame. This reads each topic of tf once."""
+    read = [
+        bag.read(topic, lambda messages: [(time, [*read_transforms(one)]) for time, one in messages])
+        for topic in bag.topics_of(TRANSFORMS)
+    ]
+    return tracks_of((time, pose) for topic in read for time, poses in topic for pose in poses)
+
+
+def _chosen(shares: dict[str, float], topic: str | None, bag: Path) -> str:
+    """Return `topic`, or else the topic that covers most scans; "" if it covers less than half of them."""
     if topic is None:
         best = max(shares, key=lambda one: shares[one], default="")
         return best if best and shares[best] >= LEAST_SHARE else ""
@@ -182,10 +197,7 @@ def _of_lidar(track: Track, transforms: list[Track], lidar: str) -> tuple[Float[
 
 
 def _imu_topic(bag: RosBag, lidar_topic: str, imu_topic: str | None) -> str | None:
-    """Return `imu_topic`, or else the IMU topic whose name has most in common with the topic of the LiDAR, or None.
-
-    Raises ValueError if `imu_topic` does not exist.
-    """
+    """Return `imu_topic`, or else the IMU topic whose name has most in common with the topic of the LiDAR."""
 
     def shared(topic: str) -> int:
         """Number of parts in common: 1 for /livox/imu and /livox/lidar."""
@@ -205,9 +217,9 @@ def _ups(
 ) -> tuple[Float[np.ndarray, "n 3"], str] | None:
     """Return up in the frame of the LiDAR at each scan by an IMU, and the source in words. This reads the topic once.
 
-    If the IMU does not measure gravity, raises ValueError if it is `required`, or else warns and returns None.
+    Without gravity, raises ValueError if the IMU is `required`, or else warns and returns None.
     """
-    found, frame, imu = bag.imu(topic)
+    found, frame, imu = bag.read(topic, read_imu)
     source = f"{bag.paths[0]}, {topic}"
     stamps, times = times_on_one_clock(found, scans)
     try:
@@ -219,7 +231,7 @@ def _ups(
         warn(f"{error}; the ground of the scans is used")
         return None
     frame = frame.strip("/")
-    lidar_from_imu = np.eye(4) if frame == lidar else fixed_transform(bag.transforms(), lidar, frame)
+    lidar_from_imu = np.eye(4) if frame == lidar else fixed_transform(_transforms(bag), lidar, frame)
     if lidar_from_imu is None:
         expected = f"a static transform from {frame} to {lidar}"
         warn(f"{source}: expected {expected}, found none; their axes are taken as parallel")

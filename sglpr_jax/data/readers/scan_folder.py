@@ -34,10 +34,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the folder `root`. Warns if the format looks wrong or consecutive poses are far apart.
 
-    If neither `options.format` nor the name defines the record of a .bin file, it is detected (`find_record`).
-
-    Raises FileNotFoundError without scans or the given poses or times, and ValueError if two files differ
-    only by their ending, the record cannot be detected, or the poses or timestamps are malformed.
+    Raises ValueError if two files differ only by their ending, or if the record of the .bin files cannot be detected.
     """
     paths = _scans(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
     ids = _ids(root, paths)
@@ -66,10 +63,7 @@ def _scans(root: Path) -> tuple[Path, ...]:
 def _trajectory(
     root: Path, scans: int, options: ReadOptions
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
-    """Positions in metres, times in seconds and the source of the poses; each may be unknown (None).
-
-    Poses with other times than the scans, or another number of rows, are interpolated (`poses_at_scans`).
-    """
+    """Positions in metres, times in seconds and the source of the poses; each may be unknown (None)."""
     beside = [root / name for name in POSE_FILES if (root / name).is_file()]
     if options.poses is None and len(beside) > 1:
         raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")

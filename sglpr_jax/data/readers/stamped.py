@@ -144,7 +144,7 @@ def recording_names(root: Path, *, dataset: str) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions, *, dataset: str) -> Recording:
-    """Open a recording. Raises what `stamped_recording` and `read_table` raise."""
+    """Open a recording."""
     folder, layout = _recordings(root, dataset)[name]
     poses = folder / layout.poses
     stamps, numbers = read_table(poses, columns=layout.columns, header_lines=layout.header_lines)
@@ -184,8 +184,6 @@ def stamped_recording(
       read_points: Function that reads a scan.
       max_gap_s: Maximum time between a scan and its pose, in seconds. Other scans are skipped.
       fields: More fields of the recording.
-
-    Raises FileNotFoundError without scans, and ValueError for a scan with another name, no poses or a change of units.
     """
     paths = scans_in(folder, ".bin")
     strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
@@ -218,11 +216,12 @@ def stamped_recording(
     )
 
 
-def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:
+def read_table(
+    path: Path, *, columns: int, header_lines: int = 0, finite: bool = True
+) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:
     """Read the first column, times as integers of up to 19 digits, and the other columns (float64) of a table of poses.
 
-    Columns are separated by commas or white space. Raises FileNotFoundError, or ValueError with the first malformed
-    line.
+    Columns are separated by commas or white space. With `finite`, NaN is an error.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table of poses, found none")
@@ -238,7 +237,8 @@ def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int6
         except (ValueError, OverflowError):
             words = []
         # Python parses 1_0 as 10.
-        if len(words) != columns or "_" in line or not line.isascii() or not np.isfinite(rows[-1]).all():
+        valid = len(words) == columns and "_" not in line and line.isascii() and abs(times[-1]) < 2**63
+        if not valid or (finite and not np.isfinite(rows[-1]).all()):
             expected = f"{path}, line {number + 1}: expected a time and {columns - 1} finite numbers"
             raise ValueError(f"{expected}, found {line[:60]!r}")
     if not rows:

@@ -17,7 +17,7 @@ TABLES = ("pointcloud_locations_*.csv", "pointcloud_centroids_*.csv")
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the runs in `root`, which is a folder of submaps, a run, or a folder of runs or districts."""
+    """Return the names of the runs in `root`: a folder of submaps, a run, or a folder of runs or districts."""
     if not root.is_dir():
         return ()
     top = root.resolve().parent if root.name.startswith("pointcloud_") else root
@@ -26,7 +26,6 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def refuse(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Raise ValueError with the reason why submaps cannot be used."""
     raise ValueError(
         f"{root}: expected scans in metres, found submaps ({name}, PointNetVLAD benchmark): each is scaled to"
         " [-1, 1] by an unknown factor, and has neither a sensor nor the ground; open the original scans of the dataset"
