@@ -208,7 +208,7 @@ def test_wrong_queries_and_maps_are_one_clear_error(command, scans, places_file,
     assert_one_line_error(ask(scans), "08: expected one scan or image, found a folder; name a file in it")
     assert_one_line_error(ask(scans / "000002.bin", places=tmp_path / "none"), "none", "expected an index")
     ended = command("relocalize", tmp_path / "dot.bin", "--map", places_file, "--weights", "circular")
-    assert_one_line_error(ended, "one.safetensors: expected descriptors of the weights")
+    assert_one_line_error(ended, "one.safetensors: expected descriptors with weights")
     ended = command("relocalize", "scan.bin", "--map", places_file, "--candidates", "1000000000")
     assert_one_line_error(ended, "--candidates: expected a number from 1 up to 1000, found 1000000000")
     content = places_file.read_bytes()
