@@ -66,11 +66,12 @@ def encode(kind: str, fields: Mapping[str, Any]) -> bytes:
 
 def _message(kind: str, fields: Mapping[str, Any]) -> Any:
     defined = typestore().fielddefs[kind][1]
-    return typestore().types[kind](**{name: _value(*of, fields.get(name)) for name, of in defined})
+    return typestore().types[kind](**{name: _value(of, fields.get(name)) for name, of in defined})
 
 
-def _value(node: Any, of: Any, given: Any) -> Any:
+def _value(field: tuple[Any, Any], given: Any) -> Any:
     """Value of a field, from its definition by rosbags."""
+    node, of = field
     if node.name == "NAME":
         return _message(of, given or {})
     if node.name == "BASE":

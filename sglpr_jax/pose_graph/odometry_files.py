@@ -39,8 +39,13 @@ def read_odometry(
     format = _format_of(path) if format == "auto" else format
     if format == "tum":
         poses = read_tum(path, time_unit=time_unit)[0]
+    elif format == "g2o":
+        found = read_g2o(path).poses
+        if sorted(found) != list(range(len(found))):
+            raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without gaps, found others")
+        poses = np.array([found[i] for i in range(len(found))])
     else:
-        poses = _vertices(path) if format == "g2o" else read_kitti(path, camera=format == "kitti")
+        poses = read_kitti(path, camera=format == "kitti")
     if not len(poses):
         raise ValueError(f"{path}: expected at least one pose, found none")
     return poses
@@ -126,10 +131,3 @@ def _format_of(path: Path) -> OdometryFormat:
         f"{path}: expected odometry as tum (8 numbers a line) or g2o, found {found}; for 12 numbers a line, "
         "name the axes with --odometry-format (bin/map: --pose-format): kitti (camera axes) or lidar (z up)"
     )
-
-
-def _vertices(path: Path) -> Float[np.ndarray, "n 4 4"]:
-    poses = read_g2o(path).poses
-    if sorted(poses) != list(range(len(poses))):
-        raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without gaps, found others")
-    return np.array([poses[i] for i in range(len(poses))]).reshape(-1, 4, 4)

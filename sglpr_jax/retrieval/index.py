@@ -295,8 +295,11 @@ class Index:
             near = rows[np.argpartition(rough, few - 1, axis=1)[:, :few]]
         else:
             near = np.argpartition(np.where(allowed, self._rough(queries), np.inf), few - 1, axis=1)[:, :few]
-        found = [_nearest_of(query, self.descriptors[row], row, k) for query, row in zip(queries, near, strict=True)]
-        return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
+        near = np.sort(near, axis=1)  # equal distances keep the order of the rows
+        pairs = zip(queries.astype(np.float64), near, strict=True)
+        apart = np.stack([np.linalg.norm(query - self.descriptors[row], axis=1) for query, row in pairs])
+        order = np.argsort(apart, axis=1, kind="stable")[:, :k]
+        return np.take_along_axis(near, order, axis=1), np.take_along_axis(apart, order, axis=1)
 
     def _rough(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
         """Return the squared distances in float32, without the squared lengths of the queries.
@@ -367,15 +370,6 @@ def check_asked(k: int, *, queries: int, places: int) -> None:
         raise ValueError(f"expected k from 1 up to {max(MOST, places)}, found {k}")
     if queries > 1 and queries * k > MOST_ANSWERS:
         raise ValueError(f"expected at most {MOST_ANSWERS // k} queries at a time for k = {k}, found {queries}")
-
-
-def _nearest_of(
-    query: Float[np.ndarray, " d"], descriptors: Float[np.ndarray, "n d"], rows: Int[np.ndarray, " n"], k: int
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Return the nearest k of a few candidates by their distances in float64, ties in the order of their rows."""
-    apart = np.linalg.norm(query.astype(np.float64) - descriptors, axis=1)
-    order = np.lexsort((rows, apart))[:k]
-    return rows[order], apart[order]
 
 
 def _finite(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:

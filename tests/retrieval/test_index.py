@@ -113,13 +113,6 @@ def test_what_does_not_fit_is_refused_and_changes_nothing():
     assert len(index) == 5
 
 
-def test_equal_places_are_equal_bytes():
-    index = Index.empty(4)
-    index.add(np.eye(4), positions=np.zeros((4, 3)))
-    contents = {index.to_bytes({"more": np.arange(n)}) for n in (3,) * 20}
-    assert len(contents) == 1
-
-
 def test_a_flipped_byte_anywhere_is_noticed(tmp_path):
     path = tmp_path / "places.safetensors"
     index_of(20).save(path)
