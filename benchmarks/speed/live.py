@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.timing import resident_mb
 from sglpr_jax.live.messages import Reports
 from sglpr_jax.live.ros import Transport, domain_of
-from sglpr_jax.live.ros_messages import CLOUD, TRANSFORMS, encode, transform_message, typestore
+from sglpr_jax.live.ros_messages import CLOUD, TRANSFORMS, encode, header, transform_message
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.se3 import quaternions
 from sglpr_jax.sim.recording import simulate_recording
@@ -65,30 +65,25 @@ class RosPublisher:
             self._wire = self._connect()
             self._clouds = self._wire.advertise("/points", CLOUD, depth=1, latched=False)
             self._poses = self._wire.advertise("/odometry", TRANSFORMS, depth=100, latched=False)
-        self._poses(encode(transform_message(world_from_lidar, time=stamp, frame="odom", child="lidar")))
+        self._poses(transform_message(world_from_lidar, time=stamp, frame="odom", child="lidar"))
         self._clouds(_cloud(points, stamp))
 
 
 def _cloud(points: np.ndarray, stamp: float) -> bytes:
     """PointCloud2 with the fields x, y and z."""
-    types = typestore().types
     padded = np.zeros((len(points), 4), np.float32)
     padded[:, :3] = points
-    seconds, nanoseconds = divmod(round(stamp * 1e9), 10**9)
-    time_of = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    field = types["sensor_msgs/msg/PointField"]
-    found = types[CLOUD](
-        header=types["std_msgs/msg/Header"](stamp=time_of, frame_id="lidar"),
-        height=1,
-        width=len(points),
-        fields=[field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate("xyz")],
-        is_bigendian=False,
-        point_step=16,
-        row_step=padded.nbytes,
-        data=padded.view(np.uint8).reshape(-1),
-        is_dense=True,
-    )
-    return encode(found)
+    fields = {
+        "header": header(stamp, "lidar"),
+        "height": 1,
+        "width": len(points),
+        "fields": [{"name": name, "offset": 4 * at, "datatype": 7, "count": 1} for at, name in enumerate("xyz")],
+        "point_step": 16,
+        "row_step": padded.nbytes,
+        "data": padded.view(np.uint8).reshape(-1),
+        "is_dense": True,
+    }
+    return encode(CLOUD, fields)
 
 
 def _dds(where: str) -> Transport:

@@ -94,7 +94,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.pose_graph.files import write_tum
-    from sglpr_jax.retrieval.index import check_scale
+    from sglpr_jax.retrieval.descriptor_file import check_made_alike
 
     before = None
     if command.add_to is not None:
@@ -107,7 +107,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
         write_tum(command.out.with_suffix(TRAJECTORY), poses, times)
     if before is not None:
         with naming(f"{command.add_to}"):
-            check_scale(effective.scale, before.scale)
+            check_made_alike({"scale": effective.scale}, {"scale": before.scale})
     unfinished = command.out.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         places, scans, skipped = map_recording(

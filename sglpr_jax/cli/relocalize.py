@@ -67,7 +67,7 @@ def relocalize(command: RelocalizeCommand) -> None:
     from sglpr_jax.maps.query import query_of, read_query
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.models.weights_file import load
-    from sglpr_jax.retrieval.index import check_scale
+    from sglpr_jax.retrieval.descriptor_file import check_made_alike
 
     if command.out is not None:
         check_writable(command.out)
@@ -76,7 +76,7 @@ def relocalize(command: RelocalizeCommand) -> None:
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     with naming(command.map):
-        check_scale(places.scale if command.scale is None else command.scale, places.scale)
+        check_made_alike({"scale": command.scale or places.scale}, {"scale": places.scale})
     name = command.scan.name
     if command.frame is None:
         record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)

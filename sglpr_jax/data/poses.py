@@ -91,6 +91,14 @@ def interpolate_poses(
     return poses_of(positions, turns.as_matrix().reshape(-1, 3, 3))
 
 
+def pose_at(
+    stamps: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"], time: float
+) -> Float[np.ndarray, "4 4"] | None:
+    """Interpolate poses at one time, in seconds. Returns None if no poses are near enough in time (`have_poses`)."""
+    times = np.array([time])
+    return interpolate_poses(stamps, poses, times)[0] if have_poses(stamps, times).all() else None
+
+
 class ScanPoses(NamedTuple):
     """Poses of the scans."""
 

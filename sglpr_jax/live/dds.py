@@ -184,28 +184,19 @@ def _described(reliable: bool, latched: bool) -> str:
     return f"{'reliable' if reliable else 'best effort'}, {'transient local' if latched else 'volatile'}"
 
 
-class _Raw:
-    """Message that stays encoded, with the interface that cyclonedds expects of its own types."""
-
-    def __init__(self, cdr: bytes):
-        self.cdr = cdr
-
-    def serialize(self, **_: Any) -> bytes:
-        return self.cdr
-
-    @classmethod
-    def deserialize(cls, data: bytes) -> Any:
-        return cls(data)
-
-    deserialize_key = deserialize  # a notice that a publisher has ended: it holds no message
-
-
 @functools.cache
 def _raw_type(kind: str) -> Any:
-    """Type of messages that stay encoded. Others see the fields of ROS 2."""
+    """Type of messages that stay encoded, as the attribute `cdr`. Others see the fields of ROS 2."""
+
+    def begin(self: Any, cdr: bytes) -> None:
+        self.cdr = cdr
+
+    def read(cls: Any, cdr: bytes) -> Any:
+        return cls(cdr)
+
     found = _type.__wrapped__(kind)
-    for name in ("__init__", "serialize", "deserialize", "deserialize_key"):
-        setattr(found, name, vars(_Raw)[name])
+    found.__init__, found.serialize = begin, lambda self, **_: self.cdr
+    found.deserialize = found.deserialize_key = classmethod(read)  # a key: a publisher has ended
     return found
 
 

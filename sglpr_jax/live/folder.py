@@ -13,7 +13,7 @@ from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import record_of_scan
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rotations_of
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
-from sglpr_jax.data.poses import BEYOND_S, have_poses, interpolate_poses, poses_of
+from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.times import EPOCH, PER_SECOND
@@ -40,6 +40,7 @@ class FolderSource:
     def __init__(self, root: Path, options: LiveOptions, report: Report, taken: Taken):
         self._root, self._options, self._report = root, options, report
         self._records: RecordFormat | None = None
+        """Format of .bin files whose name does not define it, by the content of the first one."""
         self._sizes: dict[Path, int] = {}
         """Size of each waiting file at the last look."""
         self._done: set[Path] = set()
@@ -49,9 +50,9 @@ class FolderSource:
         found = files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
         last = max((i for i, path in enumerate(found) if taken(_name(path))), default=-1)
         self._done.update(found[: last + 1])
-        self._poses = (
-            None if options.poses is None else GrowingPoses(options.poses, options.pose_format, options.time_unit)
-        )
+        self._poses = None
+        if options.poses is not None:
+            self._poses = GrowingPoses(options.poses, options.pose_format, options.time_unit)
 
     def frames(self) -> Iterator[LiveFrame | None]:
         """Yield scans as they are completed. Never ends."""
@@ -103,7 +104,9 @@ class FolderSource:
     def _frame(self, path: Path, received: float) -> Iterator[LiveFrame | None]:
         """Read a scan and wait for its pose. A scan that cannot be read is reported."""
         try:
-            record = scan_record(path, format=self._options.format, records=self._record_of(path))
+            if self._records is None and self._options.format == "auto" and named_format(path) is None:
+                self._records = record_of_scan(path)
+            record = scan_record(path, format=self._options.format, records=self._records or "kitti")
             seconds = _time_in_name(path)
             written = path.stat().st_mtime
         except (ValueError, OSError, ImportError) as error:
@@ -124,12 +127,6 @@ class FolderSource:
             return self._poses.of(row, seconds)
         except ValueError as error:
             return self._report("poses", f"a pose is left out: {error}")
-
-    def _record_of(self, path: Path) -> RecordFormat:
-        """Format of .bin files whose name does not define it, by the content of the first one."""
-        if self._records is None and self._options.format == "auto" and named_format(path) is None:
-            self._records = record_of_scan(path)
-        return self._records or "kitti"
 
 
 def _name(path: Path) -> str:
@@ -194,9 +191,8 @@ class GrowingPoses:
         known = [(self._times[i], pose) for i in near if (pose := self._poses[i]) is not None]
         if len(known) < 2 or known[-1][0] < time - BEYOND_S:
             return None
-        stamps, poses = np.array([stamp for stamp, _ in known]), np.stack([pose for _, pose in known])
-        at = np.array([time])
-        return interpolate_poses(stamps, poses, at)[0] if have_poses(stamps, at).all() else None
+        stamps, poses = zip(*known, strict=True)
+        return pose_at(np.array(stamps), np.stack(poses), time)
 
     def _add(self, words: list[str], where: str) -> None:
         if self._format == "auto" and len(words) == 12:

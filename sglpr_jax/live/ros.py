@@ -21,7 +21,6 @@ from sglpr_jax.live.ros_messages import (
     Received,
     decode_cloud,
     edge_message,
-    encode,
     marker_message,
     transform_message,
 )
@@ -166,17 +165,17 @@ class RosSink:
             return
         at = status.time if np.isfinite(status.time) and status.time > 0 else time.time()
         frames = {"frame": self._options.map_frame, "child": self._options.odometry_frame}
-        self._transforms(encode(transform_message(status.map_from_world, time=at, **frames)))
+        self._transforms(transform_message(status.map_from_world, time=at, **frames))
 
     def loop(self, edge: LoopEdge) -> None:
         """Publish an edge. With odometry of both scans, draw it."""
-        self._edges(encode(edge_message(edge)))
+        self._edges(edge_message(edge))
         query, match = edge.world_from_query, edge.world_from_match
         if query is None or match is None:
             return
         self._lines.append(np.stack([match[:3, 3], query[:3, 3]]))
         drawn = marker_message(list(self._lines), time=edge.query_time, frame=self._options.odometry_frame)
-        self._markers(encode(drawn))
+        self._markers(drawn)
 
     def close(self) -> None:
         self._transport.close()

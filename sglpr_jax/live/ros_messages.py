@@ -5,7 +5,7 @@ Messages are encoded by rosbags. Scans and poses are decoded by the readers of b
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,9 +56,30 @@ def typestore() -> Any:
     return types
 
 
-def encode(message: Any) -> bytes:
-    """Encode a message of `typestore`, with the four bytes of the encapsulation header."""
-    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+def encode(kind: str, fields: Mapping[str, Any]) -> bytes:
+    """Encode a message, with the four bytes of the encapsulation header. Fields that are not given are zero.
+
+    The fields of a message within the message are a mapping, too.
+    """
+    return bytes(typestore().serialize_cdr(_message(kind, fields), kind))
+
+
+def _message(kind: str, fields: Mapping[str, Any]) -> Any:
+    defined = typestore().fielddefs[kind][1]
+    return typestore().types[kind](**{name: _value(of, fields.get(name)) for name, of in defined})
+
+
+def _value(field: tuple[Any, Any], given: Any) -> Any:
+    """Value of a field, from its definition by rosbags."""
+    node, of = field
+    if node.name == "NAME":
+        return _message(of, given or {})
+    if node.name == "BASE":
+        return given if given is not None else {"string": "", "bool": False}.get(of[0], 0)
+    (inner, content), count = of
+    if inner.name == "NAME":
+        return [_message(content, one) for one in given or ()]
+    return given if given is not None else np.zeros(count, content[0])
 
 
 def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Record]:
@@ -75,84 +96,53 @@ def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Record]:
         raise ValueError(f"expected a cloud with points, found an invalid one ({in_short(error)})") from error
 
 
-def edge_message(edge: LoopEdge) -> Any:
+def edge_message(edge: LoopEdge) -> bytes:
     """Loop edge as geometry_msgs/PoseWithCovarianceStamped.
 
     The stamp is the time of the query, and the frame is `match/SECONDS.NANOSECONDS`, with the time of the match. The
     pose is that of the query's LiDAR in the frame of the match's LiDAR. As ROS defines it, the covariance is along and
     about the axes of the match's frame: x, y, z in metres, then rotations about x, y, z in radians.
     """
-    types = typestore().types
     turned = np.kron(np.eye(2), edge.match_from_query[:3, :3])
-    covariance = turned @ edge.covariance @ turned.T
+    covariance = np.ascontiguousarray(turned @ edge.covariance @ turned.T, np.float64).reshape(-1)
     seconds, nanoseconds = _split(edge.match_time)
-    return types[EDGE](
-        header=_header(edge.query_time, f"match/{seconds}.{nanoseconds:09d}"),
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](
-            pose=_pose(edge.match_from_query), covariance=np.ascontiguousarray(covariance, np.float64).reshape(-1)
-        ),
-    )
+    at, turn = _pose(edge.match_from_query)
+    pose = {"pose": {"position": at, "orientation": turn}, "covariance": covariance}
+    return encode(EDGE, {"header": header(edge.query_time, f"match/{seconds}.{nanoseconds:09d}"), "pose": pose})
 
 
-def marker_message(ends: Sequence[Float[np.ndarray, "2 3"]], *, time: float, frame: str) -> Any:
+def marker_message(ends: Sequence[Float[np.ndarray, "2 3"]], *, time: float, frame: str) -> bytes:
     """Lines between the positions of the scans of each loop, as visualization_msgs/MarkerArray with one marker."""
-    types = typestore().types
-    point, colour = types["geometry_msgs/msg/Point"], types["std_msgs/msg/ColorRGBA"]
-    nothing = types["std_msgs/msg/Header"](stamp=_stamp(0.0), frame_id="")
-    marker = types["visualization_msgs/msg/Marker"](
-        header=_header(time, frame),
-        ns="loops",
-        id=0,
-        type=LINE_LIST,
-        action=0,
-        pose=_pose(np.eye(4)),
-        scale=types["geometry_msgs/msg/Vector3"](x=LINE_M, y=0.0, z=0.0),
-        color=colour(r=0.1, g=0.8, b=0.2, a=1.0),
-        lifetime=types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0),
-        frame_locked=False,
-        points=[point(*map(float, end)) for pair in ends for end in pair],
-        colors=[],
-        texture_resource="",
-        texture=types["sensor_msgs/msg/CompressedImage"](header=nothing, format="", data=np.zeros(0, np.uint8)),
-        uv_coordinates=[],
-        text="",
-        mesh_resource="",
-        mesh_file=types["visualization_msgs/msg/MeshFile"](filename="", data=np.zeros(0, np.uint8)),
-        mesh_use_embedded_materials=False,
-    )
-    return types[MARKERS](markers=[marker])
+    marker = {
+        "header": header(time, frame),
+        "ns": "loops",
+        "type": LINE_LIST,
+        "pose": {"orientation": {"w": 1.0}},
+        "scale": {"x": LINE_M},
+        "color": {"r": 0.1, "g": 0.8, "b": 0.2, "a": 1.0},
+        "points": [dict(zip("xyz", end.tolist(), strict=True)) for pair in ends for end in pair],
+    }
+    return encode(MARKERS, {"markers": [marker]})
 
 
-def transform_message(frame_from_child: Float[np.ndarray, "4 4"], *, time: float, frame: str, child: str) -> Any:
+def transform_message(frame_from_child: Float[np.ndarray, "4 4"], *, time: float, frame: str, child: str) -> bytes:
     """Pose of a child frame in a frame, as tf2_msgs/TFMessage."""
-    types = typestore().types
-    pose = _pose(frame_from_child)
-    at = pose.position
-    transform = types["geometry_msgs/msg/Transform"](
-        translation=types["geometry_msgs/msg/Vector3"](x=at.x, y=at.y, z=at.z), rotation=pose.orientation
-    )
-    one = types["geometry_msgs/msg/TransformStamped"](
-        header=_header(time, frame), child_frame_id=child, transform=transform
-    )
-    return types[TRANSFORMS](transforms=[one])
+    at, turn = _pose(frame_from_child)
+    transform = {"translation": at, "rotation": turn}
+    one = {"header": header(time, frame), "child_frame_id": child, "transform": transform}
+    return encode(TRANSFORMS, {"transforms": [one]})
 
 
-def _pose(frame_from_body: Float[np.ndarray, "4 4"]) -> Any:
-    types = typestore().types
-    x, y, z, w = map(float, quaternions(frame_from_body[None])[0])
-    return types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](*map(float, frame_from_body[:3, 3])),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
-    )
-
-
-def _header(time: float, frame: str) -> Any:
-    return typestore().types["std_msgs/msg/Header"](stamp=_stamp(time), frame_id=frame)
-
-
-def _stamp(time: float) -> Any:
+def header(time: float, frame: str) -> dict[str, Any]:
+    """Fields of a std_msgs/Header."""
     seconds, nanoseconds = _split(time)
-    return typestore().types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
+
+
+def _pose(frame_from_body: Float[np.ndarray, "4 4"]) -> tuple[dict[str, float], dict[str, float]]:
+    """Position and quaternion of a pose."""
+    turn = quaternions(frame_from_body[None])[0].tolist()
+    return dict(zip("xyz", frame_from_body[:3, 3].tolist(), strict=True)), dict(zip("xyzw", turn, strict=True))
 
 
 def _split(time: float) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from sglpr_jax.data.formats.ros_messages import (
     read_transforms,
     tracks_of,
 )
-from sglpr_jax.data.poses import have_poses, interpolate_poses
+from sglpr_jax.data.poses import pose_at
 from sglpr_jax.live.messages import Report
 from sglpr_jax.live.ros_messages import TRANSFORMS, Received
 
@@ -136,6 +136,4 @@ def _at(poses: list[StampedPose], time: float) -> Float[np.ndarray, "4 4"] | Non
     before = [one for one in nearest if one.time <= time][:1]
     after = [one for one in nearest if one.time > time][:1]
     track = Track.of((0, one) for one in (before + after if before and after else nearest[:2]))
-    times = np.array([time])
-    known = have_poses(track.stamps.own, times).all()
-    return interpolate_poses(track.stamps.own, track.poses, times)[0] if known else None
+    return pose_at(track.stamps.own, track.poses, time)

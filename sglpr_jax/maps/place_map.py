@@ -30,7 +30,7 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
-from sglpr_jax.retrieval.index import Index, check_scale, check_weights
+from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import NEGATIVE_M
 from sglpr_jax.schema import Column, check_columns
 from sglpr_jax.se3 import ROTATION_TOLERANCE, inverse
@@ -134,7 +134,7 @@ class PlaceMap(Keyframes):
         Raises:
           ValueError: If the maps were made with other weights or another scale, or have images of another size.
         """
-        check_scale(self.scale, other.scale)
+        self.index.check(scale=other.scale)
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
         known = set(self._contents())
@@ -187,7 +187,7 @@ class PlaceMap(Keyframes):
         self, seen: Seen, *, weights_hash: str | None, model: LoopModel | None = None, candidates: int = CANDIDATES
     ) -> list[Relocated]:
         """Locate a scan, described with the map's scale by weights with this hash. See `relocate`."""
-        check_weights(self.index.weights_hash, weights_hash)
+        self.index.check(weights=weights_hash)
         image = seen.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")

@@ -9,7 +9,7 @@ import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -137,23 +137,27 @@ def write_loops_jsonl(
 
 def loop_lines(loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None) -> str:
     """Return the lines of a file of `write_loops_jsonl`."""
-    lines = []
-    for loop in loops:
-        numbers = {"match_from_query": loop.match_from_query.tolist(), "covariance": loop.covariance.tolist()}
-        lines.append(f"{json.dumps({**_named(loop, ids, recordings), **numbers, **_shares(loop)})}\n")
-    return "".join(lines)
+    names = ("match_from_query", "covariance", "probability", "overlap")
+    return "".join(_line(loop, names, ids, recordings) for loop in loops)
 
 
 def write_rejected_jsonl(
     path: Path | str, rejected: Sequence[Rejected], ids: Ids | None = None, recordings: Ids | None = None
 ) -> None:
     """Write rejected pairs, one JSON object a line, with the `ids` and the `recordings` of the frames if given."""
-    lines = []
-    for one in rejected:
-        pose = one.loop.match_from_query.tolist()
-        row = {**_named(one.loop, ids, recordings), "reason": one.reason, **_shares(one.loop), "match_from_query": pose}
-        lines.append(f"{json.dumps(row)}\n")
+    names = ("reason", "probability", "overlap", "match_from_query")
+    lines = (_line(one.loop, names, ids, recordings, reason=one.reason) for one in rejected)
     write_text(Path(path), "".join(lines))
+
+
+def _line(loop: Loop, names: Sequence[str], ids: Ids | None, recordings: Ids | None, **more: str) -> str:
+    """The frames of a loop, their ids and recordings if given, and the values of these `names`, as a line of JSON."""
+    row: dict[str, Any] = {"query": loop.query, "match": loop.match}
+    for suffix, known in (("id", ids), ("recording", recordings)):
+        if known is not None:
+            row |= {f"query_{suffix}": known[loop.query], f"match_{suffix}": known[loop.match]}
+    row |= {name: more[name] if name in more else getattr(loop, name) for name in names}
+    return json.dumps(row, default=np.ndarray.tolist) + "\n"
 
 
 def read_loops_jsonl(path: Path | str) -> list[Loop]:
@@ -214,18 +218,6 @@ def _all_digits(values: Float[np.ndarray, " n"]) -> str:
 
 def _numbers(values: Float[np.ndarray, " n"]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
-
-
-def _named(loop: Loop, ids: Ids | None, recordings: Ids | None) -> dict:
-    """Frames of a loop, and their ids and recordings if they are given."""
-    named = {} if ids is None else {"query_id": ids[loop.query], "match_id": ids[loop.match]}
-    if recordings is not None:
-        named |= dict(zip(OF_RECORDINGS, (recordings[loop.query], recordings[loop.match]), strict=True))
-    return {"query": loop.query, "match": loop.match, **named}
-
-
-def _shares(loop: Loop) -> dict:
-    return {"probability": loop.probability, "overlap": loop.overlap}
 
 
 def _from_json(line: bytes, where: str) -> Loop:

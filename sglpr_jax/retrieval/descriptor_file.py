@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -138,27 +139,31 @@ class DescriptorFile:
             )
 
 
+def check_made_alike(expected: Mapping[str, Any], found: Mapping[str, Any], *, of: str = "descriptors") -> None:
+    """Raise ValueError if descriptors were made in another way than expected. A `found` value of None is not checked.
+
+    `of` names the descriptors in the message.
+    """
+    for name, value in found.items():
+        if value is not None and value != expected[name]:
+            wanted, other = (json_in_short(one) or "(none)" for one in (expected[name], value))
+            raise ValueError(f"expected {of} with {name} {wanted}, found {other}: they are not comparable")
+
+
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
     """Raise ValueError unless the descriptors of two files can be compared: same method, model, weights and scale.
 
     The recordings and the rotations may differ.
     """
-    for what in ("numbers", "distance", "method", "model", "weights", "scale"):
-        ours, theirs = _made_by(a)[what], _made_by(b)[what]
-        if ours != theirs:
-            raise ValueError(
-                f"expected the descriptors of {b.sequence} to be made as those of {a.sequence}, with {what} "
-                f"{json_in_short(ours)}, found {json_in_short(theirs)}"
-            )
+    check_made_alike(_made_by(a), _made_by(b), of=f"descriptors of {b.sequence}, as those of {a.sequence},")
 
 
 def _made_by(file: DescriptorFile) -> dict[str, Any]:
-    config = {name: file.config.get(name) for name in ("method", "model", "grid")}
     return {
         "numbers": file.descriptors.shape[1],
         "distance": file.distance,
-        "method": config["method"],
-        "model": json.loads(json.dumps([config["model"], config["grid"]])),  # Tuples become lists, as in a file.
+        "method": file.config.get("method", ""),
+        "model": json.loads(json.dumps([file.config.get(name) for name in ("model", "grid")])),  # tuples become lists
         "weights": file.weights_hash,
         "scale": file.scale,
     }

@@ -65,17 +65,14 @@ def distance_function(name: str) -> DistanceFn:
       FileNotFoundError: If the weights of a learned distance do not exist.
       ValueError: If the name is unknown, with all names and the nearest one, or if the weights have changed.
     """
-    if name.partition(":")[0] in LEARNED_NAMES:
-        return _learned(name)
+    method = name.partition(":")[0]
+    if method in LEARNED_NAMES:
+        from sglpr_jax.methods.learned import LEARNED  # slow import: the networks
+        from sglpr_jax.methods.learned.describe import distance_of_weights
+
+        return distance_of_weights(LEARNED[method], name)
     if name not in DISTANCES:
         near = difflib.get_close_matches(name, DISTANCES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise ValueError(f"expected a distance among {', '.join(DISTANCES)}, found {name!r:.60}{hint}")
     return DISTANCES[name]
-
-
-def _learned(name: str) -> DistanceFn:
-    from sglpr_jax.methods.learned import LEARNED  # slow import: the networks
-    from sglpr_jax.methods.learned.describe import distance_of_weights
-
-    return distance_of_weights(LEARNED[name.partition(":")[0]], name)

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sglpr_jax.files import naming
+from sglpr_jax.retrieval.descriptor_file import check_made_alike
 from sglpr_jax.retrieval.index import check_asked, checked_rows
-from sglpr_jax.retrieval.parquet import KEY, about_of, check_made_alike, usable
+from sglpr_jax.retrieval.parquet import KEY, about_of, usable
 
 if TYPE_CHECKING:
     import pyarrow
@@ -124,5 +126,7 @@ class FleetIndex:
 
     def _check(self, found: dict[str, Any]) -> None:
         """Raise ValueError if places are not comparable with those of the table, or have other weights than asked."""
+        expected = found if self.table is None else self.about
         asked = {} if self.weights_hash is None else {"weights_hash": self.weights_hash}
-        check_made_alike(found | asked if self.table is None else self.about | asked, found, self.place)
+        with naming(self.place):
+            check_made_alike(expected | asked, found, of="places")

@@ -73,22 +73,17 @@ def save_map(path: Path, found: SemanticMap, record: Record, *, categories: int)
 def _predict(
     params: Params, counts: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
 ) -> tuple[Int[Array, "h w"], Int[Array, "h w"]]:
+    """Classes of the highest mean probability over the image and its mirror image, and the truth.
+
+    The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds more.
+    """
     seen = (counts > 0) & field_of_view(params.config)[0]
-    probability = _class_probabilities(params, counts)
+    logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
+    as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])
+    probability = (as_it_is + mirrored[:, ::-1]) / 2
     predicted = probability.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
     sure = probability.max(-1) >= min_confidence
     return jnp.where(seen & sure, predicted, UNLABELLED), jnp.where(seen, truth, UNLABELLED)
-
-
-def _class_probabilities(params: Params, counts: Float[Array, "h w"]) -> Float[Array, "h w known"]:
-    """Return the mean probabilities over the image and its mirror image, of all classes except unlabelled.
-
-    The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds
-    information.
-    """
-    logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
-    as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])
-    return (as_it_is + mirrored[:, ::-1]) / 2
 
 
 def heat_maps(
@@ -107,12 +102,8 @@ def heat_maps(
       Maps by title, with NaN outside the field of view of the model.
     """
     found = jax.device_get(_strengths(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
-    return {title: _scaled(found[name]) for title, name in params.config.pictures.items()}
-
-
-def _scaled(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    low, high = np.nanmin(values), np.nanmax(values)
-    return (values - low) / max(high - low, 1e-9)
+    shown = {title: found[name] - np.nanmin(found[name]) for title, name in params.config.pictures.items()}
+    return {title: values / max(np.nanmax(values), 1e-9) for title, values in shown.items()}
 
 
 @jax.jit

@@ -21,7 +21,7 @@ from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.files import in_short, naming, parse_json, replacing
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile
+from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile, check_made_alike
 from sglpr_jax.retrieval.distances import distance_function, smallest
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 from sglpr_jax.schema import check_about, check_columns
@@ -147,7 +147,7 @@ class Index:
           ValueError: If descriptors have another width or weights, if a value is not finite, or if the places have
             other fields than the places before.
         """
-        check_weights(self.weights_hash, weights_hash)
+        self.check(weights=weights_hash)
         rows = checked_rows(descriptors, self.width)
         n = len(rows)
         names = [f"{row:06d}" for row in range(len(self), len(self) + n)] if ids is None else ids
@@ -179,9 +179,7 @@ class Index:
 
     def add_file(self, file: DescriptorFile) -> None:
         """Add the places of a descriptor file. Raises ValueError if another model, method or scale made it."""
-        check_scale(self.scale, file.scale)
-        if file.distance != self.distance:
-            raise ValueError(f"expected descriptors compared by {self.distance}, found {file.distance}")
+        self.check(scale=file.scale, distance=file.distance)
         about = {"times": file.times, "positions": file.positions, "weights_hash": file.weights_hash}
         self.add(file.descriptors, ids=file.ids, **about)
 
@@ -207,7 +205,7 @@ class Index:
         Raises:
           ValueError: If descriptors have another width or weights, or if too much is asked for (`check_asked`).
         """
-        check_weights(self.weights_hash, weights_hash)
+        self.check(weights=weights_hash)
         queries = checked_rows(descriptors, self.width)
         check_asked(k, queries=len(queries), places=len(self))
         allowed = ~self._excluded(exclude)
@@ -266,8 +264,12 @@ class Index:
             about["width"], about["weights_hash"], about["distance"], about["ids"], columns, scale=about["scale"]
         )
         with naming(path):
-            check_weights(index.weights_hash, weights_hash)
+            index.check(weights=weights_hash)
         return index, arrays
+
+    def check(self, **found: Any) -> None:
+        """Raise ValueError if descriptors have other `weights` (hash), `scale` or `distance`. None skips a check."""
+        check_made_alike({"weights": self.weights_hash, "scale": self.scale, "distance": self.distance}, found)
 
     def _excluded(self, flags: ArrayLike | None) -> Bool[np.ndarray, " n"]:
         """Convert the flags of excluded places to an array. Raises ValueError unless they are a boolean a place."""
@@ -293,8 +295,11 @@ class Index:
             near = rows[np.argpartition(rough, few - 1, axis=1)[:, :few]]
         else:
             near = np.argpartition(np.where(allowed, self._rough(queries), np.inf), few - 1, axis=1)[:, :few]
-        found = [_nearest_of(query, self.descriptors[row], row, k) for query, row in zip(queries, near, strict=True)]
-        return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
+        near = np.sort(near, axis=1)  # equal distances keep the order of the rows
+        pairs = zip(queries.astype(np.float64), near, strict=True)
+        apart = np.stack([np.linalg.norm(query - self.descriptors[row], axis=1) for query, row in pairs])
+        order = np.argsort(apart, axis=1, kind="stable")[:, :k]
+        return np.take_along_axis(near, order, axis=1), np.take_along_axis(apart, order, axis=1)
 
     def _rough(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
         """Return the squared distances in float32, without the squared lengths of the queries.
@@ -365,33 +370,6 @@ def check_asked(k: int, *, queries: int, places: int) -> None:
         raise ValueError(f"expected k from 1 up to {max(MOST, places)}, found {k}")
     if queries > 1 and queries * k > MOST_ANSWERS:
         raise ValueError(f"expected at most {MOST_ANSWERS // k} queries at a time for k = {k}, found {queries}")
-
-
-def check_weights(expected: str, found: str | None) -> None:
-    """Raise ValueError if descriptors come from other weights. None skips the check."""
-    if found is not None and found != expected:
-        raise ValueError(
-            f"expected descriptors of the weights {expected[:12] or '(none)'}, "
-            f"found those of {found[:12] or '(none)'}: descriptors of different models are not comparable"
-        )
-
-
-def check_scale(expected: Scale, found: Scale) -> None:
-    """Raise ValueError if descriptors come from scans of another scale."""
-    if found != expected:
-        raise ValueError(
-            f"expected scale {expected}, found scale {found}: descriptors of scans with different scales are not "
-            "comparable"
-        )
-
-
-def _nearest_of(
-    query: Float[np.ndarray, " d"], descriptors: Float[np.ndarray, "n d"], rows: Int[np.ndarray, " n"], k: int
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Return the nearest k of a few candidates by their distances in float64, ties in the order of their rows."""
-    apart = np.linalg.norm(query.astype(np.float64) - descriptors, axis=1)
-    order = np.lexsort((rows, apart))[:k]
-    return rows[order], apart[order]
 
 
 def _finite(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -113,16 +113,6 @@ def about_of(found: "pyarrow.Schema", source: str) -> dict[str, Any]:
     return about
 
 
-def check_made_alike(expected: dict[str, Any], found: dict[str, Any], source: str) -> None:
-    """Raise ValueError, naming the table `source`, if the places of other weights would be compared with its own."""
-    for name, value in found.items():
-        if value != expected[name]:
-            here, there = (str(one)[:12] or "(none)" for one in (expected[name], value))
-            raise ValueError(
-                f"{source}: expected places with {name} {here}, found {there}: their descriptors are not comparable"
-            )
-
-
 @contextlib.contextmanager
 def usable(address: str) -> Iterator[None]:
     """Convert the exceptions of storage libraries, of many types, to a ValueError that names the address."""

@@ -68,7 +68,7 @@ def test_a_scan_is_located_in_a_map_of_its_kind(command, drive, tmp_path):
     values = json.loads((found / "command.json").read_text())
     assert (values["scale"], values["submap-m"]) == (2, 6)
     assert ", scale 2" in ended.out and PlaceMap.load(out).scale == 2
-    wrong = "town.safetensors: expected scale {}, found scale 2: descriptors of scans with different scales"
+    wrong = "town.safetensors: expected descriptors with scale {}, found 2: they are not comparable"
     assert_one_line_error(command(*query, "--scale", "4"), wrong.format(4))
     more = ("map", folder, "--poses", poses, "--add-to", out, "--out", out, "--weights", "circular")
     assert_one_line_error(command(*more), wrong.format(1))

@@ -242,7 +242,7 @@ def test_pointnetvlad_recall_is_the_mean_over_ordered_pairs_of_runs(make_file, s
 @pytest.mark.parametrize("name", protocols_taking("sessions"))
 def test_sessions_must_be_described_alike(make_file, two_laps, name):
     database, queries = make_file(two_laps, np.ones((800, 4))), make_file(two_laps, np.ones((800, 5)), sequence="later")
-    with pytest.raises(ValueError, match="descriptors of later to be made as those of town, with numbers 4, found 5"):
+    with pytest.raises(ValueError, match="descriptors of later, as those of town, with numbers 4, found 5"):
         PROTOCOLS[name](database, queries)
     with pytest.raises(ValueError, match="expected positions to score sequence town"):
         PROTOCOLS[name](replace(database, positions=None), database)

@@ -1,11 +1,13 @@
 """ROS 2 messages for the tests of the live node, encoded by rosbags' definitions of Humble."""
 
+import dataclasses
+
 import numpy as np
 
 from sglpr_jax.live.ros_messages import Received
 from tests import bags
 
-ODOMETRY = "nav_msgs/msg/Odometry"
+ODOMETRY = bags.ODOMETRY
 LIVOX = "livox_ros_driver2/msg/CustomMsg"
 POINTS = np.random.default_rng(5).normal(scale=9, size=(64, 3)).astype(np.float32)
 
@@ -24,23 +26,11 @@ def cloud(seconds: float = 12.5, points: np.ndarray = POINTS) -> bytes:
 
 
 def livox(seconds: float = 12.5, points: np.ndarray = POINTS) -> bytes:
-    store = bags.typestore("ros2").types
-    point = store["livox_ros_driver2/msg/CustomPoint"]
-    rows = [point(i, *map(float, xyz), 9, 0, i % 4) for i, xyz in enumerate(points)]
-    head = bags.header("ros2", seconds, "lidar")
-    return encoded(store[LIVOX](head, 7, len(rows), 1, np.zeros(3, np.uint8), rows))
+    return encoded(bags.livox("ros2", seconds, points, driver=bags.LIVOX_DRIVERS[1], frame="lidar"))
 
 
-def odometry(seconds: float, at, turned=(0.0, 0.0, 0.0, 1.0), *, child: str = "base") -> bytes:
-    store = bags.typestore("ros2").types
-    pose = store["geometry_msgs/msg/Pose"](
-        store["geometry_msgs/msg/Point"](*map(float, at)), store["geometry_msgs/msg/Quaternion"](*map(float, turned))
-    )
-    zero = store["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    head = bags.header("ros2", seconds, "odom")
-    still = store["geometry_msgs/msg/TwistWithCovariance"](store["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36))
-    posed = store["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36))
-    return encoded(store[ODOMETRY](head, child, posed, still))
+def odometry(seconds: float, at, *, child: str = "base") -> bytes:
+    return encoded(dataclasses.replace(bags.pose("ros2", seconds, at), child_frame_id=child))
 
 
 def transforms(seconds: float, found) -> bytes:

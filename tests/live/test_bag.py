@@ -7,21 +7,10 @@ import pytest
 
 from sglpr_jax.live.endpoints import open_source
 from sglpr_jax.live.options import LiveOptions
-from tests.bags import CLOUD, cloud, header, typestore, write_bag
+from tests.bags import CLOUD, POSE, cloud, pose, write_bag
 
 POINTS = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
 STAMP = 1_700_000_000.0
-
-
-def odometry(seconds: float, x: float):
-    store = typestore("ros2").types
-
-    def of(name: str, **fields):
-        return store[f"geometry_msgs/msg/{name}"](**fields)
-
-    turn = of("Quaternion", x=0.0, y=0.0, z=float(np.sin(x / 20)), w=float(np.cos(x / 20)))
-    pose = of("Pose", position=of("Point", x=x, y=0.0, z=0.0), orientation=turn)
-    return of("PoseStamped", header=header("ros2", seconds, "odom"), pose=pose)
 
 
 @pytest.fixture
@@ -31,7 +20,8 @@ def bag(tmp_path):
     for i in range(10):
         at = STAMP + 0.05 * i
         messages += [("/points", CLOUD, at, cloud("ros2", at, POINTS + i))]
-        messages += [("/odom", "geometry_msgs/msg/PoseStamped", at, odometry(at, float(i)))]
+        turned = (0, 0, np.sin(i / 20), np.cos(i / 20))
+        messages += [("/odom", POSE, at, pose("ros2", at, (i, 0, 0), turned, POSE))]
     return write_bag(tmp_path / "drive", "ros2", messages)
 
 

@@ -126,7 +126,7 @@ def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(f
         lambda: places.merged(other),
         lambda: other.relocate(params, recording.record(0)),
     ):
-        with pytest.raises(ValueError, match="expected descriptors of the weights"):
+        with pytest.raises(ValueError, match="expected descriptors with weights"):
             use()
 
 

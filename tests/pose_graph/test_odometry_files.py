@@ -106,8 +106,3 @@ def test_what_is_no_odometry_is_one_clear_error(tmp_path, text, format, message)
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"poses\.txt.*{message}"):
         read_odometry(path, format=format)
-
-
-def test_an_unknown_format_is_named(tmp_path, as_installed):
-    with pytest.raises(ValueError, match=r"poses\.txt, format: expected .*'tum'.*, found 'bogus'"):
-        read_odometry(tmp_path / "poses.txt", format="bogus")

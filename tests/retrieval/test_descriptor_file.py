@@ -116,7 +116,7 @@ def test_arrays_that_cannot_be_are_refused(tmp_path, file, changed, message):
 def test_descriptors_of_another_method_or_model_cannot_be_compared(file, change, what):
     file = dataclasses.replace(file, config={"method": "sglpr", "model": {"polar": (64, 256)}, "data": "08"})
     check_same_method(file, dataclasses.replace(file, sequence="05", config={**file.config, "data": "05"}))
-    with pytest.raises(ValueError, match=rf"of 05 to be made as those of .*, with {what} .*, found "):
+    with pytest.raises(ValueError, match=rf"of 05, as those of .*, with {what} .*, found "):
         check_same_method(file, dataclasses.replace(file, sequence="05", **change))
 
 

@@ -4,8 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.retrieval.distances import DISTANCES, cosine, distance_function, l2, smallest
+from sglpr_jax.retrieval.distances import cosine, distance_function, l2, smallest
 
 
 @pytest.fixture
@@ -31,10 +30,6 @@ def test_cosine_is_the_cosine_distance(rows):
 )
 def test_the_smallest_are_those_of_a_stable_sort(values, k):
     np.testing.assert_array_equal(smallest(values, k), np.argsort(values, axis=1, kind="stable")[:, :k])
-
-
-def test_every_baseline_has_a_distance():
-    assert {baseline.distance_name for baseline in HANDCRAFTED.values()} <= set(DISTANCES)
 
 
 def test_an_unknown_distance_is_named_with_the_nearest_one():

@@ -143,6 +143,8 @@ def test_the_batches_do_not_show_and_are_all_of_one_shape(scans, batch, size):
 
     found = embed_images(describe, scans, GRID, config={}, batch=batch, on_progress=done.append)
     np.testing.assert_array_equal(found.descriptors, embed_images(flatten, scans, GRID, config={}).descriptors)
+    with pytest.raises(ValueError, match=r"batch: expected a number from 1 .*found 0"):
+        embed_images(flatten, scans, GRID, config={}, batch=0)
     assert shapes == {(size, GRID.height, GRID.width)} and done == [*range(1, SCANS + 1)]
 
 
@@ -156,11 +158,6 @@ def test_ready_made_images_that_are_none_of_densities_are_refused_where_these_ar
     with pytest.raises(ValueError, match="at least one readable scan"):
         embed_images(flatten, others, GRID, config={}, image="density", on_bad_scan=lambda *bad: reported.append(bad))
     assert len(reported) == SCANS
-
-
-def test_a_batch_has_at_least_one_image(pictures):
-    with pytest.raises(ValueError, match=r"batch: expected a number from 1 .*found 0"):
-        embed_images(flatten, pictures, GRID, config={}, batch=0)
 
 
 def test_bad_scans_are_reported_and_left_out_if_asked(scans):
@@ -237,19 +234,6 @@ def learned(prepare=mean_of, describe=lambda inputs: inputs, takes="points") -> 
     return Method({"method": "mine"}, takes, prepared, describe, weights_hash="hash")
 
 
-def test_a_learned_method_describes_every_scan_for_itself(scans):
-    sizes = []
-
-    def describe(inputs):
-        sizes.append(len(inputs))
-        return inputs
-
-    file = embed(learned(describe=describe), scans, batch=4)
-    np.testing.assert_array_equal(file.descriptors, [cloud.mean(axis=0) for cloud in clouds()])
-    assert file.ids == scans.ids and file.weights_hash == "hash" and file.distance == "l2"
-    assert file.config["method"] == "mine" and set(sizes) == {4}
-
-
 def test_scans_and_images_of_a_learned_method_are_rotated(scans, pictures):
     file, angles = embed(learned(), scans, rotation_seed=3), drawn_angles(3)
     expected = [rotated(cloud, float(angle)).mean(axis=0) for cloud, angle in zip(clouds(), angles, strict=True)]
@@ -277,8 +261,6 @@ def test_other_lengths_from_scan_to_scan_are_errors(scans):
         embed(learned(describe=lambda inputs: np.ones((len(inputs), 2, 2))), scans)
 
 
-def test_missing_points_and_labels_are_errors(scans, pictures):
+def test_missing_points_are_an_error(pictures):
     with pytest.raises(ValueError, match="mine needs points, found only images in sequence 06"):
         embed(learned(), pictures)
-    with pytest.raises(ValueError, match="mine needs labels beside the scans, found none"):
-        embed(dataclasses.replace(learned(), takes="labelled points"), scans)

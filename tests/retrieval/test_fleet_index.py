@@ -67,7 +67,7 @@ def test_an_approximate_index_finds_nearest_places_and_those_added_later(tmp_pat
 
 
 def test_places_of_other_weights_are_refused(filled):
-    message = rf"^{filled.place}: expected places with weights_hash xyz, found abc: their descriptors"
+    message = rf"^{filled.place}: expected places with weights_hash xyz, found abc: they are"
     with pytest.raises(ValueError, match=message):
         FleetIndex(filled.place, weights_hash="xyz")
     with pytest.raises(ValueError, match="expected places with weights_hash abc, found xyz"):
