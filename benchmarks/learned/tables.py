@@ -76,6 +76,7 @@ TRAINED_TOWN = ("town-10-00", "town-10-08")
 SCENERIES = Column("other sceneries", ("outskirts-602-08", "lanes-602-08", "car_park-602-08"))
 SENSORS = Column("other sensors", ("vlp16-603-08", "os1-64-603-08"))
 DAY = Column("another day", ("days-604",))
+PLACES = (TOWN, SCENERIES, SENSORS)
 SIMULATED = (TOWN, TOWN.rotated, SCENERIES, SENSORS, DAY)
 LABELLED = SIMULATED[:-1]
 """The recordings of two days have no labels."""
@@ -155,8 +156,8 @@ def tables(results: Mapping[str, Any]) -> dict[str, Any]:
         "published_orders": orders,
         "published_pairs": pairs,
         "costs": _costs(costs),
-        "simulated": _simulated(by_recall),
-        "kitti": _kitti(by_recall),
+        "simulated": _all_scores(by_recall, [*PLACES, *(column.rotated for column in PLACES)], verified=True),
+        "kitti": _all_scores(by_recall, [each for one in SEQS for each in (one, one.rotated)]),
         "by_images": by_images,
         "by_seconds": by_seconds,
     }
@@ -168,41 +169,22 @@ def _summary(scores: Mapping[str, Scores], costs: Mapping[str, Any]) -> str:
     rows = []
     for name in finals(scores):
         cost, seen = by_method.get(method_of(name), {}), next(iter(scores[name].values()))
-        numbers = (
-            number(seen["images"]),
-            number(seen["seconds"]),
-            number(cost.get("ms"), 1),
-            number(cost.get("bytes")),
-        )
-        rows.append([f"`{name}`", *(text(mean(scores[name], column)) for column in columns), *numbers])
+        trained = (number(seen["images"]), number(seen["seconds"]))
+        described = (number(cost.get("ms"), 1), number(cost.get("bytes")))
+        rows.append([f"`{name}`", *(text(mean(scores[name], column)) for column in columns), *trained, *described])
     more = ("images seen", "training (s)", "description (ms)", "descriptor (bytes)")
     return markdown(["", *(column.title for column in columns), *more], rows)
 
 
-def _simulated(scores: Mapping[str, Scores]) -> str:
-    """All scores of simulated recordings."""
-    columns = (TOWN, SCENERIES, SENSORS, TOWN.rotated, SCENERIES.rotated, SENSORS.rotated)
-    rows = [
-        [
-            f"`{name}`",
-            *(_scores_of(found, column, *SCORES) for column in columns),
-            _scores_of(found, TOWN, "verified top1", "verified recall"),
-        ]
-        for name, found in scores.items()
-        if mean(found, TOWN) is not None
-    ]
-    return markdown(["", *(column.title for column in columns), "town, verified"], rows)
-
-
-def _kitti(scores: Mapping[str, Scores]) -> str:
-    """All scores of the images of KITTI."""
-    columns = [each for one in SEQS for each in (one, one.rotated)]
-    rows = [
-        [f"`{name}`", *(_scores_of(found, column, *SCORES) for column in columns)]
-        for name, found in scores.items()
-        if any(test in found for test in KITTI.tests)
-    ]
-    return markdown(["", *(column.title for column in columns)], rows)
+def _all_scores(scores: Mapping[str, Scores], columns: Sequence[Column], *, verified: bool = False) -> str:
+    """All scores of the contenders that have one in these columns, and those of the town after verification."""
+    rows = []
+    for name, found in scores.items():
+        if any(mean(found, column) is not None for column in columns):
+            cells = [_scores_of(found, column, *SCORES) for column in columns]
+            more = [_scores_of(found, TOWN, "verified top1", "verified recall")] if verified else []
+            rows.append([f"`{name}`", *cells, *more])
+    return markdown(["", *(column.title for column in columns), *(["town, verified"] if verified else [])], rows)
 
 
 def _published_recall(scores: Mapping[str, Scores]) -> str:
@@ -215,30 +197,28 @@ def _published_recall(scores: Mapping[str, Scores]) -> str:
 
 def _along_trainings(runs: Mapping[str, Any]) -> tuple[str, str]:
     """Recall@1 on the held-out town along the trainings, by images and by seconds."""
+
+    def recall(found: Sequence[Mapping[str, float]]) -> str:
+        return text(found[0]["recall_at_1"] if found else None)
+
     marks, by_images, by_seconds = [1000 * 2**k for k in range(8)], [], []
     for name, run in runs.items():
         if curve := run["curve"]:
             rate, end = (run["rates"] or {"best": None})["best"], curve[-1]
             searched = "-" if rate is None else f"{rate:.2g}"
-            by_images.append([f"`{name}`", searched, *(_after(curve, mark) for mark in marks)])
+            after = ([one for one in curve if mark <= one["images"] < 1.5 * mark] for mark in marks)
+            until = (
+                [one for one in curve if one["seconds"] <= 1.01 * mark] if mark <= 1.01 * end["seconds"] else []
+                for mark in MARKS_S
+            )
+            by_images.append([f"`{name}`", searched, *(recall(found[:1]) for found in after)])
             numbers = (text(end["recall_at_1"]), number(end["images"]), number(end["seconds"]))
             losses = ", ".join(f"{loss:.3g}" for loss in run["losses"] or ()) or "-"
-            by_seconds.append([f"`{name}`", *(_until(curve, mark) for mark in MARKS_S), *numbers, losses])
+            by_seconds.append([f"`{name}`", *(recall(found[-1:]) for found in until), *numbers, losses])
     return (
         markdown(["", "searched learning rate", *(f"{mark:,}" for mark in marks)], by_images),
         markdown(["", *map(str, MARKS_S), "end", "images", "seconds", "loss"], by_seconds),
     )
-
-
-def _after(curve: Sequence[Mapping[str, float]], images: int) -> str:
-    found = next((one for one in curve if images <= one["images"] < 1.5 * images), None)
-    return text(None if found is None else found["recall_at_1"])
-
-
-def _until(curve: Sequence[Mapping[str, float]], seconds: float) -> str:
-    found = [one for one in curve if one["seconds"] <= 1.01 * seconds]
-    finished = seconds <= 1.01 * curve[-1]["seconds"]
-    return text(found[-1]["recall_at_1"] if found and finished else None)
 
 
 def _costs(costs: Mapping[str, Any]) -> str:

@@ -3,6 +3,7 @@
 This module imports no JAX, so a command line can list its fields quickly.
 """
 
+import contextlib
 import dataclasses
 import typing
 from pathlib import Path
@@ -219,16 +220,12 @@ def _read(annotation: Any, value: Any, field: str) -> Any:
     value = {name: one for name, one in value.items() if (prefix + name, one) not in REMOVED}
     if isinstance(kind, str) and kind in RENAMED:
         value["kind"] = kind = RENAMED[kind]
+    expected: Any = members[0]
     if len(members) > 1:
         configs: dict[str, Any] = {member.kind: member for member in members}
         require(kind, isinstance(kind, str) and kind in configs, f"a kind, {' or '.join(configs)}", field)
-        members = [configs[kind]]
-    return _read_dataclass(members[0], value, prefix)
-
-
-def _read_dataclass(expected: Any, value: dict, prefix: str) -> Any:
-    field, begin = prefix.removesuffix("."), f"{prefix.removesuffix('.')}: " if prefix else ""
-    annotations = field_types(expected)
+        expected = configs[kind]
+    annotations, begin = field_types(expected), f"{field}: " if field else ""
     value = {name: ADDED_LATER[prefix + name] for name in annotations if prefix + name in ADDED_LATER} | value
     unknown = min(map(str, set(value) - set(annotations)), default=None)
     missing = min(set(annotations) - set(value), default=None)
@@ -237,10 +234,8 @@ def _read_dataclass(expected: Any, value: dict, prefix: str) -> Any:
     if missing is not None:
         raise ValueError(f"{begin}expected {every}, found no {missing!r}")
     read = {name: _read(annotations[name], one, prefix + name) for name, one in value.items()}
-    try:
+    with naming(field) if field else contextlib.nullcontext():  # the fields may be inconsistent
         return expected(**read)
-    except ValueError as error:  # the fields are inconsistent
-        raise ValueError(f"{begin}{error}") from error
 
 
 _PAPER = ModelConfig()

@@ -160,10 +160,9 @@ def _angles(key: Array, config: TrainConfig) -> Array:
 
 
 def visible(key: Array, images: int, grid: Grid, config: OcclusionConfig) -> Bool[Array, "b h w"]:
-    """Return the visible cells of each image. In a fraction of the images, a sector with random bearing is hidden.
+    """Return the visible cells of each image. In a fraction of the images, a random sector is hidden.
 
-    The width of the sector is uniform between 0 and `config.widest_deg`. The bearing of a cell is that of its centre,
-    seen from the middle of the grid.
+    The width of the sector is uniform between 0 and `config.widest_deg`. The bearing of a cell is that of its centre.
     """
     chosen_key, width_key, start_key = jax.random.split(key, 3)
     chosen = jax.random.bernoulli(chosen_key, config.share, (images,))

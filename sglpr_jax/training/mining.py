@@ -75,11 +75,8 @@ class Mining:
         seed: int,
         checkpoints: Callable[[], Collection[int]],
     ):
-        """Create a miner for a pool with this number of places, in a folder for the caches.
-
-        `seed` draws the described places, if `config.mined_places` are fewer than all. `checkpoints` returns the steps
-        of the complete checkpoints of the run.
-        """
+        """`places` is the size of the pool, `folder` has the caches, and `seed` draws the places that are described.
+        `checkpoints` returns the steps of the complete checkpoints of the run."""
         self._describe, self._places, self._config, self._folder = describe, places, config, folder
         self._seed, self._checkpoints = seed, checkpoints
         self.cache: DescriptorCache | None = None
