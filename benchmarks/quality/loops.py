@@ -33,7 +33,7 @@ from sglpr_jax.loops.result import FoundLoops
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
 from sglpr_jax.models.params import Params
 from sglpr_jax.pose_graph.files import read_loops_jsonl
-from sglpr_jax.pose_graph.optimize import PoseGraph, trajectory_error
+from sglpr_jax.pose_graph.optimize import solved_graph, trajectory_error
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import SimulatedRecording
@@ -81,7 +81,7 @@ def _ours(drive: Drive, *, drifting: bool, weights: str, **_: Any) -> Found:
     loops = sglpr_jax.find_loops(drive.recording, params, odometry=odometry, registered=False).loops
     taken = time.perf_counter() - start[0], time.process_time() - start[1]
     return Found(
-        closures_of(loops), None if odometry is None else PoseGraph({0: odometry}, loops).solve().poses, *taken, loops
+        closures_of(loops), None if odometry is None else solved_graph({0: odometry}, loops).poses, *taken, loops
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 from drives import PASS
 
 from sglpr_jax.loops.acceptance import LITTLE_OVERLAP
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
@@ -77,7 +77,7 @@ def streamed_pairs(params, compare_only):
         compare_only({query: (match, true[query]) for query, match in matches.items()})
         for frame in range(len(THERE_AND_BACK)):
             pose = None if poses is None else poses[frame]
-            detector.add_seen(seen, odometry=pose, compared=Compared(NO_FITS, None))
+            detector.add_seen(seen, odometry=pose, compared=NO_FITS)
         return detector
 
     return streamed

@@ -19,7 +19,6 @@ from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import search
-from sglpr_jax.loops.candidates import Compared
 from sglpr_jax.loops.closure import MEANING, Loop, Reason, Rejected, why_rejected
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
@@ -59,7 +58,7 @@ def found(params, compare_only, monkeypatch):
         true = {query: (match, inverse(poses[match]) @ poses[query]) for query, match in ways.items()}
         compare_only(true | {query: (match, np.eye(4)) for query, match in wrong.items()})
         for pose in odometry:
-            detector.add_seen(seen, odometry=pose, compared=Compared(NO_FITS, None))
+            detector.add_seen(seen, odometry=pose, compared=NO_FITS)
         monkeypatch.setattr(search, "LoopDetector", lambda *_, **__: detector)
         odometry = scaled_poses(odometry, 1 / scale)
         options = {"odometry": odometry, "config": CONFIG, "registered": False}

@@ -2,18 +2,15 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import difference, place, relative, seen_from
+from scenes import align, difference, place, relative, seen_from
 from scipy import ndimage, signal
 
 from sglpr_jax.data.levelling import uprights
-from sglpr_jax.loops.closure import position_deviation
 from sglpr_jax.loops.keyframes import square_image
-from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import inverse, yaw_of
 
@@ -78,12 +75,13 @@ def test_between_two_plain_walls_the_place_along_them_is_unknown(yaw):
     along = rng.uniform(-40, 40, (6000, 1))
     walls = np.concatenate([along, rng.choice([-5.0, 6.0], (6000, 1))], axis=1)
     images = [seen_from(walls, (x, 0.2, yaw), seed=k) for k, x in enumerate((0.0, 1.5))]
-    covariance = np.asarray(align(*images, config=dataclasses.replace(SMALL, max_shift_m=12.0)).covariance)
+    found = align(*images, config=dataclasses.replace(SMALL, max_shift_m=12.0))
+    covariance = np.asarray(found.covariance)
     direction = np.array([np.cos(yaw), -np.sin(yaw)])  # of the walls, in the frame of the match
     across = np.array([np.sin(yaw), np.cos(yaw)])
     assert np.sqrt(direction @ covariance[:2, :2] @ direction) >= 2
     assert np.sqrt(across @ covariance[:2, :2] @ across) <= 0.3
-    assert position_deviation(covariance) >= 2
+    assert found.along_m >= 2
 
 
 @pytest.mark.slow
@@ -111,16 +109,6 @@ def test_other_places_correlate_less_and_another_pose_fits_as_well():
     for other in images[1:]:
         found = align(images[0], other, config=SMALL)
         assert found.correlation < 0.5 < found.second
-
-
-@pytest.mark.slow
-def test_under_jit_and_vmap_the_same():
-    query, matches = seen_from(place(0), (0.5, 0.3, 1.0)), np.stack([seen_from(place(s), (0.0,) * 3) for s in (0, 1)])
-    mapped = jax.jit(jax.vmap(lambda q, m: align(q, m, config=SMALL)))(np.stack([query] * 2), matches)
-    for k, match in enumerate(matches):
-        alone = align(query, match, config=SMALL)
-        for one, others in zip(alone, mapped, strict=True):
-            np.testing.assert_allclose(others[k], one, rtol=1e-3, atol=1e-4)
 
 
 def test_wrong_sizes_are_refused():
