@@ -255,11 +255,6 @@ def counted(rejected: Sequence[Rejected]) -> dict[Reason, int]:
     return dict(Counter(reasons).most_common())
 
 
-def listed(counts: dict[Reason, int]) -> str:
-    """Format counts in one line: "repeats: 10, little overlap: 2"."""
-    return ", ".join(f"{reason}: {count}" for reason, count in counts.items())
-
-
 def why_rejected(rejected: Sequence[Rejected]) -> list[str]:
     """Lines for the user: one for each reason, with its count and meaning."""
     return [f"rejected, {reason} ({count}): {MEANING[reason]}" for reason, count in counted(rejected).items()]

@@ -139,7 +139,8 @@ class Comparer:
         distracts &= ~self.are_joined(match, fits.frames) & (fits.frames != match)
         rivals = np.where(distracts, fits.peaks.correlation, fits.peaks.second)
         ambiguity = float(rivals.max()) / max(float(peak.correlation), 1e-6)
-        alignment = jax.device_get(refined(query.image, searched.image_of(match), peak, config=self.verification))
+        image = searched.image(int(np.searchsorted(searched.frames, match)))
+        alignment = jax.device_get(refined(query.image, image, peak, config=self.verification))
         evidence = Evidence.of(ambiguity, alignment.along_m, deviations[row], self.surprise(query.frame, match))
         return Candidate(query.frame, match, alignment, evidence)
 

@@ -35,19 +35,9 @@ def test_the_pose_of_the_images_is_found(yaw, x, y, seed):
     assert found.correlation > 0.4 and found.second < 0.8 and -np.pi <= found.yaw <= np.pi
 
 
-@settings(deadline=None, max_examples=6)
-@given(yaw=YAWS, x=SHIFTS, y=SHIFTS)
-def test_the_other_way_round_the_pose_is_the_inverse(yaw, x, y):
-    query, match = (seen_from(place(1), pose) for pose in ((x, y, yaw), (0.0, 0.0, 0.0)))
-    there, back = pose_of(align(query, match, config=SMALL)), pose_of(align(match, query, config=SMALL))
-    again = np.array([*(-_turn(-there[2]) @ there[:2]), -there[2]])
-    assert (np.abs(difference(back, again)) < [0.1, 0.1, 0.02]).all()
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_the_peak_is_that_of_a_brute_force_search(seed):
+def test_the_peak_is_that_of_a_brute_force_search():
     """Every degree and cell, by scipy: rotate, filter, correlate."""
-    query, match = seen_from(place(seed), (0.7, -0.5, 2.0)), seen_from(place(seed), (0.0, 0.0, 0.0))
+    query, match = seen_from(place(0), (0.7, -0.5, 2.0)), seen_from(place(0), (0.0, 0.0, 0.0))
     axis = (np.arange(64) - 31.5) * 0.4
     inside = np.hypot(axis[:, None], axis[None]) < 12.8
 
@@ -123,7 +113,3 @@ def test_empty_images_fit_nothing_and_nothing_is_nan():
         found = align(query, match, config=SMALL)
         assert all(np.isfinite(value).all() for value in found) and abs(found.correlation) < 1e-3
         assert found.second == 1
-
-
-def _turn(yaw: float) -> np.ndarray:
-    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
