@@ -123,10 +123,6 @@ def found_in(frames: int, **about) -> FoundLoops:
     return FoundLoops((Session(of_images(images), frames, **about),))
 
 
-def with_frames(found: FoundLoops, frames: int) -> FoundLoops:
-    return dataclasses.replace(found, sessions=(dataclasses.replace(found.sessions[0], frames=frames),))
-
-
 def test_what_is_missing_explains_why_there_are_no_loops():
     (said,) = why_none(found_in(700))
     assert said.startswith("No pair was compared: according to the images")
@@ -134,9 +130,9 @@ def test_what_is_missing_explains_why_there_are_no_loops():
     assert "690 of 700 scans are almost empty (fewer than 20" in why_none(found_in(700, empty=690))[0]
     skipped = tuple(map(str, range(400)))
     assert why_none(found_in(700, skipped=skipped))[0] == "400 of 700 scans cannot be read."
-    assert why_none(with_frames(found_in(700), 0)) == ["The search was stopped before the first scan."]
-    first, second = why_none(with_frames(found_in(700), 5))
-    assert first == "The search was stopped after 5 of 700 frames." and second.startswith("No pair was compared")
+    for frames, words in ((0, "before the first scan."), (5, "after 5 of 700 frames.")):
+        session = dataclasses.replace(found_in(700).sessions[0], frames=frames)
+        assert why_none(FoundLoops((session,)))[0] == f"The search was stopped {words}"
     rejected = (Rejected(LOOP, "little overlap"), Rejected(LOOP, "repeats"), Rejected(LOOP, "repeats"))
     found = dataclasses.replace(found_in(700), rejected=rejected)
     assert why_none(found) == [f"3 pairs were compared. For 2 of them: {MEANING['repeats']}"]

@@ -85,15 +85,6 @@ def test_a_drive_at_another_speed_has_the_same_motion(factor):
     assert fast.segments.tolist() == slow.segments.tolist()
 
 
-def test_odometry_is_taken_as_it_is():
-    motion = Motion()
-    for frame in range(30):
-        motion.add(float(frame), pose=transform(0.5 * frame, 0.0, 0.1 * frame))
-    assert motion.travelled[-1] == pytest.approx(14.5) and set(motion.segments) == {0}
-    known = Motion.of(motion.poses)
-    np.testing.assert_allclose(known.travelled[:30], motion.travelled[:30])
-
-
 def test_after_an_unknown_motion_nothing_is_known_about_the_way():
     motion = Motion()
     for i in range(3):
