@@ -48,7 +48,7 @@ class Revisit(NamedTuple):
     def along_m(self) -> float:
         """Stated uncertainty of the right pose along its least certain direction, in metres."""
         images = self.image(self.query), self.image(int(self.fits.frames[self.right]))
-        found = refined(*images, self.fits.peaks.one(self.right), config=VERIFICATION)
+        found = refined(*images, self.fits.peaks.at(self.right), config=VERIFICATION)
         return float(jax.device_get(found.along_m)) / self.drive.scale
 
     def image(self, frame: int) -> UInt8[np.ndarray, "m m"]:
@@ -57,7 +57,7 @@ class Revisit(NamedTuple):
 
     def overlay(self, row: int) -> Float[np.ndarray, "n n 3"]:
         """The scan over the place of a fit, at the pose of this fit."""
-        peak = self.fits.peaks.one(row)
+        peak = self.fits.peaks.at(row)
         pose = transform(float(peak.x), float(peak.y), float(peak.yaw))
         return overlaid(self.image(self.query), self.image(int(self.fits.frames[row])), pose)
 
@@ -87,7 +87,7 @@ def evidence(
     params, found, counts = sglpr_jax.load(weights), dict[str, list[Revisit]](), Counter[str]()
     for path in track(list(chosen(drives, sceneries, (sensor,))), description="compare"):
         drive = read(path)
-        scenery, frames = drive.about["scenery"], [one.fits for one in compared(path, drive, params)]
+        scenery, frames = drive.about["scenery"], compared(path, drive, params)
         count, some = _revisits(drive, frames)
         counts[scenery] += count
         found.setdefault(scenery, []).extend(some)

@@ -33,8 +33,9 @@ from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.files import replacing
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.loops.acceptance import accepted
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.checkpoint import frame_bytes, read_frame
+from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import MIN_CELLS
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
@@ -161,7 +162,7 @@ def chosen(folder: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> It
 
 def compared(
     path: Path, drive: RenderedDrive, params: Params, *, odometry: Odometry = "none", breaks: bool = False
-) -> list[Compared]:
+) -> list[Fits]:
     """Comparisons of each scan; read from the folder where they are kept.
 
     With `breaks`, the motion is unknown in the middle of the drive.

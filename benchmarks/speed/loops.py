@@ -12,11 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from sglpr_jax.loops.candidates import Compared
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
-from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
 
@@ -56,8 +55,9 @@ def loops(
             frame = len(detector)
             drawn = rng.normal(size=finder.index.width).astype(np.float32)
             own = Seen(drawn / np.linalg.norm(drawn), seen[frame % SCANS].image.copy(), seen[0].mounting)
-            link = Link(*map(np.asarray, (STEP_M, 0.0, 2 * np.pi / LAP, 0.9, 0.3, 0.1))) if frame else None
-            detector.add_seen(own, time=STEP_S * frame, compared=Compared(NO_FITS, link))
+            spread = np.diag([0.1, 0.1, 0.0]) ** 2
+            link = Alignment(*map(np.asarray, (STEP_M, 0.0, 2 * np.pi / LAP, spread, 0.9, 0.3))) if frame else None
+            detector.add_seen(own, time=STEP_S * frame, compared=NO_FITS._replace(link=link))
         held = held_bytes(detector) - before
         describing = _mean_s(lambda record: finder.seen(record), records, repeats)
         adding = _mean_s(lambda record: detector.add(record, time=STEP_S * len(detector)), records, repeats)

@@ -18,9 +18,9 @@ from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.messages import LiveFrame, LoopEdge, Report
 from sglpr_jax.live.odometry_input import Clock, Continuity, FirstScans
 from sglpr_jax.loops.arguments import given_pose
-from sglpr_jax.loops.candidates import Compared
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
@@ -41,7 +41,7 @@ class LiveScan(NamedTuple):
 
     seen: Seen | None
     """None for a scan that is damaged in the log."""
-    compared: Compared | None
+    compared: Fits | None
     pose: Float[np.ndarray, "4 4"] | None
     """Pose of the LiDAR by odometry."""
     part: int

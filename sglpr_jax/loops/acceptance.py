@@ -54,28 +54,21 @@ def accepted(
     return [loops[i] for i in sorted(members)], rejected
 
 
-def stretches(loops: Sequence[Loop], way: Float[np.ndarray, " n"], *, apart_m: float = 50.0, fewest: int = 3) -> int:
-    """Number of groups of at least `fewest` loops whose queries and matches are more than `apart_m` metres apart."""
+def stretches(loops: Sequence[Loop], way: Float[np.ndarray, " n"]) -> int:
+    """Number of groups of at least three loops whose queries and matches are more than 50 m apart."""
     query, match = frames_of(loops)
-    near = [np.abs(np.subtract.outer(way[frames], way[frames])) <= apart_m for frames in (query, match)]
+    near = [np.abs(np.subtract.outer(way[frames], way[frames])) <= 50.0 for frames in (query, match)]
     _, group = connected_components(near[0] | near[1], directed=False)
-    return int((np.bincount(group) >= fewest).sum()) if len(loops) else 0
+    return int((np.bincount(group) >= 3).sum()) if len(loops) else 0
 
 
 def check_odometry(
     name: str, agreeing: Sequence[Loop], against: Sequence[Loop], path: DrivenPath, config: DetectorConfig, scale: Scale
 ) -> None:
-    """Warn if the odometry contradicts most of the frames that have a loop.
+    """Warn if the odometry contradicts most of the frames of a recording (`name`) that have a loop.
 
     Drift or repeating places can be the cause. The message names both, and the options that state a larger drift.
-
-    Arguments:
-      name: Name of the recording.
-      agreeing: Accepted loops.
-      against: Loops between gravity-aligned frames that contradict the odometry.
-      path: Path by odometry.
-      config: Settings of the detector.
-      scale: Factor by which loops, path and settings were multiplied.
+    Loops (those `against` are between gravity-aligned frames), path and settings were multiplied by `scale`.
     """
     frames = {one.query for one in agreeing}
     contrary = {one.query for one in against} - frames

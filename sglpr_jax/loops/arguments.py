@@ -5,7 +5,7 @@ import os
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from sglpr_jax.data.recording import Record
 from sglpr_jax.files import in_short
@@ -36,26 +36,26 @@ def given_record(scan: Any) -> Record:
 
 def given_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
     """Convert a pose to a 4 x 4 array. Returns None for None."""
-    if odometry is None:
-        return None
-    expected = "odometry as a 4 x 4 pose with a rotation"
-    pose = _numbers(odometry, np.float64, expected, by="read_odometry")
-    if pose.shape != (4, 4) or not _are_poses(pose):
-        raise ValueError(f"expected {expected}, found {pose.tolist()!s:.200}")
-    return pose
+    return None if odometry is None else _poses(odometry, "odometry (4, 4)", 2)
 
 
 def given_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
     """Convert an array or a list of 4 x 4 arrays to poses. Errors name them by `of`, for instance "odometry"."""
-    expected = f"{of} (n, 4, 4)"
-    values = _numbers(poses, np.float64, expected, by="read_odometry")
-    if values.ndim != 3 or values.shape[1:] != (4, 4):
-        raise ValueError(f"expected {expected}, found an array of shape {values.shape}")
-    wrong = ~_are_poses(values)
+    return _poses(poses, f"{of} (n, 4, 4)", 3)
+
+
+def _poses(values: Any, expected: str, ndim: int) -> Float[np.ndarray, "*n 4 4"]:
+    """Convert to finite matrices that contain a rotation and have the last row 0 0 0 1."""
+    poses = _numbers(values, np.float64, expected, by="read_odometry")
+    if poses.ndim != ndim or poses.shape[-2:] != (4, 4):
+        raise ValueError(f"expected {expected}, found an array of shape {poses.shape}")
+    last = np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(-1, initial=0) < ROTATION_TOLERANCE
+    wrong = np.ravel(~(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[..., :3, :3]) & last))
     if wrong.any():
         row = int(wrong.argmax())
-        raise ValueError(f"expected {expected}, with rotations, found {values[row].tolist()} in row {row}")
-    return values
+        found = poses.reshape(-1, 4, 4)[row].tolist()
+        raise ValueError(f"expected {expected}, with rotations, found {found} in row {row}")
+    return poses
 
 
 def given_time(time: Any) -> float | None:
@@ -63,25 +63,18 @@ def given_time(time: Any) -> float | None:
     if time is None:
         return None
     if isinstance(time, datetime.datetime):
-        time = np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None))
+        time = time.astimezone(datetime.UTC).timestamp()
+    elif isinstance(time, datetime.timedelta):
+        time = time.total_seconds()
+    elif isinstance(time, np.datetime64):
+        time = time - np.datetime64(0, "s")
     try:
-        if isinstance(time, np.datetime64):
-            return given_time(time - np.datetime64(0, "s"))
-        if isinstance(time, np.timedelta64 | datetime.timedelta):
-            seconds = float(np.timedelta64(time) / np.timedelta64(1, "s"))
-        else:
-            seconds = float(time)
+        seconds = float(time / np.timedelta64(1, "s") if isinstance(time, np.timedelta64) else time)
     except (TypeError, ValueError) as error:
         raise TypeError(f"expected a time in seconds, found {_said(time)}") from error
     if not np.isfinite(seconds):
         raise ValueError(f"expected a time in seconds, found {seconds}")
     return seconds
-
-
-def _are_poses(poses: Float[np.ndarray, "*n 4 4"]) -> Bool[np.ndarray, "*n"]:
-    """Whether each matrix is finite, contains a rotation, and has the last row 0 0 0 1."""
-    last = np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(-1, initial=0) < ROTATION_TOLERANCE
-    return np.asarray(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[..., :3, :3]) & last)
 
 
 def _numbers(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:

@@ -70,24 +70,14 @@ def reliability_of(
     candidates: Sequence[Candidate], model: LoopModel, positions: Float[np.ndarray, "n 3"]
 ) -> tuple[Bin, ...]:
     """Reliability of candidates with known positions: loops are up to 10 m apart, others more than 20 m."""
-    if not candidates:
-        return ()
-    evidence, is_loop = labelled(candidates, positions)
-    return reliability(model.probability(evidence), is_loop)
-
-
-def labelled(
-    candidates: Sequence[Candidate], positions: Float[np.ndarray, "n 3"], *, loop_m: float = 10.0
-) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
-    """Evidence of candidates with known positions, and whether each is a loop (at most `loop_m` apart).
-
-    Candidates that are more than `loop_m` and at most 20 m apart are omitted.
-    """
     apart = np.array([np.linalg.norm(positions[one.query] - positions[one.match]) for one in candidates])
-    clear = (apart <= loop_m) | (apart > NEGATIVE_M)
-    chosen = [one.evidence for one, kept in zip(candidates, clear, strict=True) if kept]
-    return Evidence.stack(chosen), apart[clear] <= loop_m
+    clear = (apart <= LOOP_M) | (apart > NEGATIVE_M)
+    evidence = Evidence.stack([one.evidence for one, kept in zip(candidates, clear, strict=True) if kept])
+    return reliability(model.probability(evidence), apart[clear] <= LOOP_M)
 
+
+LOOP_M = 10.0
+"""Maximum distance of the two scans of a loop, in metres."""
 
 NEAR_M = (2.0, 10.0)
 """Minimum and maximum distance of a positive pair, in metres."""

@@ -1,7 +1,5 @@
 """Candidate matches of the scans of a stream: each scan is described, compared with earlier scans, and stored."""
 
-from typing import NamedTuple
-
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -16,11 +14,11 @@ from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.keyframes import Seen, StoredScans, described, image_spectrum
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
-from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, Link, Motion
+from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, Motion
 from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.registration.background import Background
-from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_alignment import Alignment, refined
 from sglpr_jax.registration.bev_search import Peak, search_near
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
 from sglpr_jax.retrieval.index import Index
@@ -30,15 +28,6 @@ FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
 AGREE_M, AGREE_DEG = 0.8, 6.0
 """Maximum distance and angle between two poses of a scan in one frame that agree, in metres and degrees."""
-
-
-class Compared(NamedTuple):
-    """The results of all image comparisons of a frame."""
-
-    fits: Fits
-    """Fits with earlier scans, from which the candidate is chosen."""
-    link: Link | None
-    """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
 class CandidateFinder:
@@ -58,7 +47,7 @@ class CandidateFinder:
         limits = {"keyframe_m": config.keyframe_m, "max_places": config.max_places}
         self.stored = StoredScans(index, verification=config.verification, **limits)
         """Descriptors, and centres of the images without the background, for comparison."""
-        self.compared = Compared(NO_FITS, None)
+        self.compared = NO_FITS
         """Comparisons of the last frame."""
         self.has_odometry = False
         """Whether the frames have poses from odometry. If so, `motion` holds them."""
@@ -109,7 +98,7 @@ class CandidateFinder:
         *,
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
-        compared: Compared | None = None,
+        compared: Fits | None = None,
         continues: bool = True,
     ) -> list[Candidate]:
         """Add a described scan or image, and return its candidate, or an empty list.
@@ -153,8 +142,8 @@ class CandidateFinder:
         self.motion.path.tilted |= is_tilted(to_upright)
         comparer = Comparer(self.motion, self.present_drift, self.config, self.verification, self.joined.rows)
         if compared is None:
-            compared = Compared(NO_FITS if query is None else comparer.compare(query, self.stored), link)
-        candidates = [] if query is None else comparer.candidates(query, compared.fits, self.stored)
+            compared = (NO_FITS if query is None else comparer.compare(query, self.stored))._replace(link=link)
+        candidates = [] if query is None else comparer.candidates(query, compared, self.stored)
         if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
         self._last = None if empty else (frame, detail)
@@ -187,14 +176,14 @@ class CandidateFinder:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
         return described(self.params, record)
 
-    def _link(self, query: Query | None, clock: float) -> Link | None:
+    def _link(self, query: Query | None, clock: float) -> Alignment | None:
         """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
 
         The image is compared with that of the keyframe and, if this is ambiguous, with that of the last frame. Two
         ambiguous poses that agree are trusted, too. If the images show only the position across a direction, the sensor
         is assumed to move on as before.
         """
-        found, ridge = list[Link](), None
+        found, ridge = list[Alignment](), None
         for frame, image in dict(filter(None, (self._keyframe, self._last))).items():
             if query is None:
                 break
@@ -216,8 +205,8 @@ class CandidateFinder:
         return ridge
 
     def _check_odometry(
-        self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Link | None, *, known: bool
-    ) -> Link | None:
+        self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Alignment | None, *, known: bool
+    ) -> Alignment | None:
         """Compare the odometry with the images, if this is due. Returns the pose in the frame of the last such scan."""
         if query is None or not self.odometry_check.is_due(pose):
             self.odometry_check.skip()
@@ -230,18 +219,18 @@ class CandidateFinder:
 
     def _linked(
         self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]
-    ) -> tuple[Link, Peak | None]:
+    ) -> tuple[Alignment, Peak | None]:
         """The best pose of a query in the frame of an image, and the best one near an expected pose. None if equal."""
         spectrum = image_spectrum(image, self.verification)
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
-        best = self._refined(peaks.one(0), image, query)
+        best = self._refined(peaks.at(0), image, query)
         same = bool(np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1])
-        return best, None if same else peaks.one(1)
+        return best, None if same else peaks.at(1)
 
-    def _refined(self, peak: Peak, image: UInt8[np.ndarray, "m m"], query: Query) -> Link:
-        return Link.of(jax.device_get(refined(query.image, image, peak, config=self.verification)))
+    def _refined(self, peak: Peak, image: UInt8[np.ndarray, "m m"], query: Query) -> Alignment:
+        return jax.device_get(refined(query.image, image, peak, config=self.verification))
 
-    def _from_keyframe(self, link: Link, frame: int) -> Link:
+    def _from_keyframe(self, link: Alignment, frame: int) -> Alignment:
         """A link with a frame as pose in the frame of the keyframe."""
         key, poses = self.motion.keyframe, self.motion.poses
         if frame == key:

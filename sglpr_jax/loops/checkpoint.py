@@ -21,11 +21,11 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, scan_stream
 from sglpr_jax.files import in_short
 from sglpr_jax.frame_log import RunLog
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.keyframes import Seen
-from sglpr_jax.odometry.bev_odometry import Link
 from sglpr_jax.odometry.config import MOTION_DRIFT
+from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.registration.bev_search import Peak
 from sglpr_jax.retrieval.reuse import fingerprint
 from sglpr_jax.schema import Column, check_about, check_columns
@@ -35,25 +35,26 @@ LOG = "checkpoint.log"
 OLD = "settings.json"
 """File of checkpoints of earlier versions, which are not read."""
 FRAME_FORMAT = "sglpr-jax live 4"
+LINK = ("x", "y", "yaw", "correlation", "second", "along_m")
 COLUMNS = {
     "descriptor": Column("float32", ("d",), optional=True),
     "image": Column("uint8", ("h", "h"), optional=True),
     "pose": Column("float64", (4, 4), optional=True),
     "fitted": Column("int64", ("fits",)),
     "fits": Column("float64", ("fits", len(Peak._fields))),
-    "links": Column("float64", (1, len(Link._fields)), finite=False),
+    "links": Column("float64", (1, len(LINK)), finite=False),
 }
 """Arrays of a frame. A scan that cannot be read has no descriptor and image. NaN in the links is a missing link."""
 
 
 def frame_bytes(
-    seen: Seen | None, compared: Compared, *, pose: Float[np.ndarray, "4 4"] | None = None, **about: Any
+    seen: Seen | None, compared: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **about: Any
 ) -> bytes:
     """Return the compressed bytes of a frame, with further JSON values."""
     arrays = {
-        "fitted": np.asarray(compared.fits.frames, np.int64),
-        "fits": np.stack(compared.fits.peaks, axis=1).astype(np.float64),
-        "links": np.array([[np.nan] * len(Link._fields) if compared.link is None else [*map(float, compared.link)]]),
+        "fitted": np.asarray(compared.frames, np.int64),
+        "fits": np.stack(compared.peaks, axis=1).astype(np.float64),
+        "links": np.array([[float(getattr(compared.link, name, np.nan)) for name in LINK]]),  # NaN without a link
     }
     if seen is not None:
         arrays |= {"descriptor": seen.descriptor, "image": seen.image}
@@ -67,17 +68,11 @@ def frame_bytes(
 
 def read_frame(
     content: bytes, frame: int, about: Mapping[str, Any], *, source: Path | None
-) -> tuple[Seen | None, Compared, Float[np.ndarray, "4 4"] | None, dict[str, Any]]:
+) -> tuple[Seen | None, Fits, Float[np.ndarray, "4 4"] | None, dict[str, Any]]:
     """Return the scan, the comparisons, the pose and the JSON values of `frame_bytes`.
 
-    Arguments:
-      content: The bytes.
-      frame: Number of the frame.
-      about: Annotation of each JSON value (`schema.check_about`).
-      source: File of the frame, for the error message.
-
-    Raises:
-      ValueError: If the content is invalid.
+    `about` has the annotation of each JSON value (`schema.check_about`). Raises ValueError, which names the file
+    `source`, if the content is invalid.
     """
     try:
         plain = zlib.decompress(content)
@@ -95,8 +90,10 @@ def read_frame(
             seen = Seen(arrays["descriptor"], arrays["image"], mounting)
     except Exception as error:  # another program may have written it
         raise ValueError(f"{source}: expected frame {frame}, found another content ({in_short(error)})") from error
-    compared = Compared(Fits(fitted, Peak(*arrays["fits"].T)), None if np.isnan(link).all() else Link(*link))
-    return seen, compared, arrays.get("pose"), {name: found[name] for name in about}
+    x, y, yaw, correlation, second, along_m = link
+    spread = np.diag([along_m, along_m, 0.0]) ** 2
+    known = None if np.isnan(link).all() else Alignment(x, y, yaw, spread, correlation, second)
+    return seen, Fits(fitted, Peak(*arrays["fits"].T), known), arrays.get("pose"), {name: found[name] for name in about}
 
 
 def settings(
@@ -127,7 +124,7 @@ def remove(folder: Path) -> None:
 def add_scans(
     recording: Recording,
     finder: CandidateFinder,
-    add: Callable[[Seen | None, Compared | None], None],
+    add: Callable[[Seen | None, Fits | None], None],
     *,
     rows: Iterable[int] | None = None,
     kept_in: Path | str | None,
@@ -146,9 +143,7 @@ def add_scans(
       rows: Rows of the scans that the checkpoint lacks, by default all further rows. A row is taken after the previous
         scan was added.
       kept_in: Checkpoint directory, or None.
-      on_bad_scan: See `scan_stream`. Without it, the checkpoint ends at the first bad scan.
-      should_stop: See `scan_stream`.
-      on_progress: See `scan_stream`.
+      on_bad_scan: See `scan_stream`, also for the next two. Without it, the checkpoint ends at the first bad scan.
       given: Further arguments that determine the frames (`settings`).
 
     Raises the errors of `RunLog` and `scan_stream`.

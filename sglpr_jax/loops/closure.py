@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jax import Array
 from jaxtyping import Float, Int
 
 from sglpr_jax.data.choices import Scale
@@ -87,7 +86,7 @@ class Loop:
     @property
     def is_degenerate(self) -> bool:
         """Whether the position is uncertain by more than `DEGENERATE_M` in some horizontal direction."""
-        return position_deviation(self.covariance) > DEGENERATE_M
+        return bool(np.linalg.eigvalsh(self.covariance[:2, :2])[-1] > DEGENERATE_M**2)
 
 
 def to_upright(loop: Loop, *, query: Mounting | None, match: Mounting | None) -> Loop:
@@ -127,14 +126,6 @@ def unseen_covariance(
             deviations.append((sensor.height_deviation_m, sensor.tilt_deviation_deg))
     ground, own, other = (np.diag([0, 0, up, np.radians(tilt), np.radians(tilt), 0]) ** 2 for up, tilt in deviations)
     return own + moved_covariance(other, inverse(match_from_query)) + ground
-
-
-def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
-    """Largest standard deviation of the position in the plane, over all directions, in metres.
-
-    The covariance is that of (x, y, yaw), as in `Alignment`, or of all 6 degrees of freedom, as in `Loop`.
-    """
-    return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance, np.float64)[:2, :2])[-1], 0)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -262,11 +253,6 @@ def counted(rejected: Sequence[Rejected]) -> dict[Reason, int]:
     """Number of rejected pairs by reason, the most frequent reason first."""
     reasons: list[Reason] = [one.reason for one in rejected]
     return dict(Counter(reasons).most_common())
-
-
-def listed(counts: dict[Reason, int]) -> str:
-    """Format counts in one line: "repeats: 10, little overlap: 2"."""
-    return ", ".join(f"{reason}: {count}" for reason, count in counts.items())
 
 
 def why_rejected(rejected: Sequence[Rejected]) -> list[str]:

@@ -20,7 +20,7 @@ from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.odometry.bev_odometry import Motion
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_alignment import Alignment, refined
-from sglpr_jax.registration.bev_search import NO_PEAKS, Peak, coarse_correlations, search_spectra
+from sglpr_jax.registration.bev_search import NO_PEAKS, Peak, coarse_correlations, search
 from sglpr_jax.registration.config import VerificationConfig
 
 BATCH, COARSE_BATCH = 8, 32
@@ -56,6 +56,8 @@ class Fits(NamedTuple):
     """Frames of the other scans."""
     peaks: Peak
     """Poses of the query in the frames of the other scans, and correlations."""
+    link: Alignment | None = None
+    """Pose of the query in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
 NO_FITS = Fits(np.zeros(0, np.int64), NO_PEAKS)
@@ -129,7 +131,7 @@ class Comparer:
         The poses of other scans that the motion excludes count against it. So do second-best poses, those of the match
         and of scans whose best poses the motion allows.
         """
-        match, peak, poses = int(fits.frames[row]), fits.peaks.one(row), _planar(fits.peaks)
+        match, peak, poses = int(fits.frames[row]), fits.peaks.at(row), _planar(fits.peaks)
         deviations, most = self.deviations(query.frame, fits.frames, poses), self.drift.max_deviation
         # The motion between the match and another scan may exclude that the query fits both.
         others = self.deviations(match, fits.frames, compose(poses, inverted(poses[row])))
@@ -137,7 +139,8 @@ class Comparer:
         distracts &= ~self.are_joined(match, fits.frames) & (fits.frames != match)
         rivals = np.where(distracts, fits.peaks.correlation, fits.peaks.second)
         ambiguity = float(rivals.max()) / max(float(peak.correlation), 1e-6)
-        alignment = jax.device_get(refined(query.image, searched.image_of(match), peak, config=self.verification))
+        image = searched.image(int(np.searchsorted(searched.frames, match)))
+        alignment = jax.device_get(refined(query.image, image, peak, config=self.verification))
         evidence = Evidence.of(ambiguity, alignment.along_m, deviations[row], self.surprise(query.frame, match))
         return Candidate(query.frame, match, alignment, evidence)
 
@@ -211,8 +214,8 @@ class Comparer:
             return NO_FITS
         assert query.spectra is not None
         matches = _batched(store.spectra(rows), BATCH)
-        found = jax.device_get(search_spectra(query.spectra, matches, len(rows), config=self.verification))
-        return Fits(store.frames[rows], found.some(slice(len(rows))))
+        found = jax.device_get(search(query.spectra, matches, len(rows), config=self.verification))
+        return Fits(store.frames[rows], found.at(slice(len(rows))))
 
     def deviations(
         self, query: int, matches: Int[np.ndarray, " k"], match_from_query: Planar
@@ -236,7 +239,7 @@ def _planar(found: Peak) -> Planar:
 
 
 def _joined(*fits: Fits) -> Fits:
-    frames, peaks = zip(*fits, strict=True)
+    frames, peaks, _ = zip(*fits, strict=True)
     return Fits(np.concatenate(frames), Peak(*map(np.concatenate, zip(*peaks, strict=True))))
 
 

@@ -16,6 +16,8 @@ from sglpr_jax.odometry.path import DrivenPath
 
 BLOCK = 64
 """Number of loops compared with all others at a time, to limit memory."""
+STARTS = 20
+"""Number of loops from which the search for a consistent set starts."""
 CYCLE_M, CYCLE_DEG = 0.5, 1.5
 """Standard deviations of a cycle in addition to the covariances of its loops, in metres and degrees."""
 CYCLE_DEVIATIONS = 3.0
@@ -32,13 +34,8 @@ def agree(
 ) -> Bool[np.ndarray, "a b"]:
     """Whether each loop is consistent with each of the `others`, by default with each of `loops`.
 
-    Arguments:
-      loops: Loops between gravity-aligned frames.
-      path: Path of all frames. Its length costs no time.
-      others: Loops to compare with.
-      way: Travelled distance at each frame in metres, by default that of the path.
-      drift: Drift model of the path.
-      config: Thresholds.
+    All are between gravity-aligned frames. `way` is the travelled distance at each frame in metres, by default that of
+    the path, whose length costs no time.
     """
     way = path.travelled if way is None else way
     a, b = (_columns(each, path, way) for each in (loops, loops if others is None else others))
@@ -49,16 +46,16 @@ def agree(
     return pairs
 
 
-def largest_consistent_set(pairs: Bool[np.ndarray, "n n"], *, starts: int = 20) -> Int[np.ndarray, " k"]:
+def largest_consistent_set(pairs: Bool[np.ndarray, "n n"]) -> Int[np.ndarray, " k"]:
     """Indices, in order, of a large set in which every pair is consistent.
 
-    The search is greedy, as the problem is NP-hard: it starts from each of the `starts` loops that are consistent with
+    The search is greedy, as the problem is NP-hard: it starts from each of the `STARTS` loops that are consistent with
     most others, and always adds the loop that leaves most candidates.
     """
     pairs = pairs & pairs.T
     degrees = pairs.sum(0)
     best = np.zeros(0, np.int64)
-    for start in np.argsort(-degrees, kind="stable")[:starts]:
+    for start in np.argsort(-degrees, kind="stable")[:STARTS]:
         members = _members_from(start, pairs, degrees)
         if len(members) > len(best):
             best = np.array(members)

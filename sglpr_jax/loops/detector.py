@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.recording import Record
 from sglpr_jax.loops.arguments import given_pose, given_record, given_time
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import Loop, Reason, Rejected, to_lidar
-from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.comparison import Candidate, Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import LoopModel, default_model
@@ -100,7 +100,7 @@ class LoopDetector:
         *,
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
-        compared: Compared | None = None,
+        compared: Fits | None = None,
         continues: bool = True,
     ) -> list[Loop]:
         """Add a described frame (`CandidateFinder.add_seen`), and return loops as `add` does."""
@@ -115,7 +115,13 @@ class LoopDetector:
         count = max(sum(old), len(self._waiting) - MAX_WAITING)
         self.rejected += self._verdicts(self._waiting[:count])
         self._waiting = self._waiting[count:]
-        new = self._confirmed() if candidates else []
+        new = []
+        if candidates:
+            allowed = [one for one in self._waiting if self._is_allowed(one)]
+            others = [one for one in self._waiting if not self._is_allowed(one)]
+            reason: Reason = "contradicts the odometry" if self.finder.has_odometry else "contradicts the motion"
+            self.rejected += [Rejected(loop, reason) for loop in self._probable(others, self._contradicting)]
+            new = self._probable(allowed, self._returned)
         self.loops += new
         for loop in new:
             self.finder.close_loop(loop.query, loop.match)
@@ -124,14 +130,6 @@ class LoopDetector:
     def undecided(self) -> list[Rejected]:
         """Verdicts about the pairs of the last frames, if no further frame follows."""
         return self._verdicts(self._waiting)
-
-    def _confirmed(self) -> list[Loop]:
-        """New loops of the last frames that pass the sequential test."""
-        allowed = [one for one in self._waiting if self._is_allowed(one)]
-        others = [one for one in self._waiting if not self._is_allowed(one)]
-        reason: Reason = "contradicts the odometry" if self.finder.has_odometry else "contradicts the motion"
-        self.rejected += [Rejected(loop, reason) for loop in self._probable(others, self._contradicting)]
-        return self._probable(allowed, self._returned)
 
     def _probable(self, pairs: Sequence[Pair], done: set[int]) -> list[Loop]:
         """Pairs that are probable enough given their neighbours. Queries that are `done` are left out, and noted."""

@@ -54,7 +54,11 @@ def planar_deviations(
     error = by_loop - planar(last)
     error[:, 2] = wrapped(error[:, 2])
     spread = planar_spread(path, query, match, drift=drift)
-    spread += _turned(np.broadcast_to(covariances, spread.shape), by_loop[:, 2])
+    turn = np.tile(np.eye(3), (len(error), 1, 1))  # from the frames of the queries to that of the odometry
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(by_loop[:, 2])
+    turn[:, 1, 0] = np.sin(by_loop[:, 2])
+    turn[:, 0, 1] = -turn[:, 1, 0]
+    spread += turn @ np.broadcast_to(covariances, spread.shape) @ np.swapaxes(turn, 1, 2)
     in_plane = np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
     shifts = np.column_stack([match_from_query[:, :2], np.broadcast_to(heights, len(error))])
     apart = np.einsum("kj,kj->k", start[:, 2, :3], shifts) + start[:, 2, 3] - last[:, 2, 3]
@@ -99,13 +103,3 @@ def step_deviations(
         np.hypot(drift.degrees_per_metre * root, STEP_DEG),
     )
     return metres, np.radians(degrees)
-
-
-def _turned(covariances: Float[np.ndarray, "k 3 3"], yaw: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3 3"]:
-    """Covariances rotated from the frames of the queries, whose yaw is given, to the frame of the odometry."""
-    turn = np.zeros_like(covariances)
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(yaw)
-    turn[:, 1, 0] = np.sin(yaw)
-    turn[:, 0, 1] = -turn[:, 1, 0]
-    turn[:, 2, 2] = 1
-    return turn @ covariances @ np.swapaxes(turn, 1, 2)

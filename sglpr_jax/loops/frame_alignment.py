@@ -74,13 +74,8 @@ def aligned_frames(
     closer than `INDEPENDENT_M` see the same walls, so their weights are reduced in proportion to their distance. The
     covariance also contains the drift over the path between the loops, which does not average out.
 
-    Arguments:
-      loops: At least one loop. Its match is a row of `match_poses`, its query a row of `query_poses`.
-      match_poses: Pose of the LiDAR at each frame of the match recording, in its own frame.
-      query_poses: Pose of the LiDAR at each frame of the query recording, in its own frame.
-      match_way: Travelled distance at each frame of the match recording, in metres.
-      query_way: Travelled distance at each frame of the query recording, in metres.
-      drift: Drift model of the poses.
+    Matches are rows of `match_poses`, queries rows of `query_poses`: the pose of the LiDAR at each frame of a
+    recording, in its own frame. The ways are the travelled distances there, in metres. There is at least one loop.
     """
     query, match = frames_of(loops)
     measured = match_poses[match] @ np.stack([loop.match_from_query for loop in loops])

@@ -84,10 +84,6 @@ class Keyframes(abc.ABC):
     def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
         """Image of a scan."""
 
-    def image_of(self, frame: int) -> UInt8[np.ndarray, "m m"]:
-        """Image of the scan of a frame."""
-        return self.image(int(np.searchsorted(self.frames, frame)))
-
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:

@@ -143,11 +143,6 @@ class LoopModel:
         """Log odds of each pair, given the support of its neighbours."""
         return self.tested({"alone": self.log_odds(evidence), "support": support, "surprise": evidence.surprise})
 
-    def log_odds_without_ambiguity(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Log odds of each pair alone if no other pose and place fitted as well as the match."""
-        nothing = np.zeros_like(evidence.ambiguity_ratio)
-        return self.log_odds(evidence._replace(ambiguity_ratio=nothing))
-
     def strength(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """How much a pair says about its neighbours: its log odds by the images, from 0 to `MAX_STRENGTH`.
 

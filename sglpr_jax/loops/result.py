@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, listed
+from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.frame_alignment import AlignedParts
@@ -123,7 +123,8 @@ class FoundLoops:
         return f"{names}: {len(self.loops)} loops, {len(self.rejected)} rejected{self._reasons()}; {transforms}"
 
     def _reasons(self) -> str:
-        return f" ({listed(counted(self.rejected))})" if self.rejected else ""
+        counts = (f"{reason}: {count}" for reason, count in counted(self.rejected).items())
+        return f" ({', '.join(counts)})" if self.rejected else ""
 
 
 def _ends(loop: Loop) -> tuple[int, int]:

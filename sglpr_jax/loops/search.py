@@ -24,10 +24,10 @@ from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.acceptance import AXES, accepted, check_odometry, registered_loops
 from sglpr_jax.loops.arguments import check_is, given_poses
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.closure import Loop, Rejected, in_metres, scaled_drift, to_lidar, to_upright
-from sglpr_jax.loops.comparison import Candidate, Comparer, Query
+from sglpr_jax.loops.comparison import Candidate, Comparer, Fits, Query
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.detector import LoopDetector
@@ -85,13 +85,10 @@ def find_loops(
 ) -> FoundLoops:
     """Find the loops of a recording, or those within and between several recordings.
 
-    Poses are between LiDAR frames, the frames of the points, whatever the mounting of the sensor. Scans that are almost
-    empty have no loops. A warning says if the odometry contradicts most of the loops.
-
+    Poses are between LiDAR frames, the frames of the points. A warning says if the odometry contradicts most loops.
     Several recordings need no common frame. Loops between two of them are accepted if at least five, over at least 15 m
-    of both recordings, fit one transform between the frames and no other transform fits half as many. Otherwise none is
-    accepted and there is no transform. Without odometry, the motion estimated from the images is used. Where it is
-    unknown, a recording consists of several parts, and each part is aligned by its own loops.
+    of both recordings, fit one transform between the frames and no other transform fits half as many. Without odometry,
+    parts whose motion is unknown are aligned one by one.
 
     Arguments:
       recordings: The scans of one recording, or several recordings.
@@ -103,8 +100,7 @@ def find_loops(
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap
         are rejected. None registers scans, not images.
       scale: Factor for all lengths during the search, 1, 2 or 4, for places that are small in an image, such as rooms.
-        Results are in metres. Of the settings, `keyframe_m` and `drift` are in metres, and the other lengths are those
-        of the scaled scans.
+        Results, `config.keyframe_m` and `config.drift` are in metres, the other settings those of scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
       kept_in: Checkpoint directory, from which a search of the same input resumes. It is not removed. With several
@@ -224,7 +220,7 @@ def _search_session(
     (recording, odometry, config), finder = given, detector.finder
     stream = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
 
-    def add(seen: Seen | None, compared: Compared | None) -> None:
+    def add(seen: Seen | None, compared: Fits | None) -> None:
         row = len(detector)
         time = None if recording.times is None else float(recording.times[row])
         detector.add_seen(seen, time=time, odometry=None if odometry is None else odometry[row], compared=compared)

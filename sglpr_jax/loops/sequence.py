@@ -101,5 +101,5 @@ def verdict(pair: Pair, model: LoopModel, min_probability: float) -> Reason:
     """Reason why a pair is no loop that the motion allows and the sequential test rejects."""
     if float(model.log_odds(pair.evidence)) > 0:
         return "too few neighbours"
-    repeats = float(model.log_odds_without_ambiguity(pair.evidence)) >= logit(min_probability)
-    return "repeats" if repeats else "little similarity"
+    alone = pair.evidence._replace(ambiguity_ratio=np.zeros(()))  # as if no other pose and place fitted as well
+    return "repeats" if float(model.log_odds(alone)) >= logit(min_probability) else "little similarity"

@@ -16,9 +16,9 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.arguments import check_is, given_poses
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.comparison import NO_FITS
+from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.maps.place_map import PlaceMap, place_names
@@ -89,9 +89,9 @@ def map_recording(
             looked_at.append(done)
         done = len(poses)
 
-    def add(seen: Seen | None, compared: Compared | None) -> None:
+    def add(seen: Seen | None, compared: Fits | None) -> None:
         descriptions.append(seen)
-        finder.add_seen(seen, compared=Compared(NO_FITS, None))
+        finder.add_seen(seen, compared=NO_FITS)
 
     add_scans(
         scaled(recording, scale),

@@ -7,7 +7,6 @@ Where they show nothing, a new segment begins. Only ratios of times count, so a 
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -58,30 +57,6 @@ LEAST_STEP_M, UNKNOWN_STEP_M = 0.5, 12.0
 """Minimum length of a guessed step, and its length if the speed was never known, in metres."""
 NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8")]
 """Numbers of a frame beside its pose."""
-
-
-class Link(NamedTuple):
-    """Pose of a frame in the frame of an earlier one, from their images."""
-
-    x: Float[np.ndarray, ""]
-    y: Float[np.ndarray, ""]
-    """Position, in metres."""
-    yaw: Float[np.ndarray, ""]
-    """Rotation in radians, counter-clockwise."""
-    correlation: Float[np.ndarray, ""]
-    second: Float[np.ndarray, ""]
-    """Second-peak ratio."""
-    along_m: Float[np.ndarray, ""]
-    """Standard deviation of the position along its least certain direction, in metres."""
-
-    @classmethod
-    def of(cls, one: Alignment) -> "Link":
-        """Pose of an alignment."""
-        return cls(*map(np.asarray, (one.x, one.y, one.yaw, one.correlation, one.second, one.along_m)))
-
-    def angle_to(self, yaw: float) -> float:
-        """Angle between the rotation and another one, in radians, from 0 to pi. NaN if the other one is unknown."""
-        return float(abs((float(self.yaw) - float(yaw) + np.pi) % (2 * np.pi) - np.pi))
 
 
 class Motion:
@@ -152,7 +127,7 @@ class Motion:
         time: float,
         *,
         pose: Float[np.ndarray, "4 4"] | None = None,
-        link: Link | None = None,
+        link: Alignment | None = None,
         continues: bool = True,
     ) -> None:
         """Add a frame at `time`, by its `pose` from odometry or its `link` with the keyframe.
@@ -283,7 +258,7 @@ class Motion:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return self.segments[rows] == self.segments[frame]
 
-    def is_trusted(self, link: Link, prior: Float[np.ndarray, " 3"]) -> bool:
+    def is_trusted(self, link: Alignment, prior: Float[np.ndarray, " 3"]) -> bool:
         """Whether a link shows how the sensor moved: no other pose fits about as well.
 
         A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
@@ -297,7 +272,7 @@ class Motion:
         fits = bool(link.correlation >= MIN_CORRELATION and link.second <= most)
         return fits and not self.is_ridge(link)
 
-    def is_ridge(self, link: Link) -> bool:
+    def is_ridge(self, link: Alignment) -> bool:
         """Whether the images show the position across a direction only, as between walls."""
         return bool(link.along_m > MAX_ALONG_M and link.correlation < EQUAL)
 

@@ -15,7 +15,7 @@ from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.drift import step_deviations
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.pose_graph.optimize import FIRST_POSE, gtsam_library, rotation_first
+from sglpr_jax.pose_graph.optimize import first_factor, gtsam_library, rotation_first, step_factor
 from sglpr_jax.se3 import inverse
 
 CAUCHY = 3.0
@@ -99,8 +99,7 @@ class IncrementalTrajectory:
             if not frame:  # the first pose is fixed
                 self._placed.add(0)
                 self._values.insert(0, self._gtsam.Pose3(world_from_lidar))
-                first = self._gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
-                self._graph.add(self._gtsam.PriorFactorPose3(0, self._gtsam.Pose3(world_from_lidar), first))
+                self._graph.add(first_factor(world_from_lidar))
             elif continues and segment in self._placed:
                 self._values.insert(frame, self._gtsam.Pose3(self._correction(last) @ world_from_lidar))
                 self._chain(last, frame)
@@ -113,10 +112,8 @@ class IncrementalTrajectory:
     def _chain(self, before: int, frame: int) -> None:
         """Connect two nodes by odometry."""
         ends = self._odometry.rows[[before, frame]]
-        metres, radians = step_deviations(ends, self._drift)
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians[0], metres[0]], 3))
-        step = self._gtsam.Pose3(inverse(ends[0]) @ ends[1])
-        self._graph.add(self._gtsam.BetweenFactorPose3(before, frame, step, noise))
+        (metres,), (radians,) = step_deviations(ends, self._drift)
+        self._graph.add(step_factor(before, frame, inverse(ends[0]) @ ends[1], metres, radians))
 
     def _use_loops(self) -> None:
         """Add loops with an end in the graph. Others wait until another loop connects their segments."""

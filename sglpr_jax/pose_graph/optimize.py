@@ -9,16 +9,16 @@ import importlib
 import itertools
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.levelling import is_tilted, uprights
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.closure import FrameId, Loop, frames_of, to_upright
+from sglpr_jax.loops.closure import Loop, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
-from sglpr_jax.loops.result import FoundLoops, Session
+from sglpr_jax.loops.result import FoundLoops
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import inverse
@@ -88,14 +88,21 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
         upright = {number: members[number] @ given[number] @ inverse(turned[number]) for number in members}
         level = np.eye(4)
         level[:3, :3] = DrivenPath(upright[group], tilted=is_tilted(turned[group])).level
-        loops = [_upright(found.loops[row], sessions) for row in rows]
-        graph = PoseGraph({number: level @ one for number, one in upright.items()}, loops, sessions[group].drift)
-        solved.append(graph.solve())
+        loops = []
+        for row in rows:
+            match, query = (sessions[one.session].recording.mounting_of(one.frame) for one in found.loops[row].nodes)
+            loops.append(to_upright(found.loops[row], query=query, match=match))
+        solved.append(solved_graph({k: level @ one for k, one in upright.items()}, loops, sessions[group].drift))
         inliers[rows] = solved[-1].inliers
         ends = np.cumsum([len(one) for one in upright.values()])[:-1]
         for number, one in zip(members, np.split(solved[-1].poses, ends), strict=True):
             poses[number] = inverse(level) @ one @ turned[number]
-            _check_heights(sessions[number], members[number], poses[number])
+            risen_m = np.abs(poses[number] - members[number] @ given[number])[:, 2, 3].max(initial=0)
+            if risen_m > MOST_RISEN_M:
+                warn(
+                    f"{sessions[number].recording.name}: expected heights near those of the odometry, found them moved "
+                    f"by up to {risen_m:.1f} m; only registered loops measure heights"
+                )
     moved = [one.moved_rms_m**2 * len(one.poses) for one in solved]
     return OptimizedTrajectory(
         np.concatenate([poses[number] for number in range(len(found.sessions))]),
@@ -105,24 +112,6 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
         max(one.deviation for one in solved),
         solved[0].drift,
     )
-
-
-def _upright(loop: Loop, sessions: Sequence[Session]) -> Loop:
-    """The loop between the gravity-aligned frames of its sessions, whose mountings may differ."""
-    query = sessions[loop.query_session].recording.mounting_of(loop.query)
-    return to_upright(loop, query=query, match=sessions[loop.match_session].recording.mounting_of(loop.match))
-
-
-def _check_heights(session: Session, to_first: Float[np.ndarray, "4 4"], corrected: Float[np.ndarray, "n 4 4"]) -> None:
-    """Warn if heights moved by more than `MOST_RISEN_M`."""
-    assert session.odometry is not None
-    given = to_first @ session.odometry[: session.frames]
-    risen_m = float(np.abs(corrected[:, 2, 3] - given[:, 2, 3]).max(initial=0))
-    if risen_m > MOST_RISEN_M:
-        warn(
-            f"{session.recording.name}: expected heights near those of the odometry, found them moved by up to "
-            f"{risen_m:.1f} m; only registered loops measure heights"
-        )
 
 
 def placements(found: FoundLoops) -> tuple[tuple[int, Float[np.ndarray, "4 4"]], ...]:
@@ -150,48 +139,45 @@ def placements(found: FoundLoops) -> tuple[tuple[int, Float[np.ndarray, "4 4"]],
     return tuple(placed[number] for number in range(len(found.sessions)))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PoseGraph:
-    """Pose graph of sessions in one gravity-aligned frame. A node is a `FrameId`, and its key in gtsam is its row."""
+def solved_graph(
+    odometry: Mapping[int, Float[np.ndarray, "_ 4 4"]], loops: Sequence[Loop], drift: DriftModel = DriftModel()
+) -> OptimizedTrajectory:
+    """Solve the pose graph of sessions in one gravity-aligned frame.
 
-    odometry: Mapping[int, Float[np.ndarray, "_ 4 4"]]
-    """Pose of the sensor at each frame by odometry, for each session. Consecutive frames are connected."""
-    loops: Sequence[Loop]
-    """Loops between the gravity-aligned frames of these sessions."""
-    drift: DriftModel = DriftModel()
-    """Stated drift of the odometry."""
+    Loops that contradict the odometry are dropped. If the solution contradicts the odometry between the frames of a
+    loop, that loop is dropped, too, and the graph is solved again, up to `ROUNDS` times. If a contradiction remains,
+    the odometry is returned without inliers. Loops between two sessions, where no odometry is, cannot contradict it.
 
-    @property
-    def nodes(self) -> list[FrameId]:
-        """All nodes, in the order of their rows."""
-        return [FrameId(session, frame) for session, poses in self.odometry.items() for frame in range(len(poses))]
+    Arguments:
+      odometry: Pose of the sensor at each frame, for each session. Consecutive frames are connected.
+      loops: Loops between the gravity-aligned frames of these sessions.
+      drift: Stated drift of the odometry.
 
-    def solve(self) -> OptimizedTrajectory:
-        """Solve the graph of odometry and loops. Raises ImportError if the extra `gtsam` is not installed.
-
-        Loops that contradict the odometry are dropped. If the solution contradicts the odometry between the frames of a
-        loop, that loop is dropped, too, and the graph is solved again, up to `ROUNDS` times. If a contradiction
-        remains, the odometry is returned without inliers. Loops between two sessions, where no odometry is, cannot
-        contradict it.
-        """
-        gtsam, drift, rows = gtsam_library(), self.drift, {node: row for row, node in enumerate(self.nodes)}
-        odometry, sessions = np.concatenate(list(self.odometry.values())), np.array([node.session for node in rows])
-        loops = [dataclasses.replace(one, match=rows[one.nodes[0]], query=rows[one.nodes[1]]) for one in self.loops]
-        used = _contradictions(loops, odometry, sessions, drift) <= drift.max_deviation
-        for _ in range(ROUNDS):
-            if not used.any():
-                break
-            chosen = np.flatnonzero(used)
-            poses, fits = _solved(gtsam, odometry, [loops[i] for i in chosen], sessions, drift)
-            members = chosen[fits]
-            bend = _bend(odometry, poses, [loops[i] for i in members], sessions, drift)
-            if (bend <= drift.max_deviation).all():
-                moved = np.linalg.norm(poses[:, :3, 3] - odometry[:, :3, 3], axis=1)
-                rms, deviation = float(np.sqrt(np.mean(moved**2))), float(bend.max(initial=0))
-                inliers = np.isin(np.arange(len(loops)), members)
-                return OptimizedTrajectory(poses, inliers, float(moved.max()), rms, deviation, drift)
-            used[members[bend > drift.max_deviation]] = False
-        return OptimizedTrajectory(odometry, np.zeros(len(loops), bool), drift=drift)
+    Raises ImportError if the extra `gtsam` is not installed.
+    """
+    gtsam = gtsam_library()
+    sessions = np.repeat(list(odometry), [len(one) for one in odometry.values()])
+    poses = np.concatenate(list(odometry.values()))
+    first = {session: int(np.searchsorted(sessions, session)) for session in odometry}  # the sessions ascend
+    loops = [
+        dataclasses.replace(one, match=first[one.match_session] + one.match, query=first[one.query_session] + one.query)
+        for one in loops
+    ]
+    used = _contradictions(loops, poses, sessions, drift) <= drift.max_deviation
+    for _ in range(ROUNDS):
+        if not used.any():
+            break
+        chosen = np.flatnonzero(used)
+        solved, fits = _solved(gtsam, poses, [loops[i] for i in chosen], sessions, drift)
+        members = chosen[fits]
+        bend = _bend(poses, solved, [loops[i] for i in members], sessions, drift)
+        if (bend <= drift.max_deviation).all():
+            moved = np.linalg.norm(solved[:, :3, 3] - poses[:, :3, 3], axis=1)
+            rms, deviation = float(np.sqrt(np.mean(moved**2))), float(bend.max(initial=0))
+            inliers = np.isin(np.arange(len(loops)), members)
+            return OptimizedTrajectory(solved, inliers, float(moved.max()), rms, deviation, drift)
+        used[members[bend > drift.max_deviation]] = False
+    return OptimizedTrajectory(poses, np.zeros(len(loops), bool), drift=drift)
 
 
 def _solved(
@@ -205,13 +191,12 @@ def _solved(
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for frame, pose in enumerate(odometry):
         start.insert(frame, gtsam.Pose3(pose))
-    first = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(odometry[0]), first))
-    sigmas = np.repeat(np.stack(step_deviations(odometry, drift)[::-1], axis=1), 3, axis=1)
-    sigmas[np.diff(sessions) != 0] = UNCONNECTED  # keeps the graph solvable without loops between sessions
+    graph.add(first_factor(odometry[0]))
+    metres, radians = step_deviations(odometry, drift)
+    # A large value keeps the graph solvable without loops between sessions.
+    metres, radians = (np.where(np.diff(sessions), UNCONNECTED, one) for one in (metres, radians))
     for frame, pose in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
-        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[frame])
-        graph.add(gtsam.BetweenFactorPose3(frame, frame + 1, gtsam.Pose3(pose), noise))
+        graph.add(step_factor(frame, frame + 1, pose, metres[frame], radians[frame]))
     certain = graph.size()
     for loop in loops:
         noise = gtsam.noiseModel.Gaussian.Covariance(rotation_first(loop.covariance))
@@ -222,6 +207,19 @@ def _solved(
     solution = solver.optimize()
     poses = np.stack([solution.atPose3(frame).matrix() for frame in range(len(odometry))])
     return poses, np.asarray(solver.getWeights())[certain:] > 0.5
+
+
+def first_factor(pose: Float[np.ndarray, "4 4"]) -> Any:
+    """Factor of gtsam that fixes the pose of node 0."""
+    gtsam = gtsam_library()
+    return gtsam.PriorFactorPose3(0, gtsam.Pose3(pose), gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE))
+
+
+def step_factor(before: int, after: int, step: Float[np.ndarray, "4 4"], metres: float, radians: float) -> Any:
+    """Factor of gtsam between two nodes that odometry connects, with standard deviations (`step_deviations`)."""
+    gtsam = gtsam_library()
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3))
+    return gtsam.BetweenFactorPose3(before, after, gtsam.Pose3(step), noise)
 
 
 def _contradictions(

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Num
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
-from sglpr_jax.registration.bev_search import Peak, search
-from sglpr_jax.registration.bev_spectra import DEFAULT, prepared, rotations, spectrum, twice
+from sglpr_jax.registration.bev_search import Peak
+from sglpr_jax.registration.bev_spectra import DEFAULT, AnyArray, prepared, rotations, spectrum, twice
 from sglpr_jax.registration.config import VerificationConfig
 
 NOISE = 0.8
@@ -38,7 +38,7 @@ LEAST_POSITION_M, LEAST_YAW_DEG = 0.01, 0.03
 """Fixed standard deviations from the cell size and the tilt of the vehicle, in metres and degrees."""
 
 
-def peak_covariance(
+def _peak_covariance(
     curvature: Float[Array, "3 3"],
     correlation: Float[Array, ""],
     *,
@@ -46,14 +46,9 @@ def peak_covariance(
     apart_m: Float[Array, ""],
     ridge: Float[Array, "3 3"],
 ) -> Float[Array, "3 3"]:
-    """Return the covariance of (x, y, yaw) at a peak, in metres and radians.
+    """Covariance of (x, y, yaw) at a peak, from the negative Hessian and the height of the correlation there.
 
-    Arguments:
-      curvature: Negative Hessian of the correlation at the peak.
-      correlation: Height of the peak.
-      occupied: Number of occupied cells of the image that has fewer.
-      apart_m: Distance between the two scans, in metres.
-      ridge: Covariance from `ridge_covariance`.
+    `occupied` is the number of cells of the image that has fewer.
     """
     height = jnp.clip(correlation, 0.05, 0.999)
     noise = NOISE * (1 - height) / height * (1 / jnp.maximum(occupied, 1) + 1 / NOISE_CELLS)
@@ -66,53 +61,39 @@ def peak_covariance(
     return peak + ridge + jnp.diag(others + least)
 
 
-def ridge_covariance(
+def _ridge_covariance(
     products: Complex[Array, "t s f"],
     pose: Float[Array, " 3"],
     yaws: Float[Array, " t"],
     curvature: Float[Array, "3 3"],
-    *,
-    cell_m: float,
-    reach_m: float,
-    max_shift_m: float,
+    config: VerificationConfig,
 ) -> Float[Array, "3 3"]:
-    """Return the covariance of (x, y, yaw) along the weak axis of a peak, as far as the correlation stays high there.
+    """Covariance of (x, y, yaw) along the weak axis of a peak, as far as the correlation stays high there.
 
     Along a wall the correlation falls only because the two images share less area. In a bend the ridge rotates with the
     distance, so the best of several rotations counts. Samples beyond a minimum belong to another peak and count no more
-    than the minimum.
-
-    Arguments:
-      products: Fourier transform (`rfft2`) of the correlation for each rotation of the query, that of the peak first.
-      pose: x (right) and y (up) of the peak, in metres, and its yaw, in radians.
-      yaws: Rotations, in radians.
-      curvature: Negative Hessian of the correlation at the peak, over x, y and yaw.
-      cell_m: Edge of a cell, in metres.
-      reach_m: Radius of the images, in metres.
-      max_shift_m: Maximum shift along x and y, in metres.
+    than the minimum. `products` are Fourier transforms (`rfft2`) of the correlation at the rotations `yaws`, that of
+    the peak first.
     """
-    steps = int(max_shift_m / RIDGE_STEP_M)
+    steps = int(config.max_shift_m / RIDGE_STEP_M)
     along = np.arange(-steps, steps + 1, dtype=np.float32) * np.float32(RIDGE_STEP_M)
     turned = jnp.asarray(yaws - pose[2]).at[0].set(0.0)
-    heading = _weak_axis(curvature) + turned / 2  # the chord of an arc
+    at_best_yaw = curvature[:2, 2:] * curvature[2:, :2] / jnp.maximum(curvature[2, 2], 1e-4)
+    planar = curvature[:2, :2] - at_best_yaw
+    weak_axis = jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2 + np.float32(np.pi / 2)
+    heading = weak_axis + turned / 2  # the chord of an arc
     moved = along[None, :, None] * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)[:, None]
     points = pose[None, None, :2] + moved
-    area = _shared_area(jnp.hypot(points[..., 0], points[..., 1]), reach_m)
-    heights = jax.vmap(functools.partial(_heights, cell_m=cell_m))(products, points) / area
+    area = _shared_area(jnp.hypot(points[..., 0], points[..., 1]), config.reach_m)
+    heights = jax.vmap(functools.partial(_heights, cell_m=DENSITY_RESOLUTION_M))(products, points) / area
     share = heights.max(0) / jnp.maximum(heights[0, steps], 1e-6)
     share = jnp.concatenate([jax.lax.cummin(share[steps::-1])[::-1], jax.lax.cummin(share[steps:])[1:]])
     best = heights.argmax(0)
     apart = jnp.concatenate([moved[best, np.arange(len(along))], turned[best][:, None]], axis=1)
-    inside = (jnp.abs(points[0]).max(1) <= max_shift_m + RIDGE_STEP_M) | (along == 0)
+    inside = (jnp.abs(points[0]).max(1) <= config.max_shift_m + RIDGE_STEP_M) | (along == 0)
     weight = jnp.where(inside, jnp.exp(-jnp.maximum(1 - share, 0) / RIDGE_DROP), 0)
     outside = (np.abs(along) >= RIDGE_START_M).astype(np.float32)
     return jnp.einsum("k,ki,kj->ij", weight * outside, apart, apart) / weight.sum()
-
-
-def _weak_axis(curvature: Float[Array, "3 3"]) -> Float[Array, ""]:
-    """Angle of the direction in the plane along which the correlation, at the best yaw, changes least."""
-    planar = curvature[:2, :2] - jnp.outer(curvature[:2, 2], curvature[2, :2]) / jnp.maximum(curvature[2, 2], 1e-4)
-    return jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2 + np.float32(np.pi / 2)
 
 
 def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m: float) -> Float[Array, " k"]:
@@ -136,26 +117,29 @@ def _shared_area(apart_m: Float[Array, "*b"], reach_m: float) -> Float[Array, "*
 class Alignment(NamedTuple):
     """Pose of a query in the frame of a match, in the plane, with covariance and correlation."""
 
-    x: Float[Array, "*b"]
-    y: Float[Array, "*b"]
+    x: Float[AnyArray, "*b"]
+    y: Float[AnyArray, "*b"]
     """Position of the query's sensor in the match's frame, in metres."""
-    yaw: Float[Array, "*b"]
+    yaw: Float[AnyArray, "*b"]
     """Rotation of the query in the match's frame, in radians, counter-clockwise, from -pi to pi."""
-    covariance: Float[Array, "*b 3 3"]
+    covariance: Float[AnyArray, "*b 3 3"]
     """Covariance of x, y (metres) and yaw (radians), in the match's frame.
 
-    It follows the shape of the peak: metres along a plain wall, centimetres across. It does not include the possibility
-    that another peak is the correct one; see `second`.
+    It follows the shape of the peak. That another peak may be the correct one does not count; see `second`.
     """
-    correlation: Float[Array, "*b"]
+    correlation: Float[AnyArray, "*b"]
     """Correlation at the peak: 1 for equal images, about 0 for unrelated ones."""
-    second: Float[Array, "*b"]
+    second: Float[AnyArray, "*b"]
     """Second-peak ratio: height of the second peak divided by the first. It is near 1 if another pose fits as well."""
 
     @property
     def along_m(self) -> float:
         """Standard deviation of the position of one alignment along its least certain direction, in metres."""
         return float(np.sqrt(np.linalg.eigvalsh(np.asarray(self.covariance)[:2, :2])[1]))
+
+    def angle_to(self, yaw: float) -> float:
+        """Angle between the rotation and another one, in radians, from 0 to pi. NaN if the other one is unknown."""
+        return float(abs((float(self.yaw) - float(yaw) + np.pi) % (2 * np.pi) - np.pi))
 
 
 REFINE_DEG = 3.0
@@ -169,22 +153,6 @@ SHIFT_STEPS = 5
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def align(
-    query: Num[Array | np.ndarray, "h w"],
-    match: Num[Array | np.ndarray, "h w"],
-    *,
-    config: VerificationConfig = DEFAULT,
-) -> Alignment:
-    """Estimate the pose of a query in the frame of a match from their images, also under `jit` and `vmap`.
-
-    Both are square images of counts in the orientation of eq. 1, with an even number of cells per side. Raises
-    ValueError for other images.
-    """
-    peak = jax.tree.map(lambda values: values[0], search(query, jnp.asarray(match)[None], config=config))
-    return refined(query, match, peak, config=config)
-
-
-@functools.partial(jax.jit, static_argnames="config")
 def refined(
     query: Num[Array | np.ndarray, "h w"],
     match: Num[Array | np.ndarray, "h w"],
@@ -192,7 +160,11 @@ def refined(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Alignment:
-    """Refine a peak of `search` on cells that are not merged. Raises the errors of `search`."""
+    """Return the pose of a query in the frame of a match: a peak of `search`, refined on cells that are not merged.
+
+    Both are square images of counts in the orientation of eq. 1, with an even number of cells per side. Raises
+    ValueError for other images.
+    """
     second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
     query, match = prepared(query, config), prepared(match, config)
     pose, correlation, covariance = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
@@ -222,16 +194,8 @@ def _refined(
     correlation = value + gradient @ offset + offset @ hessian @ offset / 2
     curvature = -hessian / (sizes[:, None] * sizes[None])
     turns = jnp.concatenate([middle[2][None] + jnp.round(offset[2]).astype(int), np.array(RIDGE_TURNS)])
-    ridge = ridge_covariance(
-        product[turns],
-        pose,
-        yaws[turns],
-        curvature,
-        cell_m=cell_m,
-        reach_m=config.reach_m,
-        max_shift_m=config.max_shift_m,
-    )
-    covariance = peak_covariance(
+    ridge = _ridge_covariance(product[turns], pose, yaws[turns], curvature, config)
+    covariance = _peak_covariance(
         curvature,
         correlation,
         occupied=jnp.minimum((query > 0).sum(), (match > 0).sum()),

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int, Num
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.registration.bev_spectra import (
@@ -20,9 +20,7 @@ from sglpr_jax.registration.bev_spectra import (
     cells,
     correlations,
     lower_half,
-    match_spectra,
     quarters,
-    query_spectra,
 )
 from sglpr_jax.registration.config import VerificationConfig
 
@@ -42,7 +40,7 @@ def coarse_correlations(
 ) -> Float[Array, " k"]:
     """Highest correlation of a query with each match at any pose, by the coarse comparison.
 
-    The arguments are those of `search_spectra`. Matches beyond `count` get -1.
+    The arguments are those of `search`. Matches beyond `count` get -1.
     """
     turned = quarters(lower_half(jnp.asarray(query)[:, :, ::2].swapaxes(1, 2), config).swapaxes(1, 2))
     matches = lower_half(jnp.asarray(matches), config)
@@ -67,12 +65,8 @@ class Peak(NamedTuple):
     second: Float[AnyArray, "*b"]
     """Highest correlation at any other pose (`second_m`, `second_deg`)."""
 
-    def one(self, k: int) -> "Peak":
-        """The k-th peak."""
-        return Peak(*(values[k] for values in self))
-
-    def some(self, rows: slice | np.ndarray) -> "Peak":
-        """A selection of the peaks."""
+    def at(self, rows: int | slice) -> "Peak":
+        """One of the peaks, or some of them."""
         return Peak(*(values[rows] for values in self))
 
 
@@ -81,27 +75,16 @@ NO_PEAKS = Peak(*[np.zeros(0, np.float32)] * len(Peak._fields))
 
 @functools.partial(jax.jit, static_argnames="config")
 def search(
-    query: Num[AnyArray, "h w"], matches: Num[AnyArray, "k h w"], *, config: VerificationConfig = DEFAULT
-) -> Peak:
-    """Return the best pose of a query in the frame of each of k matches.
-
-    The images are square, of counts in the orientation of eq. 1, with an even number of cells per side. Raises
-    ValueError for other images.
-    """
-    return search_spectra(query_spectra(query, config=config), match_spectra(matches, config=config), config=config)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def search_spectra(
     query: Complex[AnyArray, "2 s t f"],
     matches: Complex[AnyArray, "k s f"],
     count: Int[AnyArray, ""] | int | None = None,
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Peak:
-    """Like `search`, with the results of `query_spectra` and `match_spectra`.
+    """Return the best pose of a query in the frame of each of k matches.
 
-    With `count`, only the first matches are searched. Different counts do not compile different programs.
+    The arguments are results of `query_spectra` and `match_spectra`. With `count`, only the first matches are searched.
+    Different counts do not compile different programs.
     """
     turned, matches, reach = quarters(jnp.asarray(query)), jnp.asarray(matches), _reach(config)
 

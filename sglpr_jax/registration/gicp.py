@@ -105,8 +105,7 @@ def register(
     pose = np.asarray(found.T_target_source)
     order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp puts rotation first
     information = np.asarray(found.H)[order][:, order]
-    matched = _matched_points(target, tree, source, pose)
-    covariance = _registration_covariance(information, matched, pose, initial_covariance)
+    covariance = _registration_covariance(information, source, target, tree, pose, initial_covariance)
     least = np.repeat([LEAST_POSITION_M, np.radians(LEAST_ROTATION_DEG)], 3) ** 2
     return Registration(pose, covariance + np.diag(least), overlap(query, match, pose))
 
@@ -146,74 +145,43 @@ def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray
     return points
 
 
-class _Matched(NamedTuple):
-    """Points of a query, each with its nearest neighbour in the match."""
-
-    points: Float[np.ndarray, "k 3"]
-    """Points in the query's frame, in metres."""
-    residuals: Float[np.ndarray, "k 3"]
-    """Vector from each transformed point to its neighbour, in the match's frame."""
-    weights: Float[np.ndarray, "k 3 3"]
-    """Inverse covariances of the residuals, as in GICP."""
-    normals: Float[np.ndarray, "k 3"]
-    """Normals of the neighbours' surfaces, in the query's frame."""
-    each: int
-    """Number of points of the query that each of these represents."""
-    sparse: float
-    """Share of the ground where the neighbours of a point lie on one line."""
-
-
 def _registration_covariance(
     information: Float[np.ndarray, "6 6"],
-    matched: _Matched,
+    query: Any,
+    match: Any,
+    tree: Any,
     match_from_query: Float[np.ndarray, "4 4"],
     initial_covariance: Float[np.ndarray, "6 6"] | None,
 ) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance of a small motion of the query in its own frame: metres, then radians.
+    """Covariance of a small motion of the query in its own frame: metres, then radians.
 
-    `information` is GICP's matrix of the same motion. The covariance of the first guess is kept along degenerate
-    directions.
-    """
-    inverse = np.linalg.pinv(information, hermitian=True)
-    grow = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * matched.sparse), 3)
-    grow[[2, 5]] = SCALE * HEIGHT_SCALE, grow[0]
-    found = (inverse @ _noise(matched, match_from_query) @ inverse) * np.outer(grow, grow)
-    found[:3, :3] += _sliding(matched.normals, initial_covariance)
-    return found
-
-
-def _matched_points(match: Any, tree: Any, query: Any, match_from_query: Float[np.ndarray, "4 4"]) -> _Matched:
-    """Find the nearest neighbours of a subset of the query's points, at most `MAX_APART_M` away.
-
-    `match`, its search tree `tree`, and `query` are results of small_gicp's `preprocess_points`.
+    `information` is GICP's matrix of the same motion. Clouds and search tree are results of `_preprocessed`. The
+    covariance of the first guess is kept along degenerate directions.
     """
     turn = match_from_query[:3, :3]
     points, theirs = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))
-    each = max(1, len(points) // POINTS)
+    each = max(1, len(points) // POINTS)  # a subset of the points of the query, each with its nearest neighbour
     moved = points[::each] @ turn.T + match_from_query[:3, 3]
     nearest, squares = (np.asarray(values) for values in tree.batch_nearest_neighbor_search(moved))
     near = np.flatnonzero(squares < MAX_APART_M**2)
-    nearest = nearest[near].astype(np.int64)
+    points, nearest = points[::each][near], nearest[near].astype(np.int64)
     ours_spread = np.stack([query.cov(int(i) * each)[:3, :3] for i in near]) if len(near) else np.zeros((0, 3, 3))
     theirs_spread = np.stack([match.cov(int(i))[:3, :3] for i in nearest]) if len(near) else np.zeros((0, 3, 3))
-    return _Matched(
-        points=points[::each][near],
-        residuals=theirs[nearest] - moved[near],
-        weights=np.linalg.inv(theirs_spread + turn @ ours_spread @ turn.T),
-        normals=np.linalg.eigh(theirs_spread)[1][:, :, 0] @ turn,
-        each=each,
-        sparse=_sparse_ground(theirs, tree, nearest[::4]),
-    )
-
-
-def _noise(matched: _Matched, match_from_query: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
-    """Scatter of the gradient of GICP's error over blocks of space."""
-    pull = np.einsum("kij,kj->ki", matched.weights, matched.residuals) @ match_from_query[:3, :3]
-    gradient = np.concatenate([pull, np.cross(matched.points, pull)], axis=1)
-    _, block = np.unique(np.floor(matched.points / BLOCK_M).astype(np.int64), axis=0, return_inverse=True)
+    weights = np.linalg.inv(theirs_spread + turn @ ours_spread @ turn.T)
+    # Scatter of the gradient of GICP's error over blocks of space.
+    pull = np.einsum("kij,kj->ki", weights, theirs[nearest] - moved[near]) @ turn
+    gradient = np.concatenate([pull, np.cross(points, pull)], axis=1)
+    _, block = np.unique(np.floor(points / BLOCK_M).astype(np.int64), axis=0, return_inverse=True)
     sums = np.zeros((block.max(initial=-1) + 1, 6))
     np.add.at(sums, block.reshape(-1), gradient)
-    return sums.T @ sums * matched.each**2
+    noise = sums.T @ sums * each**2
+    inverse = np.linalg.pinv(information, hermitian=True)
+    grow = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * _sparse_ground(theirs, tree, nearest[::4])), 3)
+    grow[[2, 5]] = SCALE * HEIGHT_SCALE, grow[0]
+    found = (inverse @ noise @ inverse) * np.outer(grow, grow)
+    normals = np.linalg.eigh(theirs_spread)[1][:, :, 0] @ turn  # of the neighbours' surfaces, in the query's frame
+    found[:3, :3] += _sliding(normals, initial_covariance)
+    return found
 
 
 def _sliding(

@@ -17,7 +17,7 @@ from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.pose_graph.optimize import PoseGraph, trajectory_error
+from sglpr_jax.pose_graph.optimize import solved_graph, trajectory_error
 from sglpr_jax.registration.gicp import Registration
 from sglpr_jax.se3 import transform, travelled
 
@@ -42,7 +42,7 @@ def test_of_places_that_repeat_no_loop_is_accepted_and_the_odometry_stays(scene)
     assert len(wrong) >= 50 and deviations(wrong, DrivenPath(odometry)).min() > 8
     kept, rejected = accepted(wrong, DrivenPath(odometry))
     assert not kept and {one.reason for one in rejected} == {"contradicts the odometry"}
-    found = PoseGraph({0: odometry}, wrong).solve()
+    found = solved_graph({0: odometry}, wrong)
     np.testing.assert_array_equal(found.poses, odometry)
     assert not found.inliers.any() and str(found).startswith(f"trajectory not corrected: {len(wrong)} loops need")
 
@@ -55,7 +55,7 @@ def test_true_loops_are_kept_and_correct_the_drift():
     assert len(loops) >= 52 and deviations(loops, DrivenPath(odometry)).max() < 1.7
     kept, rejected = accepted(loops, DrivenPath(odometry))
     assert kept == loops and not rejected
-    found = PoseGraph({0: odometry}, kept).solve()
+    found = solved_graph({0: odometry}, kept)
     assert found.inliers.all() and found.deviation < 2
     before, after = (trajectory_error(poses, true[:, :3, 3]) for poses in (odometry, found.poses))
     assert after < 0.5 * before
@@ -94,7 +94,7 @@ def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_ca
     drift = DriftModel(percent / 100, degrees / 100)
     kept, _ = accepted(loops, DrivenPath(odometry), drift=drift)
     assert len(kept) > 0.98 * len(loops)
-    found = PoseGraph({0: odometry}, kept, drift).solve()
+    found = solved_graph({0: odometry}, kept, drift)
     assert trajectory_error(found.poses, true[:, :3, 3]) < 0.3 * trajectory_error(odometry, true[:, :3, 3])
 
 
@@ -128,7 +128,7 @@ def test_a_solution_beyond_the_drift_loses_the_loops_that_bend_it_or_is_not_take
         for one in loops[-wrong:]
     ]
     assert deviations(aside, DrivenPath(true)).max() < 1
-    found = PoseGraph({0: true}, (*loops[:-wrong], *aside)).solve()
+    found = solved_graph({0: true}, (*loops[:-wrong], *aside))
     assert found.inliers.sum() == right and not found.inliers[-wrong:].any()
     assert found.deviation < 1 and found.moved_m < 1
     if not right:

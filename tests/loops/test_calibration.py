@@ -49,6 +49,8 @@ def test_bins_are_counted():
         (0.9, 0.99, 1, 0),
         (0.99, 1.0, 2, 2),
     ]
+    error = sum(b.pairs * abs(b.said - b.share) for b in found) / 6
+    assert calibration_error(found) == pytest.approx(error)
     assert found[-1].said == pytest.approx(0.995) and found[-1].share == 1 and found[1].said == pytest.approx(0.2)
 
 
@@ -71,9 +73,3 @@ def test_candidates_with_true_positions_and_those_in_between_are_left_out():
     assert (low.pairs, low.loops, high.pairs, high.loops) == (1, 0, 1, 1)
     assert high.said == pytest.approx(1 / (1 + np.exp(-6)))
     assert reliability_of([], model, positions) == () == reliability_of(candidates[1:2], model, positions)
-
-
-def test_the_calibration_error_is_the_mean_difference_between_probability_and_share():
-    probability, is_loop = np.array([0.2, 0.2, 0.2, 0.2, 0.95, 0.95]), np.array([True, False, False, False, True, True])
-    found = calibration_error(reliability(probability, is_loop))
-    np.testing.assert_allclose(found, (4 * abs(0.2 - 0.25) + 2 * abs(0.95 - 1)) / 6)

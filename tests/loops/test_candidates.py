@@ -7,7 +7,7 @@ from scenes import place, seen_from
 import sglpr_jax
 from sglpr_jax.data.recording import Record
 from sglpr_jax.grid import Grid
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.keyframes import Seen, square_image
@@ -138,7 +138,7 @@ def driven(params, step_m: float, turn_deg: float = 0.0, *, frames: int = 41, **
     finder = finder_of(params, **limits)
     for frame in range(frames):
         pose = transform(step_m * frame, 0.0, np.radians(turn_deg * frame))
-        finder.add_seen(seen_by(finder, BLANK), odometry=pose, compared=Compared(NO_FITS, None))
+        finder.add_seen(seen_by(finder, BLANK), odometry=pose, compared=NO_FITS)
     return finder
 
 
@@ -152,7 +152,7 @@ def test_a_scan_near_the_last_stored_one_is_not_stored_unless_the_sensor_turned(
 def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):
     finder = finder_of(params, keyframe_m=1e9)
     for _ in range(3):  # without links the motion is unknown
-        finder.add_seen(seen_by(finder, BLANK), compared=Compared(NO_FITS, None))
+        finder.add_seen(seen_by(finder, BLANK), compared=NO_FITS)
     assert finder.stored.frames.tolist() == [int(np.flatnonzero(finder.motion.segments == k)[0]) for k in range(3)]
 
 

@@ -14,13 +14,12 @@ import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import acceptance, checkpoint, search
-from sglpr_jax.loops.candidates import Compared
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.odometry.bev_odometry import Link
 from sglpr_jax.pose_graph.folder import write_found
+from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.registration.bev_search import Peak
 from sglpr_jax.registration.gicp import Registration
 
@@ -186,20 +185,21 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
 
 @pytest.mark.parametrize(("fits", "pose"), [(FITS, np.eye(4)), (NO_FITS, None)])
 def test_a_frame_comes_back_from_its_bytes(fits, pose):
-    link = Link(*DRAW.normal(size=6)) if pose is None else None
-    content = checkpoint.frame_bytes(SEEN, Compared(fits, link), pose=pose, name="a", wall=3.5)
+    link = Alignment(*DRAW.normal(size=3), np.diag([0.3, 0.3, 0.0]) ** 2, 0.8, 0.4) if pose is None else None
+    content = checkpoint.frame_bytes(SEEN, fits._replace(link=link), pose=pose, name="a", wall=3.5)
     seen, compared, found, about = checkpoint.read_frame(content, 5, ABOUT, source=Path("log"))
     assert seen.mounting == SEEN.mounting and about == {"name": "a", "wall": 3.5}
     np.testing.assert_array_equal(seen.image, SEEN.image)
-    np.testing.assert_array_equal(compared.fits.frames, fits.frames)
-    np.testing.assert_array_equal(np.stack(compared.fits.peaks), np.stack(fits.peaks))
+    np.testing.assert_array_equal(compared.frames, fits.frames)
+    np.testing.assert_array_equal(np.stack(compared.peaks), np.stack(fits.peaks))
     assert (compared.link is None) == (link is None) and (found is None) == (pose is None)
-    assert link is None or compared.link == link
+    for one, other in zip(compared.link or (), link or (), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize(("cut", "number", "about"), [(0, 4, {}), (9, 5, {}), (0, 5, ABOUT)])
 def test_another_content_is_refused(cut, number, about):
-    content, bad_scan = (checkpoint.frame_bytes(seen, Compared(FITS, None)) for seen in (SEEN, None))
+    content, bad_scan = (checkpoint.frame_bytes(seen, FITS) for seen in (SEEN, None))
     assert checkpoint.read_frame(bad_scan, 5, {}, source=Path("log"))[0] is None
     with pytest.raises(ValueError, match=rf"log: expected frame {number}, found another content"):
         checkpoint.read_frame(content[: len(content) - cut], number, about, source=Path("log"))

@@ -7,7 +7,7 @@ import pytest
 from drives import PASS
 
 from sglpr_jax.loops.acceptance import LITTLE_OVERLAP
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
@@ -77,7 +77,7 @@ def streamed_pairs(params, compare_only):
         compare_only({query: (match, true[query]) for query, match in matches.items()})
         for frame in range(len(THERE_AND_BACK)):
             pose = None if poses is None else poses[frame]
-            detector.add_seen(seen, odometry=pose, compared=Compared(NO_FITS, None))
+            detector.add_seen(seen, odometry=pose, compared=NO_FITS)
         return detector
 
     return streamed
@@ -136,7 +136,7 @@ def test_what_does_not_fit_is_one_clear_error(params, random_params):
         (cloud, {}, "expected a time for every frame or for none"),
         (cloud, {"time": 4.0}, "times that do not decrease, found 4.0 after 5.0"),
         (cloud, {"time": 6.0, "odometry": np.eye(4)}, "expected odometry for every frame or for none"),
-        (cloud, {"time": 6.0, "odometry": 2 * np.eye(4)}, "4 x 4 pose with a rotation"),
+        (cloud, {"time": 6.0, "odometry": 2 * np.eye(4)}, r"odometry \(4, 4\), with rotations"),
         (np.zeros((900, 4)), {"time": 6.0}, r"points \(n, 3\) of x, y and z only, found an array of shape \(900, 4\)"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -69,17 +69,6 @@ def test_log_odds_never_fall_where_the_evidence_is_stronger(values, name):
 FITTED = model_of(*pairs())
 
 
-def test_evidence_says_this_much_and_no_more():
-    best, beyond = Evidence.of(0.3, 0.03, 0.5, 12.0), Evidence.of(-9.0, -9.0, 0.0, 9e9)
-    assert FITTED.log_odds(best) == FITTED.log_odds(beyond)
-
-
-def test_ambiguity_is_left_out():
-    evidence, best = (Evidence.of(ratio, 0.1, 3.0, 2.0) for ratio in (0.7, 0.0))
-    assert FITTED.log_odds_without_ambiguity(evidence) == FITTED.log_odds(best)
-    np.testing.assert_allclose(FITTED.probability(evidence), 1 / (1 + np.exp(-FITTED.log_odds(evidence))))
-
-
 def test_neighbours_add_their_support_to_what_a_pair_says_alone():
     evidence = Evidence.of(0.7, 0.1, 3.0, 2.0)
     np.testing.assert_allclose(FITTED.tested_log_odds(evidence, np.array(2.5)), FITTED.log_odds(evidence) + 2.5)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -19,8 +18,7 @@ from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import search
-from sglpr_jax.loops.candidates import Compared
-from sglpr_jax.loops.closure import MEANING, Loop, Reason, Rejected, why_rejected
+from sglpr_jax.loops.closure import MEANING, Loop, Rejected
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
@@ -59,7 +57,7 @@ def found(params, compare_only, monkeypatch):
         true = {query: (match, inverse(poses[match]) @ poses[query]) for query, match in ways.items()}
         compare_only(true | {query: (match, np.eye(4)) for query, match in wrong.items()})
         for pose in odometry:
-            detector.add_seen(seen, odometry=pose, compared=Compared(NO_FITS, None))
+            detector.add_seen(seen, odometry=pose, compared=NO_FITS)
         monkeypatch.setattr(search, "LoopDetector", lambda *_, **__: detector)
         odometry = scaled_poses(odometry, 1 / scale)
         options = {"odometry": odometry, "config": CONFIG, "registered": False}
@@ -125,10 +123,6 @@ def found_in(frames: int, **about) -> FoundLoops:
     return FoundLoops((Session(of_images(images), frames, **about),))
 
 
-def with_frames(found: FoundLoops, frames: int) -> FoundLoops:
-    return dataclasses.replace(found, sessions=(dataclasses.replace(found.sessions[0], frames=frames),))
-
-
 def test_what_is_missing_explains_why_there_are_no_loops():
     (said,) = why_none(found_in(700))
     assert said.startswith("No pair was compared: according to the images")
@@ -136,19 +130,13 @@ def test_what_is_missing_explains_why_there_are_no_loops():
     assert "690 of 700 scans are almost empty (fewer than 20" in why_none(found_in(700, empty=690))[0]
     skipped = tuple(map(str, range(400)))
     assert why_none(found_in(700, skipped=skipped))[0] == "400 of 700 scans cannot be read."
-    assert why_none(with_frames(found_in(700), 0)) == ["The search was stopped before the first scan."]
-    first, second = why_none(with_frames(found_in(700), 5))
-    assert first == "The search was stopped after 5 of 700 frames." and second.startswith("No pair was compared")
+    for frames, words in ((0, "before the first scan."), (5, "after 5 of 700 frames.")):
+        session = dataclasses.replace(found_in(700).sessions[0], frames=frames)
+        assert why_none(FoundLoops((session,)))[0] == f"The search was stopped {words}"
     rejected = (Rejected(LOOP, "little overlap"), Rejected(LOOP, "repeats"), Rejected(LOOP, "repeats"))
     found = dataclasses.replace(found_in(700), rejected=rejected)
     assert why_none(found) == [f"3 pairs were compared. For 2 of them: {MEANING['repeats']}"]
     assert why_none(dataclasses.replace(found, loops=(LOOP,))) == []
-
-
-def test_each_reason_has_a_meaning_and_a_count():
-    assert set(MEANING) == set(typing.get_args(Reason))
-    lines = why_rejected([Rejected(LOOP, reason) for reason in MEANING])
-    assert lines == [f"rejected, {reason} (1): {meaning}" for reason, meaning in MEANING.items()]
 
 
 def test_degenerate_loops_are_counted_and_can_be_rejected():

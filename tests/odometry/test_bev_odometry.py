@@ -3,17 +3,19 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.odometry.bev_odometry import AMBIGUOUS_SHARE, GAP_M, GUESS_FACTOR, MAX_COASTING, UNKNOWN_M, Link, Motion
+from sglpr_jax.odometry.bev_odometry import AMBIGUOUS_SHARE, GAP_M, GUESS_FACTOR, MAX_COASTING, UNKNOWN_M, Motion
+from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.se3 import transform
 
 
 def link(
     x: float, correlation: float = 0.9, second: float = 0.3, along_m: float = 0.1, turned_deg: float = 0.0
-) -> Link:
-    return Link(*map(np.float32, (x, 0.0, np.radians(turned_deg), correlation, second, along_m)))
+) -> Alignment:
+    spread = np.diag([along_m, along_m, 0.0]) ** 2
+    return Alignment(*map(np.float32, (x, 0.0, np.radians(turned_deg), spread, correlation, second)))
 
 
-def moved(links: list[Link | None], *, factor: float = 1.0) -> Motion:
+def moved(links: list[Alignment | None], *, factor: float = 1.0) -> Motion:
     """The motion of frames 0.1 s apart with these links to the keyframe. All times are multiplied by `factor`."""
     motion = Motion()
     for frame, one in enumerate(links):
@@ -81,15 +83,6 @@ def test_a_drive_at_another_speed_has_the_same_motion(factor):
     np.testing.assert_allclose(fast.poses, slow.poses, atol=1e-6)
     np.testing.assert_allclose(fast.guessed_m, slow.guessed_m)
     assert fast.segments.tolist() == slow.segments.tolist()
-
-
-def test_odometry_is_taken_as_it_is():
-    motion = Motion()
-    for frame in range(30):
-        motion.add(float(frame), pose=transform(0.5 * frame, 0.0, 0.1 * frame))
-    assert motion.travelled[-1] == pytest.approx(14.5) and set(motion.segments) == {0}
-    known = Motion.of(motion.poses)
-    np.testing.assert_allclose(known.travelled[:30], motion.travelled[:30])
 
 
 def test_after_an_unknown_motion_nothing_is_known_about_the_way():

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from drives import along, drifted
 
-from sglpr_jax.odometry.bev_odometry import Link
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
+from sglpr_jax.registration.bev_alignment import Alignment
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 TRUE = along([(0, 0), (150, 0), (150, 150)], 3.0)
@@ -18,7 +18,7 @@ def checked(odometry: np.ndarray, *, second: float = 0.3, steps: int = len(TRUE)
     for row in range(steps):
         assert check.is_due(odometry[row])
         moved = inverse(TRUE[row - 1]) @ TRUE[row]
-        link = Link(*map(np.float64, (*moved[:2, 3], yaw_of(moved), 0.8, second, 0.1)))
+        link = Alignment(*moved[:2, 3], yaw_of(moved), np.diag([0.01, 0.01, 0.0]), 0.8, second)
         check.add(odometry[row], link if row else None)
     return check
 

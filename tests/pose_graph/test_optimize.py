@@ -19,9 +19,9 @@ from sglpr_jax.pose_graph.files import read_g2o, write_g2o
 from sglpr_jax.pose_graph.optimize import (
     MOST_RISEN_M,
     OptimizedTrajectory,
-    PoseGraph,
     optimize_trajectory,
     placements,
+    solved_graph,
     trajectory_error,
 )
 from sglpr_jax.se3 import from_quaternions, inverse, transform
@@ -30,7 +30,7 @@ from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
 
 
 def optimized(odometry: np.ndarray, loops: Sequence[Loop]) -> OptimizedTrajectory:
-    return PoseGraph({0: odometry}, loops).solve()
+    return solved_graph({0: odometry}, loops)
 
 
 def test_the_error_of_a_drifted_drive_falls(two_laps, two_laps_odometry, second_lap_loops):

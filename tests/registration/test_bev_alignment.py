@@ -2,18 +2,15 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import difference, place, relative, seen_from
+from scenes import align, difference, place, relative, seen_from
 from scipy import ndimage, signal
 
 from sglpr_jax.data.levelling import uprights
-from sglpr_jax.loops.closure import position_deviation
 from sglpr_jax.loops.keyframes import square_image
-from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import inverse, yaw_of
 
@@ -38,19 +35,9 @@ def test_the_pose_of_the_images_is_found(yaw, x, y, seed):
     assert found.correlation > 0.4 and found.second < 0.8 and -np.pi <= found.yaw <= np.pi
 
 
-@settings(deadline=None, max_examples=6)
-@given(yaw=YAWS, x=SHIFTS, y=SHIFTS)
-def test_the_other_way_round_the_pose_is_the_inverse(yaw, x, y):
-    query, match = (seen_from(place(1), pose) for pose in ((x, y, yaw), (0.0, 0.0, 0.0)))
-    there, back = pose_of(align(query, match, config=SMALL)), pose_of(align(match, query, config=SMALL))
-    again = np.array([*(-_turn(-there[2]) @ there[:2]), -there[2]])
-    assert (np.abs(difference(back, again)) < [0.1, 0.1, 0.02]).all()
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_the_peak_is_that_of_a_brute_force_search(seed):
+def test_the_peak_is_that_of_a_brute_force_search():
     """Every degree and cell, by scipy: rotate, filter, correlate."""
-    query, match = seen_from(place(seed), (0.7, -0.5, 2.0)), seen_from(place(seed), (0.0, 0.0, 0.0))
+    query, match = seen_from(place(0), (0.7, -0.5, 2.0)), seen_from(place(0), (0.0, 0.0, 0.0))
     axis = (np.arange(64) - 31.5) * 0.4
     inside = np.hypot(axis[:, None], axis[None]) < 12.8
 
@@ -78,12 +65,13 @@ def test_between_two_plain_walls_the_place_along_them_is_unknown(yaw):
     along = rng.uniform(-40, 40, (6000, 1))
     walls = np.concatenate([along, rng.choice([-5.0, 6.0], (6000, 1))], axis=1)
     images = [seen_from(walls, (x, 0.2, yaw), seed=k) for k, x in enumerate((0.0, 1.5))]
-    covariance = np.asarray(align(*images, config=dataclasses.replace(SMALL, max_shift_m=12.0)).covariance)
+    found = align(*images, config=dataclasses.replace(SMALL, max_shift_m=12.0))
+    covariance = np.asarray(found.covariance)
     direction = np.array([np.cos(yaw), -np.sin(yaw)])  # of the walls, in the frame of the match
     across = np.array([np.sin(yaw), np.cos(yaw)])
     assert np.sqrt(direction @ covariance[:2, :2] @ direction) >= 2
     assert np.sqrt(across @ covariance[:2, :2] @ across) <= 0.3
-    assert position_deviation(covariance) >= 2
+    assert found.along_m >= 2
 
 
 @pytest.mark.slow
@@ -113,16 +101,6 @@ def test_other_places_correlate_less_and_another_pose_fits_as_well():
         assert found.correlation < 0.5 < found.second
 
 
-@pytest.mark.slow
-def test_under_jit_and_vmap_the_same():
-    query, matches = seen_from(place(0), (0.5, 0.3, 1.0)), np.stack([seen_from(place(s), (0.0,) * 3) for s in (0, 1)])
-    mapped = jax.jit(jax.vmap(lambda q, m: align(q, m, config=SMALL)))(np.stack([query] * 2), matches)
-    for k, match in enumerate(matches):
-        alone = align(query, match, config=SMALL)
-        for one, others in zip(alone, mapped, strict=True):
-            np.testing.assert_allclose(others[k], one, rtol=1e-3, atol=1e-4)
-
-
 def test_wrong_sizes_are_refused():
     for wrong in (np.zeros((64, 62), np.float32), np.zeros((63, 63), np.float32)):
         with pytest.raises(ValueError, match="square image of an even number"):
@@ -135,7 +113,3 @@ def test_empty_images_fit_nothing_and_nothing_is_nan():
         found = align(query, match, config=SMALL)
         assert all(np.isfinite(value).all() for value in found) and abs(found.correlation) < 1e-3
         assert found.second == 1
-
-
-def _turn(yaw: float) -> np.ndarray:
-    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])

@@ -39,7 +39,9 @@ def correlations(query: np.ndarray, match: np.ndarray) -> np.ndarray:
 def test_peaks_are_those_of_whole_transforms(seed):
     query = seen_from(place(seed), (0.7, -0.5, 2.0))
     matches = np.stack([seen_from(place(k), (0.0, 0.0, 0.0)) for k in (seed, seed + 1)])
-    found = jax.device_get(search(query, matches, config=SMALL))
+    found = jax.device_get(
+        search(query_spectra(query, config=SMALL), match_spectra(matches, config=SMALL), config=SMALL)
+    )
     for k, match in enumerate(matches):
         volume = correlations(query, match)
         turn, down, right = np.unravel_index(volume.argmax(), volume.shape)
@@ -59,7 +61,9 @@ def test_peaks_are_those_of_whole_transforms(seed):
 def test_the_pose_lies_between_the_cells():
     match, errors = (0.0, 0.0, 0.0), []
     for seed, pose in enumerate([(0.3, 0.1, 0.4), (-0.7, 0.5, 2.0), (1.1, -0.3, -1.2), (0.1, 0.9, 3.0)]):
-        found = search(seen_from(place(seed), pose), seen_from(place(seed), match)[None], config=SMALL).one(0)
+        spectra = query_spectra(seen_from(place(seed), pose), config=SMALL)
+        there = match_spectra(seen_from(place(seed), match)[None], config=SMALL)
+        found = search(spectra, there, config=SMALL).at(0)
         expected = relative(match, pose)
         errors.append(np.hypot(found.x - expected[0], found.y - expected[1]))
     assert np.mean(errors) < 0.2  # of cells of .8 m, whose middles would be .3 m off
@@ -83,7 +87,7 @@ def test_the_lower_half_of_a_spectrum_is_that_of_larger_cells():
 def test_a_pose_near_an_expected_one_is_found_beside_the_best_one():
     query, match = seen_from(place(1), (0.7, -0.5, 2.0)), seen_from(place(1), (0.0, 0.0, 0.0))
     spectra, there = query_spectra(query, config=SMALL), match_spectra(match[None], config=SMALL)
-    best = search(query, match[None], config=SMALL).one(0)
+    best = search(spectra, there, config=SMALL).at(0)
     unknown = search_near(spectra, there[0], np.full(3, np.nan), config=SMALL)
     right = search_near(spectra, there[0], np.stack([best.x + 1, best.y - 1, best.yaw]), config=SMALL)
     np.testing.assert_allclose(np.stack(unknown), np.stack(best)[:, None].repeat(2, 1), atol=1e-5)
