@@ -4,10 +4,6 @@ import numpy as np
 
 from sglpr_jax.bev import rasterize
 from sglpr_jax.grid import Grid
-from sglpr_jax.registration.bev_alignment import Alignment, refined
-from sglpr_jax.registration.bev_search import search
-from sglpr_jax.registration.bev_spectra import DEFAULT, match_spectra, query_spectra
-from sglpr_jax.registration.config import VerificationConfig
 
 GRID = Grid(resolution_m=0.4, height=64, width=64)
 
@@ -47,9 +43,3 @@ def difference(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
     apart = np.asarray(found, np.float64) - expected
     apart[2] = (apart[2] + np.pi) % (2 * np.pi) - np.pi
     return apart
-
-
-def align(query: np.ndarray, match: np.ndarray, *, config: VerificationConfig = DEFAULT) -> Alignment:
-    """The pose of a query in the frame of a match, by their images."""
-    spectra = query_spectra(query, config=config), match_spectra(match[None], config=config)
-    return refined(query, match, search(*spectra, config=config).at(0), config=config)

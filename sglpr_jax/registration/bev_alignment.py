@@ -13,8 +13,17 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Num
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
-from sglpr_jax.registration.bev_search import Peak
-from sglpr_jax.registration.bev_spectra import DEFAULT, AnyArray, prepared, rotations, spectrum, twice
+from sglpr_jax.registration.bev_search import Peak, search
+from sglpr_jax.registration.bev_spectra import (
+    DEFAULT,
+    AnyArray,
+    match_spectra,
+    prepared,
+    query_spectra,
+    rotations,
+    spectrum,
+    twice,
+)
 from sglpr_jax.registration.config import VerificationConfig
 
 NOISE = 0.8
@@ -153,6 +162,22 @@ SHIFT_STEPS = 5
 
 
 @functools.partial(jax.jit, static_argnames="config")
+def align(
+    query: Num[Array | np.ndarray, "h w"],
+    match: Num[Array | np.ndarray, "h w"],
+    *,
+    config: VerificationConfig = DEFAULT,
+) -> Alignment:
+    """Estimate the pose of a query in the frame of a match from their images, also under `jit` and `vmap`.
+
+    Both are square images of counts in the orientation of eq. 1, with an even number of cells per side. Raises
+    ValueError for other images.
+    """
+    spectra = query_spectra(query, config=config), match_spectra(jnp.asarray(match)[None], config=config)
+    return refined(query, match, search(*spectra, config=config).at(0), config=config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
 def refined(
     query: Num[Array | np.ndarray, "h w"],
     match: Num[Array | np.ndarray, "h w"],
@@ -160,11 +185,7 @@ def refined(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Alignment:
-    """Return the pose of a query in the frame of a match: a peak of `search`, refined on cells that are not merged.
-
-    Both are square images of counts in the orientation of eq. 1, with an even number of cells per side. Raises
-    ValueError for other images.
-    """
+    """Refine a peak of `search` on cells that are not merged. Raises the errors of `align`."""
     second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
     query, match = prepared(query, config), prepared(match, config)
     pose, correlation, covariance = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)

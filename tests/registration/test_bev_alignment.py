@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import align, difference, place, relative, seen_from
+from scenes import difference, place, relative, seen_from
 from scipy import ndimage, signal
 
 from sglpr_jax.data.levelling import uprights
 from sglpr_jax.loops.keyframes import square_image
+from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import inverse, yaw_of
 
