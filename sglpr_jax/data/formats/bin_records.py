@@ -56,7 +56,7 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
     Fewer than half of the files may be broken. A format whose record consists of several records of another one that
-    fits does not count. With too few points, the format is None. Raises ValueError if no format fits, or several do.
+    fits does not count. With too few points, it returns None. Raises ValueError if no format fits, or several do.
     """
     chosen = _some(paths)
     if not _enough(chosen, "kitti"):
