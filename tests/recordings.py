@@ -9,7 +9,8 @@ import numpy as np
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_times
 from sglpr_jax.data.formats.scan_files import read_labels
-from sglpr_jax.data.recording import Record, Recording, image_record
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording, image_record
 from sglpr_jax.se3 import positions_from_camera
 
 

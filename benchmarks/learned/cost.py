@@ -18,7 +18,8 @@ from benchmarks.learned.data import TEST, folders
 from benchmarks.learned.score import Entry, entry
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED

@@ -17,7 +17,8 @@ import sglpr_jax
 from sglpr_jax.bev import uncropped
 from sglpr_jax.data.density_image import values_of_points
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import replacing
 from sglpr_jax.grid import DENSITY_SIZE
 from sglpr_jax.labels import to_raw

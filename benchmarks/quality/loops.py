@@ -20,7 +20,7 @@ from benchmarks.quality.scoring import Closure, closures_of, counted, repeating_
 from benchmarks.timing import run_command
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.loops.calibration import reliability_of

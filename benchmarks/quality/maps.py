@@ -11,7 +11,8 @@ import sglpr_jax
 from benchmarks.drives import lidar, on_disk
 from benchmarks.quality.submaps import APART_M, PASSES, RIGHT_M, rendered, scored, submaps_of_passes
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.keyframes import Seen

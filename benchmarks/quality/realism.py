@@ -14,7 +14,8 @@ import sglpr_jax
 from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.figures import save, segmentation_panel
 from sglpr_jax.evaluation.segmentation import confusion_matrix, score_confusion
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M

@@ -17,7 +17,8 @@ from benchmarks.quality.poses import WALKS, simulated
 from sglpr_jax.data.deskew import deskew as deskew_points
 from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS

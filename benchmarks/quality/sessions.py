@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 import sglpr_jax
 from benchmarks.drives import drifted, lidar, recording_of
 from benchmarks.quality.scoring import OTHER_M
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.se3 import inverse, yaw_of

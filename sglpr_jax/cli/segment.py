@@ -13,7 +13,7 @@ from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
-    from sglpr_jax.data.recording import Record
+    from sglpr_jax.data.record import Record
     from sglpr_jax.retrieval.image_maps import SemanticMap
 
 RESULT_FILE = "segmentation.json"

@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Gravity, SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value, require

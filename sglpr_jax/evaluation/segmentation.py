@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.labels import UNLABELLED, taxonomy

@@ -10,7 +10,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 
 AGAIN_S = 30.0
 """Minimum time between two lines of the same kind, in seconds."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.files import in_short
 from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations
 

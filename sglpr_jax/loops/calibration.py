@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.levelling import uprights
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateFinder

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from sglpr_jax.data.levelling import is_tilted, upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query

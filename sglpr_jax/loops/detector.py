@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.loops.arguments import given_pose, given_record, given_time
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.closure import Loop, Reason, Rejected, to_lidar

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Complex64, Float32, Int, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.grid import DENSITY_MAX_COUNT
 from sglpr_jax.growing import GrowingArray

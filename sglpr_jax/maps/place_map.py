@@ -15,7 +15,8 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled_poses, scaled_record
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, replacing

@@ -9,7 +9,8 @@ from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.data.formats.scan_files import found_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
-from sglpr_jax.data.recording import Record, Recording, scan_record
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording, scan_record
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.pose_graph.odometry_files import BAGS
 

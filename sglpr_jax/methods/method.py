@@ -7,7 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 
 Takes = Literal["images", "points", "labelled points", "labelled images"]
 """Content of a record that a method needs. Methods on images accept ready-made images and scans."""

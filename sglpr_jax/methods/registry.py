@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.methods.handcrafted import HANDCRAFTED

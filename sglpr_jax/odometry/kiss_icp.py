@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.deskew import has_point_times, poses_at
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.warning import warn

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Float32
 
 from sglpr_jax.data.deskew import DESKEWED
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import SCALE, scale_of
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.submap import SUBMAPS

@@ -12,7 +12,7 @@ from PIL import Image
 
 from sglpr_jax.bev import uncropped
 from sglpr_jax.data.formats.png import label_image_pixels
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import view
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import UNLABELLED, to_raw

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.submap import submaps
 from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.drive import (

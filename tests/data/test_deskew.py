@@ -12,8 +12,7 @@ from scipy.linalg import expm, logm
 
 import sglpr_jax
 from sglpr_jax.data.deskew import deskew, deskewed, poses_at
-from sglpr_jax.data.record import TimeField
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record, TimeField
 from sglpr_jax.data.submap import submaps
 
 RATE_S = 0.1

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from recordings import of_images, of_scans
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.scaled import chosen_scale, scale_of, scaled, scaled_poses, scaled_record
 
 POINTS = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from recordings import of_scans, with_points
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.scan_stream import readable, scan_stream
 
 SCANS = 6

@@ -18,7 +18,8 @@ from sglpr_jax.data.formats.pose_files import Trajectory, read_times, read_traje
 from sglpr_jax.data.formats.scan_files import read_labels, read_scan
 from sglpr_jax.data.packed import open_pack, packed
 from sglpr_jax.data.readers import bev_images, nclt, open_recording
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.inputs import read_input
 from sglpr_jax.files import read_json
 from sglpr_jax.grid import Grid

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.live.endpoints import open_sink
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.messages import AGAIN_S, FrameStatus, Latest, LiveFrame, LoopEdge, Reports

@@ -10,7 +10,7 @@ from recordings import of_scans
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops.arguments import given_pose, given_poses, given_record, given_time
 from sglpr_jax.loops.candidates import CandidateFinder

@@ -5,7 +5,7 @@ import pytest
 from scenes import place, seen_from
 
 import sglpr_jax
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.comparison import NO_FITS

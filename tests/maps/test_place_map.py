@@ -10,7 +10,7 @@ from recordings import with_points
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import rotated
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap

@@ -10,7 +10,7 @@ import pytest
 
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.labels import to_raw
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.bevplace import grey_image

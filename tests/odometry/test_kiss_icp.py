@@ -9,8 +9,8 @@ import pytest
 from recordings import of_images, of_scans, with_points
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.record import TimeField
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record, TimeField
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops.config import DetectorConfig

@@ -12,7 +12,8 @@ from recordings import of_images
 
 from sglpr_jax.bev import even_cells, rasterize, rasterize_labels
 from sglpr_jax.data.formats.png import label_image_pixels
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_raw
 from sglpr_jax.models.backbone_config import SwinConfig

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.methods.learned.method import LearnedMethod, triplet
 from sglpr_jax.methods.learned.weights_file import load_variables, random_variables, save_variables
 from sglpr_jax.methods.recipe import Recipe, TupleConfig

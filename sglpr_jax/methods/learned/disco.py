@@ -11,7 +11,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Shaped, UInt8
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.methods.cells import polar
 from sglpr_jax.methods.learned.layers import Convolution, batch_norm, max_pool
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rolled

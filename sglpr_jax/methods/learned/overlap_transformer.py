@@ -11,7 +11,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.learned.layers import HE, NetVLAD
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, rolled, triplet

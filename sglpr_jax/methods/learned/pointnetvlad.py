@@ -12,7 +12,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.methods.cells import voxel_means
 from sglpr_jax.methods.learned.layers import maximum
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rotated_points

@@ -11,7 +11,7 @@ import optax
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.losses import descriptor_distance
 from sglpr_jax.methods.cells import extreme, polar

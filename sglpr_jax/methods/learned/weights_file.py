@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sglpr_jax.data.recording import Record
+from sglpr_jax.data.record import Record
 from sglpr_jax.files import read_json
 from sglpr_jax.methods.learned.method import LearnedMethod, Variables
 from sglpr_jax.models.weights import as_tree, by_name, hash_of
