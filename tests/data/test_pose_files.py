@@ -62,7 +62,7 @@ def test_a_file_of_times_replaces_those_of_the_poses(write):
 @pytest.mark.parametrize(
     ("name", "text", "error"),
     [
-        ("poses.txt", KITTI, "expected --pose-format kitti .* or lidar .*found neither"),
+        ("poses.txt", KITTI, "found 12 numbers a line; .* --pose-format .* kitti .* or lidar "),
         ("empty.csv", "x,y,z\n", "expected at least one pose, found none"),
         ("bare.csv", "1,2,3\n", "expected a header with x, y and z, found '1,2,3'"),
         ("zeros.txt", "0 0 0 0 0 0 0 0\n", r"rotation qx qy qz qw of length 1 in row 1, found 0 0 0 0"),
