@@ -30,6 +30,8 @@ AGREE, AGREE_M, AGREE_DEG = 6.0, 0.05, 0.3
 degrees) added to those of the poses."""
 FEWEST_AGAINST = 5
 """Minimum number of frames whose loops contradict the odometry, for a warning."""
+SEPARATE_M = 50.0
+"""Travelled distance beyond which loops belong to different groups, in metres."""
 AXES = "x forward, y left, z up, of the LiDAR, not of a camera."
 
 
@@ -55,9 +57,9 @@ def accepted(
 
 
 def stretches(loops: Sequence[Loop], way: Float[np.ndarray, " n"]) -> int:
-    """Number of groups of at least three loops whose queries and matches are more than 50 m apart."""
+    """Number of groups of at least three loops whose queries and matches are more than `SEPARATE_M` apart."""
     query, match = frames_of(loops)
-    near = [np.abs(np.subtract.outer(way[frames], way[frames])) <= 50.0 for frames in (query, match)]
+    near = [np.abs(np.subtract.outer(way[frames], way[frames])) <= SEPARATE_M for frames in (query, match)]
     _, group = connected_components(near[0] | near[1], directed=False)
     return int((np.bincount(group) >= 3).sum()) if len(loops) else 0
 
