@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.detector_config import DetectorFlags
+from sglpr_jax.cli.recording import DetectorFlags
 from sglpr_jax.cli.runtime import print_error, stop_on_signal
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.live.options import LiveOptions

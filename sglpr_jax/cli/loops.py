@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.detector_config import DetectorFlags
-from sglpr_jax.cli.recording import AUTO, PosedRecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
+from sglpr_jax.cli.recording import (
+    AUTO,
+    DetectorFlags,
+    PosedRecordingOptions,
+    SubmapOptions,
+    open_with_odometry,
+    report_bad_scan,
+)
 from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.files import exclusive_lock
