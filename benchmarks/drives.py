@@ -8,8 +8,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
 from sglpr_jax.se3 import inverse, transform
 from sglpr_jax.sim.drive import CARRIERS
@@ -81,7 +81,7 @@ def in_memory(recording: SimulatedRecording, frames: Sequence[int] | np.ndarray 
     """The recording, with all scans or those of some frames rendered once."""
     chosen = range(len(recording)) if frames is None else frames
     rendered = {recording.paths[i]: recording.points(int(i)) for i in chosen}
-    return dataclasses.replace(recording, read=lambda path, labels, lasers: Record(points=rendered[path]))
+    return dataclasses.replace(recording, read=lambda path, labels, lasers: Scan(points=rendered[path]))
 
 
 def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
@@ -92,13 +92,13 @@ def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
             for i, scan in enumerate(recording.ids):
                 recording.render(i)[0].astype("<f4").tofile(temporary / f"{scan}.bin")
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
-        return Record(points=np.fromfile(folder / f"{path.name}.bin", "<f4").reshape(-1, 4)[:, :3])
+    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
+        return Scan(points=np.fromfile(folder / f"{path.name}.bin", "<f4").reshape(-1, 4)[:, :3])
 
     return dataclasses.replace(recording, read=read, label_paths=())
 
 
-def recording_of(name: str, records: Sequence[Record], times: Float[np.ndarray, " n"] | None = None) -> Recording:
+def recording_of(name: str, records: Sequence[Scan], times: Float[np.ndarray, " n"] | None = None) -> Recording:
     """A recording of scans or images in memory."""
     paths = tuple(Path(f"{i:06d}") for i in range(len(records)))
     found = dict(zip(paths, records, strict=True))

@@ -5,7 +5,7 @@
     descriptor = sglpr_jax.describe(params, bev)        # image -> 256 numbers of unit length
 
 - describe a place, under jit, vmap and grad: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`
-- read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
+- read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Scan`; `Mounting`,
   `estimate_mounting`, `GroundFilter`; `deskewed`, `deskew`, `submaps`, `SubmapBuilder`, `scaled`
 - find places again: `embed`, `DescriptorFile`, `Index`, for a fleet `FleetIndex`
 - score retrieval: `evaluate`

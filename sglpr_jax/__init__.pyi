@@ -24,9 +24,9 @@ from .data.mounting import Mounting as Mounting
 from .data.mounting import estimate_mounting as estimate_mounting
 from .data.readers import open_recording as open_recording
 from .data.readers import recording_names as recording_names
-from .data.record import Record as Record
 from .data.recording import Recording as Recording
 from .data.scaled import scaled as scaled
+from .data.scan import Scan as Scan
 from .data.submap import SubmapBuilder as SubmapBuilder
 from .data.submap import submaps as submaps
 from .evaluation.scoring import Evaluation as Evaluation
@@ -35,7 +35,7 @@ from .grid import Grid as Grid
 from .labels import CATEGORIES as CATEGORIES
 from .labels import taxonomy as taxonomy
 from .labels import to_classes as to_classes
-from .loops.closure import Loop as Loop
+from .loops.closure import LoopClosure as LoopClosure
 from .loops.detector import LoopDetector as LoopDetector
 from .loops.search import find_loops as find_loops
 from .maps.build import map_recording as map_recording

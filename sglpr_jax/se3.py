@@ -49,7 +49,7 @@ def adjoint(a_from_b: Float[np.ndarray, "*m 4 4"]) -> Float[np.ndarray, "*m 6 6"
     return found
 
 
-def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "*m 4 4"]) -> np.ndarray:
+def transform_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "*m 4 4"]) -> np.ndarray:
     """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
     moved = adjoint(a_from_b)
     return moved @ covariance @ np.swapaxes(moved, -1, -2)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.loops.closure import Loop, planar_loop
-from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.loops.closure import LoopClosure, planar_loop
+from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform, yaw_of
 from sglpr_jax.sim import recording
 from sglpr_jax.sim.drive import TimedPoses
@@ -86,14 +86,14 @@ def drifted(poses: np.ndarray, *, percent: float, deg_per_100m: float, noise: fl
     return np.stack(found)
 
 
-def loop_at(query: int, match: int, match_from_query: np.ndarray, rng: np.random.Generator) -> Loop:
+def loop_at(query: int, match: int, match_from_query: np.ndarray, rng: np.random.Generator) -> LoopClosure:
     """A loop of this pose in the plane, with noise of its covariance."""
     pose = match_from_query @ transform(*rng.multivariate_normal(np.zeros(3), LOOP_COVARIANCE))
-    alignment = Alignment(*pose[:2, 3], yaw_of(pose), LOOP_COVARIANCE, 0.9, 0.3)
+    alignment = BevRegistration(*pose[:2, 3], yaw_of(pose), LOOP_COVARIANCE, 0.9, 0.3)
     return planar_loop(query, match, alignment, probability=0.999)
 
 
-def true_loops(poses: np.ndarray, *, every: int = 1, within_m: float = 5.0, exclude: int = 100) -> list[Loop]:
+def true_loops(poses: np.ndarray, *, every: int = 1, within_m: float = 5.0, exclude: int = 100) -> list[LoopClosure]:
     """The nearest earlier frame of each revisit, with its true pose."""
     rng, found = np.random.default_rng(1), []
     for query in range(exclude, len(poses), every):
@@ -104,7 +104,9 @@ def true_loops(poses: np.ndarray, *, every: int = 1, within_m: float = 5.0, excl
     return found
 
 
-def wrong_loops(poses: np.ndarray, moved: Sequence[float], queries: Sequence[int], *, exclude: int = 10) -> list[Loop]:
+def wrong_loops(
+    poses: np.ndarray, moved: Sequence[float], queries: Sequence[int], *, exclude: int = 10
+) -> list[LoopClosure]:
     """Loops that take the place at each query for the one that is farther on by the vector `moved`.
 
     The match is the earlier frame next to that place. The pose is what two scans of places alike give.

@@ -9,8 +9,8 @@ import numpy as np
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_times
 from sglpr_jax.data.formats.scan_files import read_labels
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording, image_record
+from sglpr_jax.data.recording import Recording, image_scan
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.se3 import positions_from_camera
 
 
@@ -22,18 +22,18 @@ def of_scans(clouds: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
 def of_images(images: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
     """Ready-made images (h, w) by the paths that they are said to have."""
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
-        return image_record(path, labels, lasers, read=images.__getitem__)
+    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
+        return image_scan(path, labels, lasers, read=images.__getitem__)
 
     return _recording(tuple(images), read, **{"resolution_m": 0.4, **fields})
 
 
-def reading_scans(points_of: Callable[[Path], np.ndarray]) -> Callable[..., Record]:
+def reading_scans(points_of: Callable[[Path], np.ndarray]) -> Callable[..., Scan]:
     """What reads records of scans whose points a function of the path returns."""
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
         points = points_of(path)
-        return Record(points=points, labels=None if labels is None else read_labels(labels, points=len(points)))
+        return Scan(points=points, labels=None if labels is None else read_labels(labels, points=len(points)))
 
     return read
 
@@ -43,7 +43,7 @@ def with_points(recording: Recording, points_of: Callable[[Path], np.ndarray]) -
     return dataclasses.replace(recording, read=reading_scans(points_of))
 
 
-def _recording(paths: tuple[Path, ...], read: Callable[..., Record], **fields: Any) -> Recording:
+def _recording(paths: tuple[Path, ...], read: Callable[..., Scan], **fields: Any) -> Recording:
     named = {"name": "08", "ids": tuple(path.stem for path in paths)}
     return Recording(**{**named, **fields}, paths=paths, read=read)
 

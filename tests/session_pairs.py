@@ -8,9 +8,9 @@ from drives import along, loop_at
 from recordings import of_images
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.frame_alignment import AlignedParts, Part, aligned_frames
-from sglpr_jax.loops.result import FoundLoops, Session
+from sglpr_jax.loops.closure import LoopClosure
+from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, aligned_frames
+from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse, transform, travelled
 
@@ -28,7 +28,7 @@ def two_drives() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return first, inverse(MATCH_FROM_QUERY) @ second, MATCH_FROM_QUERY
 
 
-def loops_between(first: np.ndarray, second: np.ndarray, true: np.ndarray, *, seed: int = 0) -> list[Loop]:
+def loops_between(first: np.ndarray, second: np.ndarray, true: np.ndarray, *, seed: int = 0) -> list[LoopClosure]:
     """Loops with noise, from each scan of the second drive that is within 5 m of a scan of the first one."""
     rng, found = np.random.default_rng(seed), []
     for query, pose in enumerate(true @ second):
@@ -38,12 +38,12 @@ def loops_between(first: np.ndarray, second: np.ndarray, true: np.ndarray, *, se
     return found
 
 
-def found_pair(*, odometry: tuple[np.ndarray, np.ndarray] | None = None) -> FoundLoops:
+def found_pair(*, odometry: tuple[np.ndarray, np.ndarray] | None = None) -> LoopSearchResult:
     """Result of a search in both recordings, with true odometry unless other `odometry` is given."""
     first, second, true = two_drives()
     loops = loops_between(first, second, true)
     given = (first, second) if odometry is None else odometry
-    parts = [Part(session, 0, len(poses) - 1, True) for session, poses in enumerate(given)]
+    parts = [TrajectorySegment(session, 0, len(poses) - 1, True) for session, poses in enumerate(given)]
     ways = {"match_way": travelled(given[0]), "query_way": travelled(given[1])}
     alignment = aligned_frames(loops, *given, **ways, drift=DriftModel())
     sessions = tuple(
@@ -51,7 +51,7 @@ def found_pair(*, odometry: tuple[np.ndarray, np.ndarray] | None = None) -> Foun
         for name, poses in zip(("monday", "tuesday"), given, strict=True)
     )
     between = tuple(dataclasses.replace(loop, query_session=1) for loop in loops)
-    return FoundLoops(sessions, between, transforms=(AlignedParts(*parts, *alignment, len(loops)),))
+    return LoopSearchResult(sessions, between, transforms=(SegmentAlignment(*parts, *alignment, len(loops)),))
 
 
 def _recording(scans: int, name: str) -> Recording:

@@ -18,8 +18,8 @@ from benchmarks.learned.data import TEST, folders
 from benchmarks.learned.score import Entry, entry
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
@@ -30,7 +30,7 @@ from sglpr_jax.models.shipped import shipped_weights
 from sglpr_jax.models.weights_file import load
 
 TOWN = "town-601"
-DescribeRecord = Callable[[Record], np.ndarray]
+DescribeRecord = Callable[[Scan], np.ndarray]
 """Maps a scan to its descriptor."""
 
 
@@ -54,7 +54,7 @@ def cost(
     recording = open_recording(next(one for one in folders(data, TEST) if one.name == TOWN), "00")
     contenders = [entry(name, runs) for name in entries]
     describers = [_describer(one, recording) for one in contenders]
-    records, found = [recording.record(row) for row in range(scans + 1)], {}
+    records, found = [recording.scan(row) for row in range(scans + 1)], {}
     jobs = [clocked(functools.partial(_describe_next, of_scan, iter(records))) for of_scan in describers]
     seconds = np.median(in_turn(jobs, repeats=scans), axis=0).tolist()
     for one, of_scan, taken in zip(contenders, describers, seconds, strict=True):
@@ -64,7 +64,7 @@ def cost(
     write_json(out, found)
 
 
-def _describe_next(of_scan: DescribeRecord, records: Iterator[Record]) -> None:
+def _describe_next(of_scan: DescribeRecord, records: Iterator[Scan]) -> None:
     of_scan(next(records))
 
 
@@ -72,8 +72,8 @@ def _describer(contender: Entry, recording: Recording) -> DescribeRecord:
     """Return a function from a scan to its descriptor."""
     method = contender.method(recording)
 
-    def of_scan(record: Record) -> np.ndarray:
-        inputs = jax.tree.map(lambda one: np.asarray(one)[None], method.prepare(record, None))
+    def of_scan(scan: Scan) -> np.ndarray:
+        inputs = jax.tree.map(lambda one: np.asarray(one)[None], method.prepare(scan, None))
         return np.asarray(method.describe(inputs))
 
     return of_scan

@@ -17,8 +17,8 @@ import sglpr_jax
 from sglpr_jax.bev import uncropped
 from sglpr_jax.data.density_image import values_of_points
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
 from sglpr_jax.grid import DENSITY_SIZE
 from sglpr_jax.labels import to_raw
@@ -30,7 +30,7 @@ BUILDING = 50
 """The label of all points without labels: raw id of SemanticKITTI."""
 LINKED = ("velodyne", "poses.txt", "times.txt", "calib.txt")
 
-Labels = Callable[[Record], Int[np.ndarray, " n"]]
+Labels = Callable[[Scan], Int[np.ndarray, " n"]]
 
 
 class Dataset(NamedTuple):
@@ -117,7 +117,7 @@ def labels(
         weights: weights with a segmentation head.
     """
     params = sglpr_jax.load(weights)
-    of_points = _unlabelled if kind == "none" else lambda record: _predicted(params, record)
+    of_points = _unlabelled if kind == "none" else lambda scan: _predicted(params, scan)
     for part in (TRAIN, HELD_OUT, TEST):
         for folder in folders(data, part):
             if (folder / "sequences").is_dir():
@@ -138,7 +138,7 @@ def _relabel(folder: Path, out: Path, labels: Labels) -> None:
             path = there / "labels" / f"{scan}.label"
             if not path.exists():
                 with replacing(path) as temporary:
-                    labels(recording.record(row, labels=False)).astype(np.uint32).tofile(temporary)
+                    labels(recording.scan(row, labels=False)).astype(np.uint32).tofile(temporary)
 
 
 def _link(to: Path, path: Path) -> None:
@@ -146,12 +146,12 @@ def _link(to: Path, path: Path) -> None:
         path.symlink_to(to.absolute())
 
 
-def _unlabelled(record: Record) -> Int[np.ndarray, " n"]:
-    return np.full(len(record.upright_points), BUILDING)
+def _unlabelled(scan: Scan) -> Int[np.ndarray, " n"]:
+    return np.full(len(scan.upright_points), BUILDING)
 
 
-def _predicted(params: sglpr_jax.Params, record: Record) -> Int[np.ndarray, " n"]:
+def _predicted(params: sglpr_jax.Params, scan: Scan) -> Int[np.ndarray, " n"]:
     """Return the raw label of each point's cell, 0 outside the map."""
-    cells = uncropped(semantic_map(params, record).predicted, shape=(DENSITY_SIZE, DENSITY_SIZE))
-    classes = values_of_points(np.rot90(cells), record.upright_points)  # density_image is rotated by 90 degrees
+    cells = uncropped(semantic_map(params, scan).predicted, shape=(DENSITY_SIZE, DENSITY_SIZE))
+    classes = values_of_points(np.rot90(cells), scan.upright_points)  # density_image is rotated by 90 degrees
     return to_raw(classes, categories=params.config.categories)

@@ -205,7 +205,7 @@ def _described(contender: Entry, recording: Recording, *, rotated: bool = False)
 def _images(recording: Recording) -> Float32[np.ndarray, "n h w"]:
     """The density images of scans or images of a recording, in the window of `sglpr`."""
     grid = model_preset("sglpr").grid
-    records = (recording.record(row, labels=False) for row in range(len(recording)))
+    records = (recording.scan(row, labels=False) for row in range(len(recording)))
     return np.stack([np.asarray(view(one, grid, image="density").image, np.float32) for one in records])
 
 

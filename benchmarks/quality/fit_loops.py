@@ -27,7 +27,7 @@ from benchmarks.quality.repeating import compared, read
 from benchmarks.quality.scoring import STOREY_M, pose_errors
 from sglpr_jax.files import write_json
 from sglpr_jax.loops.calibration import calibration_error, reliability
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
@@ -166,13 +166,15 @@ def fitted(found: Sequence[Pairs], kinds: Sequence[str], *, without: str | None 
 
 def _pairs(path: Path, odometry: Odometry, breaks: bool, params: Params) -> Pairs:
     """The candidates of one drive that the motion allows. With `breaks`, the motion is unknown in the middle."""
-    drive, finder = read(path), CandidateFinder(params)
+    drive, finder = read(path), CandidateSearch(params)
     frames = compared(path, drive, params, odometry=odometry, breaks=breaks)
     poses, found = drive.odometry(odometry), []
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if poses is None else poses[i]
         continues = not (breaks and i == len(frames) // 2)
-        found += finder.add_seen(seen, time=float(drive.times[i]), odometry=pose, compared=frame, continues=continues)
+        found += finder.add_keyframe(
+            seen, time=float(drive.times[i]), odometry=pose, compared=frame, continues=continues
+        )
     found = [one for one in found if one.evidence.deviation <= finder.present_drift.max_deviation]
     fits = [transform(*(float(value) for value in one.alignment[:3])) for one in found]
     errors = pose_errors([(one.query, one.match) for one in found], np.array(fits), drive.world_from_lidar)

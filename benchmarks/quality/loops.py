@@ -20,15 +20,15 @@ from benchmarks.quality.scoring import Closure, closures_of, counted, repeating_
 from benchmarks.timing import run_command
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.loops.calibration import reliability_of
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen, StoredScans
+from sglpr_jax.loops.keyframes import Keyframe, StoredScans
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
 from sglpr_jax.models.params import Params
 from sglpr_jax.pose_graph.files import read_loops_jsonl
@@ -88,16 +88,16 @@ class _ByScanContext(StoredScans):
         return allowed[np.argsort(apart, kind="stable")[:k]]
 
 
-class _ScanContextFinder(CandidateFinder):
+class _ScanContextFinder(CandidateSearch):
     """Candidates by Scan Context: its distance over all rotations."""
 
     def __init__(self, params: Params):
         super().__init__(params)
         self.stored = _ByScanContext(Index.empty(NUMBERS, weights_hash=self.index.weights_hash))
 
-    def seen(self, record: Record) -> Seen:
+    def keyframe(self, scan: Scan) -> Keyframe:
         """The matrix of Scan Context in place of the descriptor."""
-        return super().seen(record)._replace(descriptor=scan_context(np.asarray(record.points)[:, :3]))
+        return super().keyframe(scan)._replace(descriptor=scan_context(np.asarray(scan.points)[:, :3]))
 
 
 def _scan_context(drive: Drive, *, weights: str, **_: Any) -> Found:
@@ -106,7 +106,7 @@ def _scan_context(drive: Drive, *, weights: str, **_: Any) -> Found:
     detector.finder = _ScanContextFinder(detector.finder.params)
     start = time.perf_counter(), time.process_time()
     for i, stamp in enumerate(drive.recording.poses.times.tolist()):
-        detector.add(drive.recording.record(i, labels=False), time=stamp)
+        detector.add(drive.recording.scan(i, labels=False), time=stamp)
     taken = time.perf_counter() - start[0], time.process_time() - start[1]
     return Found(closures_of(detector.loops), None, *taken, detector.loops)
 
@@ -229,7 +229,9 @@ def images(
         _report_top1(found, poses, sglpr_jax.embed(params, recording).descriptors)
 
 
-def _report_top1(found: FoundLoops, poses: Float[np.ndarray, "n 4 4"], descriptors: Float32[np.ndarray, "n d"]) -> None:
+def _report_top1(
+    found: LoopSearchResult, poses: Float[np.ndarray, "n 4 4"], descriptors: Float32[np.ndarray, "n d"]
+) -> None:
     """Print top-1 F1max and Recall@1 if each query is answered by its most probable pair, or by a returned loop.
 
     Frames without a candidate are answered by the nearest descriptor that is old enough, with the least log odds.

@@ -11,11 +11,11 @@ import sglpr_jax
 from benchmarks.drives import lidar, on_disk
 from benchmarks.quality.submaps import APART_M, PASSES, RIGHT_M, rendered, scored, submaps_of_passes
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.candidates import CandidateSearch
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.odometry.kiss_icp import scan_odometry
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import distances, inverse, yaw_of
@@ -149,7 +149,7 @@ def _located_in(
     for row in np.flatnonzero(apart.min(axis=1) < APART_M)[::every].tolist():
         near = int(apart[row].argmin())
         expected = poses[near] @ inverse(first.world_from_lidar[near]) @ query.world_from_lidar[row]
-        best = places.relocate(params, Record(points=query.scans.points(row), mounting=mounting))[0]
+        best = places.relocate(params, Scan(points=query.scans.points(row), mounting=mounting))[0]
         fits = is_right(best.world_from_query, expected)
         right, sure, count = right + fits, sure + (fits and best.probability >= 0.9), count + 1
     return right, sure, count
@@ -159,7 +159,7 @@ class Driven(NamedTuple):
     """A map of the first pass, and the described scans of the other passes."""
 
     places: sglpr_jax.PlaceMap
-    seen: list[Seen]
+    keyframe: list[Keyframe]
     poses: Float[np.ndarray, "n 4 4"]
     """True pose of each query."""
 
@@ -193,7 +193,7 @@ def sensors(
         out: folder of the scans.
     """
     params, found = sglpr_jax.load(weights), dict[str, list[Driven]]()
-    finder = CandidateFinder(params)
+    finder = CandidateSearch(params)
     for sensor in sensors:
         for seed in seeds:
             drive = rendered(sensor, seed, metres, azimuth_steps, out)
@@ -204,8 +204,8 @@ def sensors(
             places = sglpr_jax.map_recording(some, params, drive.poses[mapped], spacing_m=spacing_m).places
             numbers = [list(PASSES).index(name) for name in ("opposite", "same")]
             asked = rows[np.isin(drive.passes[rows], numbers)][:: max(1, round(spacing_m))]
-            seen = [finder.seen(recording.record(row)) for row in asked.tolist()]
-            found.setdefault(sensor, []).append(Driven(places, seen, drive.poses[asked]))
+            keyframe = [finder.keyframe(recording.scan(row)) for row in asked.tolist()]
+            found.setdefault(sensor, []).append(Driven(places, keyframe, drive.poses[asked]))
     print("| map | query | recall@1 | right | wrong at .99 | queries |\n|---|---|---|---|---|---|")
     for mapped in sensors:
         for asked in sensors:
@@ -221,9 +221,9 @@ def _located(mapped: Driven, asked: Driven) -> Bool[np.ndarray, "3 n"]:
     rows = np.flatnonzero(apart.min(axis=1) < APART_M)
     found = np.zeros((3, len(rows)), bool)
     for i, row in enumerate(rows.tolist()):
-        nearest = mapped.places.index.query(asked.seen[row].descriptor).rows[0]
+        nearest = mapped.places.index.query(asked.keyframe[row].descriptor).rows[0]
         found[0, i] = apart[row, nearest] <= RIGHT_M
-        answers = mapped.places.relocate_seen(asked.seen[row], weights_hash=mapped.places.index.weights_hash)
+        answers = mapped.places.relocate_keyframe(asked.keyframe[row], weights_hash=mapped.places.index.weights_hash)
         if answers:
             pose, true = answers[0].world_from_query, asked.poses[row]
             found[1, i] = is_right(pose, true)

@@ -25,13 +25,13 @@ from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.loops.closure import Loop, planar_loop, to_lidar
+from sglpr_jax.loops.closure import LoopClosure, planar_loop, to_lidar
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.registration import bev_search
 from sglpr_jax.registration.bev_alignment import refined
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
 from sglpr_jax.registration.gicp import register
-from sglpr_jax.se3 import distances, moved_covariance
+from sglpr_jax.se3 import distances, transform_covariance
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.styles import SCENERIES
@@ -117,7 +117,7 @@ def _errors(
     twists = np.array([twist(error) for error in errors[~aliases]]).reshape(-1, 6)
     if registered:
         return twists, covariances, _squares(twists, covariances, np.arange(6)), aliases
-    level = moved_covariance(covariances, upright_from_lidar(recording.mounting))
+    level = transform_covariance(covariances, upright_from_lidar(recording.mounting))
     return twists, covariances, _squares(twists, level, PLANAR), aliases
 
 
@@ -138,17 +138,17 @@ def _revisits(recording: SimulatedRecording, count: int, rng: np.random.Generato
     return np.stack([queries, matches], axis=1)
 
 
-def _aligned(recording: Recording, pairs: np.ndarray) -> Iterator[Loop]:
+def _aligned(recording: Recording, pairs: np.ndarray) -> Iterator[LoopClosure]:
     """The loops of pairs of query and match, by their images."""
     for query, match in pairs.tolist():
-        ours, theirs = (square_image(recording.record(frame, labels=False)) for frame in (query, match))
+        ours, theirs = (square_image(recording.scan(frame, labels=False)) for frame in (query, match))
         peak = bev_search.search(query_spectra(ours), match_spectra(theirs[None])).at(0)
         sensors = recording.mounting_of(query), recording.mounting_of(match)
         loop = planar_loop(query, match, jax.device_get(refined(ours, theirs, peak)), probability=1.0, sensors=sensors)
         yield to_lidar(loop, query=sensors[0], match=sensors[1])
 
 
-def _registered(recording: Recording, loop: Loop) -> Loop:
+def _registered(recording: Recording, loop: LoopClosure) -> LoopClosure:
     points = [recording.points(frame) for frame in (loop.query, loop.match)]
     found = register(*points, initial=loop.match_from_query, initial_covariance=loop.covariance)
     return dataclasses.replace(loop, **found._asdict())
@@ -197,7 +197,7 @@ def search(
     Console(width=170).print(table)
 
 
-def _are_near(loops: Sequence[Loop], poses: Float[np.ndarray, "n 4 4"]) -> list[bool]:
+def _are_near(loops: Sequence[LoopClosure], poses: Float[np.ndarray, "n 4 4"]) -> list[bool]:
     """Whether the scans of each loop were taken at one place."""
     return [bool(np.linalg.norm(poses[one.query, :3, 3] - poses[one.match, :3, 3]) <= LOOP_M) for one in loops]
 

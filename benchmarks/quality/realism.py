@@ -14,8 +14,8 @@ import sglpr_jax
 from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation.figures import save, segmentation_panel
 from sglpr_jax.evaluation.segmentation import confusion_matrix, score_confusion
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
@@ -246,17 +246,17 @@ def semantics(
         Console(width=120).print(table)
 
 
-def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Iterator[tuple[str, Record]]:
+def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Iterator[tuple[str, Scan]]:
     """Source and record of every scan that has labels."""
     for root in roots:
         for name in recording_names(root):
             recording = open_recording(root, name)
             for row, labelled in enumerate(recording.labelled):
                 if labelled and not recording.has_images:
-                    yield f"scans of {name}", recording.record(row)
+                    yield f"scans of {name}", recording.scan(row)
     for path in _range_image_paths(range_images) if range_images else ():
         points, classes = _read_range_image(path)
-        yield f"range images of {path.stem[:2]}", Record(points=points, labels=to_raw(classes))
+        yield f"range images of {path.stem[:2]}", Scan(points=points, labels=to_raw(classes))
 
 
 def _commonest_by_cell(params: Params, root: Path, scans: int) -> np.ndarray:
@@ -267,7 +267,7 @@ def _commonest_by_cell(params: Params, root: Path, scans: int) -> np.ndarray:
     for name in recording_names(root):
         recording = open_recording(root, name)
         for row in np.linspace(0, len(recording) - 1, scans).astype(int):
-            found = semantic_map(params, recording.record(row))
+            found = semantic_map(params, recording.scan(row))
             votes[rows, columns, found.truth] += 1
     votes[..., UNLABELLED] = 0
     votes[..., CATEGORIES.index("road")] += 1

@@ -33,12 +33,12 @@ from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.files import replacing
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.loops.acceptance import accepted
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import frame_bytes, read_frame
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import MIN_CELLS
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.config import MOTION_DRIFT
 from sglpr_jax.se3 import travelled
@@ -101,13 +101,13 @@ def _render(case: Case, params: Params, *, scans: int, azimuth_steps: int, scale
     """Render a drive, write its file, and return a line about it."""
     begin = time.perf_counter()
     simulated = case.simulate(scans=scans, azimuth_steps=azimuth_steps)
-    recording, finder = scaled(simulated, scale), CandidateFinder(params)
-    seen = [finder.seen(recording.record(i, labels=False)) for i in range(len(recording))]
+    recording, finder = scaled(simulated, scale), CandidateSearch(params)
+    keyframe = [finder.keyframe(recording.scan(i, labels=False)) for i in range(len(recording))]
     with replacing(out / _name(case)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,
-            descriptors=np.stack([one.descriptor for one in seen]),
-            images=np.stack([one.image for one in seen]),
+            descriptors=np.stack([one.descriptor for one in keyframe]),
+            images=np.stack([one.image for one in keyframe]),
             world_from_lidar=simulated.poses.world_from_lidar,
             times=simulated.poses.times,
             scale=np.array(scale),
@@ -116,14 +116,14 @@ def _render(case: Case, params: Params, *, scans: int, azimuth_steps: int, scale
             sensor=case.sensor,
             seed=case.seed,
         )
-    seconds, empty = time.perf_counter() - begin, np.mean([np.count_nonzero(one.image) < MIN_CELLS for one in seen])
-    return f"{_name(case)}: {len(seen)} scans in {seconds:.1f} s, {empty:.0%} nearly empty"
+    seconds, empty = time.perf_counter() - begin, np.mean([np.count_nonzero(one.image) < MIN_CELLS for one in keyframe])
+    return f"{_name(case)}: {len(keyframe)} scans in {seconds:.1f} s, {empty:.0%} nearly empty"
 
 
 class RenderedDrive(NamedTuple):
     """A drive as its file holds it."""
 
-    seen: Sequence[Seen]
+    keyframe: Sequence[Keyframe]
     world_from_lidar: Float[np.ndarray, "n 4 4"]
     times: Float[np.ndarray, " n"]
     about: dict[str, str]
@@ -148,8 +148,8 @@ def read(path: Path) -> RenderedDrive:
     with np.load(path) as file:
         scale = int(file["scale"]) if "scale" in file else 1
         about = {name: str(file[name]) for name in ("scenery", "revisit", "sensor", "seed")}
-        seen = [Seen(*each, None) for each in zip(file["descriptors"], file["images"], strict=True)]
-        return RenderedDrive(seen, scaled_poses(file["world_from_lidar"], scale), file["times"], about, scale)
+        keyframe = [Keyframe(*each, None) for each in zip(file["descriptors"], file["images"], strict=True)]
+        return RenderedDrive(keyframe, scaled_poses(file["world_from_lidar"], scale), file["times"], about, scale)
 
 
 def chosen(folder: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> Iterator[Path]:
@@ -167,22 +167,24 @@ def compared(
 
     With `breaks`, the motion is unknown in the middle of the drive.
     """
-    finder = CandidateFinder(params)
+    finder = CandidateSearch(params)
     name = f"{path.stem}-{_settings(finder, odometry)}{'-broken' * breaks}.log"
     path = path.parent / "compared" / name
     if not path.exists():
         poses = drive.odometry(odometry)
         with replacing(path) as temporary:
             log = FrameLog(temporary)
-            for i, (seen, stamp) in enumerate(zip(drive.seen, drive.times.tolist(), strict=True)):
+            for i, (keyframe, stamp) in enumerate(zip(drive.keyframe, drive.times.tolist(), strict=True)):
                 pose = None if poses is None else poses[i]
-                finder.add_seen(seen, time=stamp, odometry=pose, continues=not (breaks and i == len(drive.seen) // 2))
+                finder.add_keyframe(
+                    keyframe, time=stamp, odometry=pose, continues=not (breaks and i == len(drive.keyframe) // 2)
+                )
                 log.append(i, frame_bytes(None, finder.compared))
             log.close()
     return [read_frame(content, i, {}, source=path)[1] for i, content in FrameLog(path).records()]
 
 
-def _settings(finder: CandidateFinder, odometry: Odometry) -> str:
+def _settings(finder: CandidateSearch, odometry: Odometry) -> str:
     """Hash of all that decides the comparisons."""
     parts = [finder.config, finder.verification, MOTION_DRIFT if odometry == "none" else finder.drift]
     about = json.dumps([finder.index.weights_hash, odometry, *map(dataclasses.asdict, parts)])
@@ -228,9 +230,9 @@ def _counts(path: Path, drive: RenderedDrive, params: Params, odometry: Odometry
     """Scans, loops, wrong ones, those of them in the plane, revisits, and revisits with a right loop."""
     given, detector = drive.odometry(odometry), LoopDetector(params)
     frames = compared(path, drive, params, odometry=odometry)
-    for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
+    for i, (keyframe, frame) in enumerate(zip(drive.keyframe, frames, strict=True)):
         pose = None if given is None else given[i]
-        detector.add_seen(seen, time=float(drive.times[i]), odometry=pose, compared=frame)
+        detector.add_keyframe(keyframe, time=float(drive.times[i]), odometry=pose, compared=frame)
     drift = detector.finder.present_drift
     path = detector.finder.motion.path
     loops = detector.loops if given is None else accepted(detector.loops, path, drift=drift)[0]
@@ -239,4 +241,4 @@ def _counts(path: Path, drive: RenderedDrive, params: Params, odometry: Odometry
     right = {loop.query for loop, ok in zip(loops, errors.right, strict=True) if ok}
     again, in_plane = drive.revisits, errors.wrong & (errors.storey_m <= STOREY_M)
     found = sum(frame in right for frame in np.flatnonzero(again).tolist())
-    return np.array([len(drive.seen), len(loops), errors.wrong.sum(), in_plane.sum(), again.sum(), found])
+    return np.array([len(drive.keyframe), len(loops), errors.wrong.sum(), in_plane.sum(), again.sum(), found])

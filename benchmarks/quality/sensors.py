@@ -17,8 +17,8 @@ from benchmarks.quality.poses import WALKS, simulated
 from sglpr_jax.data.deskew import deskew as deskew_points
 from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -84,10 +84,10 @@ def _without_ground(recording: SimulatedRecording, share: float) -> Recording:
     hidden = {path for path in rendered.paths if np.random.default_rng(int(path.name)).random() < share}
     turned = dict(zip(rendered.paths, recording.poses.world_from_lidar[:, :3, :3], strict=True))
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
         points = rendered.read(path, None, False).points
         assert points is not None
-        return Record(points=points if path not in hidden else points[points @ turned[path][2] > 0])
+        return Scan(points=points if path not in hidden else points[points @ turned[path][2] > 0])
 
     return dataclasses.replace(rendered, read=read)
 
@@ -228,7 +228,7 @@ def _row_of_motion(name: str, motion: str, towns: list[list[_Place]], params: Pa
 
 
 def _descriptors(params: Params, clouds: list[np.ndarray]) -> Float[np.ndarray, "n d"]:
-    records = [Record(points=np.ascontiguousarray(cloud, np.float32)) for cloud in clouds]
+    records = [Scan(points=np.ascontiguousarray(cloud, np.float32)) for cloud in clouds]
     return sglpr_jax.embed(params, recording_of("scans", records)).descriptors
 
 
@@ -276,7 +276,7 @@ def _rotated(params: Params, recording: Recording, views: list) -> Float[np.ndar
     describe, config, found = jax.jit(sglpr_jax.describe), params.config, []
     for start in range(0, len(views), BATCH):
         part = views[start : start + BATCH]
-        seen = [view(recording.record(row), config.grid, image=config.image, angle=angle) for row, angle in part]
+        seen = [view(recording.scan(row), config.grid, image=config.image, angle=angle) for row, angle in part]
         images = [np.asarray(one.image) for one in seen]
         images += images[-1:] * (BATCH - len(images))  # one program for all batches
         found.append(np.asarray(describe(params, np.stack(images)))[: len(part)])

@@ -20,9 +20,9 @@ from jaxtyping import Float, Int
 import sglpr_jax
 from benchmarks.drives import drifted, lidar, recording_of
 from benchmarks.quality.scoring import OTHER_M
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.se3 import inverse, yaw_of
 from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
 from sglpr_jax.sim.recording import drive_through
@@ -71,7 +71,7 @@ def render(
         out: the folder.
     """
     out.mkdir(parents=True, exist_ok=True)
-    finder = CandidateFinder(sglpr_jax.load(weights))
+    finder = CandidateSearch(sglpr_jax.load(weights))
     for seed in seeds:
         if not (out / f"{seed}.npz").exists():
             path, windows = _plan(seed, scans=scans, spacing_m=spacing_m)
@@ -79,7 +79,7 @@ def render(
             print(f"{seed}: {windows.common_m:.0f} m in common, turned by {windows.turned_deg:.0f} degrees", flush=True)
 
 
-def _render(seed: int, path: PlanarPath, windows: Windows, sensor: Sensor, finder: CandidateFinder, out: Path) -> None:
+def _render(seed: int, path: PlanarPath, windows: Windows, sensor: Sensor, finder: CandidateSearch, out: Path) -> None:
     """Render a pair and write its file."""
     seeds = drive_seed(seed, f"pair {seed}")
     world = build_world(seeds, path.xy, path.times)
@@ -96,7 +96,7 @@ def _render(seed: int, path: PlanarPath, windows: Windows, sensor: Sensor, finde
             key=jax.random.fold_in(jax.random.key(seed), day),
             rng=np.random.default_rng((*seeds, 2 + day)),
         )
-        images = [finder.seen(drive.record(i, labels=False)).image for i in range(len(drive))]
+        images = [finder.keyframe(drive.scan(i, labels=False)).image for i in range(len(drive))]
         arrays |= {f"{name}_images": np.stack(images), f"{name}_times": drive.poses.times}
         arrays[f"{name}_world_from_lidar"] = drive.poses.world_from_lidar
     with replacing(out / f"{seed}.npz") as temporary, temporary.open("wb") as file:
@@ -182,7 +182,7 @@ def search(
 def _drive(content: dict[str, np.ndarray], name: str, *, drifting: bool) -> Drive:
     images, true, times = (content[f"{name}_{part}"] for part in ("images", "world_from_lidar", "times"))
     given = drifted(true, seed=int(1e3 * times[-1])) if drifting else inverse(true[0]) @ true
-    return Drive(recording_of(name, [Record(image=image) for image in images], times), true, given)
+    return Drive(recording_of(name, [Scan(image=image) for image in images], times), true, given)
 
 
 def _found(params: sglpr_jax.Params, first: Drive, second: Drive) -> Any:

@@ -67,14 +67,14 @@ def _many_files(data: Path | None, folder: Path, scans: int, azimuth_steps: int)
 
 def _parts(params: Params, recording: sglpr_jax.Recording) -> dict[str, Callable[[], object]]:
     """What each part does for one batch."""
-    records = [recording.record(row) for row in range(BATCH)]
+    records = [recording.scan(row) for row in range(BATCH)]
 
-    def see(record: sglpr_jax.Record) -> np.ndarray:
-        return np.asarray(view(record, params.config.grid, image=params.config.image).image)
+    def see(scan: sglpr_jax.Scan) -> np.ndarray:
+        return np.asarray(view(scan, params.config.grid, image=params.config.image).image)
 
-    images = np.stack([see(record) for record in records])
+    images = np.stack([see(scan) for scan in records])
     return {
-        "reading": lambda: [recording.record(row) for row in range(BATCH)],
-        "image": lambda: [see(record) for record in records],
+        "reading": lambda: [recording.scan(row) for row in range(BATCH)],
+        "image": lambda: [see(scan) for scan in records],
         "network": lambda: jax.block_until_ready(sglpr_jax.describe(params, images)),
     }

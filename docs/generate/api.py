@@ -5,12 +5,12 @@ import sglpr_jax
 GROUPS = {
     "From a scan to a descriptor": ["load", "read_scan", "scan_image", "describe", "segment", "forward", "Outputs"],
     "Recordings": [
-        *("open_recording", "recording_names", "Recording", "Record"),
+        *("open_recording", "recording_names", "Recording", "Scan"),
         *("deskewed", "deskew", "submaps", "SubmapBuilder", "scaled"),
     ],
     "Finding places again": ["embed", "DescriptorFile", "Index", "FleetIndex"],
     "Scores": ["evaluate", "Evaluation"],
-    "Loops": ["find_loops", "LoopDetector", "Loop"],
+    "Loops": ["find_loops", "LoopDetector", "LoopClosure"],
     "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],
     "Simulation": ["simulate"],
     "Weights and presets": ["Params", "shipped_weights", "MODELS", "model_preset"],

@@ -143,7 +143,7 @@ def _search(command: LoopsCommand) -> int:
     from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.loops.closure import why_rejected
-    from sglpr_jax.loops.result import why_none
+    from sglpr_jax.loops.result import diagnose_no_loops
     from sglpr_jax.loops.search import can_register, find_loops
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.pose_graph.folder import write_found
@@ -182,7 +182,7 @@ def _search(command: LoopsCommand) -> int:
     paths.append(record_command(effective, command.out))
     if command.rerun is not None:
         write_rerun(found, command.rerun, optimized=corrected)
-    print(found, *why_none(found), *why_rejected(found.rejected), sep="\n")
+    print(found, *diagnose_no_loops(found), *why_rejected(found.rejected), sep="\n")
     if corrected is not None:
         print(corrected)
     print(f"{command.out}: {', '.join(path.name for path in paths)}")

@@ -15,7 +15,7 @@ from sglpr_jax.methods.names import LearnedName
 
 if TYPE_CHECKING:
     from sglpr_jax.methods.learned.method import LearnedMethod
-    from sglpr_jax.training.peer_inputs import Prepared
+    from sglpr_jax.training.peer_inputs import TrainingInputs
     from sglpr_jax.training.peers import ScoreFn
 
 
@@ -104,7 +104,7 @@ def _has_run(out: Path, *, resume: bool) -> bool:
     return has_run
 
 
-def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[Prepared, ScoreFn | None]":
+def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
     """Prepare the training recordings and the held-out ones. Raises ValueError if one of them does not fit."""
     from sglpr_jax.cli.datasets import all_recordings
     from sglpr_jax.training.peer_inputs import prepared
@@ -126,7 +126,7 @@ def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[Prepared, 
 def _learning_rate(
     command: PeersCommand,
     method: "LearnedMethod",
-    data: "Prepared",
+    data: "TrainingInputs",
     score: "ScoreFn | None",
     out: Path,
     stopped: StopRequest,

@@ -18,7 +18,7 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.same_place import NEGATIVE_M
 
 if TYPE_CHECKING:
-    from sglpr_jax.maps.place_map import Relocated
+    from sglpr_jax.maps.place_map import Relocalization
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,12 +79,12 @@ def relocalize(command: RelocalizeCommand) -> None:
         check_made_alike({"scale": command.scale or places.scale}, {"scale": places.scale})
     name = command.scan.name
     if command.frame is None:
-        record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
+        scan = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
     else:
         options = RecordingOptions(command.seq, format=command.format, sensor_height=command.sensor_height)
         recording = command.submap.open(options, command.scan)
-        record, name = query_of(recording, command.frame), f"frame {command.frame} of {name}"
-    found = places.relocate(params, record, candidates=command.candidates)
+        scan, name = query_of(recording, command.frame), f"frame {command.frame} of {name}"
+    found = places.relocate(params, scan, candidates=command.candidates)
     if not found:
         raise ValueError(f"{name}: expected a scan that shows a place, found an almost empty one")
     if command.out is not None:
@@ -101,7 +101,7 @@ def relocalize(command: RelocalizeCommand) -> None:
     console().print(_table(name, found))
 
 
-def _table(name: str, found: "list[Relocated]") -> Table:
+def _table(name: str, found: "list[Relocalization]") -> Table:
     title = escape(f"{name} in the map")  # rich interprets brackets as styles
     shared = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
     caption = shared if len(found) > 1 else None

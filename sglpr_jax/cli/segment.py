@@ -13,7 +13,7 @@ from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
-    from sglpr_jax.data.record import Record
+    from sglpr_jax.data.scan import Scan
     from sglpr_jax.retrieval.image_maps import SemanticMap
 
 RESULT_FILE = "segmentation.json"
@@ -58,10 +58,10 @@ def segment(command: SegmentCommand) -> None:
     command.out.mkdir(parents=True, exist_ok=True)
     labelled = cells = 0
 
-    def save(row: int, record: "Record", found: "SemanticMap") -> None:
+    def save(row: int, scan: "Scan", found: "SemanticMap") -> None:
         nonlocal labelled, cells
         path = command.out / f"{file_name(recording.ids[row])}.png"
-        save_map(path, found, record, categories=params.config.categories)
+        save_map(path, found, scan, categories=params.config.categories)
         labelled, cells = labelled + found.seen.sum(), cells + (found.counts > 0).sum()
 
     scores = segment_recording(params, recording, command.out, on_map=save, min_confidence=least, progress=progress_bar)

@@ -1,1 +1,1 @@
-"""Reads datasets from disk: a `Recording` is a sequence of scans, and a `Record` is one scan with its labels."""
+"""Reads datasets from disk: a `Recording` is a sequence of scans, and a `Scan` is one scan with its labels."""

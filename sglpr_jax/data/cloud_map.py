@@ -67,7 +67,7 @@ RAY_DEG = (0.2, 0.4)
 """Azimuth and elevation between the rays of the sensor, in degrees, as those of a sensor with 64 beams."""
 
 
-def visible_points(
+def remove_hidden_points(
     points: Float32[np.ndarray, "n 3"], *, spacing_m: float, reach_m: float
 ) -> Float32[np.ndarray, "m 3"]:
     """Return the points that a sensor at the origin sees, in their order.

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import naming
 
 GAP_DEG = 0.1
@@ -117,14 +117,14 @@ def offset(points: Cloud, metres: float, rng: np.random.Generator, lasers: objec
     return points - np.array([0, rng.choice((-1, 1)) * metres, 0], np.float32)
 
 
-def rotate_elsewhere(*_: object) -> Cloud:
+def rotate_input(*_: object) -> Cloud:
     """Raise ValueError. Embedding rotates the scans, because it can rotate images, too."""
     raise ValueError("expected a corruption other than rotation; for rotation use the rotation_seed of embed")
 
 
 KINDS: dict[str, Kind] = {
     "clean": Kind(lambda points, *_: points, strengths=()),
-    "rotation": Kind(rotate_elsewhere, strengths=(0.0,)),
+    "rotation": Kind(rotate_input, strengths=(0.0,)),
     "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), limits=(0.0, 360.0)),
     "beams": Kind(
         lambda points, beams, rng, lasers: keep_rings(ring_numbers(points, lasers=lasers), int(beams)),
@@ -218,10 +218,10 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
             "rotated (rotation)"
         )
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
-        record = recording.read_row(row, label_path, lasers or KINDS[corruption.kind].needs_lasers)
-        with naming(record.name), naming(corruption.name):
-            finite = record.only(np.flatnonzero(np.isfinite(record.cloud).all(axis=1)))
+    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
+        scan = recording.read_row(row, label_path, lasers or KINDS[corruption.kind].needs_lasers)
+        with naming(scan.name), naming(corruption.name):
+            finite = scan.only(np.flatnonzero(np.isfinite(scan.cloud).all(axis=1)))
             rng = np.random.default_rng((seed, row))
             points, kept = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
             return dataclasses.replace(finite.only(kept), points=points)

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from sglpr_jax.data.poses import poses_of_scans
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 
 TICK_S = 2e-5
 """Resolution of the times of points, in seconds. A point at 50 m moves by 3 mm in this time if the sensor turns by 180
@@ -101,7 +101,7 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
     A scan without a neighbour within a second is not changed.
 
     Arguments:
-      recording: Recording of scans with times, whose points have times (`Record.point_times`).
+      recording: Recording of scans with times, whose points have times (`Scan.point_times`).
       world_from_lidar: Pose of the LiDAR at the time of each scan, from odometry or a map.
 
     Raises ValueError if scans or points have no times, or if the poses do not fit the scans.
@@ -118,18 +118,18 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
             f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
         )
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
+    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
         """Read a scan without the motion within it. Its points have no times any more."""
-        record = recording.read_row(row, label_path, lasers)
-        point_times = record.point_times
+        scan = recording.read_row(row, label_path, lasers)
+        point_times = scan.point_times
         if point_times is None:
-            raise ValueError(f"{record.name}: expected times of the points, found none")
+            raise ValueError(f"{scan.name}: expected times of the points, found none")
         rows = _neighbours(times, row)
         if len(rows) < 2:
-            return dataclasses.replace(record, time_field=None)
+            return dataclasses.replace(scan, time_field=None)
         trajectory = {"pose_times": times[rows], "world_from_lidar": poses[rows]}
-        points = deskew(record.cloud, point_times, time=float(times[row]), **trajectory)
-        return dataclasses.replace(record, points=points, time_field=None)
+        points = deskew(scan.cloud, point_times, time=float(times[row]), **trajectory)
+        return dataclasses.replace(scan, points=points, time_field=None)
 
     alone = sum(len(_neighbours(times, row)) < 2 for row in range(len(recording)))
     left = f", but {alone} of {len(recording)} scans have no neighbour within {WIDEST_S:g} s" if alone else ""
@@ -149,16 +149,16 @@ def has_point_times(recording: Recording) -> bool:
     """Whether scans have increasing times and the points of the first readable scan have valid times."""
     if recording.has_images or recording.times is None or not (np.diff(recording.times) > 0).all():
         return False
-    record = _first_readable(recording)
+    scan = _first_readable(recording)
     try:
-        return record is not None and record.point_times is not None
+        return scan is not None and scan.point_times is not None
     except ValueError:
         return False
 
 
-def _first_readable(recording: Recording) -> Record | None:
+def _first_readable(recording: Recording) -> Scan | None:
     """The first scan that can be read, among the first `TRIED`."""
     for row in range(min(len(recording), TRIED)):
         with contextlib.suppress(ValueError, OSError):  # whoever reads the scans decides about bad ones
-            return recording.record(row, labels=False)
+            return recording.scan(row, labels=False)
     return None

@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Gravity, SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value, require
@@ -181,9 +181,9 @@ class GroundFilter:
 def with_gravity(recording: Recording, common: Mounting) -> Recording:
     """Estimate the mounting of each scan of a recording about a mean mounting. This reads all scans."""
 
-    def ground_of(row: int, record: Record) -> Mounting | None:
-        assert record.points is not None
-        return estimate_mounting(record.points, near=common)
+    def ground_of(row: int, scan: Scan) -> Mounting | None:
+        assert scan.points is not None
+        return estimate_mounting(scan.points, near=common)
 
     options = {"ahead": os.cpu_count() or 1, "on_bad_scan": lambda scan, error: None}
     ground = [found for _, found in scan_stream(recording, ground_of, **options)]

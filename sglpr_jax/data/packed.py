@@ -14,8 +14,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording, image_record
+from sglpr_jax.data.recording import Recording, image_scan
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import file_name, in_short, read_json, replacing, writing
 
 
@@ -113,12 +113,12 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
                 sync(stream)
     arrays = open_pack(target, scans=len(recording))
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
+    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
         if "images" in arrays:
-            return image_record(recording.paths[row], label_path, read=lambda _: arrays["images"][row])
+            return image_scan(recording.paths[row], label_path, read=lambda _: arrays["images"][row])
         labels = arrays["labels"][row].astype(np.int32) if label_path is not None and "labels" in arrays else None
         numbers = recording.read_row(row, None, True).lasers if lasers else None
-        return Record(points=arrays["points"][row], labels=labels, lasers=numbers)
+        return Scan(points=arrays["points"][row], labels=labels, lasers=numbers)
 
     return recording.derived(read)
 
@@ -173,11 +173,11 @@ def _close(stream: IO) -> None:
 def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
     if recording.has_images:
         return {"images": recording.image(i)}
-    record = recording.record(i)
+    scan = recording.scan(i)
     if not recording.has_labels:
-        return {"points": record.cloud}
-    labels = np.zeros(0, np.uint16) if record.labels is None else record.labels.astype(np.uint16)
-    return {"points": record.cloud, "labels": labels}
+        return {"points": scan.cloud}
+    labels = np.zeros(0, np.uint16) if scan.labels is None else scan.labels.astype(np.uint16)
+    return {"points": scan.cloud, "labels": labels}
 
 
 def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:

@@ -12,38 +12,38 @@ from jaxtyping import Float, Float32, Int, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.png import read_label_image
-from sglpr_jax.data.formats.scan_files import read_labels, read_scan_record
+from sglpr_jax.data.formats.scan_files import read_labels, read_scan_file
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 
-ReadRecord = Callable[[Path, Path | None, bool], Record]
+ReadRecord = Callable[[Path, Path | None, bool], Scan]
 """Reads a record from the file of a scan or image, its label file (None: no labels), and whether to read lasers."""
 
 
-def scan_record(
+def scan_of_file(
     path: Path,
     labels: Path | None = None,
     lasers: bool = False,
     *,
     format: ScanFormat = "auto",
     records: RecordFormat = "kitti",
-) -> Record:
+) -> Scan:
     """Read a scan and its labels, each file once. `lasers` is ignored: the laser numbers are in the file of the points.
 
-    `format` and `records` are those of `read_scan_record`.
+    `format` and `records` are those of `read_scan_file`.
     """
-    found = read_scan_record(path, format=format, records=records)
+    found = read_scan_file(path, format=format, records=records)
     if labels is None:
         return found
     return dataclasses.replace(found, labels=read_labels(labels, points=len(found.cloud)), labels_file=labels)
 
 
-def image_record(
+def image_scan(
     path: Path, labels: Path | None = None, lasers: bool = False, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]
-) -> Record:
+) -> Scan:
     """Read a ready-made image with `read`, and its label image. Images have no lasers."""
     image = read(path)
-    return Record(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
+    return Scan(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
 
 
 ReadUps = Callable[[], tuple[Float[np.ndarray, "n 3"], str] | None]
@@ -147,16 +147,16 @@ class Recording:
         options = getattr(self.read, "keywords", {})
         return {name: value for name, value in options.items() if isinstance(value, str)}
 
-    def record(self, i: int, *, labels: bool = True, lasers: bool = False) -> Record:
+    def scan(self, i: int, *, labels: bool = True, lasers: bool = False) -> Scan:
         """Read scan or image `i`, each of its files once, with or without labels and laser numbers."""
         return self.read_row(i, self.label_paths[i] if labels and self.label_paths else None, lasers)
 
-    def read_row(self, i: int, label_path: Path | None, lasers: bool) -> Record:
+    def read_row(self, i: int, label_path: Path | None, lasers: bool) -> Scan:
         """Read scan or image `i` with the labels of a file, or without labels."""
-        record = self.read(self.paths[i], label_path, lasers)
+        scan = self.read(self.paths[i], label_path, lasers)
         return dataclasses.replace(
-            record,
-            lasers=record.lasers if lasers else None,
+            scan,
+            lasers=scan.lasers if lasers else None,
             name=f"scan {self.ids[i]} of sequence {self.name}",
             time=None if self.times is None else float(self.times[i]),
             mounting=self.mounting_of(i),
@@ -164,7 +164,7 @@ class Recording:
 
     def derived(
         self,
-        read: Callable[[int, Path | None, bool], Record],
+        read: Callable[[int, Path | None, bool], Scan],
         *,
         options: Mapping[str, str] | None = None,
         found: str | None = None,
@@ -180,7 +180,7 @@ class Recording:
         """
         row_of = {path: row for row, path in enumerate(self.paths)}
 
-        def read_path(path: Path, label_path: Path | None, lasers: bool, **options: str) -> Record:
+        def read_path(path: Path, label_path: Path | None, lasers: bool, **options: str) -> Scan:
             return read(row_of[path], label_path, lasers)
 
         return dataclasses.replace(
@@ -197,18 +197,18 @@ class Recording:
 
     def points(self, i: int) -> Float32[np.ndarray, "n 3"]:
         """Read the points of scan `i`. Raises ValueError if the recording contains images."""
-        points = self.record(i, labels=False).points
+        points = self.scan(i, labels=False).points
         if points is None:
             raise ValueError(f"sequence {self.name}: expected scans, found ready-made images")
         return points
 
     def image(self, i: int) -> Float32[np.ndarray, "h w"]:
         """Read image `i`. Raises ValueError if the recording contains scans."""
-        image = self.record(i, labels=False).image
+        image = self.scan(i, labels=False).image
         if image is None:
             raise ValueError(f"sequence {self.name}: expected ready-made images, found scans")
         return image
 
     def labels(self, i: int) -> Int32[np.ndarray, "..."] | None:
         """Read the labels of scan or image `i`. This also reads the scan, to check that the labels fit."""
-        return self.record(i).labels if self.labelled[i] else None
+        return self.scan(i).labels if self.labelled[i] else None

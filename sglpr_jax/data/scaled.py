@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 
 SCALE = "scale"
@@ -40,7 +40,7 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
         raise ValueError(f"sequence {recording.name}: expected scans to scale by {scale}, found ready-made images")
     each = recording.mountings
     return recording.derived(
-        lambda row, label_path, lasers: scaled_record(recording.read_row(row, label_path, lasers), scale),
+        lambda row, label_path, lasers: scaled_scan(recording.read_row(row, label_path, lasers), scale),
         options={SCALE: str(scale)},
         mounting=_scaled_mounting(recording.mounting, scale),
         mountings=None if each is None else tuple(_scaled_mounting(mounting, scale) for mounting in each),
@@ -68,14 +68,14 @@ def scale_of(recording: Recording) -> int:
     return int(recording.read_options.get(SCALE, "1"))
 
 
-def scaled_record(record: Record, scale: Scale) -> Record:
+def scaled_scan(scan: Scan, scale: Scale) -> Scan:
     """Return a scan with its points and the height of its sensor multiplied by `scale`."""
     if scale == 1:
-        return record
-    if record.points is None:
-        raise ValueError(f"{record.name or 'record'}: expected points to scale by {scale}, found an image")
-    points = record.points * np.float32(scale)
-    return dataclasses.replace(record, points=points, mounting=_scaled_mounting(record.mounting, scale))
+        return scan
+    if scan.points is None:
+        raise ValueError(f"{scan.name or 'scan'}: expected points to scale by {scale}, found an image")
+    points = scan.points * np.float32(scale)
+    return dataclasses.replace(scan, points=points, mounting=_scaled_mounting(scan.mounting, scale))
 
 
 def scaled_poses(poses: Float[np.ndarray, "*n 4 4"], factor: float) -> Float[np.ndarray, "*n 4 4"]:

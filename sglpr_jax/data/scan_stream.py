@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NoReturn, TypeVar
 
-from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan, check_cloud
 
 OnBadScan = Callable[[str, Exception], None]
 """Receives the id and the error of a bad scan."""
 T = TypeVar("T")
-Look = Callable[[int, Record], T]
+Look = Callable[[int, Scan], T]
 """Computes a result from the row and the record of a scan."""
 
 
@@ -73,10 +73,10 @@ def _results(
     This thread reads the files, because not every file can be read in parallel. Other threads call `look`.
     """
 
-    def checked(row: int, record: Record) -> T:
-        if record.points is not None:
-            check_cloud(record.points, name=record.name)
-        return look(row, record)
+    def checked(row: int, scan: Scan) -> T:
+        if scan.points is not None:
+            check_cloud(scan.points, name=scan.name)
+        return look(row, scan)
 
     def fail(error: Exception) -> NoReturn:
         raise error
@@ -85,7 +85,7 @@ def _results(
         waiting: deque[tuple[int, Callable[[], T]]] = deque()
         for row in rows:
             try:
-                compute = functools.partial(checked, row, recording.record(row, labels=labels))
+                compute = functools.partial(checked, row, recording.scan(row, labels=labels))
                 waiting.append((row, threads.submit(compute).result if ahead else compute))
             except (ValueError, OSError) as error:
                 waiting.append((row, functools.partial(fail, error)))
@@ -105,7 +105,7 @@ def readable(
     Raises ValueError if all scans are invalid.
     """
     options = {"labels": True, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    good = [row for row, read in scan_stream(recording, lambda row, record: True, **options) if read]
+    good = [row for row, read in scan_stream(recording, lambda row, scan: True, **options) if read]
     check_readable(recording, len(good))
     return recording if len(good) == len(recording) else only(recording, good)
 

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt64
 
 from sglpr_jax.data.poses import poses_of_scans, turned_poses
-from sglpr_jax.data.record import Record, check_cloud
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.data.warning import warn
 
 LENGTH_M, KEYFRAME_M = 10.0, 1.0
@@ -55,7 +55,7 @@ class SubmapBuilder:
     def __init__(self, *, length_m: float = LENGTH_M, keyframe_m: float = KEYFRAME_M):
         """Create a builder of submaps of `length_m` metres of path, of scans at least `keyframe_m` metres apart."""
         self._window = _Window(length_m, keyframe_m)
-        self._clouds: dict[int, Record] = {}
+        self._clouds: dict[int, Scan] = {}
         self._poses: dict[int, Float[np.ndarray, "4 4"]] = {}
 
     def add(
@@ -72,7 +72,7 @@ class SubmapBuilder:
         check_cloud(points)
         pose = turned_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
         rows = self._window.add(pose)
-        self._clouds = {row: self._clouds[row] for row in rows[1:]} | {rows[0]: _thinned(Record(points=points))}
+        self._clouds = {row: self._clouds[row] for row in rows[1:]} | {rows[0]: _thinned(Scan(points=points))}
         self._poses = {row: self._poses[row] for row in rows[1:]} | {rows[0]: pose}
         return _together([self._clouds[row] for row in rows], [self._poses[row] for row in rows]).cloud
 
@@ -106,14 +106,14 @@ def submaps(
     members = [window.add(pose) for pose in poses]
 
     @lru_cache(maxsize=max(map(len, members), default=1))
-    def cloud(row: int, labelled: bool) -> Record:
-        record = recording.record(row, labels=labelled)
-        check_cloud(record.cloud, name=record.name)
-        if labelled and record.labels is None:
-            record = dataclasses.replace(record, labels=np.zeros(len(record.cloud), np.int32))
-        return _thinned(record)
+    def cloud(row: int, labelled: bool) -> Scan:
+        scan = recording.scan(row, labels=labelled)
+        check_cloud(scan.cloud, name=scan.name)
+        if labelled and scan.labels is None:
+            scan = dataclasses.replace(scan, labels=np.zeros(len(scan.cloud), np.int32))
+        return _thinned(scan)
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Record:
+    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
         """Read a submap. Submaps have no laser numbers."""
         newest, *older = members[row]
         clouds = {newest: cloud(newest, label_path is not None)}
@@ -161,7 +161,7 @@ def _motion(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -
     return float(np.linalg.norm(after[:3, 3] - before[:3, 3])), math.degrees(math.acos(np.clip(cosine, -1, 1)))
 
 
-def _together(scans: Sequence[Record], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Record:
+def _together(scans: Sequence[Scan], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Scan:
     """One cloud in the frame of the first one, as its sensor would see it."""
     turned, position = poses[0][:3, :3], poses[0][:3, 3]
     moved = [
@@ -170,27 +170,27 @@ def _together(scans: Sequence[Record], poses: Sequence[Float[np.ndarray, "4 4"]]
     ]
     labels = [scan.labels for scan in scans if scan.labels is not None]
     points = np.concatenate([scans[0].cloud, *moved])
-    return _visible(Record(points=points, labels=np.concatenate(labels) if labels else None))
+    return _visible(Scan(points=points, labels=np.concatenate(labels) if labels else None))
 
 
-def _visible(record: Record) -> Record:
+def _visible(scan: Scan) -> Scan:
     """The nearest point of each direction. A scan also shows nothing behind it, and weights are trained on scans."""
-    x, y, z = record.cloud.T
+    x, y, z = scan.cloud.T
     distance = np.sqrt(x * x + y * y + z * z)
     scale = np.float32(AZIMUTHS / (2 * np.pi))
     azimuth = np.floor(np.arctan2(y, x) * scale).astype(np.int64) + AZIMUTHS
     elevation = np.floor(np.arctan2(z, np.hypot(x, y)) * scale).astype(np.int64) + AZIMUTHS
     direction = (elevation * 2 * AZIMUTHS + azimuth).astype(np.uint64)
     keys = direction << np.uint64(20) | (distance * 500).clip(max=2**20 - 1).astype(np.uint64)
-    return record.only(_first_of(keys, shift=20))
+    return scan.only(_first_of(keys, shift=20))
 
 
-def _thinned(record: Record) -> Record:
+def _thinned(scan: Scan) -> Scan:
     """The first point of each voxel. Points that are not finite are dropped."""
     with np.errstate(over="ignore", invalid="ignore"):
-        inside = np.flatnonzero((np.abs(record.cloud) < (HALF - 1) * VOXEL_M).all(axis=1))  # false for NaN
-    x, y, z = (np.floor(record.cloud[inside].T / np.float32(VOXEL_M)) + HALF).astype(np.uint64)
-    return record.only(inside[_first_of((z * np.uint64(2 * HALF) + y) * np.uint64(2 * HALF) + x, shift=0)])
+        inside = np.flatnonzero((np.abs(scan.cloud) < (HALF - 1) * VOXEL_M).all(axis=1))  # false for NaN
+    x, y, z = (np.floor(scan.cloud[inside].T / np.float32(VOXEL_M)) + HALF).astype(np.uint64)
+    return scan.only(inside[_first_of((z * np.uint64(2 * HALF) + y) * np.uint64(2 * HALF) + x, shift=0)])
 
 
 def _first_of(keys: UInt64[np.ndarray, " n"], *, shift: int) -> Int[np.ndarray, " m"]:

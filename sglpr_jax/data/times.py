@@ -41,12 +41,12 @@ def times_of(
         return seconds
     if counts_rows(seconds):
         return None
-    if found := doubt(seconds):
+    if found := time_unit_problem(seconds):
         raise ValueError(f"{source}: expected times in seconds, found {found}; {ADVICE}")
     return seconds
 
 
-def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
+def time_unit_problem(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
     """Describe why times cannot be seconds of scans or poses: an empty text if they can, or are too few to judge.
 
     With `numbers`, whole numbers count as numbers of frames.

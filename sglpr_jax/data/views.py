@@ -20,7 +20,7 @@ from sglpr_jax.bev import (
     rotate_points,
 )
 from sglpr_jax.data.density_image import check_density_counts, density_bev, density_label_bev
-from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.grid import Grid, ImageKind, check_density_grid
 
 _POINTS_STEP = 16384
@@ -36,7 +36,7 @@ class View(NamedTuple):
 
 
 def view(
-    record: Record,
+    scan: Scan,
     grid: Grid | None,
     *,
     image: ImageKind = "points",
@@ -54,45 +54,45 @@ def view(
 
     Raises ValueError if a scan shows no place (`check_cloud`), or if the grid, the kind or the labels do not fit.
     """
-    classes = classes_of(record, categories) if categories else None
-    if record.points is None:
-        check_ready_made(record, image)
-        return image_view(*picture(record, classes), grid, angle)
-    check_cloud(record.points, name=record.name)
+    classes = classes_of(scan, categories) if categories else None
+    if scan.points is None:
+        check_ready_made(scan, image)
+        return image_view(*picture(scan, classes), grid, angle)
+    check_cloud(scan.points, name=scan.name)
     if grid is None:
         raise ValueError("expected a grid for rasterising a scan, found none")
     if image == "density":
         check_density_grid(grid)
-        points = record.upright_points if angle is None else rotated(record.upright_points, float(angle))
-        return image_view(*picture(Record(points=points), classes), grid)
-    padding = -len(record.points) % _POINTS_STEP
-    points = jnp.asarray(np.pad(record.upright_points, ((0, padding), (0, 0))))
+        points = scan.upright_points if angle is None else rotated(scan.upright_points, float(angle))
+        return image_view(*picture(Scan(points=points), classes), grid)
+    padding = -len(scan.points) % _POINTS_STEP
+    points = jnp.asarray(np.pad(scan.upright_points, ((0, padding), (0, 0))))
     padded = None if classes is None else jnp.asarray(np.pad(classes, (0, padding)))
-    return cloud_view(points, padded, jnp.int32(len(record.points)), grid, angle)
+    return cloud_view(points, padded, jnp.int32(len(scan.points)), grid, angle)
 
 
-def check_ready_made(record: Record, image: ImageKind) -> None:
+def check_ready_made(scan: Scan, image: ImageKind) -> None:
     """Raise ValueError if a record has a ready-made image that is not of the given kind."""
-    if image == "density" and record.image is not None:
-        check_density_counts(record.image, name=record.name)
+    if image == "density" and scan.image is not None:
+        check_density_counts(scan.image, name=scan.name)
 
 
-def classes_of(record: Record, categories: int) -> Int32[np.ndarray, "..."]:
+def classes_of(scan: Scan, categories: int) -> Int32[np.ndarray, "..."]:
     """Return the class of every point or pixel. Raises ValueError if the record has no labels."""
-    classes = record.classes(categories)
+    classes = scan.classes(categories)
     if classes is None:
-        raise ValueError(f"{record.name}: expected labels, found none")
+        raise ValueError(f"{scan.name}: expected labels, found none")
     return classes
 
 
 def picture(
-    record: Record, classes: Int32[np.ndarray, "..."] | None
+    scan: Scan, classes: Int32[np.ndarray, "..."] | None
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"] | None]:
     """Return the whole ready-made image, or the whole density image of a scan, and its map of `classes`."""
-    if record.points is None:
-        assert record.image is not None
-        return record.image, classes
-    points = record.upright_points
+    if scan.points is None:
+        assert scan.image is not None
+        return scan.image, classes
+    points = scan.upright_points
     return density_bev(points), None if classes is None else density_label_bev(points, classes)
 
 

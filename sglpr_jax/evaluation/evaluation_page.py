@@ -68,7 +68,7 @@ def take_pictures(
     rows = recording_rows(recording, source)
     grid = None if recording.has_images else model_preset("sglpr").grid  # ready-made images are not cropped
     images = {
-        frame: np.asarray(view(recording.record(rows[frame], labels=False), grid).image)
+        frame: np.asarray(view(recording.scan(rows[frame], labels=False), grid).image)
         for frame in sorted({frame for found in worst for frame in (found.query, found.answer)})
     }
     if params is None:
@@ -79,8 +79,8 @@ def take_pictures(
     shown = sorted({int(part * len(recording)) for part in SHOWN})
     config, heat = params.config, {}
     for row in shown:
-        record = recording.record(row, labels=bool(config.categories_read))
-        seen = view(record, config.grid, categories=config.categories_read, image=config.image)
+        scan = recording.scan(row, labels=bool(config.categories_read))
+        seen = view(scan, config.grid, categories=config.categories_read, image=config.image)
         heat[recording.ids[row]] = figures.heat_maps(np.asarray(seen.image), heat_maps(params, *seen))
     if not params.config.segments:
         return Pictures(images, "Semantic maps: add --weights that have a segmentation head; these have none.", heat)
@@ -112,7 +112,7 @@ def recording_rows(recording: Recording, source: Input) -> Mapping[int, int]:
 
 def semantic_figure(recording: Recording, params: Params, row: int, *, title: str = "") -> "matplotlib.figure.Figure":
     """Draw point counts and predicted semantic map of a scan, and the true map if the scan has labels (figure 7)."""
-    config, found = params.config, semantic_map(params, recording.record(row))
+    config, found = params.config, semantic_map(params, recording.scan(row))
     return figures.segmentation_panel(
         found.counts,
         found.truth if recording.labelled[row] else None,

@@ -11,10 +11,10 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, missing, render
 from sglpr_jax.evaluation.report import TextTable
 from sglpr_jax.loops.calibration import reliability_of
-from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted, to_upright
-from sglpr_jax.loops.frame_alignment import AlignedParts
+from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, counted, to_upright
+from sglpr_jax.loops.frame_alignment import SegmentAlignment
 from sglpr_jax.loops.keyframes import square_image
-from sglpr_jax.loops.result import FoundLoops, why_none
+from sglpr_jax.loops.result import LoopSearchResult, diagnose_no_loops
 from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.pose_graph.folder import unique_names
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements, trajectory_error
@@ -27,7 +27,7 @@ SHOWN_ROWS = 40
 NO_MATPLOTLIB = missing("The pictures need matplotlib: pip install 'sglpr-jax[viz]'.")
 
 
-def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = None) -> str:
+def loops_page(found: LoopSearchResult, *, optimized: OptimizedTrajectory | None = None) -> str:
     """Self-contained HTML of the page of one or several recordings.
 
     With `optimized` trajectories it shows them before and after the correction.
@@ -52,14 +52,14 @@ def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = Non
     return render(f"Loops of {', '.join(names)}", about, sections)
 
 
-def _about(found: FoundLoops) -> str:
+def _about(found: LoopSearchResult) -> str:
     return f"{found}; {'with odometry' if found.sessions[0].odometry is not None else 'without odometry'}."
 
 
-def _of_recording(found: FoundLoops, optimized: OptimizedTrajectory | None) -> list[Section]:
+def _of_recording(found: LoopSearchResult, optimized: OptimizedTrajectory | None) -> list[Section]:
     """Sections of a recording. With an `optimized` trajectory there is one about the correction."""
     session = found.sessions[0]
-    reasons = why_none(found)
+    reasons = diagnose_no_loops(found)
     why = [Section("Why no loops", [Text(reason) for reason in reasons])] if reasons else []
     corrected = [_corrected(found, optimized)] if optimized is not None and session.frames else []
     return [
@@ -73,7 +73,7 @@ def _of_recording(found: FoundLoops, optimized: OptimizedTrajectory | None) -> l
     ]
 
 
-def _trajectory(found: FoundLoops) -> list[Picture | Text]:
+def _trajectory(found: LoopSearchResult) -> list[Picture | Text]:
     """Draw the loops on the trajectory, if positions are known, and the match of each query."""
     session = found.sessions[0]
     if not figures.can_draw():
@@ -98,18 +98,18 @@ def _trajectory(found: FoundLoops) -> list[Picture | Text]:
     return [*drawn, figure_picture(order, "The loops in time", caption=caption)]
 
 
-def wrong_loops(found: FoundLoops) -> list[Loop]:
+def wrong_loops(found: LoopSearchResult) -> list[LoopClosure]:
     """Return loops whose true positions are more than 20 m apart. Empty if true positions are not known."""
     return [loop for loop in found.loops if (_apart_m(found, loop) or 0) > NEGATIVE_M]
 
 
-def _apart_m(found: FoundLoops, loop: Loop) -> float | None:
+def _apart_m(found: LoopSearchResult, loop: LoopClosure) -> float | None:
     """Return the true distance between the two frames of a loop in metres, or None if it is not known."""
     true = found.sessions[0].recording.positions
     return None if true is None else float(np.linalg.norm(true[loop.query] - true[loop.match]))
 
 
-def _judged(found: FoundLoops) -> str:
+def _judged(found: LoopSearchResult) -> str:
     """Return a sentence with the number of wrong loops. Empty if true positions are not known."""
     session = found.sessions[0]
     if session.recording.positions is None or not found.loops:
@@ -119,11 +119,11 @@ def _judged(found: FoundLoops) -> str:
     return f"{said}: more than {NEGATIVE_M:g} m apart by {session.recording.pose_source}."
 
 
-def _frames(loops: Iterable[Loop]) -> list[tuple[int, int]]:
+def _frames(loops: Iterable[LoopClosure]) -> list[tuple[int, int]]:
     return [(loop.query, loop.match) for loop in loops]
 
 
-def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> Section:
+def _corrected(found: LoopSearchResult, optimized: OptimizedTrajectory) -> Section:
     """Draw the trajectory before and after the correction. If true positions are known, the caption has both errors."""
     session = found.sessions[0]
     assert session.odometry is not None
@@ -145,7 +145,7 @@ def _sentence(said: object) -> str:
     return f"{str(said)[0].upper()}{str(said)[1:]}."
 
 
-def _reliability(found: FoundLoops) -> list[Picture | Text | TextTable]:
+def _reliability(found: LoopSearchResult) -> list[Picture | Text | TextTable]:
     """Plot and table of the share of loops over the predicted probability, if true positions are known."""
     session = found.sessions[0]
     if session.recording.positions is None or found.model is None:
@@ -166,7 +166,7 @@ def _reliability(found: FoundLoops) -> list[Picture | Text | TextTable]:
     return [figure_picture(drawn, "Share of loops over probability", caption=caption), table]
 
 
-def _pairs(query: Recording, match: Recording, loops: Sequence[Loop], *, nothing: str) -> Picture | Text:
+def _pairs(query: Recording, match: Recording, loops: Sequence[LoopClosure], *, nothing: str) -> Picture | Text:
     """Images of some loops, laid over each other."""
     if not loops:
         return missing(nothing)
@@ -181,17 +181,17 @@ def _pairs(query: Recording, match: Recording, loops: Sequence[Loop], *, nothing
     return figure_picture(figures.overlays(pictures), "Pairs of images", caption=caption)
 
 
-def overlay_of(query: Recording, match: Recording, loop: Loop) -> Float[np.ndarray, "h w 3"]:
+def overlay_of(query: Recording, match: Recording, loop: LoopClosure) -> Float[np.ndarray, "h w 3"]:
     """Overlay the images of the two scans of a loop, as RGB colours from 0 to 1 (`figures.overlaid`)."""
     images = (
-        square_image(query.record(loop.query, labels=False)),
-        square_image(match.record(loop.match, labels=False)),
+        square_image(query.scan(loop.query, labels=False)),
+        square_image(match.scan(loop.match, labels=False)),
     )
     level = to_upright(loop, query=query.mounting_of(loop.query), match=match.mounting_of(loop.match))
     return figures.overlaid(*images, level.match_from_query)
 
 
-def _reasons(rejected: Sequence[Rejected]) -> list[Text | TextTable]:
+def _reasons(rejected: Sequence[RejectedClosure]) -> list[Text | TextTable]:
     """Table of the reasons for rejections, with counts."""
     if not rejected:
         return [missing("No pair was rejected.")]
@@ -200,7 +200,7 @@ def _reasons(rejected: Sequence[Rejected]) -> list[Text | TextTable]:
     return [Text(about), TextTable(("reason", "pairs", "meaning"), rows, ("pairs",))]
 
 
-def _table(found: FoundLoops) -> Text | TextTable:
+def _table(found: LoopSearchResult) -> Text | TextTable:
     """Table of the wrong loops, if known, and of the loops with the lowest probabilities."""
     session = found.sessions[0]
     if not found.loops:
@@ -227,7 +227,7 @@ def _table(found: FoundLoops) -> Text | TextTable:
     return TextTable(header, rows, header[2:])
 
 
-def _transforms(found: FoundLoops, names: list[str]) -> Section:
+def _transforms(found: LoopSearchResult, names: list[str]) -> Section:
     """Table of the transforms between the recordings."""
     header = ("match", "query", "loops", "x [m]", "y [m]", "z [m]", "yaw [deg]", "+- [m]", "+- [deg]")
     rows = []
@@ -248,14 +248,14 @@ def _transforms(found: FoundLoops, names: list[str]) -> Section:
     return Section("Transforms", [Text(meaning), TextTable(header, rows, header[2:])])
 
 
-def _numbers(aligned: AlignedParts) -> tuple[str, ...]:
+def _numbers(aligned: SegmentAlignment) -> tuple[str, ...]:
     pose, sigma = aligned.match_from_query, np.sqrt(np.diag(aligned.covariance))
     position = (f"{value:.2f}" for value in pose[:3, 3])
     yaw, spread = np.degrees(yaw_of(pose)), (np.hypot(*sigma[:2]), np.degrees(sigma[5]))
     return (f"{aligned.loops}", *position, f"{yaw:.2f}", *(f"{value:.2f}" for value in spread))
 
 
-def _together(found: FoundLoops, names: list[str], optimized: OptimizedTrajectory | None) -> list[Section]:
+def _together(found: LoopSearchResult, names: list[str], optimized: OptimizedTrajectory | None) -> list[Section]:
     """Section with the trajectories of each group of recordings with a common place, if there is odometry."""
     placed = placements(found)
     if not figures.can_draw() or any(one.odometry is None for one in found.sessions):

@@ -10,9 +10,9 @@ from jaxtyping import Float, Float32
 
 from sglpr_jax.evaluation.loops_page import overlay_of, wrong_loops
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transformed, travelled
 
@@ -33,7 +33,7 @@ def check_installed() -> None:
         raise ImportError("--rerun needs rerun-sdk: pip install 'sglpr-jax[view]'")
 
 
-def write_rerun(found: FoundLoops, path: Path | str, *, optimized: OptimizedTrajectory | None = None) -> None:
+def write_rerun(found: LoopSearchResult, path: Path | str, *, optimized: OptimizedTrajectory | None = None) -> None:
     """Write the loops of a recording as an .rrd file for the rerun viewer.
 
     The time line counts frames. With poses (odometry or, without it, known poses) the file has the trajectory, the
@@ -54,7 +54,7 @@ def write_rerun(found: FoundLoops, path: Path | str, *, optimized: OptimizedTraj
         stream.disconnect()
 
 
-def _poses(found: FoundLoops, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
+def _poses(found: LoopSearchResult, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
     """Pose of each searched frame in the map: corrected, by odometry, or a known position without a rotation."""
     session = found.sessions[0]
     if optimized is not None:
@@ -81,7 +81,7 @@ def _layout(rerun: Any, *, with_map: bool) -> Any:
 def _log_map(
     rerun: Any,
     stream: Any,
-    found: FoundLoops,
+    found: LoopSearchResult,
     poses: Float[np.ndarray, "n 4 4"],
     optimized: OptimizedTrajectory | None,
 ) -> None:
@@ -99,7 +99,7 @@ def _log_map(
         stream.set_time(TIMELINE, sequence=frame)
         stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[AFTER]))
         if frame in keyframes and session.recording.ids[frame] not in session.skipped:
-            points = session.recording.record(frame, labels=False).points
+            points = session.recording.scan(frame, labels=False).points
             if points is not None and len(points):
                 placed = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)
                 stream.log(f"map/scans/{frame}", rerun.Points3D(placed, colors=[SCAN], radii=[0.05]))
@@ -117,7 +117,7 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
     return finite[first]
 
 
-def _log_loops(rerun: Any, stream: Any, found: FoundLoops, poses: Float[np.ndarray, "n 4 4"] | None) -> None:
+def _log_loops(rerun: Any, stream: Any, found: LoopSearchResult, poses: Float[np.ndarray, "n 4 4"] | None) -> None:
     """A line in the map, the pair of images and a text for each loop, at the frame of the query."""
     session = found.sessions[0]
     wrong = {(loop.query, loop.match) for loop in wrong_loops(found)}
@@ -135,12 +135,12 @@ def _log_loops(rerun: Any, stream: Any, found: FoundLoops, poses: Float[np.ndarr
         stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {_said(loop)}"))
 
 
-def _said(loop: Loop) -> str:
+def _said(loop: LoopClosure) -> str:
     overlap = "" if loop.overlap is None else f", overlap {loop.overlap:.2f}"
     return f"probability {loop.probability:.4f}{overlap}"
 
 
-def _log_evidence(rerun: Any, stream: Any, found: FoundLoops) -> None:
+def _log_evidence(rerun: Any, stream: Any, found: LoopSearchResult) -> None:
     """Correlation of the candidate of each frame, and its probability without the evidence of neighbours."""
     session = found.sessions[0]
     if found.model is None or not session.candidates:

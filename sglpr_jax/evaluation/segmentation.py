@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
@@ -86,7 +86,7 @@ def segment_recording(
     recording: Recording,
     folder: Path,
     *,
-    on_map: Callable[[int, Record, SemanticMap], None] | None = None,
+    on_map: Callable[[int, Scan, SemanticMap], None] | None = None,
     min_confidence: float = 0.0,
     progress: Progress = no_progress,
 ) -> SegmentationScore | None:
@@ -105,10 +105,10 @@ def segment_recording(
     shown, confusion = None, np.zeros((config.classes, config.classes), np.int64)
     with progress(f"segment {recording.name}", len(rows)) as show:
         for done, row in enumerate(rows, start=1):
-            record = recording.record(row)
-            found = semantic_map(params, record, min_confidence=min_confidence)
+            scan = recording.scan(row)
+            found = semantic_map(params, scan, min_confidence=min_confidence)
             if on_map is not None:
-                on_map(row, record, found)
+                on_map(row, scan, found)
             if labelled and row == labelled[len(labelled) // 2]:
                 shown = found
             confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=config.classes)

@@ -9,7 +9,7 @@ from pathlib import Path
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.live.endpoints import WAIT_S, Taken
-from sglpr_jax.live.messages import Latest, LiveFrame, Report
+from sglpr_jax.live.messages import LatestScan, LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
 
 
@@ -21,7 +21,7 @@ class BagSource:
         self._posed = options.odometry_topic is not None
         done = [row for row in range(len(recording)) if taken(self._name(row))]
         self._rows = range(done[-1] + 1 if done else 0, len(recording))
-        self._latest: Latest[LiveFrame] = Latest()
+        self._latest: LatestScan[LiveFrame] = LatestScan()
         self._stopped, self._ended = threading.Event(), threading.Event()
 
     @property
@@ -60,14 +60,14 @@ class BagSource:
     def _frame(self, row: int) -> LiveFrame | None:
         """Read a scan, or report that it cannot be read."""
         try:
-            record = self._recording.record(row, labels=False)
+            scan = self._recording.scan(row, labels=False)
         except (ValueError, OSError) as error:
             self._report("scan", f"a scan is left out: {error}")
             return None
         poses, times = self._recording.world_from_lidar, self._recording.times
         pose = poses[row] if self._posed and poses is not None else None
-        record = dataclasses.replace(record, name=self._name(row))
-        return LiveFrame(record, 0.0 if times is None else float(times[row]), pose, time.monotonic())
+        scan = dataclasses.replace(scan, name=self._name(row))
+        return LiveFrame(scan, 0.0 if times is None else float(times[row]), pose, time.monotonic())
 
     def _name(self, row: int) -> str:
         return f"{self._root}, scan {self._recording.ids[row]}"

@@ -48,7 +48,7 @@ class Sink(Protocol):
 
 
 Taken = Callable[[str], bool]
-"""Whether a scan with this `Record.name` is in the map already."""
+"""Whether a scan with this `Scan.name` is in the map already."""
 
 
 def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken = lambda name: False) -> Source:

@@ -15,7 +15,7 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rot
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
-from sglpr_jax.data.recording import scan_record
+from sglpr_jax.data.recording import scan_of_file
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import LiveFrame, Report
@@ -106,7 +106,7 @@ class FolderSource:
         try:
             if self._records is None and self._options.format == "auto" and named_format(path) is None:
                 self._records = record_of_scan(path)
-            record = scan_record(path, format=self._options.format, records=self._records or "kitti")
+            scan = scan_of_file(path, format=self._options.format, records=self._records or "kitti")
             seconds = _time_in_name(path)
             written = path.stat().st_mtime
         except (ValueError, OSError, ImportError) as error:
@@ -118,7 +118,7 @@ class FolderSource:
                 time.sleep(LOOK_S)
                 yield None
         stamp = written if seconds is None else seconds
-        yield LiveFrame(dataclasses.replace(record, name=_name(path)), stamp, pose, received)
+        yield LiveFrame(dataclasses.replace(scan, name=_name(path)), stamp, pose, received)
 
     def _pose(self, row: int, seconds: float | None):
         assert self._poses is not None

@@ -19,10 +19,10 @@ from sglpr_jax.live.messages import LiveFrame, LoopEdge, Report
 from sglpr_jax.live.odometry_input import Clock, Continuity, FirstScans
 from sglpr_jax.loops.arguments import given_pose
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
 
 SETTINGS, FRAMES, LOOPS = "settings.json", "frames.log", "loops.jsonl"
@@ -39,7 +39,7 @@ ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int}
 class LiveScan(NamedTuple):
     """A described scan of a live map."""
 
-    seen: Seen | None
+    keyframe: Keyframe | None
     """None for a scan that is damaged in the log."""
     compared: Fits | None
     pose: Float[np.ndarray, "4 4"] | None
@@ -47,7 +47,7 @@ class LiveScan(NamedTuple):
     part: int
     """Number of the part of the map. A part begins where the motion since the last scan is unknown."""
     name: str
-    """`Record.name` of the scan."""
+    """`Scan.name` of the scan."""
     stamp: float
     time: float
     wall: float
@@ -124,11 +124,11 @@ class LiveMap:
         assert self._log is not None
         scan, lost, known = None, 0, True
         for frame, content in self._log.records():
-            seen, compared, pose, about = read_frame(content, frame, ABOUT, source=self._log.path)
-            scan = LiveScan(seen, compared, pose, **about)
+            keyframe, compared, pose, about = read_frame(content, frame, ABOUT, source=self._log.path)
+            scan = LiveScan(keyframe, compared, pose, **about)
             known = scan.part == self._part
             for _ in range(len(self), frame):
-                self._extend(scan._replace(seen=None, compared=None, name=""))
+                self._extend(scan._replace(keyframe=None, compared=None, name=""))
                 lost += 1
             self._extend(scan._replace(compared=None) if lost else scan)
         if lost:
@@ -144,24 +144,24 @@ class LiveMap:
 
         Raises ValueError if the scan or its odometry is invalid.
         """
-        record, pose = frame.record, given_pose(frame.odometry)
-        if record.points is None or not np.isfinite(record.points).all(axis=1).any():
-            raise ValueError(f"{record.name or 'scan'}: expected points, found none")
-        if record.mounting is None:
-            record = dataclasses.replace(record, mounting=self._mounting.see(record.points))
-        seen = self.detector.finder.seen(record)  # first, because an invalid scan must not count below
+        scan, pose = frame.scan, given_pose(frame.odometry)
+        if scan.points is None or not np.isfinite(scan.points).all(axis=1).any():
+            raise ValueError(f"{scan.name or 'scan'}: expected points, found none")
+        if scan.mounting is None:
+            scan = dataclasses.replace(scan, mounting=self._mounting.see(scan.points))
+        keyframe = self.detector.finder.keyframe(scan)  # first, because an invalid scan must not count below
         clock = self._clock.time(frame.time, frame.received)
         placed = self._continuity.placed(pose, clock)
         if placed is None:
             return None
-        loops = self.detector.add_seen(seen, time=clock, odometry=placed.pose, continues=placed.continues)
+        loops = self.detector.add_keyframe(keyframe, time=clock, odometry=placed.pose, continues=placed.continues)
         compared, stamp, wall = self.detector.finder.compared, float(frame.time), time.time()
         stamp, part = stamp if np.isfinite(stamp) else 0.0, self._part + (not placed.continues)
-        scan = LiveScan(seen, compared, placed.pose, part, record.name, stamp, clock, wall)
-        self._note(scan)
+        described = LiveScan(keyframe, compared, placed.pose, part, scan.name, stamp, clock, wall)
+        self._note(described)
         if self.detector.finder.empty[-1]:
-            self._report("empty", f"{record.name or f'scan {len(self) - 1}'}: expected a place, found almost no points")
-        self._write(scan, loops)
+            self._report("empty", f"{scan.name or f'scan {len(self) - 1}'}: expected a place, found almost no points")
+        self._write(described, loops)
         return [self._edge(loop, frame.received) for loop in loops]
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ class LiveMap:
     def _extend(self, scan: LiveScan) -> None:
         """Add a scan of the log."""
         known = {"compared": scan.compared, "continues": scan.part == self._part}
-        self.detector.add_seen(scan.seen, time=scan.time, odometry=scan.pose, **known)
+        self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **known)
         self._note(scan)
 
     def _note(self, scan: LiveScan) -> None:
@@ -191,11 +191,11 @@ class LiveMap:
         passed = min(max(time.time() - scan.wall, 0.0), MOST_WALL_S)
         self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - passed)
         self._continuity.resume(scan.pose, scan.time, known=known)
-        assert scan.seen is not None
-        self._mounting = FirstScans(self._height, known=scan.seen.mounting)
+        assert scan.keyframe is not None
+        self._mounting = FirstScans(self._height, known=scan.keyframe.mounting)
         self._report("recall", f"the map continues after {len(self)} scans and {len(self.detector.loops)} loops")
 
-    def _restore_loops(self) -> list[Loop]:
+    def _restore_loops(self) -> list[LoopClosure]:
         """Write all loops so far, and return those that the file of an earlier process lacks."""
         written, loops = _pairs(self._loops_path), self.detector.loops
         missed = [loop for loop in loops if (loop.query, loop.match) not in written]
@@ -206,14 +206,14 @@ class LiveMap:
             self._loops_file = os.open(self._loops_path, os.O_WRONLY | os.O_APPEND)
         return missed
 
-    def _write(self, scan: LiveScan, loops: list[Loop]) -> None:
+    def _write(self, scan: LiveScan, loops: list[LoopClosure]) -> None:
         """Write a scan and its loops. After an error the map lives on in memory."""
         if self._log is None:
             return
         try:
             assert scan.compared is not None
             about = {name: getattr(scan, name) for name in ABOUT}
-            self._log.append(len(self) - 1, frame_bytes(scan.seen, scan.compared, pose=scan.pose, **about))
+            self._log.append(len(self) - 1, frame_bytes(scan.keyframe, scan.compared, pose=scan.pose, **about))
             with writing(self._loops_path):
                 os.write(self._loops_file, loop_lines(loops).encode())
             if time.monotonic() - self._synced > SYNC_S:
@@ -226,7 +226,7 @@ class LiveMap:
                 self._log.close()
             self._log = None
 
-    def _edge(self, loop: Loop, received: float) -> LoopEdge:
+    def _edge(self, loop: LoopClosure, received: float) -> LoopEdge:
         """The loop, with the times of its scans, and their poses if these are in the present frame of the odometry."""
         ends = np.array([loop.query, loop.match])
         known = self.detector.finder.motion.same(-1, ends) & (len(self.odometry) > 0)

@@ -10,7 +10,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 
 AGAIN_S = 30.0
 """Minimum time between two lines of the same kind, in seconds."""
@@ -22,7 +22,7 @@ T = TypeVar("T")
 class LiveFrame(NamedTuple):
     """A scan as it arrives."""
 
-    record: Record
+    scan: Scan
     """Points in the LiDAR frame, with the mounting if it is known. The name of a scan from a file is unique; a scan
     whose name is in the map already is not taken again. Scans without a name are always taken."""
     time: float
@@ -78,7 +78,7 @@ class LoopEdge(NamedTuple):
     """Time from the arrival of the latest scan to the loop, in seconds. A loop may belong to a scan before it."""
 
 
-class Latest(Generic[T]):
+class LatestScan(Generic[T]):
     """The newest item. `put` replaces an item that waits and counts it as dropped.
 
     Example:

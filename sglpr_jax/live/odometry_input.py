@@ -29,7 +29,7 @@ WAIT_S = 10.0
 """Time for which the first scans wait for odometry that was asked for, in seconds."""
 
 
-class Placed(NamedTuple):
+class OdometryState(NamedTuple):
     """Pose of a scan for the detector."""
 
     pose: Float[np.ndarray, "4 4"] | None
@@ -59,7 +59,7 @@ class Continuity:
         """
         self._used, self._last, self._time, self._known, self._resumed = pose is not None, pose, time, known, True
 
-    def placed(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> Placed | None:
+    def placed(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> OdometryState | None:
         """Place the next scan by its odometry, or return None if it is to be left out. Times do not decrease."""
         if self._used is None and not self._decided(pose, time):
             return None
@@ -69,7 +69,7 @@ class Continuity:
                 self._report("odometry", "expected no odometry, because the map began without it; it is not used")
             if resumed:
                 self._report("restart", "the way since the restart's last scan is unknown")
-            return Placed(None, not resumed)
+            return OdometryState(None, not resumed)
         if pose is None:
             return self._without(time, resumed)
         continues = self._last is None or (self._known and self._continues(pose, time, resumed))
@@ -77,7 +77,7 @@ class Continuity:
             said = "continues" if continues else "is taken as unknown, and begins in a frame of its own"
             self._report("restart" if resumed else "jump", f"the odometry {said}{' after the restart' * resumed}")
         self._last, self._time, self._known = pose, time, True
-        return Placed(pose, continues)
+        return OdometryState(pose, continues)
 
     def _decided(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> bool:
         """Decide whether the map has odometry. Returns False while the first scans wait for it."""
@@ -90,7 +90,7 @@ class Continuity:
             self._report("wait over", f"expected odometry, found none for {WAIT_S:.0f} s; the map is made without it")
         return True
 
-    def _without(self, time: float, resumed: bool) -> Placed | None:
+    def _without(self, time: float, resumed: bool) -> OdometryState | None:
         """Place a scan without odometry in a map that has odometry."""
         if not resumed and self._known and time - self._time < HOLD_S:
             self._report("hold", "expected odometry at a scan, found none; the scan is left out")
@@ -99,7 +99,7 @@ class Continuity:
             "stopped", f"expected odometry, found none for {time - self._time:.0f} s; loops are found by scans"
         )
         self._known = False
-        return Placed(np.eye(4) if self._last is None else self._last, False)
+        return OdometryState(np.eye(4) if self._last is None else self._last, False)
 
     def _continues(self, pose: Float[np.ndarray, "4 4"], time: float, resumed: bool) -> bool:
         """Whether a pose can follow the last one: near enough, not reset to the origin, and not after a long stop."""

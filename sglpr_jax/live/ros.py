@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from sglpr_jax.live.endpoints import WAIT_S
-from sglpr_jax.live.messages import FrameStatus, Latest, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.messages import FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_messages import (
     CLOUDS,
@@ -74,7 +74,7 @@ class RosSource:
         """Subscribe to the topics. After `missing_s` seconds without scans, the existing topics are reported."""
         self.topic = full_name(options.topic or CLOUD_TOPIC)
         self._transport, self._report, self._missing_s = transport, report, missing_s
-        self._latest: Latest[Received] = Latest()
+        self._latest: LatestScan[Received] = LatestScan()
         self._publisher = None
         self._heard = self._reported = time.monotonic()
         self._closed = threading.Event()
@@ -116,14 +116,14 @@ class RosSource:
     def _frame(self, message: Received) -> LiveFrame | None:
         """Decode a scan and find its pose. Returns None, with a report, for an invalid scan."""
         try:
-            header, record = decode_cloud(message.raw, message.kind)
+            header, scan = decode_cloud(message.raw, message.kind)
         except ValueError as error:
             self._report("cloud", f"{self.topic}: {error}")
             return None
         pose = None
         if self._odometry is not None:
             pose = self._odometry.pose(header.time, header.frame.strip("/"), wait_s=WAIT_S)
-        return LiveFrame(dataclasses.replace(record, time=header.time), header.time, pose, message.at)
+        return LiveFrame(dataclasses.replace(scan, time=header.time), header.time, pose, message.at)
 
     def _look(self) -> None:
         """Report which topics exist if no scans arrive."""

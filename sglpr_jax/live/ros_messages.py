@@ -13,7 +13,7 @@ from jaxtyping import Float
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, Header, RosMessage, read_custom_msg, read_point_cloud2
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short
 from sglpr_jax.live.messages import LoopEdge
 from sglpr_jax.se3 import quaternions
@@ -82,7 +82,7 @@ def _value(field: tuple[Any, Any], given: Any) -> Any:
     return given if given is not None else np.zeros(count, content[0])
 
 
-def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Record]:
+def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Scan]:
     """Decode a scan, a message of one of the types `CLOUDS`.
 
     Raises ValueError if the message is damaged, or the cloud has no x, y and z.

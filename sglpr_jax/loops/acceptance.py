@@ -11,7 +11,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, Loop, Reason, Rejected, frames_of, scaled_drift
+from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, LoopClosure, Reason, RejectedClosure, frames_of, scaled_drift
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.drift import deviations
@@ -36,11 +36,11 @@ AXES = "x forward, y left, z up, of the LiDAR, not of a camera."
 
 
 def accepted(
-    loops: Sequence[Loop],
+    loops: Sequence[LoopClosure],
     path: DrivenPath,
     *,
     drift: DriftModel = DriftModel(),
-) -> tuple[list[Loop], list[Rejected]]:
+) -> tuple[list[LoopClosure], list[RejectedClosure]]:
     """Accept the loops of a whole drive, between gravity-aligned frames, jointly against the path by odometry.
 
     Loops that contradict the odometry are rejected, even if many agree with each other, because loops of repeating
@@ -52,11 +52,11 @@ def accepted(
     pairs = agree([loops[i] for i in left], path, drift=drift)
     members = {left[i] for i in largest_consistent_set(pairs)}
     reasons: tuple[Reason, Reason] = ("contradicts the odometry", "contradicts other loops")
-    rejected = [Rejected(loop, reasons[int(fits[i])]) for i, loop in enumerate(loops) if i not in members]
+    rejected = [RejectedClosure(loop, reasons[int(fits[i])]) for i, loop in enumerate(loops) if i not in members]
     return [loops[i] for i in sorted(members)], rejected
 
 
-def stretches(loops: Sequence[Loop], way: Float[np.ndarray, " n"]) -> int:
+def count_revisit_segments(loops: Sequence[LoopClosure], way: Float[np.ndarray, " n"]) -> int:
     """Number of groups of at least three loops whose queries and matches are more than `SEPARATE_M` apart."""
     query, match = frames_of(loops)
     near = [np.abs(np.subtract.outer(way[frames], way[frames])) <= SEPARATE_M for frames in (query, match)]
@@ -65,7 +65,12 @@ def stretches(loops: Sequence[Loop], way: Float[np.ndarray, " n"]) -> int:
 
 
 def check_odometry(
-    name: str, agreeing: Sequence[Loop], against: Sequence[Loop], path: DrivenPath, config: DetectorConfig, scale: Scale
+    name: str,
+    agreeing: Sequence[LoopClosure],
+    against: Sequence[LoopClosure],
+    path: DrivenPath,
+    config: DetectorConfig,
+    scale: Scale,
 ) -> None:
     """Warn if the odometry contradicts most of the frames of a recording (`name`) that have a loop.
 
@@ -87,20 +92,20 @@ def check_odometry(
         f"{name}: the odometry contradicts the loops of {len(contrary)} of {len(frames)} frames, which are rejected. "
         f"Either places repeat, or the odometry drifts by about {drift}, not by {stated}: {len(members)} of "
         f"{len(against)} loops would then be consistent (separate parts of the drive with at least three of them: "
-        f"{stretches(members, path.travelled)}). If it drifts that much, state it: --drift-percent {percent:.3g} "
-        f"--drift-deg-per-100m {degrees:.3g}. Check also that the poses belong to these scans and use these axes: "
-        f"{AXES}"
+        f"{count_revisit_segments(members, path.travelled)}). If it drifts that much, state it: --drift-percent "
+        f"{percent:.3g} --drift-deg-per-100m {degrees:.3g}. Check also that the poses belong to these scans and use "
+        f"these axes: {AXES}"
     )
 
 
 def registered_loops(
     queries: Recording,
     matches: Recording,
-    loops: list[Loop],
+    loops: list[LoopClosure],
     *,
     knows_height: bool = True,
     should_stop: Callable[[], bool],
-) -> tuple[list[Loop], list[Rejected]]:
+) -> tuple[list[LoopClosure], list[RejectedClosure]]:
     """Registered loops, and those whose scans contradict the images. After `should_stop`, the others are unchanged.
 
     The frames of the loops are rows of the two recordings, which may be the same. If the odometry does not measure
@@ -114,21 +119,21 @@ def registered_loops(
         try:
             found = register(query, match, initial=loop.match_from_query, initial_covariance=loop.covariance)
         except ValueError:  # too few points
-            rejected.append(Rejected(dataclasses.replace(loop, overlap=0.0), "little overlap"))
+            rejected.append(RejectedClosure(dataclasses.replace(loop, overlap=0.0), "little overlap"))
             continue
         fine = dataclasses.replace(loop, **found._asdict())
         if not knows_height:  # registration does not tell equal storeys apart
             up = np.zeros(6)
             up[:3] = upright_from_lidar(queries.mounting_of(loop.query))[2, :3]
             fine = dataclasses.replace(fine, covariance=fine.covariance + UNKNOWN_HEIGHT_M**2 * np.outer(up, up))
-        if found.overlap >= MIN_OVERLAP or (found.overlap >= LITTLE_OVERLAP and agrees(fine, loop)):
+        if found.overlap >= MIN_OVERLAP or (found.overlap >= LITTLE_OVERLAP and registration_agrees(fine, loop)):
             kept.append(fine)
         else:
-            rejected.append(Rejected(fine, "little overlap"))
+            rejected.append(RejectedClosure(fine, "little overlap"))
     return kept, rejected
 
 
-def agrees(fine: Loop, loop: Loop) -> bool:
+def registration_agrees(fine: LoopClosure, loop: LoopClosure) -> bool:
     """Whether the pose by the scans agrees with that by the images, within the covariances of both."""
     error = logarithm((inverse(loop.match_from_query) @ fine.match_from_query)[None])[0]
     least = np.repeat([AGREE_M, np.radians(AGREE_DEG)], 3) ** 2

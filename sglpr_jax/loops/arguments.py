@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short
 from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations
 
@@ -21,9 +21,9 @@ def check_is(value: Any, kind: type, *, by: str) -> None:
         raise TypeError(f"expected a {kind.__name__}, found {_said(value)}; sglpr_jax.{by} returns one")
 
 
-def given_record(scan: Any) -> Record:
+def given_scan(scan: Any) -> Scan:
     """Convert points (n, 3) or an image (h, w) to a record. Accepts records, too."""
-    if isinstance(scan, Record):
+    if isinstance(scan, Scan):
         return scan
     expected = "points (n, 3) or an image (h, w)"
     values = _numbers(scan, np.float32, expected, by="read_scan")
@@ -31,7 +31,7 @@ def given_record(scan: Any) -> Record:
         raise ValueError(f"expected {expected}, found an array of shape {values.shape}")
     if 3 < values.shape[1] <= MOST_COLUMNS:
         raise ValueError(f"expected points (n, 3) of x, y and z only, found an array of shape {values.shape}")
-    return Record(points=values) if values.shape[1] == 3 else Record(image=values)
+    return Scan(points=values) if values.shape[1] == 3 else Scan(image=values)
 
 
 def given_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:

@@ -10,16 +10,16 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.levelling import uprights
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
-from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.comparison import Candidate, Comparer, Query
+from sglpr_jax.loops.candidates import CandidateSearch
+from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.models.params import Params
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
@@ -137,14 +137,14 @@ class _Drive:
     """Stored scans of a drive, and its odometry with a last frame of unknown pose for queries."""
 
     def __init__(self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"]):
-        self.finder, self.recording = CandidateFinder(params), recording
-        self.motion = Motion.of(level_odometry(odometry, uprights(recording)))
+        self.finder, self.recording = CandidateSearch(params), recording
+        self.motion = BevOdometry.of(level_odometry(odometry, uprights(recording)))
         self.motion.add(0.0, continues=False)
         self.stored = StoredScans(self.finder.index)
-        for row, seen in scan_stream(recording, lambda row, record: self.finder.seen(record)):
-            assert seen is not None  # the stream raises the error of a bad scan
-            self.stored.add(row, seen.descriptor, np.asarray(within_reach(seen.image)))
-        self.comparer = Comparer(self.motion, DriftModel())
+        for row, keyframe in scan_stream(recording, lambda row, scan: self.finder.keyframe(scan)):
+            assert keyframe is not None  # the stream raises the error of a bad scan
+            self.stored.add(row, keyframe.descriptor, np.asarray(within_reach(keyframe.image)))
+        self.comparer = KeyframeComparison(self.motion, DriftModel())
 
     def pair(self, frame: int, angle: float, *, positive: bool) -> Candidate | None:
         """Pair of a frame that is rotated by `angle` (radians) and a near or far one, or None."""
@@ -162,12 +162,12 @@ class _Drive:
 
     def rotated(self, frame: int, angle: float) -> Query:
         """A frame rotated by `angle` (radians), as a query of unknown pose."""
-        record = self.recording.record(frame, labels=False)
-        if record.points is not None:
-            turned = Record(points=rotated(record.upright_points, angle))
+        scan = self.recording.scan(frame, labels=False)
+        if scan.points is not None:
+            turned = Scan(points=rotated(scan.upright_points, angle))
         else:
-            whole = even_cells(jnp.asarray(picture(record, None)[0]))
-            turned = Record(image=np.asarray(rotate_image(whole, jnp.float32(angle))))
-        seen = self.finder.seen(turned)
-        image = np.asarray(within_reach(seen.image))
-        return Query(len(self.motion) - 1, seen.descriptor, image, query_spectra(image))
+            whole = even_cells(jnp.asarray(picture(scan, None)[0]))
+            turned = Scan(image=np.asarray(rotate_image(whole, jnp.float32(angle))))
+        keyframe = self.finder.keyframe(turned)
+        image = np.asarray(within_reach(keyframe.image))
+        return Query(len(self.motion) - 1, keyframe.descriptor, image, query_spectra(image))

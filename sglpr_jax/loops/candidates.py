@@ -6,20 +6,20 @@ from jaxtyping import Bool, Float, UInt8
 
 from sglpr_jax.data.levelling import is_tilted, upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.arguments import check_is
-from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query
+from sglpr_jax.loops.comparison import NO_FITS, Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
-from sglpr_jax.loops.keyframes import Seen, StoredScans, described, image_spectrum
+from sglpr_jax.loops.keyframes import Keyframe, StoredScans, described, image_spectrum
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
-from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, Motion
+from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, BevOdometry
 from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.registration.background import Background
-from sglpr_jax.registration.bev_alignment import Alignment, refined
-from sglpr_jax.registration.bev_search import Peak, search_near
+from sglpr_jax.registration.bev_alignment import BevRegistration, refined
+from sglpr_jax.registration.bev_search import CorrelationPeak, search_near
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, transform, yaw_of
@@ -30,7 +30,7 @@ AGREE_M, AGREE_DEG = 0.8, 6.0
 """Maximum distance and angle between two poses of a scan in one frame that agree, in metres and degrees."""
 
 
-class CandidateFinder:
+class CandidateSearch:
     """Finds candidates in a stream of scans. Stores descriptor and compressed image of each scan that is not empty.
 
     Each frame takes a constant number of image comparisons, and a matrix product for the nearest descriptors.
@@ -54,7 +54,7 @@ class CandidateFinder:
         self.mountings: list[Mounting | None] = []
         """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
-        self.motion = Motion()
+        self.motion = BevOdometry()
         self.joined = GrowingArray(np.empty((0, 2), np.int64))
         """Frames of the query and the match of each accepted loop."""
         self.background = Background()
@@ -92,9 +92,9 @@ class CandidateFinder:
         """Number of bytes of all frames: descriptors, compressed images, poses and times."""
         return sum(one.nbytes for one in (self.stored, self.motion, self._times, self._empty))
 
-    def add_seen(
+    def add_keyframe(
         self,
-        seen: Seen | None,
+        keyframe: Keyframe | None,
         *,
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
@@ -113,22 +113,22 @@ class CandidateFinder:
         Raises:
           ValueError: If only some frames have a time or a pose, or if times decrease.
         """
-        self._check(seen, time, odometry)
+        self._check(keyframe, time, odometry)
         frame = len(self)
-        if seen is None:
+        if keyframe is None:
             self.missing.append(frame)
             mounting = self.mountings[-1] if self.mountings else None
-            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), mounting)
-        to_upright = upright_from_lidar(seen.mounting)
+            keyframe = Keyframe(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), mounting)
+        to_upright = upright_from_lidar(keyframe.mounting)
         pose = None if odometry is None else np.asarray(odometry, np.float64) @ inverse(to_upright)
         clock = float(frame) if time is None else time
-        middle = np.asarray(within_reach(seen.image, self.verification)) if seen.image.size else seen.image
-        empty = np.count_nonzero(seen.image) < MIN_CELLS  # too few cells to recognise a place
+        middle = np.asarray(within_reach(keyframe.image, self.verification)) if keyframe.image.size else keyframe.image
+        empty = np.count_nonzero(keyframe.image) < MIN_CELLS  # too few cells to recognise a place
         if not empty:
             self.stored.check(frame, middle)
-        detail, keyframe = self.background.without(middle), self.motion.keyframe
+        detail, reference = self.background.without(middle), self.motion.keyframe
         spectra = None if empty or compared is not None else query_spectra(detail, config=self.verification)
-        query = None if empty else Query(frame, seen.descriptor, detail, spectra)
+        query = None if empty else Query(frame, keyframe.descriptor, detail, spectra)
         self.has_odometry = pose is not None
         link = None if compared is None else compared.link
         if not continues:
@@ -138,19 +138,19 @@ class CandidateFinder:
         elif compared is None and continues:
             link = self._link(query, clock)
         self.motion.add(clock, pose=pose, link=link, continues=continues)
-        self.mountings.append(seen.mounting)
+        self.mountings.append(keyframe.mounting)
         self.motion.path.tilted |= is_tilted(to_upright)
-        comparer = Comparer(self.motion, self.present_drift, self.config, self.verification, self.joined.rows)
+        comparer = KeyframeComparison(self.motion, self.present_drift, self.config, self.verification, self.joined.rows)
         if compared is None:
             compared = (NO_FITS if query is None else comparer.compare(query, self.stored))._replace(link=link)
         candidates = [] if query is None else comparer.candidates(query, compared, self.stored)
-        if middle.size and (self.motion.keyframe != keyframe or not frame):
+        if middle.size and (self.motion.keyframe != reference or not frame):
             self.background.add(middle)
         self._last = None if empty else (frame, detail)
         if self.motion.keyframe == frame:
             self._keyframe = self._last
         if not empty and self.stored.is_new_place(frame, self.motion):
-            self.stored.add(frame, seen.descriptor, detail)
+            self.stored.add(frame, keyframe.descriptor, detail)
         self._empty.append(empty)
         if time is not None:
             self._times.append(time)
@@ -172,18 +172,18 @@ class CandidateFinder:
         self.joined.append((query, match))
         self.stored.close_loop(query, match)
 
-    def seen(self, record: Record) -> Seen:
+    def keyframe(self, scan: Scan) -> Keyframe:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
-        return described(self.params, record)
+        return described(self.params, scan)
 
-    def _link(self, query: Query | None, clock: float) -> Alignment | None:
+    def _link(self, query: Query | None, clock: float) -> BevRegistration | None:
         """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
 
         The image is compared with that of the keyframe and, if this is ambiguous, with that of the last frame. Two
         ambiguous poses that agree are trusted, too. If the images show only the position across a direction, the sensor
         is assumed to move on as before.
         """
-        found, ridge = list[Alignment](), None
+        found, ridge = list[BevRegistration](), None
         for frame, image in dict(filter(None, (self._keyframe, self._last))).items():
             if query is None:
                 break
@@ -205,8 +205,8 @@ class CandidateFinder:
         return ridge
 
     def _check_odometry(
-        self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Alignment | None, *, known: bool
-    ) -> Alignment | None:
+        self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: BevRegistration | None, *, known: bool
+    ) -> BevRegistration | None:
         """Compare the odometry with the images, if this is due. Returns the pose in the frame of the last such scan."""
         if query is None or not self.odometry_check.is_due(pose):
             self.odometry_check.skip()
@@ -219,7 +219,7 @@ class CandidateFinder:
 
     def _linked(
         self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]
-    ) -> tuple[Alignment, Peak | None]:
+    ) -> tuple[BevRegistration, CorrelationPeak | None]:
         """The best pose of a query in the frame of an image, and the best one near an expected pose. None if equal."""
         spectrum = image_spectrum(image, self.verification)
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
@@ -227,10 +227,10 @@ class CandidateFinder:
         same = bool(np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1])
         return best, None if same else peaks.at(1)
 
-    def _refined(self, peak: Peak, image: UInt8[np.ndarray, "m m"], query: Query) -> Alignment:
+    def _refined(self, peak: CorrelationPeak, image: UInt8[np.ndarray, "m m"], query: Query) -> BevRegistration:
         return jax.device_get(refined(query.image, image, peak, config=self.verification))
 
-    def _from_keyframe(self, link: Alignment, frame: int) -> Alignment:
+    def _from_keyframe(self, link: BevRegistration, frame: int) -> BevRegistration:
         """A link with a frame as pose in the frame of the keyframe."""
         key, poses = self.motion.keyframe, self.motion.poses
         if frame == key:
@@ -238,7 +238,7 @@ class CandidateFinder:
         moved = inverse(poses[key]) @ poses[frame] @ transform(float(link.x), float(link.y), float(link.yaw))
         return link._replace(x=moved[0, 3], y=moved[1, 3], yaw=yaw_of(moved))
 
-    def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
+    def _check(self, keyframe: Keyframe | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self):
             return
         for name, given, known in (

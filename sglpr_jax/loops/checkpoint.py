@@ -21,13 +21,13 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, scan_stream
 from sglpr_jax.files import in_short
 from sglpr_jax.frame_log import RunLog
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Fits
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.odometry.config import MOTION_DRIFT
-from sglpr_jax.registration.bev_alignment import Alignment
-from sglpr_jax.registration.bev_search import Peak
-from sglpr_jax.retrieval.reuse import fingerprint
+from sglpr_jax.registration.bev_alignment import BevRegistration
+from sglpr_jax.registration.bev_search import CorrelationPeak
+from sglpr_jax.retrieval.descriptor_cache import fingerprint
 from sglpr_jax.schema import Column, check_about, check_columns
 
 FORMAT = "sglpr-jax unfinished loops 7"
@@ -41,14 +41,14 @@ COLUMNS = {
     "image": Column("uint8", ("h", "h"), optional=True),
     "pose": Column("float64", (4, 4), optional=True),
     "fitted": Column("int64", ("fits",)),
-    "fits": Column("float64", ("fits", len(Peak._fields))),
+    "fits": Column("float64", ("fits", len(CorrelationPeak._fields))),
     "links": Column("float64", (1, len(LINK)), finite=False),
 }
 """Arrays of a frame. A scan that cannot be read has no descriptor and image. NaN in the links is a missing link."""
 
 
 def frame_bytes(
-    seen: Seen | None, compared: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **about: Any
+    keyframe: Keyframe | None, compared: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **about: Any
 ) -> bytes:
     """Return the compressed bytes of a frame, with further JSON values."""
     arrays = {
@@ -56,9 +56,9 @@ def frame_bytes(
         "fits": np.stack(compared.peaks, axis=1).astype(np.float64),
         "links": np.array([[float(getattr(compared.link, name, np.nan)) for name in LINK]]),  # NaN without a link
     }
-    if seen is not None:
-        arrays |= {"descriptor": seen.descriptor, "image": seen.image}
-        about["mounting"] = None if seen.mounting is None else seen.mounting.fields
+    if keyframe is not None:
+        arrays |= {"descriptor": keyframe.descriptor, "image": keyframe.image}
+        about["mounting"] = None if keyframe.mounting is None else keyframe.mounting.fields
     if pose is not None:
         arrays["pose"] = np.asarray(pose, np.float64)
     contiguous = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
@@ -68,7 +68,7 @@ def frame_bytes(
 
 def read_frame(
     content: bytes, frame: int, about: Mapping[str, Any], *, source: Path | None
-) -> tuple[Seen | None, Fits, Float[np.ndarray, "4 4"] | None, dict[str, Any]]:
+) -> tuple[Keyframe | None, Fits, Float[np.ndarray, "4 4"] | None, dict[str, Any]]:
     """Return the scan, the comparisons, the pose and the JSON values of `frame_bytes`.
 
     `about` has the annotation of each JSON value (`schema.check_about`). Raises ValueError, which names the file
@@ -84,20 +84,25 @@ def read_frame(
         fitted, (link,) = arrays["fitted"], arrays["links"]
         if ((fitted < 0) | (fitted >= frame)).any():
             raise ValueError(f"expected comparisons of frame {frame}, found others")
-        seen, mounting = None, found.get("mounting")
+        keyframe, mounting = None, found.get("mounting")
         if "image" in arrays:
             mounting = None if mounting is None else Mounting(**{**mounting, "up": tuple(mounting["up"])})
-            seen = Seen(arrays["descriptor"], arrays["image"], mounting)
+            keyframe = Keyframe(arrays["descriptor"], arrays["image"], mounting)
     except Exception as error:  # another program may have written it
         raise ValueError(f"{source}: expected frame {frame}, found another content ({in_short(error)})") from error
     x, y, yaw, correlation, second, along_m = link
     spread = np.diag([along_m, along_m, 0.0]) ** 2
-    known = None if np.isnan(link).all() else Alignment(x, y, yaw, spread, correlation, second)
-    return seen, Fits(fitted, Peak(*arrays["fits"].T), known), arrays.get("pose"), {name: found[name] for name in about}
+    known = None if np.isnan(link).all() else BevRegistration(x, y, yaw, spread, correlation, second)
+    return (
+        keyframe,
+        Fits(fitted, CorrelationPeak(*arrays["fits"].T), known),
+        arrays.get("pose"),
+        {name: found[name] for name in about},
+    )
 
 
 def settings(
-    recording: Recording, finder: CandidateFinder, **given: np.ndarray | int | float | str | None
+    recording: Recording, finder: CandidateSearch, **given: np.ndarray | int | float | str | None
 ) -> dict[str, Any]:
     """Settings that determine the frames, as JSON values. `given` are further arguments of the run."""
     return {
@@ -123,8 +128,8 @@ def remove(folder: Path) -> None:
 
 def add_scans(
     recording: Recording,
-    finder: CandidateFinder,
-    add: Callable[[Seen | None, Fits | None], None],
+    finder: CandidateSearch,
+    add: Callable[[Keyframe | None, Fits | None], None],
     *,
     rows: Iterable[int] | None = None,
     kept_in: Path | str | None,
@@ -155,15 +160,15 @@ def add_scans(
         )
     with RunLog(path, {} if path is None else settings(recording, finder, **given)) as log:
         for frame, content in enumerate(log.records):
-            seen, compared, *_ = read_frame(content, frame, {}, source=log.path)
-            if seen is None and on_bad_scan is None:
+            keyframe, compared, *_ = read_frame(content, frame, {}, source=log.path)
+            if keyframe is None and on_bad_scan is None:
                 break
-            add(seen, compared)
+            add(keyframe, compared)
         if len(finder):
             on_progress(len(finder))
         left = range(len(finder), len(recording)) if rows is None else rows
         options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-        for _, seen in scan_stream(recording, lambda row, record: finder.seen(record), rows=left, **options):
-            add(seen, None)
+        for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), rows=left, **options):
+            add(keyframe, None)
             if path is not None:
-                log.append(len(finder) - 1, frame_bytes(seen, finder.compared))
+                log.append(len(finder) - 1, frame_bytes(keyframe, finder.compared))

@@ -13,8 +13,8 @@ from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_alignment import Alignment
-from sglpr_jax.se3 import inverse, moved_covariance, transform, yaw_of
+from sglpr_jax.registration.bev_alignment import BevRegistration
+from sglpr_jax.se3 import inverse, transform, transform_covariance, yaw_of
 
 Reason = Literal[
     "little similarity",
@@ -48,7 +48,7 @@ class FrameId(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Loop:
+class LoopClosure:
     """Two frames of one place, with the pose between them."""
 
     query: int
@@ -89,23 +89,23 @@ class Loop:
         return bool(np.linalg.eigvalsh(self.covariance[:2, :2])[-1] > DEGENERATE_M**2)
 
 
-def to_upright(loop: Loop, *, query: Mounting | None, match: Mounting | None) -> Loop:
+def to_upright(loop: LoopClosure, *, query: Mounting | None, match: Mounting | None) -> LoopClosure:
     """The loop between the gravity-aligned frames of two sensors, from that between their LiDAR frames."""
     return _between_frames(loop, upright_from_lidar(query), upright_from_lidar(match))
 
 
-def to_lidar(loop: Loop, *, query: Mounting | None, match: Mounting | None) -> Loop:
+def to_lidar(loop: LoopClosure, *, query: Mounting | None, match: Mounting | None) -> LoopClosure:
     """The loop between the LiDAR frames of two sensors, from that between their gravity-aligned frames."""
     return _between_frames(loop, inverse(upright_from_lidar(query)), inverse(upright_from_lidar(match)))
 
 
-def _between_frames(loop: Loop, query: Float[np.ndarray, "4 4"], match: Float[np.ndarray, "4 4"]) -> Loop:
+def _between_frames(loop: LoopClosure, query: Float[np.ndarray, "4 4"], match: Float[np.ndarray, "4 4"]) -> LoopClosure:
     """The loop between other frames of its scans, given the poses of the old frames in the new ones."""
     pose = match @ loop.match_from_query @ inverse(query)
-    return dataclasses.replace(loop, match_from_query=pose, covariance=moved_covariance(loop.covariance, query))
+    return dataclasses.replace(loop, match_from_query=pose, covariance=transform_covariance(loop.covariance, query))
 
 
-def unseen_covariance(
+def vertical_covariance(
     match_from_query: Float[np.ndarray, "4 4"], query: Mounting | None = None, match: Mounting | None = None
 ) -> Float[np.ndarray, "6 6"]:
     """Covariance of height, roll and pitch of a query in its own frame, between two gravity-aligned scans.
@@ -125,38 +125,38 @@ def unseen_covariance(
         else:
             deviations.append((sensor.height_deviation_m, sensor.tilt_deviation_deg))
     ground, own, other = (np.diag([0, 0, up, np.radians(tilt), np.radians(tilt), 0]) ** 2 for up, tilt in deviations)
-    return own + moved_covariance(other, inverse(match_from_query)) + ground
+    return own + transform_covariance(other, inverse(match_from_query)) + ground
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rejected:
+class RejectedClosure:
     """A pair that looked like a loop closure, and the reason why it was rejected."""
 
-    loop: Loop
+    loop: LoopClosure
     reason: Reason
 
 
 def planar_loop(
     query: int,
     match: int,
-    alignment: Alignment,
+    alignment: BevRegistration,
     *,
     probability: float,
     knows_height: bool = True,
     sensors: tuple[Mounting | None, Mounting | None] = (None, None),
-) -> Loop:
+) -> LoopClosure:
     """Return the loop of two aligned images, between gravity-aligned frames.
 
     If the odometry does not measure height (`knows_height`), the storey is unknown. The deviations of the `sensors` at
-    query and match count (`unseen_covariance`).
+    query and match count (`vertical_covariance`).
     """
     pose = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
-    covariance = unseen_covariance(pose, *sensors)
+    covariance = vertical_covariance(pose, *sensors)
     covariance[2, 2] += 0.0 if knows_height else UNKNOWN_HEIGHT_M**2
     to_query = np.eye(3)
     to_query[:2, :2] = pose[:2, :2].T  # the alignment's covariance is in the match's frame
     covariance[SEEN[:, None], SEEN] = to_query @ np.asarray(alignment.covariance, np.float64) @ to_query.T
-    return Loop(query, match, pose, covariance, float(probability))
+    return LoopClosure(query, match, pose, covariance, float(probability))
 
 
 Planar = Float[np.ndarray, "... 3"]
@@ -171,7 +171,7 @@ def planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:
     return np.concatenate([poses[:, :2, 3], yaw_of(poses)[:, None]], axis=1)
 
 
-def planar_loops(loops: Sequence[Loop]) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
+def planar_loops(loops: Sequence[LoopClosure]) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
     """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries.
 
     Standard deviations are limited to `DEGENERATE_M` along every direction. Otherwise a pose that may lie anywhere
@@ -183,7 +183,7 @@ def planar_loops(loops: Sequence[Loop]) -> tuple[Planar, Float[np.ndarray, "n 3 
     return planar(poses), (axes * np.minimum(variances, DEGENERATE_M**2)[:, None]) @ np.swapaxes(axes, 1, 2)
 
 
-def frames_of(loops: Sequence[Loop]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+def frames_of(loops: Sequence[LoopClosure]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Frames of the queries and of the matches."""
     return np.array([loop.query for loop in loops], np.int64), np.array([loop.match for loop in loops], np.int64)
 
@@ -194,10 +194,10 @@ def compose(a: Planar, b: Planar) -> Planar:
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
     y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
-    return np.stack([x, y, wrapped(a[..., 2] + b[..., 2])], axis=-1)
+    return np.stack([x, y, wrap_angle(a[..., 2] + b[..., 2])], axis=-1)
 
 
-def inverted(a: Planar) -> Planar:
+def inverse_planar(a: Planar) -> Planar:
     """Return b_from_a of a_from_b."""
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     return np.stack([-cos * a[..., 0] - sin * a[..., 1], sin * a[..., 0] - cos * a[..., 1], -a[..., 2]], axis=-1)
@@ -205,10 +205,10 @@ def inverted(a: Planar) -> Planar:
 
 def relative(a: Planar, b: Planar) -> Planar:
     """Return the pose of b in the frame of a (`a_from_b`), from the poses of both in one common frame."""
-    return compose(inverted(a), b)
+    return compose(inverse_planar(a), b)
 
 
-def wrapped(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def wrap_angle(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Wrap angles to the range from -pi to pi."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
@@ -218,7 +218,7 @@ def scaled_drift(drift: DriftModel, factor: float) -> DriftModel:
     return dataclasses.replace(drift, degrees_per_metre=drift.degrees_per_metre / factor)
 
 
-def in_metres(loop: Loop, scale: Scale) -> Loop:
+def in_metres(loop: LoopClosure, scale: Scale) -> LoopClosure:
     """Loop of scans before all lengths were multiplied by `scale`."""
     pose = scaled_poses(loop.match_from_query, 1 / scale)
     return dataclasses.replace(loop, match_from_query=pose, covariance=covariance_in_metres(loop.covariance, scale))
@@ -230,7 +230,7 @@ def covariance_in_metres(covariance: Float[np.ndarray, "6 6"], scale: Scale) -> 
     return covariance * np.outer(units, units)
 
 
-def renumbered(loop: Loop, numbers: Sequence[Int[np.ndarray, " _"]]) -> Loop:
+def renumbered(loop: LoopClosure, numbers: Sequence[Int[np.ndarray, " _"]]) -> LoopClosure:
     """The loop with other numbers of its frames: those of the frames of each session."""
     query, match = numbers[loop.query_session][loop.query], numbers[loop.match_session][loop.match]
     return dataclasses.replace(loop, query=int(query), match=int(match))
@@ -249,12 +249,12 @@ MEANING: dict[Reason, str] = {
 """Meaning of each reason, one sentence each."""
 
 
-def counted(rejected: Sequence[Rejected]) -> dict[Reason, int]:
+def counted(rejected: Sequence[RejectedClosure]) -> dict[Reason, int]:
     """Number of rejected pairs by reason, the most frequent reason first."""
     reasons: list[Reason] = [one.reason for one in rejected]
     return dict(Counter(reasons).most_common())
 
 
-def why_rejected(rejected: Sequence[Rejected]) -> list[str]:
+def why_rejected(rejected: Sequence[RejectedClosure]) -> list[str]:
     """Lines for the user: one for each reason, with its count and meaning."""
     return [f"rejected, {reason} ({count}): {MEANING[reason]}" for reason, count in counted(rejected).items()]

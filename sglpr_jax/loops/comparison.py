@@ -12,15 +12,15 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int, UInt8
 
-from sglpr_jax.loops.closure import Planar, compose, inverted
+from sglpr_jax.loops.closure import Planar, compose, inverse_planar
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.drift import planar_deviations, planar_spread
 from sglpr_jax.loops.keyframes import Keyframes
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_alignment import Alignment, refined
-from sglpr_jax.registration.bev_search import NO_PEAKS, Peak, coarse_correlations, search
+from sglpr_jax.registration.bev_alignment import BevRegistration, refined
+from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, search
 from sglpr_jax.registration.config import VerificationConfig
 
 BATCH, COARSE_BATCH = 8, 32
@@ -44,7 +44,7 @@ class Candidate(NamedTuple):
     query: int
     match: int
     """Frame numbers, counted from 0. The match is the earlier frame."""
-    alignment: Alignment
+    alignment: BevRegistration
     """Pose of the query's image in the frame of the match's image."""
     evidence: Evidence
 
@@ -54,9 +54,9 @@ class Fits(NamedTuple):
 
     frames: Int[np.ndarray, " k"]
     """Frames of the other scans."""
-    peaks: Peak
+    peaks: CorrelationPeak
     """Poses of the query in the frames of the other scans, and correlations."""
-    link: Alignment | None = None
+    link: BevRegistration | None = None
     """Pose of the query in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
@@ -75,10 +75,10 @@ class Query(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Comparer:
+class KeyframeComparison:
     """Compares queries with stored scans."""
 
-    motion: Motion
+    motion: BevOdometry
     """Motion of all frames. It may grow."""
     drift: DriftModel
     """Drift of this motion."""
@@ -134,7 +134,7 @@ class Comparer:
         match, peak, poses = int(fits.frames[row]), fits.peaks.at(row), _planar(fits.peaks)
         deviations, most = self.deviations(query.frame, fits.frames, poses), self.drift.max_deviation
         # The motion between the match and another scan may exclude that the query fits both.
-        others = self.deviations(match, fits.frames, compose(poses, inverted(poses[row])))
+        others = self.deviations(match, fits.frames, compose(poses, inverse_planar(poses[row])))
         distracts = (others > most) | ((deviations > most) & (deviations[row] <= most))
         distracts &= ~self.are_joined(match, fits.frames) & (fits.frames != match)
         rivals = np.where(distracts, fits.peaks.correlation, fits.peaks.second)
@@ -234,13 +234,13 @@ class Comparer:
         return found
 
 
-def _planar(found: Peak) -> Planar:
+def _planar(found: CorrelationPeak) -> Planar:
     return np.stack([np.asarray(values, np.float64) for values in (found.x, found.y, found.yaw)], axis=-1)
 
 
 def _joined(*fits: Fits) -> Fits:
     frames, peaks, _ = zip(*fits, strict=True)
-    return Fits(np.concatenate(frames), Peak(*map(np.concatenate, zip(*peaks, strict=True))))
+    return Fits(np.concatenate(frames), CorrelationPeak(*map(np.concatenate, zip(*peaks, strict=True))))
 
 
 def _batched(matches: Sequence[Complex64[np.ndarray, "s f"]], multiple: int) -> Complex64[np.ndarray, "k s f"]:

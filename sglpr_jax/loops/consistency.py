@@ -9,8 +9,18 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.loops.closure import Loop, Reason, Rejected, compose, frames_of, inverted, planar, planar_loops, relative
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.loops.closure import (
+    LoopClosure,
+    Reason,
+    RejectedClosure,
+    compose,
+    frames_of,
+    inverse_planar,
+    planar,
+    planar_loops,
+    relative,
+)
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 
@@ -25,9 +35,9 @@ CYCLE_DEVIATIONS = 3.0
 
 
 def agree(
-    loops: Sequence[Loop],
+    loops: Sequence[LoopClosure],
     path: DrivenPath,
-    others: Sequence[Loop] | None = None,
+    others: Sequence[LoopClosure] | None = None,
     *,
     way: Float[np.ndarray, " n"] | None = None,
     drift: DriftModel = DriftModel(),
@@ -79,7 +89,7 @@ def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[
         chosen = np.argmax(np.where(left, degrees, -1))
 
 
-def _columns(loops: Sequence[Loop], path: DrivenPath, way: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
+def _columns(loops: Sequence[LoopClosure], path: DrivenPath, way: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
     query, match = frames_of(loops)
     query_pose, match_pose = (planar(path.leveled(frames)) for frames in (query, match))
     poses, covariances = planar_loops(loops)
@@ -99,7 +109,7 @@ def _closes(a: dict[str, np.ndarray], b: dict[str, np.ndarray], drift: DriftMode
     # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: should equal loop a.
     query_from_query = relative(a["query_pose"][:, None], b["query_pose"][None])
     match_from_match = relative(a["match_pose"][:, None], b["match_pose"][None])
-    around = compose(match_from_match, compose(b["pose"][None], inverted(query_from_query)))
+    around = compose(match_from_match, compose(b["pose"][None], inverse_planar(query_from_query)))
     apart = relative(a["pose"][:, None], around)
     length = np.abs(a["query_way"][:, None] - b["query_way"]) + np.abs(a["match_way"][:, None] - b["match_way"])
     lever = np.hypot(query_from_query[..., 0], query_from_query[..., 1])
@@ -120,13 +130,13 @@ MAX_RIVAL = 0.5
 
 
 def accepted_between(
-    loops: Sequence[Loop], motion: Motion, *, drift: DriftModel
-) -> tuple[list[list[Loop]], list[Rejected]]:
+    loops: Sequence[LoopClosure], motion: BevOdometry, *, drift: DriftModel
+) -> tuple[list[list[LoopClosure]], list[RejectedClosure]]:
     """Accept sets of consistent loops between two sessions, at most one for each segment of each session.
 
     Arguments:
       loops: Loops between gravity-aligned frames, rows of the motion, in the order of their queries.
-      motion: Motion of both sessions (`Motion.joined`). Poses of different segments are not comparable.
+      motion: Motion of both sessions (`BevOdometry.joined`). Poses of different segments are not comparable.
       drift: Drift model of the motion.
 
     Returns:
@@ -150,5 +160,5 @@ def accepted_between(
             others = np.arange(len(some))
         else:
             found.append(chosen)
-        rejected += [Rejected(some[k], reason) for k in others]
+        rejected += [RejectedClosure(some[k], reason) for k in others]
     return sorted(found, key=len, reverse=True), rejected

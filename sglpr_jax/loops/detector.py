@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.record import Record
-from sglpr_jax.loops.arguments import given_pose, given_record, given_time
-from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.closure import Loop, Reason, Rejected, to_lidar
+from sglpr_jax.data.scan import Scan
+from sglpr_jax.loops.arguments import given_pose, given_scan, given_time
+from sglpr_jax.loops.candidates import CandidateSearch
+from sglpr_jax.loops.closure import LoopClosure, Reason, RejectedClosure, to_lidar
 from sglpr_jax.loops.comparison import Candidate, Fits
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.loops.sequence import WINDOW_M, Pair, pair_of, probable_loops, verdict
 from sglpr_jax.models.params import Params
@@ -44,14 +44,14 @@ class LoopDetector:
         config: DetectorConfig = DetectorConfig(),
     ):
         """Create a detector without frames. The default `model` of the probabilities is the one shipped."""
-        self.finder = CandidateFinder(params, config)
+        self.finder = CandidateSearch(params, config)
         self.model = default_model() if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
         """All compared pairs or, with `max_places`, that many of the last ones."""
-        self.loops: list[Loop] = []
+        self.loops: list[LoopClosure] = []
         """All returned loops."""
-        self.rejected: list[Rejected] = []
+        self.rejected: list[RejectedClosure] = []
         """All other pairs of frames that are old enough, each with the reason for its rejection."""
         self._waiting: list[Pair] = []
         self._returned: set[int] = set()
@@ -71,12 +71,12 @@ class LoopDetector:
 
     def add(
         self,
-        scan: Record | ArrayLike,
+        scan: Scan | ArrayLike,
         *,
         time: float | np.datetime64 | np.timedelta64 | datetime.datetime | datetime.timedelta | None = None,
         odometry: ArrayLike | None = None,
         continues: bool = True,
-    ) -> list[Loop]:
+    ) -> list[LoopClosure]:
         """Add the next frame. Returns the loops that it closes or confirms, of this and of the last few frames.
 
         Arguments:
@@ -91,20 +91,22 @@ class LoopDetector:
           ValueError: If a value has another shape, if times decrease, or if only some frames have a time or odometry.
           TypeError: If a value is not an array of numbers, for instance a path.
         """
-        record, pose = given_record(scan), given_pose(odometry)
-        return self.add_seen(self.finder.seen(record), time=given_time(time), odometry=pose, continues=continues)
+        scan, pose = given_scan(scan), given_pose(odometry)
+        return self.add_keyframe(self.finder.keyframe(scan), time=given_time(time), odometry=pose, continues=continues)
 
-    def add_seen(
+    def add_keyframe(
         self,
-        seen: Seen | None,
+        keyframe: Keyframe | None,
         *,
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
         compared: Fits | None = None,
         continues: bool = True,
-    ) -> list[Loop]:
-        """Add a described frame (`CandidateFinder.add_seen`), and return loops as `add` does."""
-        candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared, continues=continues)
+    ) -> list[LoopClosure]:
+        """Add a described frame (`CandidateSearch.add_keyframe`), and return loops as `add` does."""
+        candidates = self.finder.add_keyframe(
+            keyframe, time=time, odometry=odometry, compared=compared, continues=continues
+        )
         self.candidates += candidates
         if self.config.max_places is not None:
             del self.candidates[: -self.config.max_places]
@@ -120,18 +122,18 @@ class LoopDetector:
             allowed = [one for one in self._waiting if self._is_allowed(one)]
             others = [one for one in self._waiting if not self._is_allowed(one)]
             reason: Reason = "contradicts the odometry" if self.finder.has_odometry else "contradicts the motion"
-            self.rejected += [Rejected(loop, reason) for loop in self._probable(others, self._contradicting)]
+            self.rejected += [RejectedClosure(loop, reason) for loop in self._probable(others, self._contradicting)]
             new = self._probable(allowed, self._returned)
         self.loops += new
         for loop in new:
             self.finder.close_loop(loop.query, loop.match)
         return new
 
-    def undecided(self) -> list[Rejected]:
+    def undecided(self) -> list[RejectedClosure]:
         """Verdicts about the pairs of the last frames, if no further frame follows."""
         return self._verdicts(self._waiting)
 
-    def _probable(self, pairs: Sequence[Pair], done: set[int]) -> list[Loop]:
+    def _probable(self, pairs: Sequence[Pair], done: set[int]) -> list[LoopClosure]:
         """Pairs that are probable enough given their neighbours. Queries that are `done` are left out, and noted."""
         finder = self.finder
         found = probable_loops(pairs, self.model, finder.motion.path, drift=finder.present_drift, config=self.config)
@@ -143,12 +145,12 @@ class LoopDetector:
         """Whether the motion allows the pose of a pair."""
         return bool(one.evidence.deviation <= self.finder.present_drift.max_deviation)
 
-    def _verdicts(self, pairs: Sequence[Pair]) -> list[Rejected]:
+    def _verdicts(self, pairs: Sequence[Pair]) -> list[RejectedClosure]:
         """Reasons why pairs that were not returned are no loops."""
         left = [one for one in pairs if one.loop.query not in self._returned and self._is_allowed(one)]
         least = self.config.min_probability
-        return [Rejected(self._handed_out(one.loop), verdict(one, self.model, least)) for one in left]
+        return [RejectedClosure(self._handed_out(one.loop), verdict(one, self.model, least)) for one in left]
 
-    def _handed_out(self, loop: Loop) -> Loop:
+    def _handed_out(self, loop: LoopClosure) -> LoopClosure:
         """The loop between LiDAR frames."""
         return to_lidar(loop, query=self.finder.mountings[loop.query], match=self.finder.mountings[loop.match])

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.loops.closure import Loop, Planar, compose, frames_of, planar, planar_loops, wrapped
+from sglpr_jax.loops.closure import LoopClosure, Planar, compose, frames_of, planar, planar_loops, wrap_angle
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import travelled
@@ -16,7 +16,9 @@ STEP_M, STEP_DEG = 0.005, 0.005
 """Smallest standard deviation of an odometry step in a graph, for a sensor that stands still."""
 
 
-def deviations(loops: Sequence[Loop], path: DrivenPath, *, drift: DriftModel = DriftModel()) -> Float[np.ndarray, " k"]:
+def deviations(
+    loops: Sequence[LoopClosure], path: DrivenPath, *, drift: DriftModel = DriftModel()
+) -> Float[np.ndarray, " k"]:
     """Mahalanobis distance of each loop from the odometry between its gravity-aligned frames.
 
     The distance is `sqrt(e' S^-1 e)` with 3 degrees of freedom. e is x, y and yaw of the query by the loop minus those
@@ -52,7 +54,7 @@ def planar_deviations(
     start, last = path.leveled(match), path.leveled(query)
     by_loop = compose(planar(start), match_from_query)
     error = by_loop - planar(last)
-    error[:, 2] = wrapped(error[:, 2])
+    error[:, 2] = wrap_angle(error[:, 2])
     spread = planar_spread(path, query, match, drift=drift)
     turn = np.tile(np.eye(3), (len(error), 1, 1))  # from the frames of the queries to that of the odometry
     turn[:, 0, 0] = turn[:, 1, 1] = np.cos(by_loop[:, 2])

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled_poses
-from sglpr_jax.loops.closure import Loop, covariance_in_metres, frames_of
+from sglpr_jax.loops.closure import LoopClosure, covariance_in_metres, frames_of
 from sglpr_jax.loops.config import INDEPENDENT_M
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.se3 import adjoint, inverse, moved_covariance, yaw_of
+from sglpr_jax.se3 import adjoint, inverse, transform_covariance, yaw_of
 
 ROUNDS = 20
 """Maximum number of Gauss-Newton steps."""
@@ -20,7 +20,7 @@ SMALL = 1e-9
 """Step in metres and radians at which the estimate is final."""
 
 
-class Part(NamedTuple):
+class TrajectorySegment(NamedTuple):
     """Frames of a session whose poses are known in one frame: all of them if there is odometry."""
 
     session: int
@@ -31,11 +31,11 @@ class Part(NamedTuple):
     """Whether the frame is that of the odometry. Otherwise it is the LiDAR's frame at the first row."""
 
 
-class AlignedParts(NamedTuple):
+class SegmentAlignment(NamedTuple):
     """Transform between a part of one session and a part of a later one."""
 
-    match: Part
-    query: Part
+    match: TrajectorySegment
+    query: TrajectorySegment
     match_from_query: Float[np.ndarray, "4 4"]
     """Pose of the query's frame in the match's frame, in metres."""
     covariance: Float[np.ndarray, "6 6"]
@@ -43,7 +43,7 @@ class AlignedParts(NamedTuple):
     loops: int
     """Number of loops from which the transform was estimated."""
 
-    def in_metres(self, scale: Scale) -> "AlignedParts":
+    def in_metres(self, scale: Scale) -> "SegmentAlignment":
         """The transform before all lengths were multiplied by `scale`."""
         pose = scaled_poses(self.match_from_query, 1 / scale)
         return self._replace(match_from_query=pose, covariance=covariance_in_metres(self.covariance, scale))
@@ -60,7 +60,7 @@ class AlignedParts(NamedTuple):
 
 
 def aligned_frames(
-    loops: Sequence[Loop],
+    loops: Sequence[LoopClosure],
     match_poses: Float[np.ndarray, "n 4 4"],
     query_poses: Float[np.ndarray, "m 4 4"],
     *,
@@ -103,7 +103,7 @@ def aligned_frames(
             break
     middle = np.eye(4)
     middle[:3, 3] = np.median(there[:, :3, 3], axis=0)
-    common = moved_covariance(drifted.mean(axis=0), middle)  # drift does not average out
+    common = transform_covariance(drifted.mean(axis=0), middle)  # drift does not average out
     return found, np.linalg.inv(hessian) + common
 
 

@@ -12,19 +12,19 @@ from jaxtyping import Bool, Complex64, Float32, Int, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.grid import DENSITY_MAX_COUNT
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.registration.bev_spectra import match_spectra
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 
 
-class Seen(NamedTuple):
+class Keyframe(NamedTuple):
     """Descriptor and image of a scan or ready-made image."""
 
     descriptor: Float32[np.ndarray, " d"]
@@ -34,16 +34,16 @@ class Seen(NamedTuple):
     """Mounting of the sensor. Descriptor and image are gravity-aligned."""
 
 
-def described(params: Params, record: Record) -> Seen:
+def described(params: Params, scan: Scan) -> Keyframe:
     """Descriptor and 8-bit density image of a scan or image."""
     model = params.config
-    check_ready_made(record, model.image)
-    whole, _ = picture(record, None)
-    if record.points is None or model.image == "density":
+    check_ready_made(scan, model.image)
+    whole, _ = picture(scan, None)
+    if scan.points is None or model.image == "density":
         bev = image_view(whole, None, model.grid).image
     else:
-        bev = view(record, model.grid, image=model.image).image
-    return Seen(np.asarray(describe(params, bev)), _kept(whole), record.mounting)
+        bev = view(scan, model.grid, image=model.image).image
+    return Keyframe(np.asarray(describe(params, bev)), _kept(whole), scan.mounting)
 
 
 def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
@@ -54,9 +54,9 @@ def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
     return np.round(grey).clip(0, 255).astype(np.uint8)
 
 
-def square_image(record: Record) -> UInt8[np.ndarray, "n n"]:
+def square_image(scan: Scan) -> UInt8[np.ndarray, "n n"]:
     """Image for the verification of loops: the density image or the ready-made image, as 8 bits."""
-    return _kept(picture(record, None)[0])
+    return _kept(picture(scan, None)[0])
 
 
 LEVEL = 1
@@ -150,7 +150,7 @@ class StoredScans(Keyframes):
         """Number of bytes of descriptors and compressed images, without the kept spectra (`SPECTRA`)."""
         return self.index.nbytes + self._frames.nbytes + self._repeated.nbytes + sum(map(len, self._packed))
 
-    def is_new_place(self, frame: int, motion: Motion) -> bool:
+    def is_new_place(self, frame: int, motion: BevOdometry) -> bool:
         """Whether a frame is far enough from the last stored scan, or its motion from there is unknown."""
         if not self.keyframe_m or not len(self):
             return True

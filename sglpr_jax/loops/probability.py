@@ -35,7 +35,7 @@ RIDGE = 0.02
 
 
 class Evidence(NamedTuple):
-    """Evidence for pairs of scans, one number of each kind for each pair (`Comparer`)."""
+    """Evidence for pairs of scans, one number of each kind for each pair (`KeyframeComparison`)."""
 
     ambiguity_ratio: Float[np.ndarray, "*n"]
     """Correlation with the best other place, or at the best other pose, divided by the correlation with the match."""

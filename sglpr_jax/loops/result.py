@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
+from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, counted
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
-from sglpr_jax.loops.frame_alignment import AlignedParts
+from sglpr_jax.loops.frame_alignment import SegmentAlignment
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.odometry.config import DriftModel
 
@@ -39,15 +39,15 @@ class Session:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FoundLoops:
+class LoopSearchResult:
     """Loops within and between sessions."""
 
     sessions: tuple[Session, ...]
-    loops: tuple[Loop, ...] = ()
+    loops: tuple[LoopClosure, ...] = ()
     """Loops within each session, then those between each pair of sessions."""
-    rejected: tuple[Rejected, ...] = ()
+    rejected: tuple[RejectedClosure, ...] = ()
     """All other compared pairs, each with the reason for its rejection."""
-    transforms: tuple[AlignedParts, ...] = ()
+    transforms: tuple[SegmentAlignment, ...] = ()
     """Transforms between the frames of sessions. For each pair, the one with most loops is first; none if no common
     place was found. With odometry there is at most one."""
     model: LoopModel | None = None
@@ -74,7 +74,7 @@ class FoundLoops:
         """Numbers of the two sessions of each pair: first that of the matches, then that of the queries."""
         return list(itertools.combinations(range(len(self.sessions)), 2))
 
-    def between(self, match: int, query: int) -> "FoundLoops":
+    def between(self, match: int, query: int) -> "LoopSearchResult":
         """The results whose queries and matches are in these sessions, which may be the same."""
         ends = match, query
         return dataclasses.replace(
@@ -84,7 +84,7 @@ class FoundLoops:
             transforms=tuple(one for one in self.transforms if (one.match.session, one.query.session) == ends),
         )
 
-    def within(self, session: int) -> "FoundLoops":
+    def within(self, session: int) -> "LoopSearchResult":
         """The results of one session, as if it had been searched alone."""
         found, alone = self.between(session, session), {"match_session": 0, "query_session": 0}
         loops = (dataclasses.replace(loop, **alone) for loop in found.loops)
@@ -93,12 +93,12 @@ class FoundLoops:
             found, sessions=(self.sessions[session],), loops=tuple(loops), rejected=tuple(others)
         )
 
-    def without_degenerate(self) -> "FoundLoops":
+    def without_degenerate(self) -> "LoopSearchResult":
         """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction
         (`is_degenerate`). Transforms stay, because their weights contain this uncertainty.
         """
         kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
-        others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
+        others = [RejectedClosure(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
         return dataclasses.replace(self, loops=kept, rejected=tuple(ordered_rejections([*self.rejected, *others])))
 
     def __str__(self) -> str:
@@ -127,25 +127,25 @@ class FoundLoops:
         return f" ({', '.join(counts)})" if self.rejected else ""
 
 
-def _ends(loop: Loop) -> tuple[int, int]:
+def _ends(loop: LoopClosure) -> tuple[int, int]:
     """Sessions of match and query."""
     return loop.match_session, loop.query_session
 
 
-def ordered_rejections(rejected: Iterable[Rejected]) -> list[Rejected]:
+def ordered_rejections(rejected: Iterable[RejectedClosure]) -> list[RejectedClosure]:
     """Pairs within the sessions, then those between them, in the order of their frames."""
 
-    def order(one: Rejected) -> tuple[bool, tuple[int, int], int, int]:
+    def order(one: RejectedClosure) -> tuple[bool, tuple[int, int], int, int]:
         match, query = _ends(one.loop)
         return match != query, (match, query), one.loop.query, one.loop.match
 
     return sorted(rejected, key=order)
 
 
-def why_none(found: FoundLoops) -> list[str]:
+def diagnose_no_loops(found: LoopSearchResult) -> list[str]:
     """Reasons why sessions have no loops of their own, one sentence each. With several, names begin the sentences."""
     if len(found.sessions) != 1:
-        each = ((one.recording.name, why_none(found.within(k))) for k, one in enumerate(found.sessions))
+        each = ((one.recording.name, diagnose_no_loops(found.within(k))) for k, one in enumerate(found.sessions))
         return [f"{name}: {line}" for name, lines in each for line in lines]
     if found.loops:
         return []

@@ -24,20 +24,20 @@ from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.acceptance import AXES, accepted, check_odometry, registered_loops
 from sglpr_jax.loops.arguments import check_is, given_poses
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import Loop, Rejected, in_metres, scaled_drift, to_lidar, to_upright
-from sglpr_jax.loops.comparison import Candidate, Comparer, Fits, Query
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, in_metres, scaled_drift, to_lidar, to_upright
+from sglpr_jax.loops.comparison import Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.frame_alignment import AlignedParts, Part, aligned_frames
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, aligned_frames
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import LoopModel
-from sglpr_jax.loops.result import FoundLoops, Session, ordered_rejections
+from sglpr_jax.loops.result import LoopSearchResult, Session, ordered_rejections
 from sglpr_jax.loops.sequence import pair_of, probable_loops, verdict
 from sglpr_jax.models.params import Params
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.registration.gicp import check_installed, is_installed
@@ -65,8 +65,8 @@ class Searched(NamedTuple):
     given: Input
     """The drift is that of the odometry, estimated from the drive. None without usable odometry."""
     detector: LoopDetector
-    loops: list[Loop]
-    rejected: list[Rejected]
+    loops: list[LoopClosure]
+    rejected: list[RejectedClosure]
 
 
 def find_loops(
@@ -82,7 +82,7 @@ def find_loops(
     kept_in: Path | str | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
-) -> FoundLoops:
+) -> LoopSearchResult:
     """Find the loops of a recording, or those within and between several recordings.
 
     Poses are between LiDAR frames, the frames of the points. A warning says if the odometry contradicts most loops.
@@ -147,7 +147,7 @@ def find_loops(
         searches.append(found)
         own = {"match_session": number, "query_session": number}
         loops += [dataclasses.replace(loop, **own) for loop in found.loops]
-        rejected += [Rejected(dataclasses.replace(other.loop, **own), other.reason) for other in found.rejected]
+        rejected += [RejectedClosure(dataclasses.replace(other.loop, **own), other.reason) for other in found.rejected]
         steps += len(one.recording)
     for match, query in itertools.combinations(range(len(given)), 2):
         pair = _search_pair(
@@ -156,10 +156,10 @@ def find_loops(
         for all_found, new in zip((loops, rejected, transforms), pair, strict=True):
             all_found += new
         steps += len(given[query].recording)
-    return FoundLoops(
+    return LoopSearchResult(
         tuple(_session(one, found, scale, registered) for one, found in zip(given, searches, strict=True)),
         tuple(in_metres(loop, scale) for loop in loops),
-        tuple(Rejected(in_metres(one.loop, scale), one.reason) for one in rejected),
+        tuple(RejectedClosure(in_metres(one.loop, scale), one.reason) for one in rejected),
         tuple(one.in_metres(scale) for one in transforms),
         model=searches[0].detector.model,
         config=config,
@@ -220,10 +220,12 @@ def _search_session(
     (recording, odometry, config), finder = given, detector.finder
     stream = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
 
-    def add(seen: Seen | None, compared: Fits | None) -> None:
+    def add(keyframe: Keyframe | None, compared: Fits | None) -> None:
         row = len(detector)
         time = None if recording.times is None else float(recording.times[row])
-        detector.add_seen(seen, time=time, odometry=None if odometry is None else odometry[row], compared=compared)
+        detector.add_keyframe(
+            keyframe, time=time, odometry=None if odometry is None else odometry[row], compared=compared
+        )
 
     # With a limit of places, the loops decide which scans are stored, and so does all that decides about loops.
     decisive = None if config.max_places is None else repr((config, detector.model)).encode()
@@ -251,12 +253,12 @@ def _search_session(
         again = LoopDetector(finder.params, model=detector.model, config=config)
         options = {"registered": registered, "scale": scale, "kept_in": None, **stream}
         return _search_session(given._replace(odometry=None), again, **options)
-    loops, rejected, path = detector.loops, list[Rejected](), finder.motion.path
+    loops, rejected, path = detector.loops, list[RejectedClosure](), finder.motion.path
     if odometry is not None:
         config = dataclasses.replace(config, drift=finder.present_drift)
         kept, others = accepted([_moved(to_upright, loop, finder) for loop in loops], path, drift=config.drift)
         loops = [_moved(to_lidar, loop, finder) for loop in kept]
-        rejected = [Rejected(_moved(to_lidar, one.loop, finder), one.reason) for one in others]
+        rejected = [RejectedClosure(_moved(to_lidar, one.loop, finder), one.reason) for one in others]
     if registered:
         options = {"knows_height": finder.knows_height, "should_stop": should_stop}
         loops, others = registered_loops(recording, recording, loops, **options)
@@ -268,7 +270,7 @@ def _search_session(
     return Searched(given._replace(config=config), detector, loops, rejected)
 
 
-def _moved(to_frames: Callable[..., Loop], loop: Loop, finder: CandidateFinder) -> Loop:
+def _moved(to_frames: Callable[..., LoopClosure], loop: LoopClosure, finder: CandidateSearch) -> LoopClosure:
     """A loop within a session between the gravity-aligned frames (`to_upright`) or the LiDAR frames (`to_lidar`)."""
     return to_frames(loop, query=finder.mountings[loop.query], match=finder.mountings[loop.match])
 
@@ -281,11 +283,11 @@ def _search_pair(
     registered: bool,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
-) -> tuple[list[Loop], list[Rejected], list[AlignedParts]]:
+) -> tuple[list[LoopClosure], list[RejectedClosure], list[SegmentAlignment]]:
     """Loops, rejected pairs and transforms between two sessions, numbers `match` and `query` of the searched ones."""
     both = searches[match], searches[query]
     finders = both[0].detector.finder, both[1].detector.finder
-    motion = Motion.joined([finder.motion for finder in finders])
+    motion = BevOdometry.joined([finder.motion for finder in finders])
     mountings = [*finders[0].mountings, *finders[1].mountings]
     knows_height = all(finder.knows_height for finder in finders)
     model, config, drift = both[0].detector.model, both[0].given.config, finders[1].present_drift
@@ -293,7 +295,7 @@ def _search_pair(
     pairs = [pair_of(one, model, motion, mountings, knows_height=knows_height) for one in candidates]
     probable = probable_loops(pairs, model, motion.path, drift=drift, config=config)
     improbable = [
-        Rejected(pair.loop, verdict(pair, model, config.min_probability))
+        RejectedClosure(pair.loop, verdict(pair, model, config.min_probability))
         for pair, loop in zip(pairs, probable, strict=True)
         if loop is None
     ]
@@ -301,11 +303,11 @@ def _search_pair(
     sets, contradicting = accepted_between(likely, motion, drift=drift)
     offset, ends = len(finders[0]), {"match_session": match, "query_session": query}
 
-    def of_sessions(loop: Loop) -> Loop:
+    def of_sessions(loop: LoopClosure) -> LoopClosure:
         loop = to_lidar(loop, query=mountings[loop.query], match=mountings[loop.match])
         return dataclasses.replace(loop, query=loop.query - offset, **ends)
 
-    rejected = [Rejected(of_sessions(one.loop), one.reason) for one in [*improbable, *contradicting]]
+    rejected = [RejectedClosure(of_sessions(one.loop), one.reason) for one in [*improbable, *contradicting]]
     loops, transforms = [], []
     for some in sets:
         some = list(map(of_sessions, some))
@@ -321,9 +323,9 @@ def _search_pair(
 
 
 def _candidates_between(
-    matches: CandidateFinder,
-    queries: CandidateFinder,
-    motion: Motion,
+    matches: CandidateSearch,
+    queries: CandidateSearch,
+    motion: BevOdometry,
     *,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
@@ -339,7 +341,7 @@ def _candidates_between(
     if ours != theirs:
         raise ValueError(f"expected images of one size in both recordings, found {theirs} and {ours} cells")
     joined = np.concatenate([matches.joined.rows, queries.joined.rows + offset])
-    comparer = Comparer(motion, queries.present_drift, matches.config, matches.verification, joined)
+    comparer = KeyframeComparison(motion, queries.present_drift, matches.config, matches.verification, joined)
     own = queries.stored.shifted(offset)
     for row, frame in enumerate(own.frames.tolist()):
         if should_stop():
@@ -353,7 +355,9 @@ def _candidates_between(
     return found
 
 
-def _aligned(loops: Sequence[Loop], both: Sequence[Searched], motion: Motion, drift: DriftModel) -> AlignedParts:
+def _aligned(
+    loops: Sequence[LoopClosure], both: Sequence[Searched], motion: BevOdometry, drift: DriftModel
+) -> SegmentAlignment:
     """Transform between the parts of two sessions to which some loops belong."""
     first = loops[0]
     ends = (first.match_session, first.match), (first.query_session, first.query)
@@ -361,12 +365,12 @@ def _aligned(loops: Sequence[Loop], both: Sequence[Searched], motion: Motion, dr
     for (session, frame), one in zip(ends, both, strict=True):
         finder, odometry = one.detector.finder, one.given.odometry
         rows = np.flatnonzero(finder.motion.segments == finder.motion.segments[frame])
-        parts.append(Part(session, int(rows[0]), int(rows[-1]), odometry is not None))
+        parts.append(TrajectorySegment(session, int(rows[0]), int(rows[-1]), odometry is not None))
         if odometry is None:
-            seen = finder.motion.poses @ uprights(one.given.recording)[: len(finder)]
-            poses.append(inverse(seen[rows[0]]) @ seen)
+            keyframe = finder.motion.poses @ uprights(one.given.recording)[: len(finder)]
+            poses.append(inverse(keyframe[rows[0]]) @ keyframe)
         else:
             poses.append(odometry[: len(finder)])
     match_way, query_way = np.split(motion.travelled, [len(poses[0])])
     found = aligned_frames(loops, *poses, match_way=match_way, query_way=query_way, drift=drift)
-    return AlignedParts(parts[0], parts[1], *found, len(loops))
+    return SegmentAlignment(parts[0], parts[1], *found, len(loops))

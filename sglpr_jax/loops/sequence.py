@@ -13,12 +13,12 @@ from jaxtyping import Float, Int
 from scipy.special import expit, logit
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.loops.closure import Loop, Reason, planar_loop
+from sglpr_jax.loops.closure import LoopClosure, Reason, planar_loop
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import INDEPENDENT_M, DetectorConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.probability import Evidence, LoopModel
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 
@@ -31,7 +31,7 @@ BLOCK = 64
 class Pair(NamedTuple):
     """Two frames that may be a loop."""
 
-    loop: Loop
+    loop: LoopClosure
     """The pair between gravity-aligned frames, with its probability alone."""
     evidence: Evidence
     way_m: float
@@ -39,7 +39,7 @@ class Pair(NamedTuple):
 
 
 def pair_of(
-    one: Candidate, model: LoopModel, motion: Motion, mountings: Sequence[Mounting | None], *, knows_height: bool
+    one: Candidate, model: LoopModel, motion: BevOdometry, mountings: Sequence[Mounting | None], *, knows_height: bool
 ) -> Pair:
     """The pair of a candidate. `knows_height`: whether the odometry measures height."""
     probability, sensors = float(model.probability(one.evidence)), (mountings[one.query], mountings[one.match])
@@ -49,7 +49,7 @@ def pair_of(
 
 def probable_loops(
     pairs: Sequence[Pair], model: LoopModel, path: DrivenPath, *, drift: DriftModel, config: DetectorConfig
-) -> list[Loop | None]:
+) -> list[LoopClosure | None]:
     """For each pair, the loop with its probability given the neighbours, or None below `config.min_probability`.
 
     The pairs are in the order of their queries. `path` and its `drift` are those of all frames.

@@ -10,7 +10,7 @@ from sglpr_jax.loops.closure import to_upright
 from sglpr_jax.loops.consistency import accepted_between
 from sglpr_jax.loops.frame_alignment import aligned_frames
 from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import travelled, yaw_of
 
@@ -51,7 +51,7 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     """
     loops = []
     for row in np.unique(np.linspace(0, len(new) - 1, min(len(new), SAMPLE)).astype(int)).tolist():
-        answers = before.relocate_seen(new.seen(row), weights_hash=new.index.weights_hash)
+        answers = before.relocate_keyframe(new.keyframe(row), weights_hash=new.index.weights_hash)
         if answers and answers[0].probability >= MIN_PROBABILITY:
             loops.append(dataclasses.replace(answers[0].loop, query=row))
     if not loops:
@@ -60,7 +60,7 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     for loop in loops:
         level = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
         upright.append(dataclasses.replace(level, query=offset + loop.query))
-    motion = Motion.joined([Motion.of(one.upright_poses()) for one in (before, new)])
+    motion = BevOdometry.joined([BevOdometry.of(one.upright_poses()) for one in (before, new)])
     sets, _ = accepted_between(upright, motion, drift=DriftModel())
     if not sets:
         return None

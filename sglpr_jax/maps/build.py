@@ -16,17 +16,17 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.arguments import check_is, given_poses
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import SPACING_M
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.maps.place_map import PlaceMap, place_names
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
 
 
-class Mapped(NamedTuple):
+class MapBuildResult(NamedTuple):
     """Map of a recording, with the scans that were skipped."""
 
     places: PlaceMap
@@ -47,7 +47,7 @@ def map_recording(
     kept_in: Path | str | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
-) -> Mapped:
+) -> MapBuildResult:
     """Create the map of a recording with known poses. Places have ids RECORDING/SCAN. Empty scans are skipped.
 
     Arguments:
@@ -71,7 +71,7 @@ def map_recording(
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
     check_level(poses, recording)
     recording = with_odometry(recording, poses)
-    finder, descriptions = CandidateFinder(params), list[Seen | None]()
+    finder, descriptions = CandidateSearch(params), list[Keyframe | None]()
     looked_at, places, done = list[int](), list[tuple[int, int]](), 0
     """Rows that are frames of the finder, frame and row of each place, and number of processed rows."""
 
@@ -89,9 +89,9 @@ def map_recording(
             looked_at.append(done)
         done = len(poses)
 
-    def add(seen: Seen | None, compared: Fits | None) -> None:
-        descriptions.append(seen)
-        finder.add_seen(seen, compared=NO_FITS)
+    def add(keyframe: Keyframe | None, compared: Fits | None) -> None:
+        descriptions.append(keyframe)
+        finder.add_keyframe(keyframe, compared=NO_FITS)
 
     add_scans(
         scaled(recording, scale),
@@ -112,22 +112,26 @@ def map_recording(
         )
     skipped = tuple(recording.ids[looked_at[frame]] for frame in finder.missing)
     index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
-    seen = [one for one in (descriptions[frame] for frame, _ in places) if one is not None]
-    return Mapped(_places(index, recording, poses, [row for _, row in places], seen), done, skipped)
+    keyframe = [one for one in (descriptions[frame] for frame, _ in places) if one is not None]
+    return MapBuildResult(_places(index, recording, poses, [row for _, row in places], keyframe), done, skipped)
 
 
 def _places(
-    index: Index, recording: Recording, poses: Float[np.ndarray, "n 4 4"], rows: Sequence[int], seen: Sequence[Seen]
+    index: Index,
+    recording: Recording,
+    poses: Float[np.ndarray, "n 4 4"],
+    rows: Sequence[int],
+    keyframe: Sequence[Keyframe],
 ) -> PlaceMap:
     """Map of some scans of a recording, added to an index without places."""
     names = place_names(recording)
-    descriptors = np.array([one.descriptor for one in seen], np.float32).reshape(-1, index.width)
+    descriptors = np.array([one.descriptor for one in keyframe], np.float32).reshape(-1, index.width)
     index.add(descriptors, ids=[names[row] for row in rows], positions=poses[rows, :3, 3])
     sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
     deviations = [[sensor.height_deviation_m, sensor.tilt_deviation_deg] for sensor in sensors]
     return PlaceMap(
         index,
-        np.stack([one.image for one in seen]) if seen else np.zeros((0, 0, 0), np.uint8),
+        np.stack([one.image for one in keyframe]) if keyframe else np.zeros((0, 0, 0), np.uint8),
         poses[rows],
         np.array([[sensor.height_m, *sensor.up] for sensor in sensors], np.float64).reshape(-1, 4),
         np.array(deviations, np.float64).reshape(-1, 2),  # None becomes NaN

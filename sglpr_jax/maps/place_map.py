@@ -15,20 +15,20 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scaled import scaled_poses, scaled_record
+from sglpr_jax.data.scaled import scaled_poses, scaled_scan
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, replacing
-from sglpr_jax.loops.arguments import given_poses, given_record
-from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.closure import Loop, in_metres, planar_loop, to_lidar
-from sglpr_jax.loops.comparison import Comparer, Query
+from sglpr_jax.loops.arguments import given_poses, given_scan
+from sglpr_jax.loops.candidates import CandidateSearch
+from sglpr_jax.loops.closure import LoopClosure, in_metres, planar_loop, to_lidar
+from sglpr_jax.loops.comparison import KeyframeComparison, Query
 from sglpr_jax.loops.config import CANDIDATES, MIN_CELLS, CandidateConfig, PlaceCount
-from sglpr_jax.loops.keyframes import Keyframes, Seen
+from sglpr_jax.loops.keyframes import Keyframe, Keyframes
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.models.params import Params
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
 from sglpr_jax.retrieval.index import Index
@@ -37,14 +37,14 @@ from sglpr_jax.schema import Column, check_columns
 from sglpr_jax.se3 import ROTATION_TOLERANCE, inverse
 
 
-class Relocated(NamedTuple):
+class Relocalization(NamedTuple):
     """Pose of a scan, estimated from one place of the map."""
 
     place: str
     """Id of the place."""
     world_from_query: Float[np.ndarray, "4 4"]
     """Pose of the scan's LiDAR (tilted if the sensor is) in the frame of the map, in metres."""
-    loop: Loop
+    loop: LoopClosure
     """Loop between scan and place. `match` is the row of the place, `query` is the number of places."""
 
     @property
@@ -53,10 +53,10 @@ class Relocated(NamedTuple):
         return self.loop.probability
 
 
-def with_shared_probability(answers: Sequence[Relocated], *, apart_m: float = NEGATIVE_M) -> list[Relocated]:
+def with_shared_probability(answers: Sequence[Relocalization], *, apart_m: float = NEGATIVE_M) -> list[Relocalization]:
     """Sort answers by probability, scaled so that those of answers more than `apart_m` apart add up to at most 1."""
     answers = sorted(answers, key=lambda one: -one.probability)
-    best: list[Relocated] = []
+    best: list[Relocalization] = []
     for one in answers:
         position = one.world_from_query[:3, 3]
         if all(np.linalg.norm(other.world_from_query[:3, 3] - position) > apart_m for other in best):
@@ -153,11 +153,11 @@ class PlaceMap(Keyframes):
     def relocate(
         self,
         params: Params,
-        record: Record | ArrayLike,
+        scan: Scan | ArrayLike,
         *,
         model: LoopModel | None = None,
         candidates: int = CANDIDATES,
-    ) -> list[Relocated]:
+    ) -> list[Relocalization]:
         """Locate a scan or image in the map.
 
         Arguments:
@@ -177,38 +177,45 @@ class PlaceMap(Keyframes):
           TypeError: If an argument is not parameters, a record or an array.
         """
         check_value(candidates, PlaceCount, "candidates")
-        finder = CandidateFinder(params)
-        given = given_record(record)
-        if len(self) and not isinstance(record, Record) and given.points is not None:
+        finder = CandidateSearch(params)
+        given = given_scan(scan)
+        if len(self) and not isinstance(scan, Scan) and given.points is not None:
             given = dataclasses.replace(given, mounting=self.query_mounting(given.points))
-        seen = finder.seen(scaled_record(given, self.scale))
-        return self.relocate_seen(seen, weights_hash=finder.index.weights_hash, model=model, candidates=candidates)
+        keyframe = finder.keyframe(scaled_scan(given, self.scale))
+        return self.relocate_keyframe(
+            keyframe, weights_hash=finder.index.weights_hash, model=model, candidates=candidates
+        )
 
-    def relocate_seen(
-        self, seen: Seen, *, weights_hash: str | None, model: LoopModel | None = None, candidates: int = CANDIDATES
-    ) -> list[Relocated]:
+    def relocate_keyframe(
+        self,
+        keyframe: Keyframe,
+        *,
+        weights_hash: str | None,
+        model: LoopModel | None = None,
+        candidates: int = CANDIDATES,
+    ) -> list[Relocalization]:
         """Locate a scan, described with the map's scale by weights with this hash. See `relocate`."""
         self.index.check(weights=weights_hash)
-        image = seen.image
+        image = keyframe.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
         if not len(self) or np.count_nonzero(image) < MIN_CELLS:
             return []
         model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
-        query = Query(len(self), seen.descriptor, image, query_spectra(image))
-        comparer = Comparer(self._motion, NO_DRIFT, config)
+        query = Query(len(self), keyframe.descriptor, image, query_spectra(image))
+        comparer = KeyframeComparison(self._motion, NO_DRIFT, config)
         fits = comparer.compare(query, self)
         order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
         answers = []
         for row in order[np.sort(first)][:candidates].tolist():
             one = comparer.candidate(query, fits, row, self)
-            sensors = seen.mounting, self.mounting(one.match).scaled(self.scale)
+            sensors = keyframe.mounting, self.mounting(one.match).scaled(self.scale)
             loop = planar_loop(*one[:3], probability=float(model.probability(one.evidence)), sensors=sensors)
             loop = in_metres(to_lidar(loop, query=sensors[0], match=sensors[1]), self.scale)
             pose = self.world_from_place[one.match] @ loop.match_from_query
-            answers.append(Relocated(self.index.ids[one.match], pose, loop))
+            answers.append(Relocalization(self.index.ids[one.match], pose, loop))
         return with_shared_probability(answers, apart_m=NEGATIVE_M / self.scale)
 
     @property
@@ -221,9 +228,9 @@ class PlaceMap(Keyframes):
         return self.images[row]
 
     @functools.cached_property
-    def _motion(self) -> Motion:
+    def _motion(self) -> BevOdometry:
         """Poses of the scaled places, and a last frame of unknown pose for queries. The world is level."""
-        found = Motion.of(self.upright_poses(self.scale))
+        found = BevOdometry.of(self.upright_poses(self.scale))
         found.add(0.0, continues=False)
         return found
 
@@ -232,9 +239,9 @@ class PlaceMap(Keyframes):
         uprights = [upright_from_lidar(self.mounting(row).scaled(scale)) for row in range(len(self))]
         return scaled_poses(self.world_from_place, float(scale)) @ inverse(np.array(uprights).reshape(-1, 4, 4))
 
-    def seen(self, row: int) -> Seen:
+    def keyframe(self, row: int) -> Keyframe:
         """Description of the scaled scan at a place."""
-        return Seen(self.index.descriptors[row], self.images[row], self.mounting(row).scaled(self.scale))
+        return Keyframe(self.index.descriptors[row], self.images[row], self.mounting(row).scaled(self.scale))
 
     def some(self, rows: Sequence[int]) -> "PlaceMap":
         """Return a map of some of the places, by their numbers."""

@@ -9,15 +9,15 @@ from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.data.formats.scan_files import found_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.pose_graph.odometry_files import BAGS
 
 
 def read_query(
     path: Path, places: PlaceMap, *, format: ScanFormat = "auto", sensor_height: SensorHeight = "auto"
-) -> Record:
+) -> Scan:
     """Read a query for `PlaceMap.relocate`.
 
     Arguments:
@@ -30,7 +30,7 @@ def read_query(
     Raises:
       IsADirectoryError: If `path` is a folder.
       ValueError: If `path` is a bag, or if height and tilt cannot be estimated, because the scan shows no ground.
-        Errors of `scan_record` and `read_image` are raised, too.
+        Errors of `scan_of_file` and `read_image` are raised, too.
     """
     if path.is_dir():
         raise IsADirectoryError(
@@ -39,20 +39,20 @@ def read_query(
     if path.suffix in BAGS:
         raise ValueError(f"{path}: expected one scan or image, found a bag; use --frame")
     if path.suffix == ".png":
-        return Record(image=read_image(path))
-    record = scan_record(path, format=found_format(path) if format == "auto" else format)
-    assert record.points is not None
+        return Scan(image=read_image(path))
+    scan = scan_of_file(path, format=found_format(path) if format == "auto" else format)
+    assert scan.points is not None
     if sensor_height == "auto":
-        return dataclasses.replace(record, mounting=places.query_mounting(record.points))
+        return dataclasses.replace(scan, mounting=places.query_mounting(scan.points))
     if sensor_height != "estimate":
-        return dataclasses.replace(record, mounting=Mounting(float(sensor_height)))
-    found = estimate_mounting(record.points)
+        return dataclasses.replace(scan, mounting=Mounting(float(sensor_height)))
+    found = estimate_mounting(scan.points)
     if found is None:
         raise ValueError(f"{path}: expected ground to estimate the sensor's height, found none; state the height")
-    return dataclasses.replace(record, mounting=found)
+    return dataclasses.replace(scan, mounting=found)
 
 
-def query_of(recording: Recording, frame: int) -> Record:
+def query_of(recording: Recording, frame: int) -> Scan:
     """Read the scan with this number from a recording, as a query for `PlaceMap.relocate`.
 
     Raises ValueError if the recording has no such scan, or if it is left out because it has no pose.
@@ -61,4 +61,4 @@ def query_of(recording: Recording, frame: int) -> Record:
     if not rows.size:
         there = f"{len(recording)} scans from {recording.numbers[0]} to {recording.numbers[-1]}"
         raise ValueError(f"{recording.name}: expected the number of a scan, found {frame}; it has {there}")
-    return recording.record(int(rows[0]), labels=False)
+    return recording.scan(int(rows[0]), labels=False)

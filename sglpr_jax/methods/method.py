@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 
 Takes = Literal["images", "points", "labelled points", "labelled images"]
 """Content of a record that a method needs. Methods on images accept ready-made images and scans."""
@@ -47,7 +47,7 @@ class Method:
     about: dict[str, Any]
     """Name of the method (`method`) and its configuration, as JSON values."""
     takes: Takes
-    prepare: Callable[[Record, float | None], Any]
+    prepare: Callable[[Scan, float | None], Any]
     """Returns the input of a record that is first rotated about z by an angle in radians, if there is one. Called in
     several threads."""
     describe: Callable[[Any], Float[Any, "b d"]]

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
@@ -68,8 +68,8 @@ def trained_method(method: LearnedMethod, weights: str) -> Method:
     variables = load_variables(weights, method)
     hashed = variables_hash(variables)
 
-    def prepare(record: Record, angle: float | None) -> Any:
-        return method.prepare(record if angle is None else rotated_record(record, angle))
+    def prepare(scan: Scan, angle: float | None) -> Any:
+        return method.prepare(scan if angle is None else rotated_scan(scan, angle))
 
     return Method(
         {"method": method.name, "weights": weights},
@@ -121,17 +121,17 @@ def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
     )
 
 
-def _describe_points(method: HandcraftedMethod, record: Record, angle: float | None) -> np.ndarray:
+def _describe_points(method: HandcraftedMethod, scan: Scan, angle: float | None) -> np.ndarray:
     """Return the descriptor of the finite points of a scan, and of their classes if the method needs them."""
-    assert record.points is not None
-    finite = np.isfinite(record.points).all(axis=1)
-    points = record.upright_points[finite]
-    classes = [classes_of(record, 20)[finite]] if method.takes in LABELLED else []
+    assert scan.points is not None
+    finite = np.isfinite(scan.points).all(axis=1)
+    points = scan.upright_points[finite]
+    classes = [classes_of(scan, 20)[finite]] if method.takes in LABELLED else []
     return method.describe(points if angle is None else rotated(points, angle), *classes)
 
 
 def checked_view(
-    record: Record,
+    scan: Scan,
     angle: float | None,
     *,
     grid: Grid | None,
@@ -141,20 +141,20 @@ def checked_view(
 ) -> View:
     """Return the `view` of a record. Raises ValueError if too few cells within `field` (None: all) are occupied."""
     turn = None if angle is None else jnp.float32(angle)
-    found = view(record, grid, image=image, categories=categories, angle=turn)
+    found = view(scan, grid, image=image, categories=categories, angle=turn)
     seen = np.asarray(found.image)
     cells = np.count_nonzero(seen if field is None else seen * field)
     if cells < FEWEST_CELLS:
         raise ValueError(
-            f"{record.name}: expected points in at least {FEWEST_CELLS} cells of the window of {seen.shape[0]} x"
+            f"{scan.name}: expected points in at least {FEWEST_CELLS} cells of the window of {seen.shape[0]} x"
             f" {seen.shape[1]} cells, found points in {cells}"
         )
     return found
 
 
-def rotated_record(record: Record, angle: float) -> Record:
+def rotated_scan(scan: Scan, angle: float) -> Scan:
     """Return a record whose scan or image is rotated by an angle in radians, counter-clockwise."""
-    if record.points is not None:
-        return dataclasses.replace(record, points=rotated(record.upright_points, angle), mounting=None)
-    assert record.image is not None
-    return dataclasses.replace(record, image=np.asarray(rotate_image(jnp.asarray(record.image), jnp.float32(angle))))
+    if scan.points is not None:
+        return dataclasses.replace(scan, points=rotated(scan.upright_points, angle), mounting=None)
+    assert scan.image is not None
+    return dataclasses.replace(scan, image=np.asarray(rotate_image(jnp.asarray(scan.image), jnp.float32(angle))))

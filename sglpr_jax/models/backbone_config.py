@@ -42,7 +42,7 @@ class BackboneSizes(abc.ABC):
     @property
     @abc.abstractmethod
     def pictures(self) -> dict[str, str]:
-        """Maps to draw as heat maps: from the title of each picture to the name of its map in `Seen.named`."""
+        """Maps to draw as heat maps: from the title of each picture to a name in `BackboneFeatures.named`."""
 
 
 class _Stages(BackboneSizes):

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models.backbone_config import CircularConfig
 from sglpr_jax.models.convolution import Convolution
-from sglpr_jax.models.layers import LayerNorm, Linear, Seen
+from sglpr_jax.models.layers import BackboneFeatures, LayerNorm, Linear
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,11 +24,11 @@ class CircularBackbone:
 
     config: CircularConfig
 
-    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
+    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> BackboneFeatures:
         maps = CircularNet(self.config, name="rings")(image)  # the name in weight files
-        return Seen(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
+        return BackboneFeatures(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
 
-    def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
+    def decode(self, seen: BackboneFeatures) -> Float[Array, "b _ _ _"]:
         return CircularDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
 
 

@@ -19,7 +19,7 @@ from sglpr_jax.models.initial import Initial, Initializer
 NORM_FLOOR = 1e-12
 
 
-class Seen(NamedTuple):
+class BackboneFeatures(NamedTuple):
     """Output of a backbone for a batch of images."""
 
     features: Float[Array, "b p q c"]

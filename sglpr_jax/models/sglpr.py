@@ -13,7 +13,7 @@ from sglpr_jax.models.circular import CircularBackbone
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
-from sglpr_jax.models.layers import Seen
+from sglpr_jax.models.layers import BackboneFeatures
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import PlaceHead, raw_input
 from sglpr_jax.models.segmentation_head import segmentation_head
@@ -23,7 +23,7 @@ from sglpr_jax.models.swin_unet import SglprBackbone, SwinBackbone
 def _backbone(config: BackboneConfig, *, circular: bool) -> SwinBackbone | CircularBackbone | SglprBackbone:
     """Return the layers of a backbone, which belong to the calling Flax module.
 
-    They have two calls: from images to `Seen`, and from `Seen` to pixels (`decode`, at most once).
+    They have two calls: from images to `BackboneFeatures`, and from these to pixels (`decode`, at most once).
     """
     match config:
         case SwinConfig():
@@ -78,7 +78,9 @@ class SGLPR(nn.Module):
         if not (segment and config.segments):
             return Outputs(descriptor, None, maps)
         if pixels is None:
-            pixels = backbone.decode(Seen(seen.features[::segment], [one[::segment] for one in seen.finer], {}))
+            pixels = backbone.decode(
+                BackboneFeatures(seen.features[::segment], [one[::segment] for one in seen.finer], {})
+            )
         else:
             pixels = pixels[::segment]
         logits = segmentation_head(pixels, image[::segment], config)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models.backbone_config import SglprConfig, SwinConfig
 from sglpr_jax.models.circular import CircularDecoder, CircularNet
-from sglpr_jax.models.layers import LayerNorm, Linear, Seen
+from sglpr_jax.models.layers import BackboneFeatures, LayerNorm, Linear
 from sglpr_jax.models.swin import MLP_RATIO, PatchEmbed, PatchExpand, PatchMerging, SwinStage
 
 
@@ -100,12 +100,12 @@ class SwinBackbone:
     config: SwinConfig
     circular: bool
 
-    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
+    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> BackboneFeatures:
         swin_unet = SwinUnet(self.config, self.config.patch, circular=self.circular, name="backbone")
         tokens, named = swin_unet(image, train=train)
-        return Seen(tokens, [], named)
+        return BackboneFeatures(tokens, [], named)
 
-    def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
+    def decode(self, seen: BackboneFeatures) -> Float[Array, "b _ _ _"]:
         return PatchExpand(self.config.patch, seen.features.shape[-1], name="expand")(seen.features)
 
 
@@ -115,10 +115,10 @@ class SglprBackbone:
 
     config: SglprConfig
 
-    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
+    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> BackboneFeatures:
         return CircularSwin(self.config, name="backbone")(image, train=train)
 
-    def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
+    def decode(self, seen: BackboneFeatures) -> Float[Array, "b _ _ _"]:
         return CircularDecoder(self.config.stem.widths, name="decoder")([*seen.finer, seen.features])
 
 
@@ -128,10 +128,10 @@ class CircularSwin(nn.Module):
     config: SglprConfig
 
     @nn.compact
-    def __call__(self, polar: Float[Array, "b p q c"], *, train: bool = False) -> Seen:
+    def __call__(self, polar: Float[Array, "b p q c"], *, train: bool = False) -> BackboneFeatures:
         """Returns the tokens as features. The maps are named as in the circular CNN and the Swin-Unet."""
         config = self.config
         maps = CircularNet(config.stem, name="stem")(polar)
         swin_unet = SwinUnet(config, 1, config.mlp_ratio, circular=True, shift_each_way=True, name="swin_unet")
         tokens, named = swin_unet(maps[-1], train=train)
-        return Seen(tokens, maps[:-1], {f"circular_block{i}": x for i, x in enumerate(maps[1:])} | named)
+        return BackboneFeatures(tokens, maps[:-1], {f"circular_block{i}": x for i, x in enumerate(maps[1:])} | named)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform, travelled, yaw_of
 
 MOST_STEPS = 3.0
@@ -59,7 +59,7 @@ NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m",
 """Numbers of a frame beside its pose."""
 
 
-class Motion:
+class BevOdometry:
     """Planar poses of all added frames, in order."""
 
     def __init__(self):
@@ -75,7 +75,7 @@ class Motion:
         return len(self.path)
 
     @classmethod
-    def of(cls, poses: Float[np.ndarray, "n 4 4"]) -> "Motion":
+    def of(cls, poses: Float[np.ndarray, "n 4 4"]) -> "BevOdometry":
         """Motion along known poses, such as those of the places of a map."""
         found, numbers = cls(), np.zeros(len(poses), NUMBERS)
         numbers["travelled"] = travelled(poses) if len(poses) else 0.0
@@ -84,7 +84,7 @@ class Motion:
         return found
 
     @classmethod
-    def joined(cls, motions: "Sequence[Motion]") -> "Motion":
+    def joined(cls, motions: "Sequence[BevOdometry]") -> "BevOdometry":
         """Motion of several recordings, one after the other, in level worlds. Poses between two of them are unknown."""
         found = cls()
         for one in motions:
@@ -127,7 +127,7 @@ class Motion:
         time: float,
         *,
         pose: Float[np.ndarray, "4 4"] | None = None,
-        link: Alignment | None = None,
+        link: BevRegistration | None = None,
         continues: bool = True,
     ) -> None:
         """Add a frame at `time`, by its `pose` from odometry or its `link` with the keyframe.
@@ -258,7 +258,7 @@ class Motion:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return self.segments[rows] == self.segments[frame]
 
-    def is_trusted(self, link: Alignment, prior: Float[np.ndarray, " 3"]) -> bool:
+    def is_trusted(self, link: BevRegistration, prior: Float[np.ndarray, " 3"]) -> bool:
         """Whether a link shows how the sensor moved: no other pose fits about as well.
 
         A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
@@ -272,7 +272,7 @@ class Motion:
         fits = bool(link.correlation >= MIN_CORRELATION and link.second <= most)
         return fits and not self.is_ridge(link)
 
-    def is_ridge(self, link: Alignment) -> bool:
+    def is_ridge(self, link: BevRegistration) -> bool:
         """Whether the images show the position across a direction only, as between walls."""
         return bool(link.along_m > MAX_ALONG_M and link.correlation < EQUAL)
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 STEP_M, STEP_DEG, MOST_FRAMES = 2.5, 15.0, 20
@@ -51,7 +51,7 @@ class OdometryCheck:
         """Note a scan that is not compared."""
         self._frames += 1
 
-    def add(self, pose: Float[np.ndarray, "4 4"], link: Alignment | None) -> None:
+    def add(self, pose: Float[np.ndarray, "4 4"], link: BevRegistration | None) -> None:
         """Add a compared scan: its gravity-aligned pose, and by the images that in the last compared one."""
         step = np.eye(4) if self._last is None else inverse(self._last) @ pose
         far = float(np.linalg.norm(step[:3, 3])) > MAX_STEP_M

@@ -14,14 +14,14 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.deskew import has_point_times, poses_at
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.warning import warn
 from sglpr_jax.frame_log import RunLog
 from sglpr_jax.odometry.config import OdometryConfig
-from sglpr_jax.retrieval.reuse import fingerprint
+from sglpr_jax.retrieval.descriptor_cache import fingerprint
 from sglpr_jax.se3 import inverse, transformed
 
 MIN_POINTS = 100
@@ -181,7 +181,7 @@ class _FrontEnd:
         return float(np.isfinite(apart).mean())
 
 
-def _input(record: Record, timed: bool) -> _Input:
+def _input(record: Scan, timed: bool) -> _Input:
     """Measured points of a scan, with their times if the scans have times."""
     points = record.points
     assert points is not None

@@ -19,7 +19,7 @@ SUMS = 1 + 3 + 6 + 6
 """Number of integrals of a frame: length, position, and the upper halves of two matrices."""
 
 
-class Between(NamedTuple):
+class PathIntegrals(NamedTuple):
     """Integrals over the path from one frame to another, in metres and products of metres."""
 
     length: Float[np.ndarray, " k"]
@@ -30,10 +30,10 @@ class Between(NamedTuple):
     squares: Float[np.ndarray, "k d d"]
     """Integral of the outer product of the position with itself."""
 
-    def turned(self, rotation: Float[np.ndarray, "d 3"]) -> "Between":
+    def turned(self, rotation: Float[np.ndarray, "d 3"]) -> "PathIntegrals":
         """The integrals in rotated coordinates, or in some of them."""
         twice = (rotation @ part @ rotation.T for part in (self.directions, self.squares))
-        return Between(self.length, self.first @ rotation.T, *twice)
+        return PathIntegrals(self.length, self.first @ rotation.T, *twice)
 
 
 class DrivenPath:
@@ -86,7 +86,7 @@ class DrivenPath:
         return Mounting(0.0, tuple((self._up / np.linalg.norm(self._up)).tolist())).upright_from_lidar
 
     def extend(self, poses: Float[np.ndarray, "n 4 4"], guessed_m: Float[np.ndarray, " n"] | None = None) -> None:
-        """Add the poses of the next frames, and the guessed motion up to each of them (`Motion.guessed_m`).
+        """Add the poses of the next frames, and the guessed motion up to each of them (`BevOdometry.guessed_m`).
 
         Guessed motion drifts like a path of unknown direction.
         """
@@ -110,10 +110,10 @@ class DrivenPath:
         poses[:, :3] = self.level @ poses[:, :3]
         return poses
 
-    def between(self, start: Int[np.ndarray, " k"], end: Int[np.ndarray, " k"]) -> Between:
+    def between(self, start: Int[np.ndarray, " k"], end: Int[np.ndarray, " k"]) -> PathIntegrals:
         """Integrals from frames `start` to frames `end`. Positions count from that of the first frame."""
         length, first, directions, squares = np.split(self._sums.rows[end] - self._sums.rows[start], [1, 4, 10], axis=1)
-        return Between(length[:, 0], first, directions[:, WHOLE], squares[:, WHOLE])
+        return PathIntegrals(length[:, 0], first, directions[:, WHOLE], squares[:, WHOLE])
 
     def position_deviations(
         self, rows: Int[np.ndarray, " k"], frame: int, *, drift: DriftModel = DriftModel()

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of
 from sglpr_jax.files import in_short, parse_json, write_text
-from sglpr_jax.loops.closure import Loop, Rejected
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.drift import step_deviations
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import are_rotations, from_quaternions, inverse, quaternions
@@ -41,7 +41,7 @@ class Graph(NamedTuple):
 
 def write_g2o(
     path: Path | str,
-    loops: Sequence[Loop],
+    loops: Sequence[LoopClosure],
     chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]] = (),
     *,
     drift: DriftModel = DriftModel(),
@@ -129,20 +129,20 @@ def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
 
 
 def write_loops_jsonl(
-    path: Path | str, loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None
+    path: Path | str, loops: Sequence[LoopClosure], ids: Ids | None = None, recordings: Ids | None = None
 ) -> None:
     """Write loops, one JSON object a line, with the `ids` and the `recordings` of the frames if they are given."""
     write_text(Path(path), loop_lines(loops, ids, recordings))
 
 
-def loop_lines(loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None) -> str:
+def loop_lines(loops: Sequence[LoopClosure], ids: Ids | None = None, recordings: Ids | None = None) -> str:
     """Return the lines of a file of `write_loops_jsonl`."""
     names = ("match_from_query", "covariance", "probability", "overlap")
     return "".join(_line(loop, names, ids, recordings) for loop in loops)
 
 
 def write_rejected_jsonl(
-    path: Path | str, rejected: Sequence[Rejected], ids: Ids | None = None, recordings: Ids | None = None
+    path: Path | str, rejected: Sequence[RejectedClosure], ids: Ids | None = None, recordings: Ids | None = None
 ) -> None:
     """Write rejected pairs, one JSON object a line, with the `ids` and the `recordings` of the frames if given."""
     names = ("reason", "probability", "overlap", "match_from_query")
@@ -150,7 +150,7 @@ def write_rejected_jsonl(
     write_text(Path(path), "".join(lines))
 
 
-def _line(loop: Loop, names: Sequence[str], ids: Ids | None, recordings: Ids | None, **more: str) -> str:
+def _line(loop: LoopClosure, names: Sequence[str], ids: Ids | None, recordings: Ids | None, **more: str) -> str:
     """The frames of a loop, their ids and recordings if given, and the values of these `names`, as a line of JSON."""
     row: dict[str, Any] = {"query": loop.query, "match": loop.match}
     for suffix, known in (("id", ids), ("recording", recordings)):
@@ -160,7 +160,7 @@ def _line(loop: Loop, names: Sequence[str], ids: Ids | None, recordings: Ids | N
     return json.dumps(row, default=np.ndarray.tolist) + "\n"
 
 
-def read_loops_jsonl(path: Path | str) -> list[Loop]:
+def read_loops_jsonl(path: Path | str) -> list[LoopClosure]:
     """Read a file of `write_loops_jsonl`. Raises the errors of `read_g2o`."""
     path = Path(path)
     if not path.is_file():
@@ -169,7 +169,7 @@ def read_loops_jsonl(path: Path | str) -> list[Loop]:
     return [_from_json(line, f"{path}, line {i + 1}") for i, line in enumerate(lines)]
 
 
-def write_loops_csv(path: Path | str, loops: Sequence[Loop], recordings: Ids | None = None) -> None:
+def write_loops_csv(path: Path | str, loops: Sequence[LoopClosure], recordings: Ids | None = None) -> None:
     """Write a csv table with the columns `COLUMNS`. The overlap is empty if it is unknown.
 
     If the `recordings` of the frames are given, the table also has the columns `OF_RECORDINGS`.
@@ -184,7 +184,7 @@ def write_loops_csv(path: Path | str, loops: Sequence[Loop], recordings: Ids | N
     write_text(Path(path), text.getvalue())
 
 
-def _poses_of(loops: Sequence[Loop]) -> Float[np.ndarray, "n 4 4"]:
+def _poses_of(loops: Sequence[LoopClosure]) -> Float[np.ndarray, "n 4 4"]:
     return np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
 
 
@@ -220,7 +220,7 @@ def _numbers(values: Float[np.ndarray, " n"]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-def _from_json(line: bytes, where: str) -> Loop:
+def _from_json(line: bytes, where: str) -> LoopClosure:
     value = parse_json(line, source=where)
     try:
         query, match = value["query"], value["match"]
@@ -232,7 +232,7 @@ def _from_json(line: bytes, where: str) -> Loop:
         if covariance.shape != (6, 6) or not (np.isfinite(covariance).all() and np.isfinite(pose).all()):
             raise ValueError(f"a covariance {covariance.shape}: {covariance.tolist()}")
         overlap = None if value["overlap"] is None else float(value["overlap"])
-        loop = Loop(query, match, pose, covariance, float(value["probability"]), overlap)
+        loop = LoopClosure(query, match, pose, covariance, float(value["probability"]), overlap)
         if not all(0 <= share <= 1 for share in (loop.probability, loop.overlap or 0.0)):
             raise ValueError(f"probability {loop.probability} and overlap {loop.overlap}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:

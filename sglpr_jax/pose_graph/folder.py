@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import file_name, text_bytes, write_all, write_json
-from sglpr_jax.loops.closure import Loop, Rejected, renumbered
-from sglpr_jax.loops.frame_alignment import AlignedParts, Part
-from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, renumbered
+from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.pose_graph.files import (
     Ids,
@@ -37,7 +37,7 @@ FIRST_VERTEX = 1_000_000
 
 
 def write_found(
-    found: FoundLoops,
+    found: LoopSearchResult,
     folder: Path | str,
     *,
     optimized: OptimizedTrajectory | None = None,
@@ -90,8 +90,8 @@ def write_found(
 
 
 def graph_files(
-    loops: Sequence[Loop],
-    rejected: Sequence[Rejected],
+    loops: Sequence[LoopClosure],
+    rejected: Sequence[RejectedClosure],
     chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
     *,
     drift: DriftModel,
@@ -107,7 +107,7 @@ def graph_files(
     }
 
 
-def unique_names(found: FoundLoops) -> list[str]:
+def unique_names(found: LoopSearchResult) -> list[str]:
     """Names of the recordings. A repeated name gets the suffix ~2, ~3 and so on."""
     names: list[str] = []
     for one in found.sessions:
@@ -118,7 +118,7 @@ def unique_names(found: FoundLoops) -> list[str]:
     return names
 
 
-def vertices(found: FoundLoops) -> list[Int[np.ndarray, " _"]]:
+def vertices(found: LoopSearchResult) -> list[Int[np.ndarray, " _"]]:
     """Vertex of each scan in the graph: the scan's number plus a multiple of `FIRST_VERTEX`, the same for a session.
 
     If a recording has more scans, the multiple is of the next power of ten.
@@ -131,7 +131,7 @@ def vertices(found: FoundLoops) -> list[Int[np.ndarray, " _"]]:
     return [rows + k * step for k, rows in enumerate(numbers)]
 
 
-def frames_json(found: FoundLoops) -> dict[str, Any]:
+def frames_json(found: LoopSearchResult) -> dict[str, Any]:
     """Recordings with their first vertices, and transforms between their frames, as a JSON value."""
     names, of = unique_names(found), vertices(found)
     recordings = [
@@ -145,7 +145,7 @@ def frames_json(found: FoundLoops) -> dict[str, Any]:
     return {"recordings": recordings, "transforms": transforms, "no_common_place": without}
 
 
-def _transform(names: Sequence[str], aligned: AlignedParts, found: FoundLoops) -> dict[str, Any]:
+def _transform(names: Sequence[str], aligned: SegmentAlignment, found: LoopSearchResult) -> dict[str, Any]:
     """A transform between two frames as a JSON value."""
     return {
         "match_recording": names[aligned.match.session],
@@ -158,14 +158,14 @@ def _transform(names: Sequence[str], aligned: AlignedParts, found: FoundLoops) -
     }
 
 
-def _frame(part: Part, found: FoundLoops) -> dict[str, Any]:
+def _frame(part: TrajectorySegment, found: LoopSearchResult) -> dict[str, Any]:
     """The frame of a part, and the scans whose poses are known in it."""
     numbers = found.sessions[part.session].recording.numbers
     first, last = int(numbers[part.first]), int(numbers[part.last])
     return {"frame": "odometry" if part.is_odometry else f"LiDAR at scan {first}", "first": first, "last": last}
 
 
-def _comments(found: FoundLoops, names: Sequence[str], of: Sequence[Int[np.ndarray, " _"]]) -> list[str]:
+def _comments(found: LoopSearchResult, names: Sequence[str], of: Sequence[Int[np.ndarray, " _"]]) -> list[str]:
     """Lines that state the vertices and the frame of each of several sessions."""
     lines = []
     for name, rows, (group, _), one in zip(names, of, placements(found), found.sessions, strict=True):
@@ -176,7 +176,7 @@ def _comments(found: FoundLoops, names: Sequence[str], of: Sequence[Int[np.ndarr
 
 
 def _trajectories(
-    found: FoundLoops, names: Sequence[str], optimized: OptimizedTrajectory | None
+    found: LoopSearchResult, names: Sequence[str], optimized: OptimizedTrajectory | None
 ) -> dict[str, Callable[[Path], object]]:
     """Writers of the trajectories, by file name. Names of several sessions are part of it."""
     files: dict[str, Callable[[Path], object]] = {}

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.drift import step_deviations
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.pose_graph.optimize import first_factor, gtsam_library, rotation_first, step_factor
@@ -58,7 +58,7 @@ class IncrementalTrajectory:
         self._segments: list[int] = []
         """Frame and segment of each node. The keys of the graph are these frames."""
         self._placed: set[int] = set()
-        self._waiting: list[Loop] = []
+        self._waiting: list[LoopClosure] = []
         self._last_query = 0
         self._travelled = GrowingArray(np.empty(0))
 
@@ -81,7 +81,7 @@ class IncrementalTrajectory:
         return found
 
     def add(
-        self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[Loop] = (), *, continues: bool = True
+        self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[LoopClosure] = (), *, continues: bool = True
     ) -> None:
         """Add the pose of the LiDAR by odometry at the next frame, and new loops of this and of earlier frames.
 
@@ -128,7 +128,7 @@ class IncrementalTrajectory:
             for loop in now:
                 self._use(loop)
 
-    def _use(self, loop: Loop) -> None:
+    def _use(self, loop: LoopClosure) -> None:
         """Connect the nodes of a loop. The covariance is that of the loop, because the nodes are near its frames."""
         query, match = self._node(loop.query), self._node(loop.match)
         ends = (loop.match, match), (loop.query, query)
@@ -146,7 +146,7 @@ class IncrementalTrajectory:
         noise = self._gtsam.noiseModel.Robust.Create(robust, covariance)
         self._graph.add(self._gtsam.BetweenFactorPose3(match, query, self._gtsam.Pose3(pose), noise))
 
-    def _is_useful(self, loop: Loop, query: int, match: int, pose: Float[np.ndarray, "4 4"]) -> bool:
+    def _is_useful(self, loop: LoopClosure, query: int, match: int, pose: Float[np.ndarray, "4 4"]) -> bool:
         """Whether a loop between two nodes contradicts the graph, or no other loop was used for a while."""
         way = self._travelled.rows
         if query == self._last_query:

@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.levelling import is_tilted, uprights
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.closure import Loop, frames_of, to_upright
+from sglpr_jax.loops.closure import LoopClosure, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
-from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import inverse
@@ -37,8 +37,8 @@ class OptimizedTrajectory(NamedTuple):
     """A corrected trajectory, and its distance from the odometry."""
 
     poses: Float[np.ndarray, "n 4 4"]
-    """Pose of the LiDAR at each searched frame of one session after the other (`FoundLoops.split`), in the frame of the
-    odometry of the first session that loops connect with it. The first pose is not changed."""
+    """Pose of the LiDAR at each searched frame of one session after the other (`LoopSearchResult.split`), in the
+    odometry frame of the first session that loops connect with it. The first pose is not changed."""
     inliers: Bool[np.ndarray, " k"]
     """Whether the corrected trajectory agrees with each loop."""
     moved_m: float = 0.0
@@ -60,7 +60,7 @@ class OptimizedTrajectory(NamedTuple):
         return f"trajectory corrected by {loops}: moved by {moved}, {self.deviation:.2f} sigmas of the stated drift"
 
 
-def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
+def optimize_trajectory(found: LoopSearchResult) -> OptimizedTrajectory:
     """Correct the odometry of all sessions by their loops, within the stated drift. Warns if heights move by metres.
 
     Sessions that loops connect get one frame, that of the first one. It takes about a second for a few hundred frames,
@@ -114,7 +114,7 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     )
 
 
-def placements(found: FoundLoops) -> tuple[tuple[int, Float[np.ndarray, "4 4"]], ...]:
+def placements(found: LoopSearchResult) -> tuple[tuple[int, Float[np.ndarray, "4 4"]], ...]:
     """Return the group of each session, and the transform from its odometry frame to that of the group's first one.
 
     Groups are named by the number of their first session. Transforms with more loops are used first. Sessions without
@@ -140,7 +140,7 @@ def placements(found: FoundLoops) -> tuple[tuple[int, Float[np.ndarray, "4 4"]],
 
 
 def solved_graph(
-    odometry: Mapping[int, Float[np.ndarray, "_ 4 4"]], loops: Sequence[Loop], drift: DriftModel = DriftModel()
+    odometry: Mapping[int, Float[np.ndarray, "_ 4 4"]], loops: Sequence[LoopClosure], drift: DriftModel = DriftModel()
 ) -> OptimizedTrajectory:
     """Solve the pose graph of sessions in one gravity-aligned frame.
 
@@ -183,7 +183,7 @@ def solved_graph(
 def _solved(
     gtsam: ModuleType,
     odometry: Float[np.ndarray, "n 4 4"],
-    loops: Sequence[Loop],
+    loops: Sequence[LoopClosure],
     sessions: Int[np.ndarray, " n"],
     drift: DriftModel,
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " k"]]:
@@ -223,7 +223,10 @@ def step_factor(before: int, after: int, step: Float[np.ndarray, "4 4"], metres:
 
 
 def _contradictions(
-    loops: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"], sessions: Int[np.ndarray, " n"], drift: DriftModel
+    loops: Sequence[LoopClosure],
+    odometry: Float[np.ndarray, "n 4 4"],
+    sessions: Int[np.ndarray, " n"],
+    drift: DriftModel,
 ) -> Float[np.ndarray, " k"]:
     """Deviation of each loop from the odometry (`deviations`). It is 0 for loops between two sessions."""
     query, match = frames_of(loops)
@@ -233,7 +236,7 @@ def _contradictions(
 def _bend(
     odometry: Float[np.ndarray, "n 4 4"],
     poses: Float[np.ndarray, "n 4 4"],
-    loops: Sequence[Loop],
+    loops: Sequence[LoopClosure],
     sessions: Int[np.ndarray, " n"],
     drift: DriftModel,
 ) -> Float[np.ndarray, " k"]:
@@ -244,7 +247,7 @@ def _bend(
     """
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
-    solved = [Loop(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
+    solved = [LoopClosure(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
     found = _contradictions(solved, odometry, sessions, drift)
     bends = []
     for k, loop in enumerate(loops):

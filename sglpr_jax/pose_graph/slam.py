@@ -12,7 +12,7 @@ from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -27,7 +27,7 @@ class Slam(NamedTuple):
 
     odometry: Float[np.ndarray, "n 4 4"]
     """Pose of the LiDAR at each scan, in the frame of the first scan."""
-    loops: FoundLoops
+    loops: LoopSearchResult
     trajectory: optimize.OptimizedTrajectory
 
     def __str__(self) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Num
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
-from sglpr_jax.registration.bev_search import Peak, search
+from sglpr_jax.registration.bev_search import CorrelationPeak, search
 from sglpr_jax.registration.bev_spectra import (
     DEFAULT,
     AnyArray,
@@ -123,7 +123,7 @@ def _shared_area(apart_m: Float[Array, "*b"], reach_m: float) -> Float[Array, "*
     return (jnp.arccos(ratio) - ratio * jnp.sqrt(1 - ratio**2)) * np.float32(2 / np.pi)
 
 
-class Alignment(NamedTuple):
+class BevRegistration(NamedTuple):
     """Pose of a query in the frame of a match, in the plane, with covariance and correlation."""
 
     x: Float[AnyArray, "*b"]
@@ -167,7 +167,7 @@ def align(
     match: Num[Array | np.ndarray, "h w"],
     *,
     config: VerificationConfig = DEFAULT,
-) -> Alignment:
+) -> BevRegistration:
     """Estimate the pose of a query in the frame of a match from their images, also under `jit` and `vmap`.
 
     Both are square images of counts in the orientation of eq. 1, with an even number of cells per side. Raises
@@ -181,16 +181,16 @@ def align(
 def refined(
     query: Num[Array | np.ndarray, "h w"],
     match: Num[Array | np.ndarray, "h w"],
-    peak: Peak,
+    peak: CorrelationPeak,
     *,
     config: VerificationConfig = DEFAULT,
-) -> Alignment:
+) -> BevRegistration:
     """Refine a peak of `search` on cells that are not merged. Raises the errors of `align`."""
     second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
     query, match = prepared(query, config), prepared(match, config)
     pose, correlation, covariance = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
     yaw = jnp.mod(pose[2] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return Alignment(pose[0], pose[1], yaw, covariance, correlation, second)
+    return BevRegistration(pose[0], pose[1], yaw, covariance, correlation, second)
 
 
 def _refined(

@@ -52,7 +52,7 @@ def coarse_correlations(
     return jax.lax.fori_loop(0, len(matches) if count is None else count, compare, jnp.full(len(matches), -1.0))
 
 
-class Peak(NamedTuple):
+class CorrelationPeak(NamedTuple):
     """The best pose of a query in the frame of a match, to a fraction of a merged cell."""
 
     x: Float[AnyArray, "*b"]
@@ -65,12 +65,12 @@ class Peak(NamedTuple):
     second: Float[AnyArray, "*b"]
     """Highest correlation at any other pose (`second_m`, `second_deg`)."""
 
-    def at(self, rows: int | slice) -> "Peak":
+    def at(self, rows: int | slice) -> "CorrelationPeak":
         """One of the peaks, or some of them."""
-        return Peak(*(values[rows] for values in self))
+        return CorrelationPeak(*(values[rows] for values in self))
 
 
-NO_PEAKS = Peak(*[np.zeros(0, np.float32)] * len(Peak._fields))
+NO_PEAKS = CorrelationPeak(*[np.zeros(0, np.float32)] * len(CorrelationPeak._fields))
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -80,7 +80,7 @@ def search(
     count: Int[AnyArray, ""] | int | None = None,
     *,
     config: VerificationConfig = DEFAULT,
-) -> Peak:
+) -> CorrelationPeak:
     """Return the best pose of a query in the frame of each of k matches.
 
     The arguments are results of `query_spectra` and `match_spectra`. With `count`, only the first matches are searched.
@@ -88,11 +88,11 @@ def search(
     """
     turned, matches, reach = quarters(jnp.asarray(query)), jnp.asarray(matches), _reach(config)
 
-    def search_one(k: Int[Array, ""], found: Peak) -> Peak:
+    def search_one(k: Int[Array, ""], found: CorrelationPeak) -> CorrelationPeak:
         peak = _peak(correlations(turned, matches[k], reach), jnp.full(3, jnp.nan), config)
         return jax.tree.map(lambda all_found, one: all_found.at[k].set(one), found, peak)
 
-    none = Peak(*[jnp.zeros(len(matches))] * len(Peak._fields))
+    none = CorrelationPeak(*[jnp.zeros(len(matches))] * len(CorrelationPeak._fields))
     return jax.lax.fori_loop(0, len(matches) if count is None else count, search_one, none)
 
 
@@ -103,7 +103,7 @@ def search_near(
     prior: Float[AnyArray, " 3"],
     *,
     config: VerificationConfig = DEFAULT,
-) -> Peak:
+) -> CorrelationPeak:
     """Return two peaks: the best pose anywhere, and the best pose near an expected one.
 
     Arguments:
@@ -122,7 +122,7 @@ def _reach(config: VerificationConfig) -> int:
     return cells(config.max_shift_m, DENSITY_RESOLUTION_M * config.coarse)
 
 
-def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], config: VerificationConfig) -> Peak:
+def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], config: VerificationConfig) -> CorrelationPeak:
     reach, step = len(found) // 2, np.float32(2 * np.pi / config.turns)
     cell_m = DENSITY_RESOLUTION_M * config.coarse
     x, y, yaw = prior  # NaN allows all poses
@@ -137,7 +137,7 @@ def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], config: Verif
     at = down, turn, right
     down, turn, right = (index + offset for index, offset in zip(at, _offsets(found, at), strict=True))
     x, y, yaw = (right - reach) * cell_m, (reach - down) * cell_m, jnp.mod(turn * step, 2 * np.pi)
-    return Peak(x, y, yaw, found[at], second)
+    return CorrelationPeak(x, y, yaw, found[at], second)
 
 
 def _second(

@@ -59,7 +59,7 @@ def feature_heat_maps(found: Reproduction) -> Figures:
     models = {"without": runs.params(NO_SEGMENTATION, seq), "with": runs.params(FULL, seq)}
     for recording in (runs.recording(seq), open_recording(root, recording_names(root)[-1])):
         row = len(recording) // 2
-        image = np.asarray(view(recording.record(row, labels=False), model.grid, image=model.image).image)
+        image = np.asarray(view(recording.scan(row, labels=False), model.grid, image=model.image).image)
         maps = {
             f"{name}: {layer}": values
             for name, params in models.items()

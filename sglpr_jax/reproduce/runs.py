@@ -20,8 +20,8 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
+from sglpr_jax.retrieval.descriptor_cache import embed_or_reuse
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.reuse import embed_or_reuse
 from sglpr_jax.training.callbacks import Callbacks, ProgressBar
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.recipe import LIMITS, TrainResult, run_settings, train

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, Float32
 
 from sglpr_jax.data.deskew import DESKEWED
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import SCALE, scale_of
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
 from sglpr_jax.data.warning import warn
@@ -66,8 +66,8 @@ def embed(
     if rotation_seed is not None:
         angles = np.random.default_rng(rotation_seed).uniform(0, 2 * np.pi, len(recording))
 
-    def prepare(row: int, record: Record) -> Any:
-        return method.prepare(record, None if angles is None else float(angles[row]))
+    def prepare(row: int, scan: Scan) -> Any:
+        return method.prepare(scan, None if angles is None else float(angles[row]))
 
     labels = method.takes in LABELLED
     options = {"labels": labels, "ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
@@ -118,8 +118,8 @@ def scan_image(
       ValueError: If the scan shows no place: no finite points, coordinates not in metres, or almost no points where the
         model looks.
     """
-    record = Record(points=points, mounting=mounting, name="the scan")
-    seen = checked_view(record, None, grid=config.grid, image=config.image, field=field_of_view(config)[0])
+    scan = Scan(points=points, mounting=mounting, name="the scan")
+    seen = checked_view(scan, None, grid=config.grid, image=config.image, field=field_of_view(config)[0])
     return jnp.asarray(seen.image)
 
 

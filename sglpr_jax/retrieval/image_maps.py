@@ -12,7 +12,7 @@ from PIL import Image
 
 from sglpr_jax.bev import uncropped
 from sglpr_jax.data.formats.png import label_image_pixels
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import view
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import UNLABELLED, to_raw
@@ -37,7 +37,7 @@ class SemanticMap(NamedTuple):
         return self.predicted != UNLABELLED
 
 
-def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0) -> SemanticMap:
+def semantic_map(params: Params, scan: Scan, *, min_confidence: float = 0.0) -> SemanticMap:
     """Predict the class of every occupied cell of a scan or a ready-made image.
 
     The probabilities are the mean over the image and its mirror image.
@@ -52,19 +52,19 @@ def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0)
       found = semantic_map(params, recording.record(0))
     """
     config = params.config
-    categories = 0 if record.labels is None else config.categories
-    counts, truth = view(record, config.grid, image=config.image, categories=categories)
+    categories = 0 if scan.labels is None else config.categories
+    counts, truth = view(scan, config.grid, image=config.image, categories=categories)
     truth = jnp.zeros(counts.shape, jnp.int32) if truth is None else truth
     return SemanticMap(*jax.device_get((counts, *_predict(params, counts, truth, jnp.float32(min_confidence)))))
 
 
-def save_map(path: Path, found: SemanticMap, record: Record, *, categories: int) -> None:
+def save_map(path: Path, found: SemanticMap, scan: Scan, *, categories: int) -> None:
     """Write the class ids of a map as a PNG. For a ready-made image, write its label image, with 0 outside the grid."""
-    if record.image is None:
+    if scan.image is None:
         pixels = found.predicted.astype(np.uint8)
     else:
         raw = to_raw(found.predicted, categories=categories)
-        pixels = label_image_pixels(uncropped(raw, shape=record.image.shape))
+        pixels = label_image_pixels(uncropped(raw, shape=scan.image.shape))
     with replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
 

@@ -19,9 +19,9 @@ from sglpr_jax.files import file_name, in_short, naming, parse_json, replacing
 from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.descriptor_cache import fingerprint
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
-from sglpr_jax.retrieval.reuse import fingerprint
 from sglpr_jax.schema import check_about
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import numpy as np
 
 from sglpr_jax.sim import objects
 from sglpr_jax.sim.labels import FENCE, OTHER_OBJECT, POLE, TERRAIN, TRAFFIC_SIGN
-from sglpr_jax.sim.objects import Part, Range, Thing
-from sglpr_jax.sim.placing import Spot, Zone
+from sglpr_jax.sim.objects import ObjectModel, Primitive, Range
+from sglpr_jax.sim.placement import Spot, Zone
 from sglpr_jax.sim.styles import Side, draw_house
 
 Clock = tuple[float, float]
@@ -74,7 +74,11 @@ def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float
 
 
 def _changing(
-    rng: np.random.Generator, make: Callable[[np.random.Generator], Thing], place: Spot, clock: Clock, occupied: float
+    rng: np.random.Generator,
+    make: Callable[[np.random.Generator], ObjectModel],
+    place: Spot,
+    clock: Clock,
+    occupied: float,
 ) -> Iterator[Spot]:
     """Yields the things that occupy one place one after another."""
     for since, until in stays(rng, clock, occupied):
@@ -118,7 +122,7 @@ def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -
             yield Spot(_tree(rng, side, spread), s, d, zone="verge" if side.strips else "plot")
 
 
-def _tree(rng: np.random.Generator, side: Side, spread: Range) -> Thing:
+def _tree(rng: np.random.Generator, side: Side, spread: Range) -> ObjectModel:
     return objects.limbed_tree(rng, spread) if side.style.old_trees else objects.tree(rng, spread)
 
 
@@ -128,24 +132,24 @@ class Border(NamedTuple):
     thickness: float
     height: Range
     closed: float  # fraction of the line that is closed
-    make: Callable[..., Thing]  # of a random generator, length, thickness and height
+    make: Callable[..., ObjectModel]  # of a random generator, length, thickness and height
 
 
-def _wall(_: np.random.Generator, length: float, thickness: float, height: float, porosity: float = 0.0) -> Thing:
+def _wall(_: np.random.Generator, length: float, thickness: float, height: float, porosity: float = 0.0) -> ObjectModel:
     return (objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=porosity),)
 
 
-def _trimmed(rng: np.random.Generator, *size: float) -> Thing:
+def _trimmed(rng: np.random.Generator, *size: float) -> ObjectModel:
     """Hedge that is straight and dense like a wall."""
     return objects.hedge(*size, roughness=rng.uniform(0.05, 0.2), porosity=rng.uniform(0.05, 0.25))
 
 
-def _rail(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
+def _rail(rng: np.random.Generator, length: float, thickness: float, height: float) -> ObjectModel:
     beam = objects.block(FENCE, length, thickness, 0.35, bottom=height - 0.35)
     return beam, objects.post(FENCE, 0.12, height)
 
 
-def _lattice(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
+def _lattice(rng: np.random.Generator, length: float, thickness: float, height: float) -> ObjectModel:
     """Low see-through fence on posts, with a bush behind some pieces."""
     mesh = _wall(rng, length, thickness, height, rng.uniform(0.4, 0.8))
     parts = [*mesh, objects.block(FENCE, 0.15, 0.15, height + 0.1)]
@@ -251,7 +255,7 @@ def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> I
     """Banks beside the road, with bushes on them."""
     for s in _steps(rng, start, stop, (9.0, 14.0)):
         length, width, height = rng.uniform((16, 9, 1.5), (30, 16, 4.0)).tolist()
-        bank = Part("ellipsoid", TERRAIN, (length, width, 2 * height), bottom=-height, roughness=0.02)
+        bank = Primitive("ellipsoid", TERRAIN, (length, width, 2 * height), bottom=-height, roughness=0.02)
         bushes = [
             part._replace(x=part.x + rng.uniform(-0.3, 0.3) * length, bottom=part.bottom + 0.85 * height)
             for part in objects.bush(rng, 1.3)
@@ -265,14 +269,16 @@ def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> I
     for s in _steps(rng, start, stop, (5.0, 7.0)):
         across = width * rng.uniform(0.95, 1.05)
         size, bottom = (length, across, 2 * height), -(1 + sunk) * height
-        yield Spot((Part("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2)
+        yield Spot(
+            (Primitive("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2
+        )
 
 
-def _bin_or_bench(rng: np.random.Generator) -> Thing:
+def _bin_or_bench(rng: np.random.Generator) -> ObjectModel:
     return (objects.block(OTHER_OBJECT, *rng.uniform((0.5, 0.5, 0.8), (1.8, 0.8, 1.3)).tolist()),)
 
 
-def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generator], Thing]]:
+def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generator], ObjectModel]]:
     """Yields makers of bystanders, without end: in ten, three people, three bicycles and one of each other kind."""
     kinds = [*3 * [objects.person], *3 * [objects.bicycle]]
     kinds += [objects.bicyclist, objects.motorcycle, objects.motorcyclist, _bin_or_bench]

@@ -15,7 +15,7 @@ _FACADE_M = 0.06
 """Roughness of a facade, in metres. In real scans, points within 1 m of facade are 4 cm (rms) off their plane."""
 
 
-class Part(NamedTuple):
+class Primitive(NamedTuple):
     """One shape of a thing, in metres and radians in the thing's frame: x forward, y left, z = 0 on the ground."""
 
     kind: Kind
@@ -30,26 +30,26 @@ class Part(NamedTuple):
     glass: float = 0.0
 
 
-Thing = tuple[Part, ...]
+ObjectModel = tuple[Primitive, ...]
 """Parts that stand, appear and disappear together."""
 
 
-def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
+def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
     """Box with its centre at x and y. `more` holds fields of Part."""
-    return Part("box", label, (length, width, height), x, y, **more)
+    return Primitive("box", label, (length, width, height), x, y, **more)
 
 
-def post(label: int, thick: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
+def post(label: int, thick: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
     """Cylinder with its axis at x and y. `more` holds fields of Part."""
-    return Part("cylinder", label, (thick, thick, height), x, y, **more)
+    return Primitive("cylinder", label, (thick, thick, height), x, y, **more)
 
 
-def ball(label: int, wide: float, high: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
+def ball(label: int, wide: float, high: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
     """Round ellipsoid with its axis at x and y, such as a crown of leaves. `more` holds fields of Part."""
-    return Part("ellipsoid", label, (wide, wide, high), x, y, **more)
+    return Primitive("ellipsoid", label, (wide, wide, high), x, y, **more)
 
 
-def tree(rng: np.random.Generator, spread: Range) -> Thing:
+def tree(rng: np.random.Generator, spread: Range) -> ObjectModel:
     """Tree whose crown has a diameter in the range `spread`, in metres. A large crown has several ellipsoids."""
     crown, below = rng.uniform(*spread), rng.uniform(0.9, 2.6)
     thick = 0.12 + 0.05 * crown * rng.uniform(0.6, 1.4)
@@ -65,7 +65,7 @@ def tree(rng: np.random.Generator, spread: Range) -> Thing:
     return tuple(parts)
 
 
-def limbed_tree(rng: np.random.Generator, spread: Range) -> Thing:
+def limbed_tree(rng: np.random.Generator, spread: Range) -> ObjectModel:
     """Old street tree: a thick trunk and bare limbs under a crown that begins above most lasers."""
     crown, fork = rng.uniform(*spread), rng.uniform(1.2, 2.2)
     thick = rng.uniform(0.25, 0.7)
@@ -79,14 +79,14 @@ def limbed_tree(rng: np.random.Generator, spread: Range) -> Thing:
     return tuple(parts)
 
 
-def conifer(rng: np.random.Generator) -> Thing:
+def conifer(rng: np.random.Generator) -> ObjectModel:
     """Conifer with a crown that reaches the ground."""
     spread = rng.uniform(1.5, 4)
     leaves = ball(labels.VEGETATION, spread, 3 * spread, bottom=-0.8 * spread, roughness=0.5, porosity=0.45)
     return post(labels.TRUNK, 0.3, 1.5), leaves
 
 
-def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
+def bush(rng: np.random.Generator, large: float = 1.0) -> ObjectModel:
     """Bush of one or two ellipsoids. `large` scales their size."""
     parts = []
     large *= rng.uniform(0.6, 1.7)
@@ -94,17 +94,21 @@ def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
         length, width, height = large * rng.uniform((0.8, 0.8, 0.7), (3.0, 2.0, 2.4))
         x, y = i * rng.uniform(-0.5, 0.5, 2) * (length, width)
         size, yaw = (length, width, 1.4 * height), rng.uniform(0, np.pi)
-        parts.append(Part("ellipsoid", labels.VEGETATION, size, float(x), float(y), -0.4 * height, yaw, 0.45, 0.45))
+        parts.append(
+            Primitive("ellipsoid", labels.VEGETATION, size, float(x), float(y), -0.4 * height, yaw, 0.45, 0.45)
+        )
     return tuple(parts)
 
 
-def hedge(length: float, thickness: float, height: float, *, roughness: float = 0.3, porosity: float = 0.25) -> Thing:
+def hedge(
+    length: float, thickness: float, height: float, *, roughness: float = 0.3, porosity: float = 0.25
+) -> ObjectModel:
     """Trimmed hedge along x."""
     size = length, thickness, height + 0.3
     return (block(labels.VEGETATION, *size, bottom=-0.3, roughness=roughness, porosity=porosity),)
 
 
-def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
+def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: float) -> ObjectModel:
     """Piece of an overgrown hedge along x: a dense face, with leaves behind it (y > 0) that become thinner."""
     parts = [*hedge(length, thickness, height, roughness=0.12, porosity=rng.uniform(0.2, 0.5))]
     behind = thickness / 2
@@ -116,7 +120,7 @@ def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: 
     return tuple(parts)
 
 
-def thicket(rng: np.random.Generator) -> Thing:
+def thicket(rng: np.random.Generator) -> ObjectModel:
     """Piece of the edge of a wood: undergrowth with visible trunks."""
     parts = [*bush(rng, rng.uniform(1.2, 2.4))]
     for _ in range(int(rng.integers(1, 4))):
@@ -130,7 +134,7 @@ def thicket(rng: np.random.Generator) -> Thing:
     return tuple(parts)
 
 
-def car(rng: np.random.Generator) -> Thing:
+def car(rng: np.random.Generator) -> ObjectModel:
     """Car: a body of full length, with a shorter and narrower cabin on top."""
     length, width, height = rng.uniform(3.7, 4.8), rng.uniform(1.65, 1.85), rng.uniform(1.4, 1.65)
     cabin, estate = rng.uniform(0.45, 0.7) * length, rng.uniform(0, 0.12) * length
@@ -140,7 +144,7 @@ def car(rng: np.random.Generator) -> Thing:
     )
 
 
-def van(rng: np.random.Generator) -> Thing:
+def van(rng: np.random.Generator) -> ObjectModel:
     length, height = rng.uniform(4.8, 5.8), rng.uniform(1.8, 2.5)
     return (
         block(labels.OTHER_VEHICLE, length, 1.95, 0.45 * height, bottom=0.25),
@@ -148,7 +152,7 @@ def van(rng: np.random.Generator) -> Thing:
     )
 
 
-def truck(rng: np.random.Generator) -> Thing:
+def truck(rng: np.random.Generator) -> ObjectModel:
     """Truck: a cab and, behind a gap, the load."""
     length, height = rng.uniform(6, 9), rng.uniform(2.7, 3.6)
     return (
@@ -157,51 +161,53 @@ def truck(rng: np.random.Generator) -> Thing:
     )
 
 
-def bus(rng: np.random.Generator) -> Thing:
+def bus(rng: np.random.Generator) -> ObjectModel:
     return (block(labels.BUS, rng.uniform(10, 12.5), 2.5, 2.8, bottom=0.3),)
 
 
-def bicycle(rng: np.random.Generator) -> Thing:
+def bicycle(rng: np.random.Generator) -> ObjectModel:
     return (block(labels.BICYCLE, rng.uniform(1.6, 1.8), 0.15, 1.0, porosity=0.5),)
 
 
-def motorcycle(rng: np.random.Generator) -> Thing:
+def motorcycle(rng: np.random.Generator) -> ObjectModel:
     return (block(labels.MOTORCYCLE, rng.uniform(1.9, 2.2), 0.45, 1.1, bottom=0.05),)
 
 
-def _rider(rng: np.random.Generator, label: int, vehicle: Part) -> Thing:
-    body = Part("cylinder", label, (0.4, 0.45, rng.uniform(1.6, 1.85) - 0.7), bottom=0.7)
+def _rider(rng: np.random.Generator, label: int, vehicle: Primitive) -> ObjectModel:
+    body = Primitive("cylinder", label, (0.4, 0.45, rng.uniform(1.6, 1.85) - 0.7), bottom=0.7)
     return vehicle._replace(label=label), body
 
 
-def bicyclist(rng: np.random.Generator) -> Thing:
+def bicyclist(rng: np.random.Generator) -> ObjectModel:
     return _rider(rng, labels.BICYCLIST, *bicycle(rng))
 
 
-def motorcyclist(rng: np.random.Generator) -> Thing:
+def motorcyclist(rng: np.random.Generator) -> ObjectModel:
     return _rider(rng, labels.MOTORCYCLIST, *motorcycle(rng))
 
 
-def person(rng: np.random.Generator) -> Thing:
-    return (Part("cylinder", labels.PERSON, (rng.uniform(0.3, 0.5), rng.uniform(0.4, 0.6), rng.uniform(1.5, 1.9))),)
+def person(rng: np.random.Generator) -> ObjectModel:
+    return (
+        Primitive("cylinder", labels.PERSON, (rng.uniform(0.3, 0.5), rng.uniform(0.4, 0.6), rng.uniform(1.5, 1.9))),
+    )
 
 
-def people(rng: np.random.Generator) -> Thing:
+def people(rng: np.random.Generator) -> ObjectModel:
     """One to three people side by side, including their arms and bags."""
     parts = []
     for place in range(int(rng.integers(1, 4))):
         deep, wide, height = rng.uniform((0.35, 0.5, 1.5), (0.6, 0.8, 1.9)).tolist()
         x, y = rng.uniform(-0.15, 0.15, 2).tolist()
-        parts.append(Part("cylinder", labels.PERSON, (deep, wide, height), x, y + 0.75 * place, roughness=0.12))
+        parts.append(Primitive("cylinder", labels.PERSON, (deep, wide, height), x, y + 0.75 * place, roughness=0.12))
     return tuple(parts)
 
 
-def moving(thing: Thing) -> Thing:
+def moving(thing: ObjectModel) -> ObjectModel:
     """`thing` with the labels of the moving classes."""
     return tuple(part._replace(label=labels.MOVING[part.label]) for part in thing)
 
 
-def parked(rng: np.random.Generator) -> Thing:
+def parked(rng: np.random.Generator) -> ObjectModel:
     """Parked vehicle, mostly a car."""
     return (car, van, truck)[rng.choice(3, p=[0.955, 0.03, 0.015])](rng)
 
@@ -215,13 +221,13 @@ class House(NamedTuple):
     glass: float
 
 
-def _block(width: float, depth: float, height: float, x: float, front: float, glass: float) -> Part:
+def _block(width: float, depth: float, height: float, x: float, front: float, glass: float) -> Primitive:
     """Box with its front at y = `front`. It extends below the ground."""
     size = width, depth, height + _BELOW_M
-    return Part("box", labels.BUILDING, size, x, front + depth / 2, -_BELOW_M, roughness=_FACADE_M, glass=glass)
+    return Primitive("box", labels.BUILDING, size, x, front + depth / 2, -_BELOW_M, roughness=_FACADE_M, glass=glass)
 
 
-def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
+def house(rng: np.random.Generator, plan: House, *, porch: bool) -> ObjectModel:
     """House with the middle of its front at the origin, and y into the house. A `porch` needs room in front of it."""
     width, depth, height = plan.width, plan.depth, plan.height
     parts = [_block(width, depth, height, 0.0, 0.0, plan.glass)]
@@ -241,6 +247,6 @@ def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
     return tuple(parts)
 
 
-def garage(rng: np.random.Generator, width: float) -> Thing:
+def garage(rng: np.random.Generator, width: float) -> ObjectModel:
     """Garage or shed with its front at the origin."""
     return (_block(width, rng.uniform(4, 6.5), rng.uniform(2.2, 3.0), 0.0, 0.0, 0.0),)

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.submap import submaps
 from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.drive import (
@@ -104,9 +104,9 @@ def with_submaps(recording: SimulatedRecording, length_m: float) -> SimulatedRec
     view = submaps(recording, recording.poses.world_from_lidar, length_m=length_m)
 
     def render(i: int) -> tuple[np.ndarray, np.ndarray]:
-        record = view.record(i)
-        assert record.points is not None and record.labels is not None
-        return np.pad(record.points, ((0, 0), (0, 1))), record.labels  # submaps have no intensities
+        scan = view.scan(i)
+        assert scan.points is not None and scan.labels is not None
+        return np.pad(scan.points, ((0, 0), (0, 1))), scan.labels  # submaps have no intensities
 
     return dataclasses.replace(recording, read=view.read, render=render, found=view.found)
 
@@ -168,9 +168,9 @@ def drive_through(
         pose, velocity = in_world[i], np.array([speed[i], 0, 0])
         return scan(jax.random.fold_in(key, i), world, pose, sensor=sensor, time=float(clock[i]), velocity=velocity)
 
-    def read(path: Path, label_path: Path | None, lasers: bool) -> Record:
+    def read(path: Path, label_path: Path | None, lasers: bool) -> Scan:
         points, labels = render(row_of[path.name])
-        return Record(points=points[:, :3], labels=None if label_path is None else labels)
+        return Scan(points=points[:, :3], labels=None if label_path is None else labels)
 
     names = tuple(Path(scan_id) for scan_id in ids)
     return SimulatedRecording(

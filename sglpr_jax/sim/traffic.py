@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.sim import objects
-from sglpr_jax.sim.objects import Range, Thing
-from sglpr_jax.sim.placing import CLEARANCE_M, Spot, footprint_distance
+from sglpr_jax.sim.objects import ObjectModel, Range
+from sglpr_jax.sim.placement import CLEARANCE_M, Spot, footprint_distance
 from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
 
 KEPT_M = 8.0  # minimum distance of traffic ahead of the vehicle or behind it, in metres
@@ -26,7 +26,7 @@ LaneName = Literal["oncoming", "own", "left walk", "right walk"]
 class Flow:
     """One kind of traffic. The vehicle meets one such thing per `every_m` metres."""
 
-    make: Callable[[np.random.Generator], Thing]
+    make: Callable[[np.random.Generator], ObjectModel]
     every_m: float
     lanes: tuple[LaneName, ...]
     speed: Range  # m/s relative to the ground; not used in the vehicle's own lane
@@ -105,7 +105,7 @@ def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], p
 
 
 def _pieces(
-    thing: Thing,
+    thing: ObjectModel,
     lane: Float[np.ndarray, "n 2"],
     path: Path,
     times: Float[np.ndarray, " k"],
@@ -126,7 +126,7 @@ def _pieces(
     return [Spot(thing, x, y, turn, 1, (vx, vy), *when) for x, y, turn, vx, vy, *when in rows]
 
 
-def _clear(thing: Thing, pieces: tuple[np.ndarray, ...], path: Path) -> Bool[np.ndarray, " k"]:
+def _clear(thing: ObjectModel, pieces: tuple[np.ndarray, ...], path: Path) -> Bool[np.ndarray, " k"]:
     """Whether each piece stays clear of the vehicle: CLEARANCE_M beside it, KEPT_M ahead of it and behind."""
     begin, end, heading, since, until = pieces
     half = np.max([(abs(part.x) + part.size[0] / 2, part.size[1] / 2, 0.0) for part in thing], axis=0)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from sglpr_jax.sim.frontage import Clock, bystanders, frontage
 from sglpr_jax.sim.ground import Ground, draw_relief
 from sglpr_jax.sim.objects import bush
-from sglpr_jax.sim.placing import CLEARANCE_M, HEAD_ROOM_M, Placed, Spot, distances, place, to_scene
+from sglpr_jax.sim.placement import CLEARANCE_M, HEAD_ROOM_M, PlacedObjects, Spot, distances, place, to_scene
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.shapes import Scene
 from sglpr_jax.sim.streets import Island, Network, draw_streets, paint_ground, resample, roundabouts, runs
@@ -156,7 +156,9 @@ def _bent(network: Network, point: np.ndarray, spots: list[Spot]) -> list[Spot]:
     return [spot._replace(x=x, y=y, heading=turn) for spot, (x, y, turn) in zip(spots, poses, strict=True)]
 
 
-def _on_a_street(network: Network, placed: Placed, street: np.ndarray, zone: np.ndarray) -> Bool[np.ndarray, " n"]:
+def _on_a_street(
+    network: Network, placed: PlacedObjects, street: np.ndarray, zone: np.ndarray
+) -> Bool[np.ndarray, " n"]:
     """Whether each shape touches a road, or strips that it belongs behind. Cars must park on their own street."""
     shapes, bad = placed.shapes, np.zeros(len(zone), bool)
     cos, sin = np.cos(shapes.yaw), np.sin(shapes.yaw)

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from sglpr_jax.data.record import check_cloud
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import check_cloud
 from sglpr_jax.data.views import View, check_ready_made, cloud_view, image_view, picture
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.labels import UNLABELLED
@@ -104,12 +104,12 @@ def read_batch(
         if recording.has_images != images:
             expected, found = ("images", "scans") if images else ("scans", "images")
             raise ValueError(f"expected only {expected} in a batch, found {found} in recording {recording.name}")
-        record = recording.record(frame, labels=has_labels)
-        if record.points is not None:
-            check_cloud(record.points, name=record.name)
-        check_ready_made(record, image)
-        classes = record.classes(categories) if has_labels else None
-        return picture(record, classes) if pictures else (record.upright_points, classes)
+        scan = recording.scan(frame, labels=has_labels)
+        if scan.points is not None:
+            check_cloud(scan.points, name=scan.name)
+        check_ready_made(scan, image)
+        classes = scan.classes(categories) if has_labels else None
+        return picture(scan, classes) if pictures else (scan.upright_points, classes)
 
     found = [read(*place) for place in places]
     labelled = np.array([classes is not None for _, classes in found])

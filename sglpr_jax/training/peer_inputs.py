@@ -23,7 +23,7 @@ SCANS_AHEAD = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class TrainingInputs:
     """Recordings and the inputs of their scans."""
 
     recordings: tuple[Recording, ...]
@@ -37,7 +37,7 @@ class Prepared:
 
 def prepared(
     method: LearnedMethod, recordings: Sequence[Recording], cache: Path, *, progress: Progress = no_progress
-) -> Prepared:
+) -> TrainingInputs:
     """Compute the inputs of all scans, or read them from the cache.
 
     Each recording becomes one file in the folder `cache`, which is complete or does not exist. A repeated call
@@ -55,7 +55,7 @@ def prepared(
     inputs = tuple(_inputs(method, recording, cache, progress) for recording in recordings)
     for recording, array in zip(recordings, inputs, strict=True):
         _require_alike(array[0], inputs[0][0], name=f"sequence {recording.name}")
-    return Prepared(tuple(recordings), inputs)
+    return TrainingInputs(tuple(recordings), inputs)
 
 
 def _inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: Progress) -> np.ndarray:
@@ -76,7 +76,7 @@ def _write(path: Path, method: LearnedMethod, recording: Recording, show) -> Non
     """Write the inputs of a recording, completely or not at all."""
     check_readable(recording, len(recording))
     options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD, "on_progress": show}
-    made = scan_stream(recording, lambda row, record: method.prepare(record), **options)
+    made = scan_stream(recording, lambda row, scan: method.prepare(scan), **options)
     with replacing(path) as temporary:
         file = None
         for row, one in made:

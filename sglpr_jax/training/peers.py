@@ -27,8 +27,8 @@ from sglpr_jax.training.checkpoint import checkpoint_steps
 from sglpr_jax.training.devices import AXIS
 from sglpr_jax.training.mining import FOLDER as MINING
 from sglpr_jax.training.mining import Mining
-from sglpr_jax.training.peer_inputs import Prepared
-from sglpr_jax.training.run_folder import CONFIG_FILE, claimed
+from sglpr_jax.training.peer_inputs import TrainingInputs
+from sglpr_jax.training.run_folder import CONFIG_FILE, lock_run
 from sglpr_jax.training.step import Gradient, TrainState
 from sglpr_jax.training.trainer import CHECKPOINTS, Schedule, Trained, run_steps
 from sglpr_jax.training.tuples import TuplePool
@@ -130,7 +130,7 @@ def variables_of(state: TrainState) -> Variables:
 
 def train_learned(
     method: LearnedMethod,
-    data: Prepared,
+    data: TrainingInputs,
     settings: RunSettings,
     out: Path,
     *,
@@ -186,7 +186,7 @@ def train_learned(
     del recipe["learning_rates"]  # the settings have the chosen one
     recordings = [{"name": one.name, "scans": len(one)} for one in data.recordings]
     config = {"method": method.name, "settings": dataclasses.asdict(settings), "recipe": recipe}
-    claim = claimed(out, config | {"recordings": recordings}, seed=settings.seed, resume=resume, limits=LIMITS)
+    claim = lock_run(out, config | {"recordings": recordings}, seed=settings.seed, resume=resume, limits=LIMITS)
     with claim, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
         pool = TuplePool(
             [one.positions for one in data.recordings if one.positions is not None], method.recipe.sampling
@@ -228,7 +228,7 @@ class _Report(Callback):
         self._report(self._line)
 
 
-def _first_state(network: PeerNetwork, data: Prepared, pool: TuplePool, learning_rate: float) -> TrainState:
+def _first_state(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, learning_rate: float) -> TrainState:
     """Return random weights, changed by the method's `start`, which sees the inputs of random places."""
     state = network.new_state(learning_rate)
     if network.method.start is None:
@@ -238,7 +238,7 @@ def _first_state(network: PeerNetwork, data: Prepared, pool: TuplePool, learning
     return dataclasses.replace(state, params=variables["params"])
 
 
-def _batches(network: PeerNetwork, data: Prepared, pool: TuplePool, out: Path) -> TupleBatches:
+def _batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, out: Path) -> TupleBatches:
     """Return the batches of a run, with hard negatives if its recipe mines them."""
     recipe, seed, mining = network.method.recipe, network.seed, None
 
@@ -256,7 +256,7 @@ def _batches(network: PeerNetwork, data: Prepared, pool: TuplePool, out: Path) -
     return TupleBatches(data.recordings, pool, read, seed=seed, tuples=recipe.tuples, mining=mining)
 
 
-def held_out_score(method: LearnedMethod, held_out: Prepared) -> ScoreFn:
+def held_out_score(method: LearnedMethod, held_out: TrainingInputs) -> ScoreFn:
     """Return a function that scores weights on held-out recordings.
 
     The entries of a score are `recall_at_1`, the mean, and `recall_at_1 NAME` for each recording. Raises ValueError if
@@ -282,7 +282,7 @@ class Stopped(Exception):
 
 def best_rate(
     method: LearnedMethod,
-    data: Prepared,
+    data: TrainingInputs,
     score: ScoreFn,
     out: Path,
     *,

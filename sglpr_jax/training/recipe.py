@@ -26,7 +26,7 @@ from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
 from sglpr_jax.training.mining import FOLDER as MINING
 from sglpr_jax.training.mining import Mining
-from sglpr_jax.training.run_folder import claimed
+from sglpr_jax.training.run_folder import lock_run
 from sglpr_jax.training.step import TrainState
 from sglpr_jax.training.trainer import CHECKPOINTS, METRICS_FILE, Schedule, Trained, run_steps
 from sglpr_jax.training.tuples import TuplePool, hold_out
@@ -138,7 +138,7 @@ def train(
                 f"{folder}: expected at least the {made} steps that are already done, found {config.steps}"
             )
         noted = run_settings(config, settings)
-        claim = claimed(folder, noted, seed=config.seed, resume=resume, limits=LIMITS)
+        claim = lock_run(folder, noted, seed=config.seed, resume=resume, limits=LIMITS)
         on_all_hosts(lambda: is_first_host() and opened.enter_context(claim))
         run = run_network(
             config,

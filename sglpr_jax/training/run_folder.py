@@ -26,7 +26,7 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 @contextlib.contextmanager
-def claimed(
+def lock_run(
     folder: Path, settings: Mapping[str, Any], *, seed: int, resume: bool, limits: Collection[str] = ()
 ) -> Iterator[None]:
     """Lock a run's folder while the block runs. Writes settings and environment, removes unfinished files.

@@ -6,7 +6,7 @@ import pytest
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.loops import search
-from sglpr_jax.loops.closure import Loop, Rejected
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl, write_tum
@@ -84,7 +84,7 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
 ):
     def ended_meanwhile(recordings, params, *, should_stop, **options):
         should_stop.signal = 2
-        return search.FoundLoops((search.Session(recordings[0], SCANS, unregistered=unregistered),))
+        return search.LoopSearchResult((search.Session(recordings[0], SCANS, unregistered=unregistered),))
 
     monkeypatch.setattr(search, "find_loops", ended_meanwhile)
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
@@ -95,10 +95,12 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
 @pytest.mark.slow
 def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path, monkeypatch):
     """And a degenerate loop is kept, or rejected with `--degenerate drop`."""
-    unsure = Loop(35, 1, np.eye(4), np.diag([4.0, 0.01, 1, 1, 1, 1]), 0.995)
+    unsure = LoopClosure(35, 1, np.eye(4), np.diag([4.0, 0.01, 1, 1, 1, 1]), 0.995)
 
     def some(recordings, params, **options):
-        return search.FoundLoops((search.Session(recordings[0], SCANS),), (unsure,), (Rejected(unsure, "repeats"),))
+        return search.LoopSearchResult(
+            (search.Session(recordings[0], SCANS),), (unsure,), (RejectedClosure(unsure, "repeats"),)
+        )
 
     monkeypatch.setattr(search, "find_loops", some)
     run = ("loops", town, "--seq", "08", "--out", tmp_path / "found")
@@ -151,7 +153,7 @@ def test_scans_are_registered_if_they_can_be(
 
     def searched(recordings, params, *, registered, **options):
         asked.append(registered)
-        return search.FoundLoops((search.Session(recordings[0], len(recordings[0])),))
+        return search.LoopSearchResult((search.Session(recordings[0], len(recordings[0])),))
 
     monkeypatch.setattr(search, "find_loops", searched)
     monkeypatch.setattr(search, "is_installed", lambda: installed)

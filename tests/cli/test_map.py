@@ -11,10 +11,10 @@ import sglpr_jax
 from sglpr_jax.cli.relocalize import _table
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.maps import build
 from sglpr_jax.maps.build import map_recording
-from sglpr_jax.maps.place_map import PlaceMap, Relocated
+from sglpr_jax.maps.place_map import PlaceMap, Relocalization
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.retrieval.index import Index
@@ -180,7 +180,8 @@ def test_brackets_in_a_name_are_no_style_and_answers_that_share_the_probability_
     far = np.eye(4)
     far[0, 3] = 55.0
     answers = [
-        Relocated(f"[red]08/{i:06d}", pose, Loop(2, i, pose, np.eye(6), 0.5)) for i, pose in enumerate((np.eye(4), far))
+        Relocalization(f"[red]08/{i:06d}", pose, LoopClosure(2, i, pose, np.eye(6), 0.5))
+        for i, pose in enumerate((np.eye(4), far))
     ]
     for few, words in ((answers, True), (answers[:1], False)):
         Console(width=140).print(_table("[bold]scan.bin", few))
@@ -192,13 +193,13 @@ def test_brackets_in_a_name_are_no_style_and_answers_that_share_the_probability_
 def test_a_frame_of_a_recording_is_asked_in_the_map(command, town, places_file, monkeypatch):
     """The scan, the mounting and the name are those of the recording."""
     asked = []
-    monkeypatch.setattr(PlaceMap, "relocate", lambda self, params, record, **options: asked.append(record) or [])
+    monkeypatch.setattr(PlaceMap, "relocate", lambda self, params, scan, **options: asked.append(scan) or [])
     run = ("relocalize", town, "--seq", "08", "--map", places_file)
     ended = command(*run, "--frame", "12", "--sensor-height", "2")
     assert_one_line_error(ended, f"frame 12 of {town.name}: expected a scan that shows a place")
-    (record,) = asked
-    assert record.name == "scan 000012 of sequence 08" and record.mounting.height_m == 2
-    np.testing.assert_array_equal(record.points, open_recording(town, "08").points(12))
+    (scan,) = asked
+    assert scan.name == "scan 000012 of sequence 08" and scan.mounting.height_m == 2
+    np.testing.assert_array_equal(scan.points, open_recording(town, "08").points(12))
     assert_one_line_error(
         command(*run, "--frame", "40"), "08: expected the number of a scan, found 40; it has 40 scans"
     )

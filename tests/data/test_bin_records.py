@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.bin_records import find_record, unusual_record
+from sglpr_jax.data.formats.bin_records import detect_point_format, unusual_record
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers import open_recording as open_any
 from sglpr_jax.data.warning import DataWarning
@@ -79,7 +79,7 @@ def test_a_broken_file_among_others_does_not_hide_it(tmp_path):
         columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
     (tmp_path / "4.bin").write_bytes(np.random.default_rng(0).bytes(48000))
     (tmp_path / "0.bin").write_bytes(b"")
-    assert find_record(sorted(tmp_path.iterdir()))[0] == "float32x6"
+    assert detect_point_format(sorted(tmp_path.iterdir()))[0] == "float32x6"
     assert unusual_record(sorted(tmp_path.iterdir())) == "float32x6"
 
 
@@ -152,4 +152,4 @@ def test_real_scans(shared, tmp_path):
         for layout, more in LAYOUTS.items():
             records = columns(cloud[: len(cloud) // 16 * 16], more)
             records.astype("<f8" if layout.startswith("float64") else "<f4").tofile(tmp_path / "0.bin")
-            assert find_record([tmp_path / "0.bin"])[0] == layout
+            assert detect_point_format([tmp_path / "0.bin"])[0] == layout

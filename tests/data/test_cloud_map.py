@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, TILE_M, on_trail, tiled_cloud, visible_points
+from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, TILE_M, on_trail, remove_hidden_points, tiled_cloud
 from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
 from sglpr_jax.data.warning import DataWarning
@@ -52,7 +52,7 @@ CLOUDS = arrays(np.float32, st.tuples(st.integers(0, 60), st.just(3)), elements=
 
 
 def seen(points, **options):
-    return visible_points(points, **{"spacing_m": SPACING_M, "reach_m": 36.0, **options})
+    return remove_hidden_points(points, **{"spacing_m": SPACING_M, "reach_m": 36.0, **options})
 
 
 def as_rows(points):

@@ -19,7 +19,7 @@ from sglpr_jax.data.corruption import (
     ring_numbers,
 )
 from sglpr_jax.data.corruption import corrupted as corrupted_recording
-from sglpr_jax.data.formats.scan_files import read_scan, read_scan_record
+from sglpr_jax.data.formats.scan_files import read_scan, read_scan_file
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.sim.sensor import HDL64E_DEG
 
@@ -138,7 +138,7 @@ def test_real_scans_of_other_sensors(shared):
     samples = shared / "data/samples"
     (nclt,) = (samples / "nclt/velodyne_sync").glob("*.bin")
     for path, expected in ((nclt, 32), (samples / "nuscenes_32_beams.pcd.bin", 32), (samples / "16_beams.pcd", 16)):
-        found = read_scan_record(path)
+        found = read_scan_file(path)
         points, lasers = found.points, found.lasers
         finite = np.isfinite(points).all(axis=1)
         rings = ring_numbers(points[finite], lasers=None if lasers is None else lasers[finite])

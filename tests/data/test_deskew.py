@@ -12,7 +12,7 @@ from scipy.linalg import expm, logm
 
 import sglpr_jax
 from sglpr_jax.data.deskew import deskew, deskewed, poses_at
-from sglpr_jax.data.record import Record, TimeField
+from sglpr_jax.data.scan import Scan, TimeField
 from sglpr_jax.data.submap import submaps
 
 RATE_S = 0.1
@@ -100,7 +100,7 @@ def test_submaps_of_deskewed_scans():
     ("changed", "message"),
     [
         ({"times": None}, "sequence 08: expected times of the scans to remove their motion, found none"),
-        ({"read": lambda *_: Record(points=np.ones((5, 3), np.float32))}, "expected times of the points to remove"),
+        ({"read": lambda *_: Scan(points=np.ones((5, 3), np.float32))}, "expected times of the points to remove"),
     ],
 )
 def test_missing_times_are_one_clear_error(changed, message):

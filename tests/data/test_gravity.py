@@ -62,7 +62,7 @@ def test_each_scan_of_a_hand_has_its_own_mounting(hand, opened):
     np.testing.assert_allclose([one.height_m for one in opened.mountings], heights, atol=0.1)
     assert opened.mountings[7].tilt_deviation_deg > 4 > 2 * GROUND_TILT_DEG > opened.mountings[8].tilt_deviation_deg
     assert opened.found[-1].startswith("gravity: the sensor tilts by ") and "in 29 of 30 scans" in opened.found[-1]
-    assert opened.record(3).mounting == opened.mountings[3]
+    assert opened.scan(3).mounting == opened.mountings[3]
     assert only(opened, [4, 6]).mountings == (opened.mountings[4], opened.mountings[6])
 
 
@@ -79,7 +79,7 @@ def test_a_vehicle_keeps_one_mounting():
     recording = recording_of(*swinging(1.5))
     found = mounted(recording, "auto", known=False)
     assert found.mountings is None and found.found[-1].startswith("sensor: 1.4")
-    assert found.record(3).mounting is found.mounting
+    assert found.scan(3).mounting is found.mounting
 
 
 def test_odometry_averages_gravity_over_the_path_and_keeps_the_height(hand, opened):

@@ -30,7 +30,7 @@ from PIL import Image
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.readers import kitti_raw, open_recording, recording_names, stamped
-from sglpr_jax.retrieval.reuse import fingerprint
+from sglpr_jax.retrieval.descriptor_cache import fingerprint
 
 
 class Layout(NamedTuple):
@@ -171,10 +171,10 @@ def test_every_layout(tree, layout):
         assert (found.name, found.ids, found.pose_source) == (expected.name, expected.ids, expected.pose_source)
         np.testing.assert_allclose(found.positions, expected.positions, atol=1e-4)
         np.testing.assert_allclose(np.diff(found.times), expected.steps_s, atol=1e-6)
-        record = found.record(len(found) - 1, lasers=True)
-        np.testing.assert_allclose(record.points, expected.points, atol=2e-5)
-        assert record.points.dtype == np.float32
-        assert (None if record.lasers is None else record.lasers.tolist()) == expected.lasers
+        scan = found.scan(len(found) - 1, lasers=True)
+        np.testing.assert_allclose(scan.points, expected.points, atol=2e-5)
+        assert scan.points.dtype == np.float32
+        assert (None if scan.lasers is None else scan.lasers.tolist()) == expected.lasers
         assert found.found[0].startswith(expected.found)
 
 
@@ -270,7 +270,7 @@ def test_simulated_drives_know_how_high_their_sensor_stood(tree):
     found = open_recording(root)
     assert found.mounting == Mounting(0.8) and found.found[-1] == "sensor: 0.80 m above the ground, as simulated"
     lowered = found.points(0) - [0, 0, MODEL_HEIGHT_M - 0.8]
-    np.testing.assert_allclose(found.record(0).upright_points, lowered, rtol=1e-6)
+    np.testing.assert_allclose(found.scan(0).upright_points, lowered, rtol=1e-6)
     write(root / "simulation.json", {"sensor": {"height_m": MODEL_HEIGHT_M}})
     assert open_recording(root).mounting is None
 
@@ -311,8 +311,8 @@ def test_the_ground_truth_of_nclt_is_found_in_any_of_three_places(tree, place):
     root = tree("nclt")
     (root / place).mkdir(exist_ok=True)
     (root / TRUTH).rename(root / place / TRUTH)
-    record = open_recording(root).record(0)
-    np.testing.assert_allclose(record.upright_points, record.points - [0, 0, MODEL_HEIGHT_M], rtol=1e-6)
+    scan = open_recording(root).scan(0)
+    np.testing.assert_allclose(scan.upright_points, scan.points - [0, 0, MODEL_HEIGHT_M], rtol=1e-6)
 
 
 def test_long_times_keep_all_their_digits(tmp_path):

@@ -144,7 +144,7 @@ def test_every_road_levels(low_robot):
     batch = read_batch([recording], pool, frames, **options)
     np.testing.assert_array_equal(batch.points[0, : len(lifted)], lifted)
     mean = handcrafted("m2dp", recording, config.grid)
-    mean = dataclasses.replace(mean, prepare=lambda record, angle: record.upright_points.mean(axis=0))
+    mean = dataclasses.replace(mean, prepare=lambda scan, angle: scan.upright_points.mean(axis=0))
     file = sglpr_jax.embed(mean, recording)
     np.testing.assert_allclose(file.descriptors[0], lifted.mean(axis=0), atol=1e-5)
     assert file.config["sensor"] == "0.50 m above the ground"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_rows, read_times, read_trajectory, read_tum, rows_of
-from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, doubt, times_of, unit_change
+from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, time_unit_problem, times_of, unit_change
 from sglpr_jax.data.warning import DataWarning
 
 KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n"
@@ -145,7 +145,7 @@ def test_numbers_of_rows_and_of_keyframes_are_not_times(first):
 def test_few_steps_stops_pauses_and_new_clocks_prove_nothing():
     stops = np.repeat(SECONDS, 3) + np.repeat(np.arange(28), 30) * 60.0
     for times in (np.array([0.0, 500.0, 900.0]), np.zeros(50), np.zeros(0), stops):
-        assert doubt(times) == ""
+        assert time_unit_problem(times) == ""
     for later in (1e4 + SECONDS, 1.7e9 + SECONDS, 100 + 100 * SECONDS, np.array([28e9, 28.1e9])):
         times = np.append(SECONDS, later)
         np.testing.assert_array_equal(times_of(times, source="a", unit="s"), times)

@@ -9,7 +9,7 @@ from sglpr_jax.data.warning import DataWarning
 
 MULE = """
 from sglpr_jax.data.readers.reader import Reader
-from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.data.recording import Recording, scan_of_file
 
 
 def names(root):
@@ -18,7 +18,7 @@ def names(root):
 
 def open_recording(root, name, options):
     paths = tuple(sorted((root / name).glob("*.bin")))
-    return Recording(name, tuple(p.stem for p in paths), paths, scan_record, pose_source=options.pose_source)
+    return Recording(name, tuple(p.stem for p in paths), paths, scan_of_file, pose_source=options.pose_source)
 
 
 READER = Reader(layout="NN/scans.here (mule)", recording_names=names, open=open_recording, rank=3)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sglpr_jax
-from sglpr_jax.data.record import Record, TimeField, check_cloud
+from sglpr_jax.data.scan import Scan, TimeField, check_cloud
 from sglpr_jax.data.views import view
 from sglpr_jax.grid import Grid
 from sglpr_jax.models.config import model_preset
@@ -27,7 +27,7 @@ DRIVERS = {
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_every_driver(driver):
     values, first_s = DRIVERS[driver]
-    found = Record(points=CLOUD, time_field=TimeField("t", values), time=EPOCH_S).point_times
+    found = Scan(points=CLOUD, time_field=TimeField("t", values), time=EPOCH_S).point_times
     np.testing.assert_allclose(found, first_s + WITHIN, atol=2e-6)
     assert found.dtype == np.float32
 
@@ -54,7 +54,7 @@ def test_points_that_were_not_measured_have_any_time():
     """Drivers write 0 or left-over memory for rays without an echo."""
     points, times = CLOUD.copy(), EPOCH_S + WITHIN
     points[3], points[4], times[3], times[4] = np.nan, 0, 0, 1e30
-    found = Record(points=points, time_field=TimeField("timestamp", times), time=EPOCH_S).point_times
+    found = Scan(points=points, time_field=TimeField("timestamp", times), time=EPOCH_S).point_times
     assert found[3] == found[4] == 0
     np.testing.assert_allclose(np.delete(found, [3, 4]), np.delete(WITHIN, [3, 4]), atol=1e-6)
 
@@ -69,10 +69,10 @@ def test_points_that_were_not_measured_have_any_time():
     ],
 )
 def test_values_that_are_no_times_of_a_scan(values, found):
-    record = Record(points=CLOUD, time_field=TimeField("time", values), name="scan 7")
+    scan = Scan(points=CLOUD, time_field=TimeField("time", values), name="scan 7")
     with pytest.raises(ValueError, match=f"scan 7: expected times of points .*the field time, {found}"):
-        _ = record.point_times
-    assert Record(points=CLOUD).point_times is None
+        _ = scan.point_times
+    assert Scan(points=CLOUD).point_times is None
 
 
 BAD = {
@@ -94,7 +94,7 @@ def test_no_place_is_refused_on_every_road_to_an_image(as_installed, kind):
     points, found = BAD[kind]
     roads = (
         lambda: check_cloud(points, name="scan 7"),
-        lambda: view(Record(points=points, name="scan 7"), Grid()),
+        lambda: view(Scan(points=points, name="scan 7"), Grid()),
         lambda: sglpr_jax.scan_image(points, model_preset("tiny")),
     )
     for road in roads:

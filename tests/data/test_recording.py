@@ -44,9 +44,9 @@ def recording(kitti_root):
 
 
 def test_a_record_opens_each_of_its_files_once(recording, opened):
-    record = recording.record(0)
-    assert record.labels is not None and opened == {"000000.bin": 1, "000000.label": 1}
-    assert (record.name, record.time) == ("scan 000000 of sequence 08", 0.0)
+    scan = recording.scan(0)
+    assert scan.labels is not None and opened == {"000000.bin": 1, "000000.label": 1}
+    assert (scan.name, scan.time) == ("scan 000000 of sequence 08", 0.0)
 
 
 def test_lasers_come_from_the_read_of_the_points(tmp_path, opened):
@@ -54,11 +54,11 @@ def test_lasers_come_from_the_read_of_the_points(tmp_path, opened):
     points[:, 4] = np.arange(64) % 32
     points.tofile(tmp_path / "0.bin")
     recording = open_recording(tmp_path, format="nuscenes")
-    record = recording.record(0, lasers=True)
-    np.testing.assert_array_equal(record.lasers, np.arange(64) % 32)
-    assert recording.record(0).lasers is None
+    scan = recording.scan(0, lasers=True)
+    np.testing.assert_array_equal(scan.lasers, np.arange(64) % 32)
+    assert recording.scan(0).lasers is None
     opened.clear()
-    left = corrupted(recording, Corruption("beams", 16.0), seed=0).record(0, lasers=True)
+    left = corrupted(recording, Corruption("beams", 16.0), seed=0).scan(0, lasers=True)
     assert len(left.points) == len(left.lasers) == 32 and opened == {"0.bin": 1}
 
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from recordings import of_images, of_scans
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.scaled import chosen_scale, scale_of, scaled, scaled_poses, scaled_record
+from sglpr_jax.data.scaled import chosen_scale, scale_of, scaled, scaled_poses, scaled_scan
+from sglpr_jax.data.scan import Scan
 
 POINTS = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)
 MOUNTINGS = (None, Mounting(0.5), Mounting(0.9, (0.6, 0.0, 0.8), 0.02, 0.3))
@@ -23,8 +23,8 @@ def recording(**fields):
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from(MOUNTINGS), st.sampled_from([2, 4]))
 def test_points_and_the_ground_below_them_are_scaled(mounting, scale):
-    record, ground = Record(points=POINTS, mounting=mounting), np.array([0, 0, MODEL_HEIGHT_M])
-    before, after = (one.upright_points + ground for one in (record, scaled_record(record, scale)))
+    scan, ground = Scan(points=POINTS, mounting=mounting), np.array([0, 0, MODEL_HEIGHT_M])
+    before, after = (one.upright_points + ground for one in (scan, scaled_scan(scan, scale)))
     np.testing.assert_allclose(after, scale * before, atol=1e-4)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from recordings import of_scans, with_points
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import readable, scan_stream
 
 SCANS = 6
@@ -16,11 +16,11 @@ WHOLE = of_scans(CLOUDS)
 FAR = np.full((5, 3), 1e5, np.float32)
 
 
-def first_x(row: int, record: Record) -> float:
-    assert record.points is not None
+def first_x(row: int, scan: Scan) -> float:
+    assert scan.points is not None
     if row == 4:
         raise ValueError("4: expected another row")
-    return float(record.points[0, 0])
+    return float(scan.points[0, 0])
 
 
 def points_with_bad_ones(path: Path) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_after_a_stop_no_scan_is_read_and_those_that_were_are_yielded(ahead):
 def test_this_thread_reads_and_others_look_ahead(ahead):
     reading, looking, here = set(), set(), threading.get_ident()
     read = with_points(WHOLE, lambda path: reading.add(threading.get_ident()) or CLOUDS[path])
-    list(scan_stream(read, lambda row, record: looking.add(threading.get_ident()), ahead=ahead))
+    list(scan_stream(read, lambda row, scan: looking.add(threading.get_ident()), ahead=ahead))
     assert reading == {here}
     assert (here in looking) == (not ahead)
 

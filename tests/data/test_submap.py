@@ -98,10 +98,10 @@ def test_labels_stay_with_their_points(tmp_path):
     for i, path in enumerate(paths):
         np.full(len(seen_from(poses[i])), 40 + i, "<u4").tofile(path)
     recording, _ = drive(poses, label_paths=(*paths[:2], None))
-    record = submaps(recording, poses).record(1)
-    assert set(record.labels) == {40, 41} and record.labels.shape == (len(record.points),)
-    assert record.labels[0] == 41  # the newest scan comes first
-    assert submaps(recording, poses).record(2).labels is None
+    scan = submaps(recording, poses).scan(1)
+    assert set(scan.labels) == {40, 41} and scan.labels.shape == (len(scan.points),)
+    assert scan.labels[0] == 41  # the newest scan comes first
+    assert submaps(recording, poses).scan(2).labels is None
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from recordings import of_images
 
-from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.result import FoundLoops, Session
+from sglpr_jax.loops.closure import LoopClosure
+from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.se3 import transform
 
@@ -60,10 +60,10 @@ def straight() -> np.ndarray:
 
 
 @pytest.fixture
-def found_loops(tmp_path) -> FoundLoops:
+def found_loops(tmp_path) -> LoopSearchResult:
     """Three loops of eight images, with odometry."""
     rng = np.random.default_rng(0)
     images = {tmp_path / f"{i:06d}.png": rng.uniform(0, 10, (20, 20)).astype(np.float32) for i in range(8)}
     odometry = np.stack([transform(float(x), 0.0, 0.0) for x in range(8)])
-    loops = tuple(Loop(q, q - 4, transform(1.0, 2.0, 0.3), np.eye(6), 0.99 + q / 1000) for q in (5, 6, 7))
-    return FoundLoops((Session(of_images(images, times=np.arange(8.0)), 8, odometry),), loops)
+    loops = tuple(LoopClosure(q, q - 4, transform(1.0, 2.0, 0.3), np.eye(6), 0.99 + q / 1000) for q in (5, 6, 7))
+    return LoopSearchResult((Session(of_images(images, times=np.arange(8.0)), 8, odometry),), loops)

@@ -7,11 +7,11 @@ import pytest
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.loops_page import loops_page
-from sglpr_jax.loops.closure import Loop, Rejected
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.frame_alignment import AlignedParts, Part
+from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.result import FoundLoops
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transform
 
@@ -19,11 +19,11 @@ from .test_evaluation_page import Parsed
 
 
 @pytest.fixture
-def found(found_loops) -> FoundLoops:
+def found(found_loops) -> LoopSearchResult:
     return found_loops
 
 
-def with_session(found: FoundLoops, **change) -> FoundLoops:
+def with_session(found: LoopSearchResult, **change) -> LoopSearchResult:
     return dataclasses.replace(found, sessions=(dataclasses.replace(found.sessions[0], **change),))
 
 
@@ -50,7 +50,11 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
 def test_rejected_pairs_are_counted_by_reason(found):
     assert "No pair was rejected." in Parsed(loops_page(found)).texts["Rejected"]
     pair = found.loops[0]
-    rejected = (Rejected(pair, "little overlap"), Rejected(pair, "repeats"), Rejected(pair, "repeats"))
+    rejected = (
+        RejectedClosure(pair, "little overlap"),
+        RejectedClosure(pair, "repeats"),
+        RejectedClosure(pair, "repeats"),
+    )
     page = Parsed(loops_page(dataclasses.replace(found, rejected=rejected)))
     said = page.texts["Rejected"]
     assert said.index("repeats") < said.index("little overlap") and "Another place, or another pose" in said
@@ -66,7 +70,7 @@ def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(known)
 
 
 @pytest.fixture
-def known(found) -> FoundLoops:
+def known(found) -> LoopSearchResult:
     """The same with true positions, off the odometry, and with candidates: two loops, and one that is none."""
     model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((8, 3))
@@ -100,12 +104,12 @@ def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, m
 
 
 @pytest.fixture
-def several(found) -> FoundLoops:
-    loop = Loop(2, 3, transform(1.0, 2.0, 0.3), np.eye(6), 0.995, query_session=1)
+def several(found) -> LoopSearchResult:
+    loop = LoopClosure(2, 3, transform(1.0, 2.0, 0.3), np.eye(6), 0.995, query_session=1)
     second = (dataclasses.replace(one, query_session=1, match_session=1) for one in found.loops)
     alignment = transform(10.0, 0.0, 0.5), 0.01 * np.eye(6)
-    transforms = (AlignedParts(Part(0, 0, 7, True), Part(1, 0, 7, True), *alignment, 1),)
-    return FoundLoops(2 * found.sessions, (*found.loops, *second, loop), transforms=transforms)
+    transforms = (SegmentAlignment(TrajectorySegment(0, 0, 7, True), TrajectorySegment(1, 0, 7, True), *alignment, 1),)
+    return LoopSearchResult(2 * found.sessions, (*found.loops, *second, loop), transforms=transforms)
 
 
 def test_transforms_pairs_and_recordings_are_shown(several):

@@ -18,12 +18,12 @@ from sglpr_jax.data.formats.pose_files import Trajectory, read_times, read_traje
 from sglpr_jax.data.formats.scan_files import read_labels, read_scan
 from sglpr_jax.data.packed import open_pack, packed
 from sglpr_jax.data.readers import bev_images, nclt, open_recording
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation.inputs import read_input
 from sglpr_jax.files import read_json
 from sglpr_jax.grid import Grid
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, config_from_dict
@@ -98,7 +98,7 @@ def pack() -> dict[str, bytes]:
         read = dict(zip(paths, clouds, strict=True))
         names = tuple(path.stem for path in paths)
         packed(
-            Recording("08", names, paths, lambda path, *_: Record(points=read[path])),
+            Recording("08", names, paths, lambda path, *_: Scan(points=read[path])),
             Path(folder) / "packs",
         )
         return {path.name: path.read_bytes() for path in (Path(folder) / "packs").glob("*/*")}
@@ -138,8 +138,8 @@ ABOUT = {"sequence": "08", "pose_source": "poses.txt", "config": {"method": "m"}
 DESCRIBED = DescriptorFile(ids=IDS, positions=POSITIONS, times=TIMES, descriptors=DESCRIPTORS, distance="l2", **ABOUT)
 POSES = np.stack([transform(x, y, 0.1 * i) for i, (x, y, _) in enumerate(POSITIONS)])
 LOOPS = [
-    Loop(3, 0, transform(1.0, 0.5, 0.2), np.diag([0.1] * 6), 0.9375),
-    Loop(4, 1, transform(-1.0, 0.25, 3.0), np.diag([0.2] * 6), 0.5, 0.75),
+    LoopClosure(3, 0, transform(1.0, 0.5, 0.2), np.diag([0.1] * 6), 0.9375),
+    LoopClosure(4, 1, transform(-1.0, 0.25, 3.0), np.diag([0.2] * 6), 0.5, 0.75),
 ]
 INDEX = Index.empty(DESCRIPTORS.shape[1], weights_hash="ab")
 INDEX.add(DESCRIPTORS, times=TIMES, positions=POSITIONS)

@@ -43,6 +43,6 @@ def said() -> Said:
 
 def live_frame(drive, i: int, *, pose=None, time: float | None = None, received: float | None = None) -> LiveFrame:
     """Scan `i` of a drive as it arrives, at its own pace."""
-    record = dataclasses.replace(drive.record(i), name=f"scan {i}", mounting=None)
+    scan = dataclasses.replace(drive.scan(i), name=f"scan {i}", mounting=None)
     time = BEGIN + float(drive.times[i]) if time is None else time
-    return LiveFrame(record, time, pose, float(drive.times[i]) if received is None else received)
+    return LiveFrame(scan, time, pose, float(drive.times[i]) if received is None else received)

@@ -30,8 +30,8 @@ def test_a_bag_is_replayed_as_fast_as_possible(bag, said):
     frames = list(open_source(f"bag:{bag}", options, said).frames())
     np.testing.assert_allclose([frame.time for frame in frames], STAMP + 0.05 * np.arange(10))
     assert [frame.odometry[0, 3] for frame in frames] == pytest.approx(range(10), abs=1e-6)
-    assert frames[3].record.mounting.height_m == 1.5 and frames[3].record.name.endswith("scan 000003")
-    known = {frames[3].record.name, frames[6].record.name}
+    assert frames[3].scan.mounting.height_m == 1.5 and frames[3].scan.name.endswith("scan 000003")
+    known = {frames[3].scan.name, frames[6].scan.name}
     rest = open_source(f"bag:{bag}", LiveOptions(rate=0.0), said, taken=known.__contains__)
     assert [frame.time for frame in rest.frames()] == [frame.time for frame in frames[7:]]
 

@@ -130,7 +130,7 @@ def test_scans_and_poses_come_in_types_that_cyclonedds_encodes_itself(domain, pe
         if frame is not None and frame.odometry is not None:
             break
         time.sleep(0.02)
-    np.testing.assert_array_equal(frame.record.points, np.arange(60, dtype=np.float32).reshape(20, 3))
+    np.testing.assert_array_equal(frame.scan.points, np.arange(60, dtype=np.float32).reshape(20, 3))
     np.testing.assert_allclose(frame.odometry[:3, 3], [2 * (frame.time - 100), 0, 2], atol=1e-5)
     assert set(said.kinds) <= {"odometry", "missing"}, said
 

@@ -51,8 +51,8 @@ def test_scans_of_a_folder_come_in_order_once_they_are_complete(incoming, said):
     for i in (10, 9):
         scan(incoming / f"{STAMP + i}.bin")
     first, second = taken(source, 2)
-    assert (first.time, second.time) == (STAMP + 9, STAMP + 10) and first.record.name.endswith("09.0.bin")
-    np.testing.assert_array_equal(first.record.points, POINTS)
+    assert (first.time, second.time) == (STAMP + 9, STAMP + 10) and first.scan.name.endswith("09.0.bin")
+    np.testing.assert_array_equal(first.scan.points, POINTS)
     assert first.odometry is None and source.dropped == 0
     with (incoming / "1700000011.0.bin").open("wb") as file:
         content = (incoming / "1700000010.0.bin").read_bytes()
@@ -67,7 +67,7 @@ def test_a_folder_is_continued_after_the_last_scan_of_the_map(incoming, said):
     paths = [scan(incoming / f"{i}.bin") for i in range(4)]
     known = {str(paths[1].resolve())}
     source = open_source(f"folder:{incoming}", LiveOptions(), said, taken=known.__contains__)
-    assert [Path(frame.record.name).name for frame in looked(source, 0.5)] == ["2.bin", "3.bin"]
+    assert [Path(frame.scan.name).name for frame in looked(source, 0.5)] == ["2.bin", "3.bin"]
 
 
 def test_a_scan_that_cannot_be_read_is_reported_and_the_others_come(incoming, said):
@@ -78,7 +78,7 @@ def test_a_scan_that_cannot_be_read_is_reported_and_the_others_come(incoming, sa
     for path in incoming.iterdir():
         os.utime(path, (STAMP, STAMP))
     source = open_source(f"folder:{incoming}", LiveOptions(), said)
-    assert [Path(frame.record.name).name for frame in looked(source, 1.0)] == ["0.bin", "2.bin"]
+    assert [Path(frame.scan.name).name for frame in looked(source, 1.0)] == ["0.bin", "2.bin"]
     assert said.kinds == ["scan", "scan"] and "1.bin" in said[0][1]
 
 

@@ -16,17 +16,17 @@ from sglpr_jax.live.results import CorrectedTrajectory, write_results
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import read_loops_jsonl
-from sglpr_jax.registration.bev_search import Peak
+from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.se3 import inverse
 from tests.live.conftest import SCANS, live_frame
 
 CONFIG = DetectorConfig(min_probability=0.5)
 HALF = 20
 DRAW = np.random.default_rng(0)
-FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(5, 2))))
-SEEN = Seen(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))
+FITS = Fits(np.array([1, 4]), CorrelationPeak(*DRAW.normal(size=(5, 2))))
+SEEN = Keyframe(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))
 
 
 def opened(params, folder, said, **more) -> LiveMap:
@@ -101,8 +101,8 @@ def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(
     poses = drive.poses.world_from_lidar
     shutil.copy(whole[0] / SETTINGS, tmp_path)
     log = FrameLog(tmp_path / FRAMES)
-    for number, record in itertools.islice(FrameLog(whole[0] / FRAMES).records(), HALF):
-        log.append(number, record)
+    for number, scan in itertools.islice(FrameLog(whole[0] / FRAMES).records(), HALF):
+        log.append(number, scan)
     log.close()
     live = opened(params, tmp_path, said)
     assert live.recall() == [] and len(live) == HALF
@@ -148,11 +148,11 @@ def test_scans_of_nothing_are_left_out_or_hold_no_place(drive, params, tmp_path,
     live = opened(params, tmp_path, said)
     live.recall()
     frame = live_frame(drive, 0)
-    nothing = dataclasses.replace(frame.record, points=np.full((5, 3), np.nan, np.float32))
+    nothing = dataclasses.replace(frame.scan, points=np.full((5, 3), np.nan, np.float32))
     with pytest.raises(ValueError, match="scan 0: expected points, found none"):
-        live.add(frame._replace(record=nothing))
-    little = dataclasses.replace(frame.record, points=np.ones((3, 3), np.float32))
-    assert live.add(frame._replace(record=little)) == [] and said.kinds == ["empty"]
+        live.add(frame._replace(scan=nothing))
+    little = dataclasses.replace(frame.scan, points=np.ones((3, 3), np.float32))
+    assert live.add(frame._replace(scan=little)) == [] and said.kinds == ["empty"]
     live.close()
 
 

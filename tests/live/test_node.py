@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.live.endpoints import open_sink
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.live.messages import AGAIN_S, FrameStatus, Latest, LiveFrame, LoopEdge, Reports
+from sglpr_jax.live.messages import AGAIN_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.node import Node
 from sglpr_jax.live.options import LiveOptions
 
@@ -76,7 +76,7 @@ class Kept:
 
 @pytest.fixture
 def frame() -> LiveFrame:
-    return LiveFrame(Record(points=np.ones((3, 3), np.float32)), 0.0, None, 0.0)
+    return LiveFrame(Scan(points=np.ones((3, 3), np.float32)), 0.0, None, 0.0)
 
 
 def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said):
@@ -94,7 +94,7 @@ def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said):
 
 
 def test_a_newer_item_replaces_one_that_waits():
-    latest = Latest()
+    latest = LatestScan()
     assert latest.take(0.0) is None
     for item in range(3):
         latest.put(item)

@@ -49,8 +49,8 @@ def test_a_scan_has_points_time_and_pose(transport, source, said):
         transport.receive["/odom"](received(ODOMETRY, message, at=clock.monotonic()))
     transport.receive["/points"](received(CLOUD, cloud(12.5), at=3.0))
     frame = next(source.frames())
-    np.testing.assert_array_equal(frame.record.points, POINTS)
-    assert (frame.time, frame.received, frame.record.name) == (12.5, 3.0, "")
+    np.testing.assert_array_equal(frame.scan.points, POINTS)
+    assert (frame.time, frame.received, frame.scan.name) == (12.5, 3.0, "")
     np.testing.assert_allclose(frame.odometry[:3, 3], [12.5, 0, 0])
     assert not said
 

@@ -127,7 +127,7 @@ def test_messages_stay_encoded(package, said):
     assert (qos["depth"], qos["reliability"], qos["durability"]) == (1, "best", 0)
     assert node.subscribed["/tf_static", TRANSFORMS][1]["durability"] == 1
     frame = next(source.frames())
-    np.testing.assert_array_equal(frame.record.points, POINTS)
+    np.testing.assert_array_equal(frame.scan.points, POINTS)
     np.testing.assert_allclose(frame.odometry[:3, 3], [12.5, 0, 0])
     wire.advertise("/sglpr/loops", EDGE, depth=5, latched=True)(b"cdr")
     assert node.sent == [("/sglpr/loops", EDGE, b"cdr")]

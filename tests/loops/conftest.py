@@ -7,13 +7,13 @@ import pytest
 from drives import drive, revisit, street  # noqa: F401
 
 import sglpr_jax
-from sglpr_jax.loops.comparison import Candidate, Comparer
+from sglpr_jax.loops.comparison import Candidate, KeyframeComparison
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.keyframes import described as describe_scan
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.models.params import Params
-from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import yaw_of
 
 
@@ -23,9 +23,9 @@ def params() -> Params:
 
 
 @pytest.fixture(scope="session")
-def described(street, params) -> list[Seen]:  # noqa: F811
+def described(street, params) -> list[Keyframe]:  # noqa: F811
     """Description of each scan of the street."""
-    return [describe_scan(params, street.record(i, labels=False)) for i in range(len(street))]
+    return [describe_scan(params, street.scan(i, labels=False)) for i in range(len(street))]
 
 
 @pytest.fixture(scope="session")
@@ -33,7 +33,7 @@ def streamed(street, described, params):  # noqa: F811
     """The detector after the whole street, with odometry, and what it returned frame by frame."""
     detector = LoopDetector(params)
     frames = zip(described, street.times.tolist(), street.poses.world_from_lidar, strict=True)
-    return detector, [detector.add_seen(seen, time=time, odometry=pose) for seen, time, pose in frames]
+    return detector, [detector.add_keyframe(keyframe, time=time, odometry=pose) for keyframe, time, pose in frames]
 
 
 @pytest.fixture
@@ -48,9 +48,9 @@ def compare_only(monkeypatch) -> Callable[[Mapping[int, tuple[int, np.ndarray]]]
             match, pose = pairs[query.frame]
             planar = np.array([[*pose[:2, 3], yaw_of(pose)]])
             (deviation,) = self.deviations(query.frame, np.array([match]), planar)
-            alignment = Alignment(*planar[0], np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
+            alignment = BevRegistration(*planar[0], np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
             return [Candidate(query.frame, match, alignment, Evidence.of(0.3, 0.1, deviation, 3.0))]
 
-        monkeypatch.setattr(Comparer, "candidates", candidates)
+        monkeypatch.setattr(KeyframeComparison, "candidates", candidates)
 
     return only

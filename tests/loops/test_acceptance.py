@@ -11,8 +11,8 @@ from recordings import of_scans
 
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import acceptance
-from sglpr_jax.loops.acceptance import accepted, check_odometry, stretches
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.acceptance import accepted, check_odometry, count_revisit_segments
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.odometry.config import DriftModel
@@ -24,13 +24,13 @@ from sglpr_jax.se3 import transform, travelled
 SERPENTINE = along([(0, 0), (150, 0), (150, 26), (0, 26), (0, 52), (150, 52), (150, 78), (0, 78)], 2.0)
 
 
-def of_rooms() -> tuple[np.ndarray, list[Loop]]:
+def of_rooms() -> tuple[np.ndarray, list[LoopClosure]]:
     """Exact odometry of two rooms, and loops that take one for the other."""
     poses = rooms()
     return poses, wrong_loops(poses, (-8, 0), range(len(poses) - 60, len(poses) - 1))
 
 
-def of_a_car_park() -> tuple[np.ndarray, list[Loop]]:
+def of_a_car_park() -> tuple[np.ndarray, list[LoopClosure]]:
     """Odometry 1 % too long of a car park, and loops that take each row for the one before."""
     queries = [i for i, pose in enumerate(SERPENTINE) if pose[1, 3] > 25 and i % 5 == 0]
     return drifted(SERPENTINE, percent=1, deg_per_100m=0), wrong_loops(SERPENTINE, (0, -26), queries)
@@ -101,7 +101,7 @@ def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_ca
 def test_a_few_wrong_loops_among_many_true_ones_are_no_reason_to_doubt_the_odometry():
     true = town()
     loops = true_loops(true, every=6)
-    wrong = [Loop(300 + i, 100 + i, np.eye(4), loops[0].covariance, 1.0) for i in range(20)]
+    wrong = [LoopClosure(300 + i, 100 + i, np.eye(4), loops[0].covariance, 1.0) for i in range(20)]
     kept, rejected = accepted([*wrong, *loops], DrivenPath(true))
     assert kept == loops and len(rejected) == 20
     against = [one.loop for one in rejected]
@@ -111,10 +111,10 @@ def test_a_few_wrong_loops_among_many_true_ones_are_no_reason_to_doubt_the_odome
 def test_loops_in_a_row_are_one_part_of_the_drive():
     poses = along([(0, 0), (600, 0)])
     at = [*range(300, 320), *range(400, 402), *range(500, 510)]
-    loops = [Loop(query, query - 300, np.eye(4), np.eye(6), 1.0) for query in at]
-    assert stretches(loops, travelled(poses)) == 2 and stretches([], travelled(poses)) == 0
-    same_match = [Loop(query, 100 + i, np.eye(4), np.eye(6), 1.0) for i, query in enumerate(at)]
-    assert stretches(same_match, travelled(poses)) == 1
+    loops = [LoopClosure(query, query - 300, np.eye(4), np.eye(6), 1.0) for query in at]
+    assert count_revisit_segments(loops, travelled(poses)) == 2 and count_revisit_segments([], travelled(poses)) == 0
+    same_match = [LoopClosure(query, 100 + i, np.eye(4), np.eye(6), 1.0) for i, query in enumerate(at)]
+    assert count_revisit_segments(same_match, travelled(poses)) == 1
 
 
 @pytest.mark.slow
@@ -145,7 +145,7 @@ def test_scans_that_overlap_little_are_a_loop_if_both_poses_agree(monkeypatch, o
 
     monkeypatch.setattr(acceptance, "register", registered)
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
-    loop = Loop(1, 0, np.eye(4), 0.01 * np.eye(6), 0.99)
+    loop = LoopClosure(1, 0, np.eye(4), 0.01 * np.eye(6), 0.99)
     loops, rejected = acceptance.registered_loops(recording, recording, [loop], should_stop=lambda: False)
     (found,) = loops if kept else [one.loop for one in rejected]
     assert found.overlap == overlap and found.match_from_query[0, 3] == off_m

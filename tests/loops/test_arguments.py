@@ -10,12 +10,12 @@ from recordings import of_scans
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.arguments import given_pose, given_poses, given_record, given_time
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.arguments import given_pose, given_poses, given_scan, given_time
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
@@ -25,17 +25,17 @@ from sglpr_jax.se3 import transform
 
 POSES = [np.eye(4).tolist(), transform(1.0, 0.0, 0.5)]
 FLAT = np.zeros((2, 4, 4))
-EMPTY = Seen(np.ones(256, np.float32), np.zeros((152, 152), np.uint8), None)
+EMPTY = Keyframe(np.ones(256, np.float32), np.zeros((152, 152), np.uint8), None)
 
 
 def test_lists_are_taken_for_arrays():
     np.testing.assert_array_equal(given_poses(POSES, of="odometry"), np.array(POSES))
     np.testing.assert_array_equal(given_pose(POSES[0]), np.eye(4))
-    record = Record()
-    assert given_record(record) is record
-    points = given_record([[1, 2, 3], [4, 5, 6]])
+    scan = Scan()
+    assert given_scan(scan) is scan
+    points = given_scan([[1, 2, 3], [4, 5, 6]])
     assert points.points.dtype == np.float32 and points.points.shape == (2, 3) and points.mounting is None
-    assert given_record(np.ones((9, 9), int)).image.shape == (9, 9)
+    assert given_scan(np.ones((9, 9), int)).image.shape == (9, 9)
     assert given_time(np.int64(3)) == 3.0 and given_time(None) is None and given_pose(None) is None
 
 
@@ -47,9 +47,9 @@ def test_lists_are_taken_for_arrays():
         (lambda: given_poses(np.zeros((5, 3)), of="odometry"), ValueError, r"odometry .*, found .* shape \(5, 3\)"),
         (lambda: given_poses(FLAT, of="odometry"), ValueError, r"with rotations, found \[\[0\.0.* in row 0"),
         (lambda: given_pose(np.eye(3)), ValueError, r"odometry \(4, 4\), found an array of shape \(3, 3\)"),
-        (lambda: given_record("000000.bin"), TypeError, "found the path 000000.bin; read it with sglpr_jax.read_scan"),
-        (lambda: given_record([[1, 2, 3], [4]]), TypeError, r"points \(n, 3\) or an image \(h, w\), found a list"),
-        (lambda: given_record(np.zeros((3, 3, 3))), ValueError, r"found an array of shape \(3, 3, 3\)"),
+        (lambda: given_scan("000000.bin"), TypeError, "found the path 000000.bin; read it with sglpr_jax.read_scan"),
+        (lambda: given_scan([[1, 2, 3], [4]]), TypeError, r"points \(n, 3\) or an image \(h, w\), found a list"),
+        (lambda: given_scan(np.zeros((3, 3, 3))), ValueError, r"found an array of shape \(3, 3, 3\)"),
         (lambda: given_time("now"), TypeError, "expected a time in seconds, found 'now'"),
         (lambda: given_time(np.nan), ValueError, "expected a time in seconds, found nan"),
     ],
@@ -85,10 +85,10 @@ def test_points_are_looked_for_in_a_map_as_those_of_its_sensor(params, monkeypat
     places = PlaceMap(
         index, np.zeros((1, 152, 152), np.uint8), np.eye(4)[None], np.array([[2.5, 0, 0, 1.0]]), np.full((1, 2), np.nan)
     )
-    seen = []
-    monkeypatch.setattr(CandidateFinder, "seen", lambda self, record: seen.append(record) or EMPTY)
+    asked = []
+    monkeypatch.setattr(CandidateSearch, "keyframe", lambda self, scan: asked.append(scan) or EMPTY)
     assert places.relocate(params, [[5, 3, 1]]) == [] and places.relocate(params, np.zeros((9, 9))) == []
-    assert seen[0].mounting == Mounting(2.5) and seen[1].image is not None
+    assert asked[0].mounting == Mounting(2.5) and asked[1].image is not None
 
 
 def test_loops_and_maps_warn_of_poses_in_the_cameras_axes(params):

@@ -5,12 +5,12 @@ import pytest
 from scenes import place, seen_from
 
 import sglpr_jax
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.grid import Grid
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
-from sglpr_jax.loops.keyframes import Seen, square_image
+from sglpr_jax.loops.keyframes import Keyframe, square_image
 from sglpr_jax.registration import background
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.se3 import inverse, transform
@@ -20,26 +20,26 @@ CELLS, CELL_M = 152, 0.4
 BLANK = np.ones((CELLS, CELLS), np.uint8)
 
 
-def finder_of(params, candidates: CandidateConfig = CandidateConfig(), **limits) -> CandidateFinder:
-    return CandidateFinder(params, DetectorConfig(candidates=candidates, **{"keyframe_m": 0.0, **limits}))
+def finder_of(params, candidates: CandidateConfig = CandidateConfig(), **limits) -> CandidateSearch:
+    return CandidateSearch(params, DetectorConfig(candidates=candidates, **{"keyframe_m": 0.0, **limits}))
 
 
-def seen_by(finder: CandidateFinder, image: np.ndarray) -> Seen:
+def seen_by(finder: CandidateSearch, image: np.ndarray) -> Keyframe:
     """An image with a descriptor of nothing."""
-    return Seen(np.zeros(finder.index.width, np.float32), image, None)
+    return Keyframe(np.zeros(finder.index.width, np.float32), image, None)
 
 
 def test_images_and_scans_are_the_same_to_it(drive, params, revisit):
     points = drive.points(revisit[1])
     scans, images = finder_of(params, NOW), finder_of(params, NOW)
     for cloud in (points, drive.points(revisit[0])):
-        found = scans.add_seen(scans.seen(Record(points=cloud)))
-        same = images.add_seen(images.seen(Record(image=sglpr_jax.density_bev(cloud))))
+        found = scans.add_keyframe(scans.keyframe(Scan(points=cloud)))
+        same = images.add_keyframe(images.keyframe(Scan(image=sglpr_jax.density_bev(cloud))))
     assert (found[0].query, found[0].match) == (1, 0)
     for one, other in zip(found[0].alignment, same[0].alignment, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5)
     assert found[0].alignment.correlation > 0.4
-    np.testing.assert_array_equal(scans.stored.image(0), within_reach(square_image(Record(points=points))))
+    np.testing.assert_array_equal(scans.stored.image(0), within_reach(square_image(Scan(points=points))))
 
 
 def test_odometry_that_is_far_off_contradicts_a_match(drive, params, revisit):
@@ -47,8 +47,8 @@ def test_odometry_that_is_far_off_contradicts_a_match(drive, params, revisit):
     true = inverse(drive.poses.world_from_lidar[revisit[1]]) @ drive.poses.world_from_lidar[revisit[0]]
     for metres, allowed in ((0.0, True), (12.0, False)):
         finder = finder_of(params, NOW)
-        finder.add_seen(finder.seen(Record(points=match)), odometry=np.eye(4))
-        (found,) = finder.add_seen(finder.seen(Record(points=query)), odometry=transform(metres, 0.0, 0.0) @ true)
+        finder.add_keyframe(finder.keyframe(Scan(points=match)), odometry=np.eye(4))
+        (found,) = finder.add_keyframe(finder.keyframe(Scan(points=query)), odometry=transform(metres, 0.0, 0.0) @ true)
         assert (found.evidence.deviation <= finder.drift.max_deviation) == allowed
 
 
@@ -56,9 +56,9 @@ def test_odometry_that_is_far_off_contradicts_a_match(drive, params, revisit):
 def test_scans_of_one_pass_are_no_candidates(drive, params, revisit, share, there):
     """The sensor drives this share of `recent_m` away from a place, and back."""
     finder = finder_of(params)
-    seen = finder.seen(Record(points=drive.points(revisit[0])))
+    keyframe = finder.keyframe(Scan(points=drive.points(revisit[0])))
     for x in (0.0, share * CandidateConfig().recent_m, 0.0):
-        found = finder.add_seen(seen, odometry=transform(x, 0.0, 0.0))
+        found = finder.add_keyframe(keyframe, odometry=transform(x, 0.0, 0.0))
     assert len(found) == there
 
 
@@ -78,9 +78,9 @@ def test_places_with_distant_descriptors_are_found_by_further_comparisons(params
     finder = finder_of(params, config)
     descriptors = np.eye(PLACES + 1, finder.index.width, dtype=np.float32)
     for image, descriptor in zip(places[:-1], descriptors, strict=False):
-        finder.add_seen(Seen(descriptor, image, None))
+        finder.add_keyframe(Keyframe(descriptor, image, None))
     wrong = (descriptors[0] + 0.1 * descriptors[-1]).astype(np.float32)
-    candidates = finder.add_seen(Seen(wrong / np.linalg.norm(wrong), places[-1], None))
+    candidates = finder.add_keyframe(Keyframe(wrong / np.linalg.norm(wrong), places[-1], None))
     assert [one.match for one in candidates] == ([TRUE] if found else [])
 
 
@@ -93,9 +93,9 @@ def test_a_good_fit_on_another_floor_does_not_end_the_search(params, places):
     for frame, (image, descriptor) in enumerate(zip(upstairs, descriptors, strict=True)):
         pose = np.eye(4)
         pose[:3, 3] = frame % 3, 0.0, 0.0 if frame else 8.0
-        finder.add_seen(Seen(descriptor, image, None), odometry=pose)
+        finder.add_keyframe(Keyframe(descriptor, image, None), odometry=pose)
     pose = transform(TRUE % 3 + 1.2, -0.8, 2.5)
-    best, *others = finder.add_seen(Seen(descriptors[0], places[-1], None), odometry=pose)
+    best, *others = finder.add_keyframe(Keyframe(descriptors[0], places[-1], None), odometry=pose)
     assert best.match == TRUE and [one.match for one in others] in ([], [0])
 
 
@@ -107,7 +107,7 @@ def test_between_plain_walls_the_sensor_moves_on_and_drifts(params):
     world = np.concatenate([walls, np.repeat(rng.uniform((-60, -5), (10.0, 5), (60, 2)), 20, axis=0)])
     for frame in range(60):
         image = seen_from(world, (float(frame), 0.0, 0.0), grid=grid, seed=frame)
-        finder.add_seen(seen_by(finder, image.astype(np.uint8)), time=0.1 * frame)
+        finder.add_keyframe(seen_by(finder, image.astype(np.uint8)), time=0.1 * frame)
     motion = finder.motion
     assert motion.guessed_m[10] == motion.guessed_m[20] < motion.guessed_m[-1]
     assert (motion.poses[-1] - motion.poses[10])[0, 3] == pytest.approx(49, rel=0.1)
@@ -128,17 +128,17 @@ def test_rings_on_the_floor_do_not_hold_the_motion(params, monkeypatch, rings):
     floor = np.where((np.abs(radius[..., None] - (4.0, 6.0, 9.0, 13.0)) < 0.2).any(axis=-1), 80, 0)
     for k in range(20):
         apart = np.hypot(axis[:, None, None] - (posts[:, 0] - k), axis[None, :, None] - posts[:, 1]).min(axis=-1)
-        finder.add_seen(seen_by(finder, np.where(apart < 0.5, 160, floor).astype(np.uint8)), time=0.1 * k)
+        finder.add_keyframe(seen_by(finder, np.where(apart < 0.5, 160, floor).astype(np.uint8)), time=0.1 * k)
     moved = np.linalg.norm(finder.motion.poses[-1][:3, 3])
     assert moved < 1 if rings else moved == pytest.approx(19, abs=1)
 
 
-def driven(params, step_m: float, turn_deg: float = 0.0, *, frames: int = 41, **limits) -> CandidateFinder:
+def driven(params, step_m: float, turn_deg: float = 0.0, *, frames: int = 41, **limits) -> CandidateSearch:
     """A finder after frames that are `step_m` metres apart, all with one image."""
     finder = finder_of(params, **limits)
     for frame in range(frames):
         pose = transform(step_m * frame, 0.0, np.radians(turn_deg * frame))
-        finder.add_seen(seen_by(finder, BLANK), odometry=pose, compared=NO_FITS)
+        finder.add_keyframe(seen_by(finder, BLANK), odometry=pose, compared=NO_FITS)
     return finder
 
 
@@ -152,7 +152,7 @@ def test_a_scan_near_the_last_stored_one_is_not_stored_unless_the_sensor_turned(
 def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):
     finder = finder_of(params, keyframe_m=1e9)
     for _ in range(3):  # without links the motion is unknown
-        finder.add_seen(seen_by(finder, BLANK), compared=NO_FITS)
+        finder.add_keyframe(seen_by(finder, BLANK), compared=NO_FITS)
     assert finder.stored.frames.tolist() == [int(np.flatnonzero(finder.motion.segments == k)[0]) for k in range(3)]
 
 

@@ -16,11 +16,11 @@ from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import acceptance, checkpoint, search
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
 from sglpr_jax.pose_graph.folder import write_found
-from sglpr_jax.registration.bev_alignment import Alignment
-from sglpr_jax.registration.bev_search import Peak
+from sglpr_jax.registration.bev_alignment import BevRegistration
+from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.registration.gicp import Registration
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
@@ -30,8 +30,8 @@ find_loops = functools.partial(search.find_loops, model=ALWAYS)
 """Every candidate is probable, so that the loops depend on nothing but what is kept."""
 CONFIG = DetectorConfig(candidates=CandidateConfig(recent_m=20.0))
 DRAW = np.random.default_rng(0)
-FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(5, 2))))
-SEEN = Seen(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))
+FITS = Fits(np.array([1, 4]), CorrelationPeak(*DRAW.normal(size=(5, 2))))
+SEEN = Keyframe(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))
 ABOUT = {"name": str, "wall": float}
 
 
@@ -185,11 +185,11 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
 
 @pytest.mark.parametrize(("fits", "pose"), [(FITS, np.eye(4)), (NO_FITS, None)])
 def test_a_frame_comes_back_from_its_bytes(fits, pose):
-    link = Alignment(*DRAW.normal(size=3), np.diag([0.3, 0.3, 0.0]) ** 2, 0.8, 0.4) if pose is None else None
+    link = BevRegistration(*DRAW.normal(size=3), np.diag([0.3, 0.3, 0.0]) ** 2, 0.8, 0.4) if pose is None else None
     content = checkpoint.frame_bytes(SEEN, fits._replace(link=link), pose=pose, name="a", wall=3.5)
-    seen, compared, found, about = checkpoint.read_frame(content, 5, ABOUT, source=Path("log"))
-    assert seen.mounting == SEEN.mounting and about == {"name": "a", "wall": 3.5}
-    np.testing.assert_array_equal(seen.image, SEEN.image)
+    keyframe, compared, found, about = checkpoint.read_frame(content, 5, ABOUT, source=Path("log"))
+    assert keyframe.mounting == SEEN.mounting and about == {"name": "a", "wall": 3.5}
+    np.testing.assert_array_equal(keyframe.image, SEEN.image)
     np.testing.assert_array_equal(compared.frames, fits.frames)
     np.testing.assert_array_equal(np.stack(compared.peaks), np.stack(fits.peaks))
     assert (compared.link is None) == (link is None) and (found is None) == (pose is None)
@@ -199,7 +199,7 @@ def test_a_frame_comes_back_from_its_bytes(fits, pose):
 
 @pytest.mark.parametrize(("cut", "number", "about"), [(0, 4, {}), (9, 5, {}), (0, 5, ABOUT)])
 def test_another_content_is_refused(cut, number, about):
-    content, bad_scan = (checkpoint.frame_bytes(seen, FITS) for seen in (SEEN, None))
+    content, bad_scan = (checkpoint.frame_bytes(keyframe, FITS) for keyframe in (SEEN, None))
     assert checkpoint.read_frame(bad_scan, 5, {}, source=Path("log"))[0] is None
     with pytest.raises(ValueError, match=rf"log: expected frame {number}, found another content"):
         checkpoint.read_frame(content[: len(content) - cut], number, about, source=Path("log"))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scenes import place, seen_from
 
-from sglpr_jax.loops.comparison import Candidate, Comparer, Query
+from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
 from sglpr_jax.loops.keyframes import StoredScans
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.retrieval.index import Index
@@ -47,10 +47,10 @@ def compared(
     return comparer.candidates(query, comparer.compare(query, stored), stored)
 
 
-def comparer_along(poses: Sequence[np.ndarray], *, drift: DriftModel = EXACT, joined=()) -> Comparer:
+def comparer_along(poses: Sequence[np.ndarray], *, drift: DriftModel = EXACT, joined=()) -> KeyframeComparison:
     joined = np.array(joined, np.int64).reshape(-1, 2)
-    motion = Motion.of(np.stack(poses))
-    return Comparer(motion, drift, joined=joined)
+    motion = BevOdometry.of(np.stack(poses))
+    return KeyframeComparison(motion, drift, joined=joined)
 
 
 def test_the_place_is_found_and_no_other_place_fits_as_well():

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from session_pairs import loops_between, two_drives
 
-from sglpr_jax.loops.closure import Loop, planar_loop
+from sglpr_jax.loops.closure import LoopClosure, planar_loop
 from sglpr_jax.loops.consistency import MIN_LOOPS, accepted_between, agree, largest_consistent_set
-from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform
 
 
@@ -28,11 +28,13 @@ def square_drive(laps: int = 2, side: int = 50) -> np.ndarray:
     return np.stack(poses)
 
 
-def loop_of(poses: np.ndarray, query: int, match: int, error: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Loop:
+def loop_of(
+    poses: np.ndarray, query: int, match: int, error: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> LoopClosure:
     relative = inverse(poses[match]) @ poses[query] @ transform(*error)
     yaw = np.arctan2(relative[1, 0], relative[0, 0])
     covariance = np.diag([0.05, 0.05, np.radians(0.3)]) ** 2
-    return planar_loop(query, match, Alignment(*relative[:2, 3], yaw, covariance, 0.8, 0.3), probability=0.99)
+    return planar_loop(query, match, BevRegistration(*relative[:2, 3], yaw, covariance, 0.8, 0.3), probability=0.99)
 
 
 @pytest.mark.slow
@@ -86,7 +88,7 @@ def test_the_set_is_the_one_that_all_degrees_taken_anew_choose(n, share, seed):
 def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
     """Unsure along the match's x; the query is turned by 90 degrees, so along its own y."""
     covariance = np.diag([4.0, 0.01, 0.001])
-    loop = planar_loop(9, 1, Alignment(1.0, 2.0, np.pi / 2, covariance, 0.8, 0.3), probability=0.9)
+    loop = planar_loop(9, 1, BevRegistration(1.0, 2.0, np.pi / 2, covariance, 0.8, 0.3), probability=0.9)
     np.testing.assert_allclose(loop.covariance.diagonal()[[0, 1, 5]], [0.01, 4.0, 0.001], atol=1e-9)
     np.testing.assert_allclose(loop.information @ loop.covariance, np.eye(6), atol=1e-9)
     assert loop.yaw == pytest.approx(np.pi / 2)
@@ -98,10 +100,10 @@ def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
 
 RULES = {"drift": DriftModel()}
 FIRST, SECOND, TRUE = two_drives()
-MOTION = Motion.joined([Motion.of(FIRST), Motion.of(SECOND)])
+MOTION = BevOdometry.joined([BevOdometry.of(FIRST), BevOdometry.of(SECOND)])
 
 
-def joined_loops(true: np.ndarray) -> list[Loop]:
+def joined_loops(true: np.ndarray) -> list[LoopClosure]:
     """Loops by this transform, with the rows of both recordings, one after the other."""
     rng = np.random.default_rng(3)
     return [
@@ -141,7 +143,7 @@ def test_a_place_that_repeats_gives_two_transforms_and_therefore_none():
 def test_parts_without_known_motion_are_accepted_one_by_one():
     loops = joined_loops(TRUE)
     middle = int(np.median([loop.query for loop in loops]))
-    offset, parts = middle - len(FIRST) + 1, [Motion.of(FIRST)]
-    parts += [Motion.of(some) for some in (SECOND[:offset], SECOND[offset:])]
-    sets, rejected = accepted_between(loops, Motion.joined(parts), **RULES)
+    offset, parts = middle - len(FIRST) + 1, [BevOdometry.of(FIRST)]
+    parts += [BevOdometry.of(some) for some in (SECOND[:offset], SECOND[offset:])]
+    sets, rejected = accepted_between(loops, BevOdometry.joined(parts), **RULES)
     assert len(sets) == 2 and sum(map(len, sets)) == len(loops) and not rejected

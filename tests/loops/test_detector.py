@@ -7,12 +7,12 @@ import pytest
 from drives import PASS
 
 from sglpr_jax.loops.acceptance import LITTLE_OVERLAP
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.se3 import inverse, transform, yaw_of
@@ -71,13 +71,13 @@ def streamed_pairs(params, compare_only):
 
     def streamed(matches, log_odds: float, poses=THERE_AND_BACK, *, wrong=()) -> LoopDetector:
         detector = LoopDetector(params, model=model_of(log_odds))
-        seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
+        keyframe = Keyframe(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
         off = {query: transform(5.0 * (query in wrong), 0.0, 0.0) for query in matches}
         true = {q: inverse(THERE_AND_BACK[m]) @ THERE_AND_BACK[q] @ off[q] for q, m in matches.items()}
         compare_only({query: (match, true[query]) for query, match in matches.items()})
         for frame in range(len(THERE_AND_BACK)):
             pose = None if poses is None else poses[frame]
-            detector.add_seen(seen, odometry=pose, compared=NO_FITS)
+            detector.add_keyframe(keyframe, odometry=pose, compared=NO_FITS)
         return detector
 
     return streamed
@@ -145,4 +145,4 @@ def test_what_does_not_fit_is_one_clear_error(params, random_params):
     head = dataclasses.replace(params.config.head, input="counts+labels")
     reads = dataclasses.replace(params.config, categories=20, head=head)
     with pytest.raises(ValueError, match="describes images alone"):
-        CandidateFinder(dataclasses.replace(params, config=reads))
+        CandidateSearch(dataclasses.replace(params, config=reads))

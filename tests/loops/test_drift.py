@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.loops.closure import Loop, inverted
+from sglpr_jax.loops.closure import LoopClosure, inverse_planar
 from sglpr_jax.loops.drift import deviations, planar_deviations, step_deviations
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
@@ -19,8 +19,8 @@ from sglpr_jax.se3 import inverse, transform
 SHARP = dataclasses.replace(DriftModel(), position_m=1e-3, yaw_deg=1e-3)
 
 
-def exact(poses: np.ndarray, query: int, match: int) -> Loop:
-    return Loop(query, match, inverse(poses[match]) @ poses[query], np.zeros((6, 6)), 1.0)
+def exact(poses: np.ndarray, query: int, match: int) -> LoopClosure:
+    return LoopClosure(query, match, inverse(poses[match]) @ poses[query], np.zeros((6, 6)), 1.0)
 
 
 @pytest.mark.slow
@@ -37,11 +37,11 @@ def test_by_hand_straight_on():
     """After 100 m: 1 % along, a quarter of it across, .5 degrees, and the constants."""
     odometry = along([(0, 0), (101, 0)])
     pose = odometry[100] @ transform(3.0, 0.0, 0.0)
-    ahead = Loop(100, 0, pose, np.zeros((6, 6)), 1.0)
+    ahead = LoopClosure(100, 0, pose, np.zeros((6, 6)), 1.0)
     np.testing.assert_allclose(deviations([ahead], DrivenPath(odometry)), 3 / np.hypot(1.0, 0.5), rtol=1e-6)
     unsure = dataclasses.replace(ahead, covariance=np.diag([0.64, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(deviations([unsure], DrivenPath(odometry)), 3 / np.sqrt(1 + 0.25 + 0.64), rtol=1e-6)
-    turned = Loop(100, 0, odometry[100] @ transform(0.0, 0.0, np.pi / 2), np.diag([0, 0.64, 0, 0, 0, 0]), 1.0)
+    turned = LoopClosure(100, 0, odometry[100] @ transform(0.0, 0.0, np.pi / 2), np.diag([0, 0.64, 0, 0, 0, 0]), 1.0)
     ahead_is_its_right = dataclasses.replace(
         turned, match_from_query=turned.match_from_query @ transform(0.0, -3.0, 0.0)
     )
@@ -58,14 +58,16 @@ def test_a_pose_deviates_as_much_as_its_inverse():
     pose = np.column_stack([apart[:, :2, 3], np.arctan2(apart[:, 1, 0], apart[:, 0, 0])])
     pose += rng.normal(scale=[0.5, 0.5, 0.01], size=(3, 3))
     found = planar_deviations(path, query, match, pose, drift=SHARP)
-    np.testing.assert_allclose(planar_deviations(path, match, query, inverted(pose), drift=SHARP), found, rtol=0.01)
+    np.testing.assert_allclose(
+        planar_deviations(path, match, query, inverse_planar(pose), drift=SHARP), found, rtol=0.01
+    )
     assert found.max() > 1
 
 
 def test_a_guessed_path_drifts_in_every_direction():
     odometry = along([(0, 0), (101, 0)])
     guessed_m = np.where(np.arange(101) < 50, 0.0, 100.0)  # one step as uncertain as 100 m
-    beside = Loop(100, 0, odometry[100] @ transform(0.0, 3.0, 0.0), np.zeros((6, 6)), 1.0)
+    beside = LoopClosure(100, 0, odometry[100] @ transform(0.0, 3.0, 0.0), np.zeros((6, 6)), 1.0)
     before, after = (deviations([beside], DrivenPath(odometry, guessed_m=one)) for one in (None, guessed_m))
     assert after < 0.6 * before
     (same,) = deviations([exact(odometry, 100, 60)], DrivenPath(odometry, guessed_m=guessed_m))
@@ -131,7 +133,7 @@ def test_floors_that_look_alike_are_apart_in_height():
 
 def test_height_by_hand():
     odometry = along([(0, 0), (101, 0)])
-    above = Loop(100, 0, odometry[100] @ transform(0.0, 0.0, 0.0), np.diag([0, 0, 0.16, 0, 0, 0]), 1.0)
+    above = LoopClosure(100, 0, odometry[100] @ transform(0.0, 0.0, 0.0), np.diag([0, 0, 0.16, 0, 0, 0]), 1.0)
     above.match_from_query[2, 3] = 2.0
     np.testing.assert_allclose(
         deviations([above], DrivenPath(odometry)), 2 / np.sqrt(0.3**2 + 0.3**2 + 0.16), rtol=1e-6

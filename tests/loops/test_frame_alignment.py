@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from session_pairs import loops_between, two_drives
 
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.frame_alignment import aligned_frames
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.se3 import inverse, moved_covariance, transform, travelled, yaw_of
+from sglpr_jax.se3 import inverse, transform, transform_covariance, travelled, yaw_of
 
 EXACT = DriftModel(metres_per_metre=0.0, degrees_per_metre=0.0)
 
@@ -61,12 +61,12 @@ def test_other_frames_change_only_the_transform(x, y, yaw):
     loops, moved = loops_between(first, second, true), transform(x, y, yaw)
     before, after = aligned(loops, first, second), aligned(loops, first, moved @ second)
     np.testing.assert_allclose(after[0] @ moved, before[0], atol=1e-5)
-    expected = moved_covariance(before[1], moved)
+    expected = transform_covariance(before[1], moved)
     np.testing.assert_allclose(after[1], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
 def test_one_loop_is_enough_for_a_transform():
-    loop = Loop(1, 0, transform(1.0, 2.0, 0.3), np.eye(6), 0.99)
+    loop = LoopClosure(1, 0, transform(1.0, 2.0, 0.3), np.eye(6), 0.99)
     poses = np.stack([np.eye(4), transform(5.0, 0.0, 0.0)])
     found, _ = aligned([loop], poses, poses)
     np.testing.assert_allclose(found @ poses[1], loop.match_from_query, atol=1e-9)

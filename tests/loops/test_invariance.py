@@ -29,14 +29,14 @@ EVERY = list(range(2 * PASS))
 )
 def test_the_loops_of_a_drive_stay_the_same_and_are_right(params, street, described, rows, factor, turned, share):
     """Without odometry. The first loops of a revisit need neighbours, so that not all scans have one."""
-    poses, seen = street.poses.world_from_lidar, described
+    poses, keyframe = street.poses.world_from_lidar, described
     if turned:
-        records = [street.record(row, labels=False) for row in EVERY]
+        records = [street.scan(row, labels=False) for row in EVERY]
         others = [dataclasses.replace(one, points=rotated(one.points, ANGLE)) for one in records]
-        poses, seen = poses @ transform(0.0, 0.0, -ANGLE), [describe_scan(params, one) for one in others]
+        poses, keyframe = poses @ transform(0.0, 0.0, -ANGLE), [describe_scan(params, one) for one in others]
     detector = LoopDetector(params)
     for row in rows:
-        detector.add_seen(seen[row], time=None if factor is None else factor * float(street.times[row]))
+        detector.add_keyframe(keyframe[row], time=None if factor is None else factor * float(street.times[row]))
     for loop in detector.loops:
         query, match = rows[loop.query], rows[loop.match]
         error = inverse(inverse(poses[match]) @ poses[query]) @ loop.match_from_query

@@ -83,8 +83,8 @@ def test_loops_with_limits_are_right_and_limits_that_are_not_reached_change_noth
 
     def searched(**limits) -> LoopDetector:
         detector = LoopDetector(params, config=DetectorConfig(**limits))
-        for seen, time, pose in zip(described, street.times.tolist(), poses, strict=True):
-            detector.add_seen(seen, time=time, odometry=pose)
+        for keyframe, time, pose in zip(described, street.times.tolist(), poses, strict=True):
+            detector.add_keyframe(keyframe, time=time, odometry=pose)
             assert len(detector.finder.stored) <= limits["max_places"]
         return detector
 

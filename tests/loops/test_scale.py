@@ -3,7 +3,7 @@
 import numpy as np
 
 from sglpr_jax.data.scaled import scaled_poses
-from sglpr_jax.loops.closure import Loop, in_metres, scaled_drift
+from sglpr_jax.loops.closure import LoopClosure, in_metres, scaled_drift
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
@@ -18,7 +18,7 @@ def test_odometry_drifts_as_much_at_any_scale():
     """Only the deviation of the comparison itself belongs to the images."""
     poses = scaled_poses(there_and_back(), 1 / SCALE)
     drift = DriftModel(degrees_per_metre=0.1, position_m=1e-3, height_m=1e-3)
-    loops = [Loop(2 * N - 1 - i, i, transform(0.1, 1.0, 3.0), 1e-9 * np.eye(6), 1.0) for i in range(0, N - 5, 5)]
+    loops = [LoopClosure(2 * N - 1 - i, i, transform(0.1, 1.0, 3.0), 1e-9 * np.eye(6), 1.0) for i in range(0, N - 5, 5)]
     large = [in_metres(loop, 1) for loop in loops]
     for loop in large:
         loop.match_from_query[:3, 3] *= SCALE

@@ -18,13 +18,13 @@ from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import search
-from sglpr_jax.loops.closure import MEANING, Loop, Rejected
+from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.loops.result import FoundLoops, Session, why_none
+from sglpr_jax.loops.result import LoopSearchResult, Session, diagnose_no_loops
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
@@ -50,14 +50,16 @@ def found(params, compare_only, monkeypatch):
     """
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
 
-    def found(odometry: np.ndarray, *, wrong: Mapping[int, int] = MappingProxyType({}), scale: int = 1) -> FoundLoops:
+    def found(
+        odometry: np.ndarray, *, wrong: Mapping[int, int] = MappingProxyType({}), scale: int = 1
+    ) -> LoopSearchResult:
         detector, poses = LoopDetector(params, model=ALWAYS, config=CONFIG), there_and_back()
-        seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
+        keyframe = Keyframe(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
         ways = {query: 2 * N - 1 - query for query in range(N, 2 * N)}
         true = {query: (match, inverse(poses[match]) @ poses[query]) for query, match in ways.items()}
         compare_only(true | {query: (match, np.eye(4)) for query, match in wrong.items()})
         for pose in odometry:
-            detector.add_seen(seen, odometry=pose, compared=NO_FITS)
+            detector.add_keyframe(keyframe, odometry=pose, compared=NO_FITS)
         monkeypatch.setattr(search, "LoopDetector", lambda *_, **__: detector)
         odometry = scaled_poses(odometry, 1 / scale)
         options = {"odometry": odometry, "config": CONFIG, "registered": False}
@@ -114,29 +116,33 @@ def test_loops_that_contradict_the_odometry_are_rejected_and_do_not_keep_the_tru
     assert str(result).endswith(f"{len(rejected)} rejected (contradicts the odometry: {len(rejected)})")
 
 
-LOOP = Loop(5, 0, np.eye(4), np.eye(6), 0.995)
+LOOP = LoopClosure(5, 0, np.eye(4), np.eye(6), 0.995)
 
 
-def found_in(frames: int, **about) -> FoundLoops:
+def found_in(frames: int, **about) -> LoopSearchResult:
     """No loops in a recording of this many frames."""
     images = {Path(f"{i:06d}.png"): np.eye(8, dtype=np.float32) for i in range(frames)}
-    return FoundLoops((Session(of_images(images), frames, **about),))
+    return LoopSearchResult((Session(of_images(images), frames, **about),))
 
 
 def test_what_is_missing_explains_why_there_are_no_loops():
-    (said,) = why_none(found_in(700))
+    (said,) = diagnose_no_loops(found_in(700))
     assert said.startswith("No pair was compared: according to the images")
-    assert "according to the odometry" in why_none(found_in(700, odometry=np.tile(np.eye(4), (700, 1, 1))))[0]
-    assert "690 of 700 scans are almost empty (fewer than 20" in why_none(found_in(700, empty=690))[0]
+    assert "according to the odometry" in diagnose_no_loops(found_in(700, odometry=np.tile(np.eye(4), (700, 1, 1))))[0]
+    assert "690 of 700 scans are almost empty (fewer than 20" in diagnose_no_loops(found_in(700, empty=690))[0]
     skipped = tuple(map(str, range(400)))
-    assert why_none(found_in(700, skipped=skipped))[0] == "400 of 700 scans cannot be read."
+    assert diagnose_no_loops(found_in(700, skipped=skipped))[0] == "400 of 700 scans cannot be read."
     for frames, words in ((0, "before the first scan."), (5, "after 5 of 700 frames.")):
         session = dataclasses.replace(found_in(700).sessions[0], frames=frames)
-        assert why_none(FoundLoops((session,)))[0] == f"The search was stopped {words}"
-    rejected = (Rejected(LOOP, "little overlap"), Rejected(LOOP, "repeats"), Rejected(LOOP, "repeats"))
+        assert diagnose_no_loops(LoopSearchResult((session,)))[0] == f"The search was stopped {words}"
+    rejected = (
+        RejectedClosure(LOOP, "little overlap"),
+        RejectedClosure(LOOP, "repeats"),
+        RejectedClosure(LOOP, "repeats"),
+    )
     found = dataclasses.replace(found_in(700), rejected=rejected)
-    assert why_none(found) == [f"3 pairs were compared. For 2 of them: {MEANING['repeats']}"]
-    assert why_none(dataclasses.replace(found, loops=(LOOP,))) == []
+    assert diagnose_no_loops(found) == [f"3 pairs were compared. For 2 of them: {MEANING['repeats']}"]
+    assert diagnose_no_loops(dataclasses.replace(found, loops=(LOOP,))) == []
 
 
 def test_degenerate_loops_are_counted_and_can_be_rejected():

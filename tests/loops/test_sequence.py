@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.loops import sequence
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.config import INDEPENDENT_M
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.sequence import WINDOW_M, Pair, neighbour_weights, verdict
@@ -48,7 +48,7 @@ def test_neighbours_whose_matches_move_as_they_do_support_a_loop_and_others_oppo
     poses = np.stack(line + [transform(98.0 - 2.0 * frame, 1.0, np.pi) for frame in range(50)])
     true = [(query, 99 - query, inverse(poses[99 - query]) @ poses[query]) for query in range(60, 70)]
     wrong = (70, 38, transform(4.0, 1.0, 0.0))
-    loops = [Loop(*one, 1e-4 * np.eye(6), 0.9) for one in [*true, wrong]]
+    loops = [LoopClosure(*one, 1e-4 * np.eye(6), 0.9) for one in [*true, wrong]]
     evidence = Evidence.of(0.5, 0.1, 1.0, 0.0)  # log odds of 2 alone
     pairs = [Pair(loop, evidence, 2.0 * loop.query) for loop in loops]
     path, rules = DrivenPath(poses), {"drift": DriftModel()}
@@ -64,5 +64,5 @@ def test_neighbours_whose_matches_move_as_they_do_support_a_loop_and_others_oppo
     [(0.5, 0.0, "too few neighbours"), (1.0, 2.0, "little similarity"), (1.0, 3.0, "repeats")],
 )
 def test_the_reason_of_a_rejection_is_what_is_missing(ambiguity, surprise, reason):
-    pair = Pair(Loop(9, 0, np.eye(4), np.eye(6), 0.5), Evidence.of(ambiguity, 0.1, 1.0, surprise), 90.0)
+    pair = Pair(LoopClosure(9, 0, np.eye(4), np.eye(6), 0.5), Evidence.of(ambiguity, 0.1, 1.0, surprise), 90.0)
     assert verdict(pair, MODEL, 0.99) == reason

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.loops.closure import Loop, planar_loop, to_lidar, to_upright
+from sglpr_jax.loops.closure import LoopClosure, planar_loop, to_lidar, to_upright
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.path import level_odometry
-from sglpr_jax.registration.bev_alignment import Alignment
-from sglpr_jax.se3 import inverse, moved_covariance, transform, transformed
+from sglpr_jax.registration.bev_alignment import BevRegistration
+from sglpr_jax.se3 import inverse, transform, transform_covariance, transformed
 
 TILTS = {"forward": (0.0, 25.0, 0.0), "sideways": (20.0, 10.0, 0.0), "upside down": (170.0, 5.0, 0.0)}
 
@@ -72,11 +72,11 @@ def test_scans_of_a_tilted_and_of_an_upright_sensor_find_themselves_in_one_map(d
     map_recording(dataclasses.replace(recording, **few), params, poses[:8]).places.save(tmp_path / "map.safetensors")
     places = PlaceMap.load(tmp_path / "map.safetensors")
     assert places.mounting() == recording.mounting
-    for record, world_from_lidar in (
-        (recording.record(5), poses[5]),
-        (drive.record(5), drive.poses.world_from_lidar[5]),
+    for scan, world_from_lidar in (
+        (recording.scan(5), poses[5]),
+        (drive.scan(5), drive.poses.world_from_lidar[5]),
     ):
-        metres, degrees = error_of(places.relocate(params, record)[0].world_from_query, world_from_lidar)
+        metres, degrees = error_of(places.relocate(params, scan)[0].world_from_query, world_from_lidar)
         assert metres < 0.7 and degrees < 3
 
 
@@ -88,7 +88,7 @@ def test_poses_go_there_and_back_and_points_with_them(degrees):
     level = transformed(upright_from_lidar(mounting), cloud)
     np.testing.assert_allclose(level, mounting.level(cloud), atol=1e-5)
     pose = transform(3.0, -2.0, 0.7)
-    upright = Loop(1, 0, pose, np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), 1.0)
+    upright = LoopClosure(1, 0, pose, np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), 1.0)
     loop = to_lidar(upright, query=mounting, match=mounting)
     back, of_lidar = to_upright(loop, query=mounting, match=mounting), loop.match_from_query
     np.testing.assert_allclose(back.match_from_query, pose, atol=1e-12)
@@ -120,9 +120,9 @@ def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
     motions = np.tile(np.eye(4), (len(drawn), 1, 1))
     motions[:, :3, :3], motions[:, :3, 3] = Rotation.from_rotvec(drawn[:, 3:]).as_matrix(), drawn[:, :3]
     moved = lidar @ motions @ inverse(lidar)
-    seen = np.concatenate([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()], axis=1)
-    expected = moved_covariance(root @ root.T, lidar)
-    np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.05 * expected.diagonal().max())
+    keyframe = np.concatenate([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()], axis=1)
+    expected = transform_covariance(root @ root.T, lidar)
+    np.testing.assert_allclose(np.cov(keyframe.T), expected, atol=0.05 * expected.diagonal().max())
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_the_covariance_of_estimated_mountings_is_that_of_drawn_ones():
         dataclasses.replace(mounting_of(tilted), height_deviation_m=0.04, tilt_deviation_deg=1.0) for tilted in tilts
     )
     upright, none = transform(3.0, -2.0, 2.0), np.zeros((3, 3), np.float32)
-    alignment = Alignment(3.0, -2.0, 2.0, none, 1.0, 0.0)
+    alignment = BevRegistration(3.0, -2.0, 2.0, none, 1.0, 0.0)
     level = planar_loop(1, 0, alignment, probability=1.0, sensors=(query, match))
     loop = to_lidar(level, query=query, match=match)
 

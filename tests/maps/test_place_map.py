@@ -10,7 +10,7 @@ from recordings import with_points
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import rotated
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
@@ -24,7 +24,7 @@ PLACES = 10
 def test_scans_between_those_of_the_map_find_themselves_and_one_from_elsewhere_does_not(drive, places, params):
     for frame in (10, 18, 30):
         angle = 2.0 + frame
-        found = places.relocate(params, Record(points=rotated(drive.points(frame), angle)))
+        found = places.relocate(params, Scan(points=rotated(drive.points(frame), angle)))
         true = drive.poses.world_from_lidar[frame]
         error = inverse(true) @ found[0].world_from_query
         assert found[0].probability > 0.5 and np.linalg.norm(error[:2, 3]) < 0.4
@@ -33,7 +33,7 @@ def test_scans_between_those_of_the_map_find_themselves_and_one_from_elsewhere_d
         assert [one.probability for one in found] == sorted((one.probability for one in found), reverse=True)
         assert len({one.place for one in found}) == len(found)
     assert np.linalg.norm(drive.positions[120] - drive.positions[:40], axis=1).min() > 40
-    assert all(one.probability < 0.5 for one in places.relocate(params, drive.record(120)))
+    assert all(one.probability < 0.5 for one in places.relocate(params, drive.scan(120)))
 
 
 @pytest.mark.slow
@@ -63,7 +63,7 @@ def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, fir
     assert both.index.ids == places.index.ids + ids
     np.testing.assert_array_equal(both.index.positions, both.world_from_place[:, :3, 3])
     np.testing.assert_array_equal(both.world_from_place[PLACES:], shifted)
-    found = both.relocate(params, drive.record(20), candidates=2)
+    found = both.relocate(params, drive.scan(20), candidates=2)
     assert {one.place.split("/")[0] for one in found} == {"08", "sunday"}
     assert min(one.probability for one in found) > 0.5
 
@@ -108,7 +108,7 @@ def test_places_of_a_drive_are_called_the_same_wherever_it_was_stopped(here, own
 def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(first, places, params, tmp_path):
     recording, poses = first
     assert len(map_recording(recording, params, np.tile(poses[:1], (len(poses), 1, 1))).places) == 1
-    assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
+    assert places.relocate(params, Scan(points=np.zeros((3, 3), np.float32))) == []
     for cloud, words in (
         (np.full((1, 3), 5, np.float32), "08: expected at least one scan that is not empty, found 10 empty ones"),
         (np.zeros((3, 3), np.float32), "scan 000000 of sequence 08: expected points around the sensor"),
@@ -124,7 +124,7 @@ def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(f
     for use in (
         lambda: PlaceMap.load(tmp_path / "town.safetensors", weights_hash="other"),
         lambda: places.merged(other),
-        lambda: other.relocate(params, recording.record(0)),
+        lambda: other.relocate(params, recording.scan(0)),
     ):
         with pytest.raises(ValueError, match="expected descriptors with weights"):
             use()

@@ -10,7 +10,7 @@ import pytest
 
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.labels import to_raw
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.bevplace import grey_image
@@ -54,9 +54,9 @@ KEPT = {  # what a rotation of one input for the training does not change
 }
 
 
-def record(points, classes=None, name="scan 7"):
+def scan(points, classes=None, name="scan 7"):
     labels = None if classes is None else to_raw(np.asarray(classes)).astype(np.int32)
-    return Record(points=np.asarray(points, np.float32), labels=labels, name=name)
+    return Scan(points=np.asarray(points, np.float32), labels=labels, name=name)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def inputs(places):
 
     @functools.cache
     def of(name):
-        found = np.stack([LEARNED[name].prepare(record(*place)) for place in places[:3]])
+        found = np.stack([LEARNED[name].prepare(scan(*place)) for place in places[:3]])
         return {"bevplace++": found[:, 59:92, 59:92], "pointnetvlad": found[:, :40]}.get(name, found)
 
     return of
@@ -99,7 +99,7 @@ def test_a_method_is_complete_and_has_the_published_number_of_weights(name):
 @pytest.mark.parametrize("name", INPUTS)
 def test_the_input_is_that_of_its_definition(places, wide, name):
     for points, classes in (places[0], wide):
-        found = LEARNED[name].prepare(record(points, classes))
+        found = LEARNED[name].prepare(scan(points, classes))
         np.testing.assert_allclose(found, INPUTS[name](points, classes), rtol=1e-6)
 
 
@@ -107,10 +107,10 @@ def test_the_input_is_that_of_its_definition(places, wide, name):
 def test_holes_and_the_height_of_the_sensor_do_not_change_the_input(places, name):
     points, classes = places[0]
     prepare = LEARNED[name].prepare
-    expected = prepare(record(points, classes))
+    expected = prepare(scan(points, classes))
     holes = np.concatenate([points, [[np.nan, 5, 0], [5, np.inf, 0]]])
-    np.testing.assert_array_equal(prepare(record(holes, [*classes, 13, 13])), expected)
-    lower = record(points - np.float32([[0, 0, 1]]), classes)
+    np.testing.assert_array_equal(prepare(scan(holes, [*classes, 13, 13])), expected)
+    lower = scan(points - np.float32([[0, 0, 1]]), classes)
     higher = dataclasses.replace(lower, mounting=Mounting(height_m=2.73))
     assert np.mean(np.abs(prepare(higher) - expected) > 1e-3) < 0.01
 
@@ -120,14 +120,14 @@ def test_a_scan_without_a_place_is_named(name):
     method = LEARNED[name]
     if method.takes == "labelled points":
         with pytest.raises(ValueError, match="scan 7: expected labels, found none"):
-            method.prepare(record(np.ones((9, 3))))
+            method.prepare(scan(np.ones((9, 3))))
     if name != "rinet":  # scan_stream has checked it
         with pytest.raises(ValueError, match="scan 7: expected finite points"):
-            method.prepare(record(np.full((9, 3), np.nan), np.full(9, 13)))
+            method.prepare(scan(np.full((9, 3), np.nan), np.full(9, 13)))
     words = {"pointnetvlad": "scan 7: expected points within 40 m", "sgpr": "scan 7: expected clusters of 12 classes"}
     if name in words:
         with pytest.raises(ValueError, match=words[name]):
-            method.prepare(record([[5, 0, -1.7], [6, 0, -1.6]], [9, 9]))
+            method.prepare(scan([[5, 0, -1.7], [6, 0, -1.6]], [9, 9]))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -280,21 +280,21 @@ def test_inputs_of_any_number_are_described_in_batches(inputs):
 
 def test_a_scan_and_its_ready_made_image_are_the_same_input_of_bevplace(places):
     counts = density_bev(places[0][0])
-    made = grey_image(record(places[0][0]))
-    np.testing.assert_array_equal(grey_image(Record(image=counts)), made)
+    made = grey_image(scan(places[0][0]))
+    np.testing.assert_array_equal(grey_image(Scan(image=counts)), made)
     np.testing.assert_allclose(made / 25.5, counts, atol=1e-5)
     with pytest.raises(ValueError, match=r"image 3: expected a density image of 151 x 151 pixels, found \(100, 151\)"):
-        grey_image(Record(image=np.zeros((100, 151), np.float32), name="image 3"))
+        grey_image(Scan(image=np.zeros((100, 151), np.float32), name="image 3"))
     with pytest.raises(ValueError, match="image 4: expected a density image"):
-        grey_image(Record(image=np.full((151, 151), 255, np.float32), name="image 4"))
+        grey_image(Scan(image=np.full((151, 151), 255, np.float32), name="image 4"))
 
 
 def test_pointnetvlad_draws_each_voxel_above_the_ground_once(places):
     many = np.random.default_rng(0).uniform((-45, -45, -1.7), (45, 45, 20), (30000, 3)).astype(np.float32)
-    found = LEARNED["pointnetvlad"].prepare(record(many))
+    found = LEARNED["pointnetvlad"].prepare(scan(many))
     assert found.shape == (4096, 3) and len(np.unique(found, axis=0)) == 4096 and np.abs(found).max() <= 1
     assert found[:, 2].min() > -1.4 / 40
-    few = LEARNED["pointnetvlad"].prepare(record(places[0][0]))
+    few = LEARNED["pointnetvlad"].prepare(scan(places[0][0]))
     assert few.shape == (4096, 3) and len(np.unique(few, axis=0)) < 4096
 
 
@@ -312,14 +312,14 @@ def test_the_nodes_of_sgpr_are_the_centres_of_clusters_of_a_class():
         (blob((20, 0, 0), 50_001, 5), 13),  # too many
     ]
     points = np.concatenate([points for points, _ in parts])
-    found = LEARNED["sgpr"].prepare(record(points, np.repeat([kind for _, kind in parts], [len(p) for p, _ in parts])))
+    found = LEARNED["sgpr"].prepare(scan(points, np.repeat([kind for _, kind in parts], [len(p) for p, _ in parts])))
     assert found.shape == (100, 15) and found.dtype == np.float32 and not found[3:].any()
     expected = np.stack([points.mean(axis=0) for points, _ in parts[:3]])
     order = np.lexsort((found[:3, 0], -found[:3, 3]))
     np.testing.assert_allclose(found[:3][order][:, :3], expected, atol=1e-5)
     np.testing.assert_array_equal(found[:3, 3:][order], np.eye(12)[[0, 0, 8]])
     many = np.concatenate([blob((2 * i, 0, 0), 100 + i, i) for i in range(110)])
-    largest = LEARNED["sgpr"].prepare(record(many, np.full(len(many), 18)))
+    largest = LEARNED["sgpr"].prepare(scan(many, np.full(len(many), 18)))
     np.testing.assert_allclose(np.sort(largest[:, 0]), 2.0 * np.arange(10, 110), atol=0.05)
 
 

@@ -3,28 +3,28 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.odometry.bev_odometry import AMBIGUOUS_SHARE, GAP_M, GUESS_FACTOR, MAX_COASTING, UNKNOWN_M, Motion
-from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.odometry.bev_odometry import AMBIGUOUS_SHARE, GAP_M, GUESS_FACTOR, MAX_COASTING, UNKNOWN_M, BevOdometry
+from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import transform
 
 
 def link(
     x: float, correlation: float = 0.9, second: float = 0.3, along_m: float = 0.1, turned_deg: float = 0.0
-) -> Alignment:
+) -> BevRegistration:
     spread = np.diag([along_m, along_m, 0.0]) ** 2
-    return Alignment(*map(np.float32, (x, 0.0, np.radians(turned_deg), spread, correlation, second)))
+    return BevRegistration(*map(np.float32, (x, 0.0, np.radians(turned_deg), spread, correlation, second)))
 
 
-def moved(links: list[Alignment | None], *, factor: float = 1.0) -> Motion:
+def moved(links: list[BevRegistration | None], *, factor: float = 1.0) -> BevOdometry:
     """The motion of frames 0.1 s apart with these links to the keyframe. All times are multiplied by `factor`."""
-    motion = Motion()
+    motion = BevOdometry()
     for frame, one in enumerate(links):
         motion.add(0.1 * factor * frame, link=one)
     return motion
 
 
 def test_links_to_keyframes_add_up():
-    motion = Motion()
+    motion = BevOdometry()
     for frame in range(10):  # 1 m each; the keyframe is the last frame that was more than 3 m from the one before
         motion.add(float(frame), link=link(float(frame - motion.keyframe)) if frame else None)
     for found in ([pose[0, 3] for pose in motion.poses], motion.travelled):
@@ -68,7 +68,7 @@ def test_a_sensor_that_seems_to_turn_round_at_once_may_be_in_another_row(turned_
 
 
 def test_a_link_after_a_gap_drifts_by_what_the_sensor_may_have_moved_meanwhile():
-    motion = Motion()
+    motion = BevOdometry()
     for time, one in ((0.0, None), (0.1, link(1.0)), (0.2, link(2.0)), (1.2, link(2.5)), (1.3, link(3.5))):
         motion.add(time, link=one)
     share = AMBIGUOUS_SHARE * GUESS_FACTOR
@@ -86,7 +86,7 @@ def test_a_drive_at_another_speed_has_the_same_motion(factor):
 
 
 def test_after_an_unknown_motion_nothing_is_known_about_the_way():
-    motion = Motion()
+    motion = BevOdometry()
     for i in range(3):
         motion.add(float(i), pose=transform(float(i), 0.0, 0.0))
     motion.add(3.0, pose=transform(500.0, 0.0, 1.0), continues=False)
@@ -96,8 +96,8 @@ def test_after_an_unknown_motion_nothing_is_known_about_the_way():
     np.testing.assert_allclose(np.diff(motion.path.travelled)[[0, 1, 3]], 1.0, rtol=1e-6)
 
 
-def straight(frames: int) -> Motion:
-    motion = Motion()
+def straight(frames: int) -> BevOdometry:
+    motion = BevOdometry()
     for frame in range(frames):
         motion.add(float(frame), pose=transform(4.0 * frame, 0.0, 0.0))
     return motion
@@ -105,7 +105,7 @@ def straight(frames: int) -> Motion:
 
 def test_joined_motions_keep_their_poses_and_are_apart():
     first, second = straight(5), straight(3)
-    joined = Motion.joined([first, second])
+    joined = BevOdometry.joined([first, second])
     assert joined.segments.tolist() == [0] * 5 + [1] * 3 and len(joined) == 8
     np.testing.assert_array_equal(joined.poses[5:], second.poses)
     np.testing.assert_allclose(np.diff(joined.travelled), [4, 4, 4, 4, GAP_M, 4, 4])

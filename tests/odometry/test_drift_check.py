@@ -6,7 +6,7 @@ from drives import along, drifted
 
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
-from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 TRUE = along([(0, 0), (150, 0), (150, 150)], 3.0)
@@ -18,7 +18,7 @@ def checked(odometry: np.ndarray, *, second: float = 0.3, steps: int = len(TRUE)
     for row in range(steps):
         assert check.is_due(odometry[row])
         moved = inverse(TRUE[row - 1]) @ TRUE[row]
-        link = Alignment(*moved[:2, 3], yaw_of(moved), np.diag([0.01, 0.01, 0.0]), 0.8, second)
+        link = BevRegistration(*moved[:2, 3], yaw_of(moved), np.diag([0.01, 0.01, 0.0]), 0.8, second)
         check.add(odometry[row], link if row else None)
     return check
 

@@ -9,8 +9,8 @@ import pytest
 from recordings import of_images, of_scans, with_points
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.record import Record, TimeField
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan, TimeField
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops.config import DetectorConfig
@@ -136,7 +136,7 @@ def test_the_motion_within_scans_is_removed():
         clouds[Path(f"{row:06d}")] = rotations.apply(seen).astype(np.float32)
     plain = of_scans(clouds, times=times)
     timed = dataclasses.replace(
-        plain, read=lambda path, *_: Record(points=clouds[path], time_field=TimeField("t", stamps))
+        plain, read=lambda path, *_: Scan(points=clouds[path], time_field=TimeField("t", stamps))
     )
     still, moved = (kiss_icp.scan_odometry(one)[:, 0, 3] for one in (timed, plain))
     np.testing.assert_allclose(still, 3 * times**2, atol=0.06)

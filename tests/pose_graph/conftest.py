@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.se3 import inverse, transform
 
 LAPS_FRAMES = 120
@@ -36,12 +36,12 @@ def two_laps_odometry(two_laps) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def second_lap_loops(two_laps) -> tuple[Loop, ...]:
+def second_lap_loops(two_laps) -> tuple[LoopClosure, ...]:
     """The second time around sees the first, to a decimetre."""
     rng = np.random.default_rng(1)
     found = []
     for query in range(64, LAPS_FRAMES, 4):
         match = int(np.linalg.norm(two_laps[:50, :3, 3] - two_laps[query, :3, 3], axis=1).argmin())
         pose = inverse(two_laps[match]) @ two_laps[query] @ transform(*rng.normal(scale=0.05, size=2), 0.002)
-        found.append(Loop(query, match, pose, LOOP_COVARIANCE, 0.99))
+        found.append(LoopClosure(query, match, pose, LOOP_COVARIANCE, 0.99))
     return tuple(found)

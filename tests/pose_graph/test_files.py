@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_trajectory, read_tum
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.pose_graph.files import (
     read_g2o,
     read_loops_jsonl,
@@ -31,11 +31,14 @@ def poses() -> np.ndarray:
 
 
 @pytest.fixture
-def loops(poses) -> list[Loop]:
+def loops(poses) -> list[LoopClosure]:
     rng = np.random.default_rng(1)
     spread = [a @ a.T + np.eye(6) for a in rng.normal(size=(2, 6, 6))]
     relative = [inverse(poses[m]) @ poses[q] for q, m in ((5, 0), (4, 1))]
-    return [Loop(5, 0, relative[0], spread[0], 0.99), Loop(4, 1, relative[1], spread[1], 0.95, overlap=0.7)]
+    return [
+        LoopClosure(5, 0, relative[0], spread[0], 0.99),
+        LoopClosure(4, 1, relative[1], spread[1], 0.95, overlap=0.7),
+    ]
 
 
 def test_a_graph_comes_back_from_g2o(tmp_path, poses, loops):
@@ -56,7 +59,7 @@ def test_a_graph_comes_back_from_g2o(tmp_path, poses, loops):
 def test_the_numbers_of_an_edge_by_hand(tmp_path):
     pose = np.eye(4)
     pose[:3, 3] = 1, 2, 3
-    write_g2o(tmp_path / "a.g2o", [Loop(7, 3, pose, np.diag([1, 0.25, 0.2, 0.1, 0.05, 0.04]), 0.9)])
+    write_g2o(tmp_path / "a.g2o", [LoopClosure(7, 3, pose, np.diag([1, 0.25, 0.2, 0.1, 0.05, 0.04]), 0.9)])
     (line,) = (tmp_path / "a.g2o").read_text().splitlines()
     assert line == "EDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1 " + "1 0 0 0 0 0 4 0 0 0 0 5 0 0 0 10 0 0 20 0 25"
 

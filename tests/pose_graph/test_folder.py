@@ -12,8 +12,8 @@ from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
-from sglpr_jax.loops.closure import Loop, Rejected
-from sglpr_jax.loops.result import FoundLoops, Session
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
+from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph import folder
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl
 from sglpr_jax.pose_graph.folder import FIRST_VERTEX, unique_names, vertices, write_found
@@ -22,19 +22,19 @@ from sglpr_jax.se3 import inverse, transform
 
 
 @pytest.fixture
-def found(tmp_path) -> FoundLoops:
+def found(tmp_path) -> LoopSearchResult:
     images = {tmp_path / f"{i:06d}.png": np.eye(8, dtype=np.float32) for i in range(6)}
     odometry = np.stack([transform(float(x), 0.0, 0.1 * x) for x in range(6)])
-    loop = Loop(4, 0, transform(1.0, 2.0, 0.3), np.eye(6), 0.995)
-    return FoundLoops((Session(of_images(images, times=10.0 + np.arange(6)), 5, odometry),), (loop,))
+    loop = LoopClosure(4, 0, transform(1.0, 2.0, 0.3), np.eye(6), 0.995)
+    return LoopSearchResult((Session(of_images(images, times=10.0 + np.arange(6)), 5, odometry),), (loop,))
 
 
 @pytest.fixture(scope="module")
-def pair() -> FoundLoops:
+def pair() -> LoopSearchResult:
     return found_pair()
 
 
-def corrected(found: FoundLoops) -> OptimizedTrajectory:
+def corrected(found: LoopSearchResult) -> OptimizedTrajectory:
     poses = [one.odometry[: one.frames] for one in found.sessions]
     return OptimizedTrajectory(np.concatenate(poses), np.ones(len(found.loops), bool))
 
@@ -44,7 +44,7 @@ def table(path) -> list[tuple[int, int]]:
     return [tuple(map(int, line.split(",")[:2])) for line in path.read_text().splitlines()[1:]]
 
 
-def with_session(found: FoundLoops, **change) -> FoundLoops:
+def with_session(found: LoopSearchResult, **change) -> LoopSearchResult:
     return dataclasses.replace(found, sessions=(dataclasses.replace(found.sessions[0], **change),))
 
 
@@ -92,7 +92,7 @@ def test_frames_keep_the_numbers_of_the_recording_and_rejected_pairs_have_a_file
     """Also if scans without a pose were left out before the search. Without times, the numbers are the times."""
     images = {tmp_path / f"{i:06d}.png": np.eye(8, dtype=np.float32) for i in range(80)}
     some = only(of_images(images), [70, 71, 72, 75, 76, 77])
-    rejected = Rejected(Loop(3, 1, transform(2.0, 0.0, 0.0), np.eye(6), 0.25), "repeats")
+    rejected = RejectedClosure(LoopClosure(3, 1, transform(2.0, 0.0, 0.0), np.eye(6), 0.25), "repeats")
     write_found(dataclasses.replace(with_session(found, recording=some), rejected=(rejected,)), tmp_path / "out")
     assert table(tmp_path / "out/loops.csv") == [(76, 70)]
     first, second = (json.loads((tmp_path / "out" / f"{name}.jsonl").read_text()) for name in ("loops", "rejected"))
@@ -117,7 +117,7 @@ def test_one_graph_has_all_trajectories_in_one_frame_and_all_loops(pair, tmp_pat
 
 
 def test_rows_name_the_recordings_and_the_transform_is_in_frames_json(pair, tmp_path):
-    write_found(dataclasses.replace(pair, rejected=(Rejected(pair.loops[0], "repeats"),)), tmp_path)
+    write_found(dataclasses.replace(pair, rejected=(RejectedClosure(pair.loops[0], "repeats"),)), tmp_path)
     loops = read_loops_jsonl(tmp_path / "loops.jsonl")
     assert [loop.query - FIRST_VERTEX for loop in loops] == [loop.query for loop in pair.loops]
     assert table(tmp_path / "loops.csv") == [(loop.query, loop.match) for loop in loops]

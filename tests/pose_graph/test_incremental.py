@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.pose_graph.incremental import LOOP_EVERY_M, IncrementalTrajectory
 from sglpr_jax.pose_graph.optimize import solved_graph, trajectory_error
 from sglpr_jax.se3 import inverse, transform
@@ -42,11 +42,11 @@ def test_loops_correct_the_last_pose_and_the_path(two_laps, two_laps_odometry, s
 
 
 def test_a_wrong_loop_moves_little(two_laps, two_laps_odometry, second_lap_loops):
-    wrong = Loop(102, 20, transform(1.0, 0.0, 0.1), LOOP_COVARIANCE, 1.0)
+    wrong = LoopClosure(102, 20, transform(1.0, 0.0, 0.1), LOOP_COVARIANCE, 1.0)
     right = driven(two_laps_odometry, second_lap_loops).poses
     bent = driven(two_laps_odometry, (*second_lap_loops, wrong)).poses
     assert np.linalg.norm(bent[:, :3, 3] - right[:, :3, 3], axis=1).max() < 0.5
-    trusted = Loop(102, 20, wrong.match_from_query, LOOP_COVARIANCE / 1e4, 1.0)
+    trusted = LoopClosure(102, 20, wrong.match_from_query, LOOP_COVARIANCE / 1e4, 1.0)
     assert np.linalg.norm(driven(two_laps_odometry, (trusted,)).poses[102, :3, 3] - two_laps[102, :3, 3]) > 3
 
 
@@ -62,8 +62,8 @@ def test_a_new_odometry_frame_waits_for_a_loop(two_laps, two_laps_odometry, seco
 
 
 def test_loops_of_an_unconnected_part_are_used_once_it_is_connected(two_laps_odometry, second_lap_loops):
-    inside = Loop(79, 76, inverse(two_laps_odometry[76]) @ two_laps_odometry[79], LOOP_COVARIANCE / 1e4, 0.99)
-    earlier = Loop(80, 77, inside.match_from_query @ transform(0.1, 0.0, 0.0), LOOP_COVARIANCE, 0.99)
+    inside = LoopClosure(79, 76, inverse(two_laps_odometry[76]) @ two_laps_odometry[79], LOOP_COVARIANCE / 1e4, 0.99)
+    earlier = LoopClosure(80, 77, inside.match_from_query @ transform(0.1, 0.0, 0.0), LOOP_COVARIANCE, 0.99)
     late = tuple(loop for loop in second_lap_loops if loop.query >= 84)
     with_loops = driven(two_laps_odometry, (inside, earlier, *late), new_world_at=70)
     without = driven(two_laps_odometry, late, new_world_at=70)
@@ -75,7 +75,7 @@ def test_a_route_driven_again_and_again_needs_few_loops():
     laps, steps = 4, 40
     angle = np.linspace(0, 2 * np.pi * laps, laps * steps, endpoint=False)
     poses = np.stack([transform(40 * np.sin(a), 40 - 40 * np.cos(a), a) for a in angle])
-    found = [Loop(i, i - steps, np.eye(4), LOOP_COVARIANCE, 0.99) for i in range(steps, len(poses))]
+    found = [LoopClosure(i, i - steps, np.eye(4), LOOP_COVARIANCE, 0.99) for i in range(steps, len(poses))]
     trajectory = driven(poses, found)
     np.testing.assert_allclose(trajectory.poses, poses, atol=1e-4)
     loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._nodes)

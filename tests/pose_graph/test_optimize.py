@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from session_pairs import found_pair, two_drives
 
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.closure import Loop
-from sglpr_jax.loops.result import FoundLoops, Session
+from sglpr_jax.loops.closure import LoopClosure
+from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o
 from sglpr_jax.pose_graph.optimize import (
     MOST_RISEN_M,
@@ -29,7 +29,7 @@ from sglpr_jax.se3 import from_quaternions, inverse, transform
 from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
 
 
-def optimized(odometry: np.ndarray, loops: Sequence[Loop]) -> OptimizedTrajectory:
+def optimized(odometry: np.ndarray, loops: Sequence[LoopClosure]) -> OptimizedTrajectory:
     return solved_graph({0: odometry}, loops)
 
 
@@ -47,7 +47,7 @@ def test_the_error_of_a_drifted_drive_falls(two_laps, two_laps_odometry, second_
 
 def test_wrong_loops_do_not_bend_it(two_laps, two_laps_odometry, second_lap_loops):
     true = two_laps[:, :3, 3]
-    wrong = tuple(Loop(100 + k, 20 + k, transform(1.0, 0.0, 0.1), LOOP_COVARIANCE, 1.0) for k in range(3))
+    wrong = tuple(LoopClosure(100 + k, 20 + k, transform(1.0, 0.0, 0.1), LOOP_COVARIANCE, 1.0) for k in range(3))
     found = optimized(two_laps_odometry, (*wrong, *second_lap_loops))
     assert not found.inliers[:3].any() and found.inliers[3:].all()
     assert trajectory_error(found.poses, true) == pytest.approx(
@@ -59,13 +59,13 @@ def test_of_a_recording_the_searched_frames_are_corrected(two_laps_odometry, sec
     images = {tmp_path / f"{i:06d}.png": np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
     early = tuple(loop for loop in second_lap_loops if loop.query < 90)
     session = Session(of_images(images), 90, two_laps_odometry)
-    found = FoundLoops((session,), early)
+    found = LoopSearchResult((session,), early)
     corrected = optimize_trajectory(found)
     assert corrected.poses.shape == (90, 4, 4)
     np.testing.assert_allclose(corrected.poses, optimized(two_laps_odometry[:90], early).poses, atol=1e-9)
     with pytest.raises(ValueError, match="08: expected loops found with odometry, found loops without it"):
-        optimize_trajectory(FoundLoops((dataclasses.replace(session, odometry=None),), early))
-    none = optimize_trajectory(FoundLoops((session,)))
+        optimize_trajectory(LoopSearchResult((dataclasses.replace(session, odometry=None),), early))
+    none = optimize_trajectory(LoopSearchResult((session,)))
     np.testing.assert_array_equal(none.poses, two_laps_odometry[:90])
     assert none.inliers.shape == (0,)
     monkeypatch.setitem(sys.modules, "gtsam", None)
@@ -134,7 +134,7 @@ def test_heights_that_move_by_metres_are_told(two_laps, two_laps_odometry, secon
     images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
     low = two_laps_odometry.copy()
     low[:, 2, 3] -= 0.06 * np.arange(LAPS_FRAMES)  # odometry that sinks, which loops of known heights correct
-    moved = FoundLoops((Session(of_images(images), LAPS_FRAMES, low),), second_lap_loops)
+    moved = LoopSearchResult((Session(of_images(images), LAPS_FRAMES, low),), second_lap_loops)
     with pytest.warns(DataWarning, match="08: expected heights near those of the odometry, found them moved by"):
         corrected = optimize_trajectory(moved)
     assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MOST_RISEN_M

@@ -82,7 +82,7 @@ def test_errors_in_a_town_are_as_large_as_the_covariance_says(drive):
     apart[np.subtract.outer(drive.times, drive.times) < 30] = np.inf
     queries = np.flatnonzero(apart.min(1) < 8)[::2]
     pairs = [(int(query), int(apart[query].argmin())) for query in queries]
-    images = {frame: square_image(drive.record(frame)) for pair in pairs for frame in pair}
+    images = {frame: square_image(drive.scan(frame)) for pair in pairs for frame in pair}
     squares = []
     for query, match in pairs:
         found, true = align(images[query], images[match]), inverse(poses[match]) @ poses[query]

@@ -16,7 +16,7 @@ from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod, Method
-from sglpr_jax.methods.registry import checked_view, handcrafted, rotated_record
+from sglpr_jax.methods.registry import checked_view, handcrafted, rotated_scan
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 
@@ -221,15 +221,15 @@ def test_points_that_are_not_finite_are_left_out_with_their_labels(scans, tmp_pa
     np.testing.assert_allclose(found.descriptors[0], [*clouds()[0][1:].mean(axis=0), classes[1:].mean()], rtol=1e-5)
 
 
-def mean_of(record):
-    return record.upright_points.mean(axis=0)
+def mean_of(scan):
+    return scan.upright_points.mean(axis=0)
 
 
 def learned(prepare=mean_of, describe=lambda inputs: inputs, takes="points") -> Method:
     """A method with weights."""
 
-    def prepared(record, angle):
-        return prepare(record if angle is None else rotated_record(record, angle))
+    def prepared(scan, angle):
+        return prepare(scan if angle is None else rotated_scan(scan, angle))
 
     return Method({"method": "mine"}, takes, prepared, describe, weights_hash="hash")
 
@@ -238,7 +238,7 @@ def test_scans_and_images_of_a_learned_method_are_rotated(scans, pictures):
     file, angles = embed(learned(), scans, rotation_seed=3), drawn_angles(3)
     expected = [rotated(cloud, float(angle)).mean(axis=0) for cloud, angle in zip(clouds(), angles, strict=True)]
     np.testing.assert_allclose(file.descriptors, expected, atol=1e-5)
-    on_images = learned(prepare=lambda record: record.image.reshape(-1), takes="images")
+    on_images = learned(prepare=lambda scan: scan.image.reshape(-1), takes="images")
     found = embed(on_images, pictures, rotation_seed=3).descriptors
     expected = [np.asarray(rotate_image(pictures.image(row), angle)) for row, angle in enumerate(angles)]
     np.testing.assert_allclose(found, np.reshape(expected, (SCANS, -1)), atol=1e-4)
@@ -246,15 +246,15 @@ def test_scans_and_images_of_a_learned_method_are_rotated(scans, pictures):
 
 @pytest.mark.parametrize(("value", "words"), [(np.nan, "values that are not finite"), (0, "only zeros")])
 def test_invalid_descriptors_are_one_line_errors(scans, value, words):
-    def prepare(record):
-        return np.full(3, value if "000006" in record.name else 1, np.float32)
+    def prepare(scan):
+        return np.full(3, value if "000006" in scan.name else 1, np.float32)
 
     with pytest.raises(ValueError, match=f"^mine: expected a descriptor of scan 000006 of sequence .*{words}$"):
         embed(learned(prepare), scans)
 
 
 def test_other_lengths_from_scan_to_scan_are_errors(scans):
-    odd = learned(lambda record: np.ones(4 if "000006" in record.name else 3, np.float32))
+    odd = learned(lambda scan: np.ones(4 if "000006" in scan.name else 3, np.float32))
     with pytest.raises(ValueError, match=r"mine: expected an input \(3,\) of scan 000006 .*found \(4,\)"):
         embed(odd, scans)
     with pytest.raises(ValueError, match="mine: expected 7 descriptors"):

@@ -12,8 +12,8 @@ from recordings import of_images
 
 from sglpr_jax.bev import even_cells, rasterize, rasterize_labels
 from sglpr_jax.data.formats.png import label_image_pixels
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_raw
 from sglpr_jax.models.backbone_config import SwinConfig
@@ -52,7 +52,7 @@ def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 9, (700, 3)).astype(np.float32)
     classes = rng.integers(0, 20, 700).astype(np.int32)
-    found = semantic_map(params, Record(points=points, labels=to_raw(classes)))
+    found = semantic_map(params, Scan(points=points, labels=to_raw(classes)))
     grid = params.config.grid
     counts = np.asarray(rasterize(points, grid=grid))
     seen = (counts > 0) & field_of_view(params.config)[0]
@@ -61,7 +61,7 @@ def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     np.testing.assert_array_equal(found.seen, seen)
     np.testing.assert_array_equal(found.predicted, np.where(seen, likeliest, 0))
     np.testing.assert_array_equal(found.truth, np.where(seen, rasterize_labels(points, classes, grid=grid), 0))
-    unlabelled = semantic_map(params, Record(points=points))
+    unlabelled = semantic_map(params, Scan(points=points))
     np.testing.assert_array_equal(unlabelled.predicted, found.predicted)
     assert not unlabelled.truth.any()
 
@@ -75,22 +75,22 @@ def test_the_map_of_an_image_is_that_of_its_middle_where_it_is_not_empty(params,
     rng = np.random.default_rng(0)
     image = rng.poisson(0.3, (grid.height + 3, grid.width + 6)).astype(np.float32)
     Image.fromarray(label_image_pixels(np.full(image.shape, 50))).save(tmp_path / "0.png")
-    found = semantic_map(params, image_sequence(image, tmp_path / "0.png").record(0))
+    found = semantic_map(params, image_sequence(image, tmp_path / "0.png").scan(0))
     middle = np.asarray(even_cells(jnp.asarray(image)))[2 : 2 + grid.height, 3 : 3 + grid.width]
     seen = (middle > 0) & field_of_view(params.config)[0]
     likeliest = probabilities(params, middle).argmax(-1) + 1
     np.testing.assert_array_equal(found.counts, middle)
     np.testing.assert_array_equal(found.predicted, np.where(seen, likeliest, 0))
     np.testing.assert_array_equal(found.truth, np.where(seen, 13, 0))  # building
-    assert not semantic_map(params, image_sequence(image, None).record(0)).truth.any()
+    assert not semantic_map(params, image_sequence(image, None).scan(0)).truth.any()
 
 
 def test_cells_the_network_is_not_sure_of_are_left_unlabelled(params):
     points = np.random.default_rng(0).normal(0, 9, (700, 3)).astype(np.float32)
-    every = semantic_map(params, Record(points=points))
+    every = semantic_map(params, Scan(points=points))
     confidence = probabilities(params, every.counts).max(-1)
     least = np.quantile(confidence[every.seen], 0.5) + 1e-6
-    found = semantic_map(params, Record(points=points), min_confidence=least)
+    found = semantic_map(params, Scan(points=points), min_confidence=least)
     clear = np.abs(confidence - least) > 1e-5
     expected = np.where(confidence >= least, every.predicted, 0)
     np.testing.assert_array_equal(found.predicted[clear], expected[clear])

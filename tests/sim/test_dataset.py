@@ -196,7 +196,7 @@ def test_submaps_of_a_carrier_in_a_scenery_where_places_repeat(tmp_path):
     assert written.positions == pytest.approx(drive.positions, abs=1e-5)
     for i in range(4):
         np.testing.assert_array_equal(written.points(i), expected.points(i))
-        np.testing.assert_array_equal(written.record(i).labels, expected.record(i).labels)
+        np.testing.assert_array_equal(written.scan(i).labels, expected.scan(i).labels)
     assert len(written.points(3)) > len(drive.points(3))
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.learned.method import LearnedMethod, triplet
 from sglpr_jax.methods.learned.weights_file import load_variables, random_variables, save_variables
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
@@ -33,9 +33,9 @@ SECTORS = 24
 MINED = TupleConfig(positives=1, negatives=2, revisit_gap=5, mining="hardest", hardest=4, refresh_steps=4)
 
 
-def ranges(record: Record) -> np.ndarray:
+def ranges(scan: Scan) -> np.ndarray:
     """The nearest point of each of 24 sectors, in units of 20 m."""
-    x, y, _ = record.upright_points.T
+    x, y, _ = scan.upright_points.T
     sector = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     found = np.full(SECTORS, 60, np.float32)
     np.minimum.at(found, sector, np.hypot(x, y))
@@ -88,7 +88,7 @@ def loop(name: str, seed: int, *, scans: int = 60) -> Recording:
     clouds = np.stack([reach * np.cos(angle), reach * np.sin(angle), 0 * reach], axis=-1).astype(np.float32)
 
     def read(path, labels, lasers):
-        return Record(points=np.repeat(clouds[int(path.stem)], 20, axis=0))
+        return Scan(points=np.repeat(clouds[int(path.stem)], 20, axis=0))
 
     return Recording(
         name=name,
@@ -123,17 +123,17 @@ def assert_equal(a, b):
 def test_inputs_are_prepared_once_and_by_method_and_recording(tmp_path):
     recording, counted = loop("a", 0), []
 
-    def counting(record):
-        counted.append(record.name)
-        return ranges(record)
+    def counting(scan):
+        counted.append(scan.name)
+        return ranges(scan)
 
     method = dataclasses.replace(TINY, prepare=counting)
     first = prepared(method, [recording], tmp_path)
     again = prepared(method, [recording], tmp_path)
     assert len(counted) == 60 and isinstance(again.inputs[0], np.memmap)
-    np.testing.assert_array_equal(first.inputs[0], np.stack([ranges(recording.record(i)) for i in range(60)]))
+    np.testing.assert_array_equal(first.inputs[0], np.stack([ranges(recording.scan(i)) for i in range(60)]))
     prepared(dataclasses.replace(method, name="other"), [recording], tmp_path)
-    bad = dataclasses.replace(loop("c", 1), read=lambda *_: Record(points=np.zeros((0, 3), "f4")))
+    bad = dataclasses.replace(loop("c", 1), read=lambda *_: Scan(points=np.zeros((0, 3), "f4")))
     with pytest.raises(ValueError, match="scan 000000 of sequence c"):
         prepared(method, [loop("b", 0), bad], tmp_path)
     assert len(counted) == 180 and sorted(path.name[:6] for path in tmp_path.iterdir()) == [
@@ -144,7 +144,7 @@ def test_inputs_are_prepared_once_and_by_method_and_recording(tmp_path):
 
 
 def test_recordings_that_do_not_fit_are_errors(tmp_path):
-    odd = dataclasses.replace(TINY, prepare=lambda record: ranges(record)[: 23 if "000007" in record.name else 24])
+    odd = dataclasses.replace(TINY, prepare=lambda scan: ranges(scan)[: 23 if "000007" in scan.name else 24])
     with pytest.raises(ValueError, match=r"scan 000007 of sequence a: expected an input float32 \(24,\).*\(23,\)"):
         prepared(odd, [loop("a", 0)], tmp_path)
     with pytest.raises(ValueError, match="sequence a has no poses"):

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_record
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_scan
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.numpy_files import read_array
 
 NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 """Names of the array with the points in an .npz file with several arrays, in order of preference."""
 
 
-def array_record(path: Path) -> Record:
+def array_scan(path: Path) -> Scan:
     """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields.
 
     In an .npz file, they are the first array of `NAMES`, or the only one. Pickled objects are not read.
@@ -28,7 +28,7 @@ def array_record(path: Path) -> Record:
     numbers = array.dtype.kind in "fiu"
     if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not 0 < len(array) <= MOST_POINTS:
         raise ValueError(f"expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}")
-    return cloud_record(dict(zip("xyz", array.T, strict=False)))
+    return cloud_scan(dict(zip("xyz", array.T, strict=False)))
 
 
 def _archived(path: Path) -> np.ndarray:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.clouds import check_points
-from sglpr_jax.data.record import Record, TimeField
+from sglpr_jax.data.scan import Scan, TimeField
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import naming
 
@@ -52,7 +52,7 @@ Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
 scans."""
 
 
-def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
+def detect_point_format(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
     Fewer than half of the files may be broken. A format whose record consists of several records of another one that
@@ -77,13 +77,13 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
 
 def record_of_scan(path: Path) -> RecordFormat:
     """Detect the format of one headerless scan: KITTI's if the scan fits it or has too few points, or else another."""
-    return "kitti" if _fits_kitti([path]) else find_record([path])[0] or "kitti"
+    return "kitti" if _fits_kitti([path]) else detect_point_format([path])[0] or "kitti"
 
 
 def unusual_record(paths: Sequence[Path]) -> RecordFormat | None:
     """Return the format of scans in KITTI's layout if it is clearly another one, as of users' own scans."""
     with contextlib.suppress(ValueError):
-        return None if _fits_kitti(paths) else find_record(paths)[0]
+        return None if _fits_kitti(paths) else detect_point_format(paths)[0]
     return None
 
 
@@ -198,7 +198,7 @@ def described(format: RecordFormat) -> str:
     return f"{format} ({record_type(format).itemsize} bytes a point)"
 
 
-def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Record:
+def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Scan:
     """Read a file of records. With `last_is_time`, the last column is the time of the point."""
     dtype = record_type(format)
     size = path.stat().st_size
@@ -220,4 +220,4 @@ def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False
         elif format == "nclt":
             xyz = (xyz.astype(np.float64) * NCLT_UNIT_M + NCLT_OFFSET_M) * Z_UP_FROM_Z_DOWN
         # Column-major order: the copy takes half the time, and later steps work along the axes.
-        return Record(points=np.asfortranarray(xyz, dtype=np.float32), lasers=lasers, time_field=times)
+        return Scan(points=np.asfortranarray(xyz, dtype=np.float32), lasers=lasers, time_field=times)

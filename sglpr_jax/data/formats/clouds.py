@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from sglpr_jax.data.record import Record, TimeField
+from sglpr_jax.data.scan import Scan, TimeField
 from sglpr_jax.files import in_short
 
 MOST_POINTS = 1 << 24
@@ -19,12 +19,12 @@ BLOCK_POINTS = 1 << 21
 """Number of points of a point cloud map that are read at a time."""
 
 
-def cloud_record(
+def cloud_scan(
     columns: Mapping[str, np.ndarray] | np.ndarray, *, time: str | None = None, laser: str | None = None
-) -> Record:
+) -> Scan:
     """Return the record of the columns x, y and z, and of the columns of times and laser numbers, if any."""
     with np.errstate(over="ignore", invalid="ignore"):  # invalid points are dropped by the callers
-        return Record(
+        return Scan(
             points=np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float32),
             lasers=None if laser is None else columns[laser].astype(np.int32),
             time_field=None if time is None else TimeField(time, np.array(columns[time])),

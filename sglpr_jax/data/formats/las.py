@@ -8,8 +8,8 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float64
 
-from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_record
-from sglpr_jax.data.record import Record, time_field_of
+from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_scan
+from sglpr_jax.data.scan import Scan, time_field_of
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
 """Minimum size of a variable-length record before and after the points, in bytes."""
@@ -17,13 +17,13 @@ _COMPRESSED = 0x80
 """Bit of the point format in the header of a .laz file."""
 
 
-def las_record(path: Path) -> Record:
+def las_scan(path: Path) -> Scan:
     """Read the points of a .las file in metres, scaled by the header, and their times. The axes are not changed."""
     with _laspy(path, one_scan=True).open(path) as stream:
         found = stream.read()
     time = time_field_of(list(found.point_format.dimension_names))
     columns = {"x": found.x, "y": found.y, "z": found.z} | ({} if time is None else {time: found[time]})
-    return cloud_record({name: np.asarray(column) for name, column in columns.items()}, time=time)
+    return cloud_scan({name: np.asarray(column) for name, column in columns.items()}, time=time)
 
 
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:

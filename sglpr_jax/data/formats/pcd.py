@@ -11,14 +11,14 @@ from jaxtyping import Float64
 from sglpr_jax.data.formats.clouds import (
     blocks_of,
     check_points,
-    cloud_record,
+    cloud_scan,
     mapped,
     number_rows,
     packed_type,
     text_lines,
     whole_number,
 )
-from sglpr_jax.data.record import Record, time_field_of
+from sglpr_jax.data.scan import Scan, time_field_of
 
 _NUMBERS = {(kind, str(size)): f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
 _NUMBERS |= {("F", "4"): "<f4", ("F", "8"): "<f8"}
@@ -54,7 +54,7 @@ class _Header(NamedTuple):
         return [field for field in self.fields if field.name != PADDING], self.fields
 
 
-def pcd_record(path: Path) -> Record:
+def pcd_scan(path: Path) -> Scan:
     """Decode a file with `DATA binary`, `binary_compressed` or `ascii`."""
     header, body = _split(path.read_bytes())
     decode = {"binary": _binary_records, "binary_compressed": _compressed_columns, "ascii": _text_columns}
@@ -63,7 +63,7 @@ def pcd_record(path: Path) -> Record:
     check_points(header.points, bytes_each=sum(field.width for field in header.fields))
     time = time_field_of([field.name for field in header.fields if field.count == 1])
     names = AXES if time is None else (*AXES, time)
-    return cloud_record(decode[header.encoding](header, body, names), time=time)
+    return cloud_scan(decode[header.encoding](header, body, names), time=time)
 
 
 def pcd_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
@@ -72,7 +72,7 @@ def pcd_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
     if header.encoding == "binary":
         yield from blocks_of(_binary_records(header, body, AXES))
     else:
-        yield pcd_record(path).cloud.astype(np.float64)
+        yield pcd_scan(path).cloud.astype(np.float64)
 
 
 def _split(content: bytes | memoryview) -> tuple[_Header, bytes | memoryview]:
@@ -125,11 +125,11 @@ def _fields(words: dict[str, list[str]]) -> list[_Field]:
 
 
 def _binary_records(header: _Header, body: bytes | memoryview, names: Sequence[str]) -> np.ndarray:
-    record = packed_type([(field.name, field.kind, field.width) for field in header.fields], names)
-    end = header.points * record.itemsize
+    row = packed_type([(field.name, field.kind, field.width) for field in header.fields], names)
+    end = header.points * row.itemsize
     if len(body) < end or _holds_more(body[end:]):
-        raise ValueError(f"expected {header.points} points of {record.itemsize} bytes, found {len(body)} bytes")
-    return np.frombuffer(body, record, header.points)
+        raise ValueError(f"expected {header.points} points of {row.itemsize} bytes, found {len(body)} bytes")
+    return np.frombuffer(body, row, header.points)
 
 
 def _holds_more(rest: bytes | memoryview) -> bool:

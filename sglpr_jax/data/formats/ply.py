@@ -11,14 +11,14 @@ from jaxtyping import Float64
 from sglpr_jax.data.formats.clouds import (
     blocks_of,
     check_points,
-    cloud_record,
+    cloud_scan,
     mapped,
     number_rows,
     packed_type,
     text_lines,
     whole_number,
 )
-from sglpr_jax.data.record import Record, time_field_of
+from sglpr_jax.data.scan import Scan, time_field_of
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -58,19 +58,19 @@ class _Header(NamedTuple):
     behind: list[_Element]
 
 
-def ply_record(path: Path) -> Record:
+def ply_scan(path: Path) -> Scan:
     """Decode the vertices of a file."""
     header, body = _split(path.read_bytes())
     properties = [name for name, _ in header.vertices.properties]
     time = time_field_of([name for name in properties if properties.count(name) == 1])
     check_points(header.vertices.count, bytes_each=sum(size for _, _, size in header.vertices.fields("<")))
     if header.order:
-        return cloud_record(_binary_records(header, body, ("x", "y", "z", *([time] if time else []))), time=time)
+        return cloud_scan(_binary_records(header, body, ("x", "y", "z", *([time] if time else []))), time=time)
     first, count = sum(element.count for element in header.before), header.vertices.count
     lines = text_lines(bytes(body))  # one for each instance of an element
     _check_end(len(lines), first + count + sum(element.count for element in header.behind), unit="lines")
     rows = number_rows(lines[first : first + count], rows=count, columns=len(properties))
-    return cloud_record({name: rows[:, properties.index(name)] for name in properties}, time=time)
+    return cloud_scan({name: rows[:, properties.index(name)] for name in properties}, time=time)
 
 
 def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
@@ -79,7 +79,7 @@ def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
     if header.order:
         yield from blocks_of(_binary_records(header, body, "xyz"))
     else:
-        yield ply_record(path).cloud.astype(np.float64)
+        yield ply_scan(path).cloud.astype(np.float64)
 
 
 def _split(content: bytes | memoryview) -> tuple[_Header, bytes | memoryview]:
@@ -121,14 +121,14 @@ def _parse_header(lines: Sequence[str]) -> _Header:
 
 
 def _binary_records(header: _Header, body: bytes | memoryview, names: Sequence[str]) -> np.ndarray:
-    record = packed_type(header.vertices.fields(header.order), names)
+    row = packed_type(header.vertices.fields(header.order), names)
     body = body[sum(element.bytes for element in header.before) :]
     if len(body) < header.vertices.bytes:
-        raise ValueError(f"expected {header.vertices.count} points of {record.itemsize} bytes, found {len(body)} bytes")
+        raise ValueError(f"expected {header.vertices.count} points of {row.itemsize} bytes, found {len(body)} bytes")
     lists = [kind for element in header.behind for _, kind in element.properties if kind.startswith("list ")]
     if not lists:  # their size is not known
         _check_end(len(body), header.vertices.bytes + sum(element.bytes for element in header.behind), unit="bytes")
-    return np.frombuffer(body, record, count=header.vertices.count)
+    return np.frombuffer(body, row, count=header.vertices.count)
 
 
 def _check_end(found: int, most: int, *, unit: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, POINT, RosMessage, read_custom_msg, read_point_cloud2
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
@@ -66,7 +66,7 @@ class RosBag:
             )
         return clouds
 
-    def cloud(self, topic: str, time: int, nth: int) -> Record:
+    def cloud(self, topic: str, time: int, nth: int) -> Scan:
         """Return the `nth` cloud among those of a topic recorded at `time` (ns). Raises ValueError if it is empty."""
         kind, message = self.topics[topic], self.message(topic, time, nth)
         try:

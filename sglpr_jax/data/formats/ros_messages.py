@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.clouds import check_points, cloud_record, packed_type
+from sglpr_jax.data.formats.clouds import check_points, cloud_scan, packed_type
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
-from sglpr_jax.data.record import TIME_FIELDS, Record, time_field_of
-from sglpr_jax.data.times import doubt
+from sglpr_jax.data.scan import TIME_FIELDS, Scan, time_field_of
+from sglpr_jax.data.times import time_unit_problem
 from sglpr_jax.data.warning import warn
 from sglpr_jax.se3 import from_quaternions
 
@@ -89,7 +89,7 @@ class RosMessage:
         return found
 
 
-def read_point_cloud2(message: Any, *, name: str = "cloud") -> Record:
+def read_point_cloud2(message: Any, *, name: str = "cloud") -> Scan:
     """Return the points in the axes of a sensor_msgs/PointCloud2, and their lasers and times if it has such fields.
 
     Some drivers set `is_bigendian` for little-endian data. If only the little-endian numbers are metres, they are
@@ -104,7 +104,7 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Record:
             records = others
     names = records.dtype.names or ()
     laser = next((field for field in _LASERS if field in names), None)
-    return cloud_record(records, time=time_field_of(names), laser=laser)
+    return cloud_scan(records, time=time_field_of(names), laser=laser)
 
 
 def _point_bytes(message: Any) -> UInt8[np.ndarray, " n"]:
@@ -141,7 +141,7 @@ def _record(message: Any, order: str) -> np.dtype:
         raise ValueError(f"expected fields within {message.point_step} bytes, found others ({error})") from error
 
 
-def read_custom_msg(message: RosMessage) -> Record:
+def read_custom_msg(message: RosMessage) -> Scan:
     """Return the points in the axes of a Livox message, their line numbers and their times."""
     message.header()
     for kind, count in (("u8", 1), ("u4", 1), ("u1", 4)):  # time base, number of points, LiDAR and reserved bytes
@@ -149,7 +149,7 @@ def read_custom_msg(message: RosMessage) -> Record:
     points = message.records(POINT)
     if not len(points):
         raise ValueError("expected at least one point, found none")
-    return cloud_record(points, time="offset_time", laser="line")
+    return cloud_scan(points, time="offset_time", laser="line")
 
 
 class StampedPose(NamedTuple):
@@ -201,9 +201,9 @@ class Stamps(NamedTuple):
 
     @property
     def orderly(self) -> bool:
-        """Whether the header times are positive, never decrease, and can be seconds (`times.doubt`)."""
+        """Whether the header times are positive, never decrease, and can be seconds (`times.time_unit_problem`)."""
         ordered = len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all()
-        return bool(ordered and not doubt(self.own, numbers=False))
+        return bool(ordered and not time_unit_problem(self.own, numbers=False))
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:

@@ -8,22 +8,22 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.arrays import array_record
+from sglpr_jax.data.formats.arrays import array_scan
 from sglpr_jax.data.formats.bin_records import is_record, read_records, record_of_scan
 from sglpr_jax.data.formats.clouds import check_bytes
-from sglpr_jax.data.formats.las import las_blocks, las_record
-from sglpr_jax.data.formats.pcd import pcd_blocks, pcd_record
-from sglpr_jax.data.formats.ply import ply_blocks, ply_record
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.formats.las import las_blocks, las_scan
+from sglpr_jax.data.formats.pcd import pcd_blocks, pcd_scan
+from sglpr_jax.data.formats.ply import ply_blocks, ply_scan
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import in_short
 
-READERS: dict[ScanFormat, Callable[[Path], Record]] = {
-    "pcd": pcd_record,
-    "ply": ply_record,
-    "npy": array_record,
-    "npz": array_record,
-    "las": las_record,
+READERS: dict[ScanFormat, Callable[[Path], Scan]] = {
+    "pcd": pcd_scan,
+    "ply": ply_scan,
+    "npy": array_scan,
+    "npz": array_scan,
+    "las": las_scan,
 }
 """Readers of formats with a header. The name of each format is also its file ending."""
 BLOCKS: dict[str, Callable[[Path], Iterator[Float64[np.ndarray, "_ 3"]]]] = {
@@ -84,10 +84,10 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
       ImportError: If the file is a .las file and the extra `las` is not installed.
     """
     path = Path(path)
-    return read_scan_record(path, format=found_format(path) if format == "auto" else format).cloud
+    return read_scan_file(path, format=found_format(path) if format == "auto" else format).cloud
 
 
-def read_scan_record(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Record:
+def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Scan:
     """Read the points of a scan, with the laser numbers and times that the file contains.
 
     The format "auto" does not use the content: `records` is the format of .bin files whose name does not define it.

@@ -16,7 +16,7 @@ from sglpr_jax.data.formats.png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, image_record
+from sglpr_jax.data.recording import Recording, image_scan
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
@@ -35,7 +35,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         name=name,
         ids=ids,
         paths=image_paths,
-        read=partial(image_record, read=read_image),
+        read=partial(image_scan, read=read_image),
         positions=positions,
         pose_source=source,
         label_paths=tuple(labels.get(image) for image in ids),

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.cloud_map import TiledCloud, tiled_cloud, visible_points
+from sglpr_jax.data.cloud_map import TiledCloud, remove_hidden_points, tiled_cloud
 from sglpr_jax.data.formats.pose_files import read_trajectory
 from sglpr_jax.data.formats.scan_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import warn
 
@@ -73,9 +73,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 def _read(
     path: Path, labels: Path | None, lasers: bool, *, cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"]
-) -> Record:
+) -> Scan:
     points = _points_at(cloud, world_from_lidar[int(path.name)])
-    return Record(points=visible_points(points, spacing_m=cloud.spacing_m, reach_m=REACH_M))
+    return Scan(points=remove_hidden_points(points, spacing_m=cloud.spacing_m, reach_m=REACH_M))
 
 
 def _points_at(cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "4 4"]) -> np.ndarray:

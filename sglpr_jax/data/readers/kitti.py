@@ -18,7 +18,7 @@ from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import ReadRecord, Recording, scan_record
+from sglpr_jax.data.recording import ReadRecord, Recording, scan_of_file
 from sglpr_jax.files import naming, read_json
 from sglpr_jax.se3 import positions_from_camera
 
@@ -70,11 +70,11 @@ def _mounting(root: Path) -> Mounting | None:
 def _format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:
     """Function that reads a scan, and its format in words."""
     if format != "auto":
-        return partial(scan_record, format=format), f"{format}, as given"
+        return partial(scan_of_file, format=format), f"{format}, as given"
     unusual = unusual_record(paths)
     if unusual is None:
-        return scan_record, described("kitti")
-    return partial(scan_record, format=unusual), f"{described(unusual)}, not KITTI's"
+        return scan_of_file, described("kitti")
+    return partial(scan_of_file, format=unusual), f"{described(unusual)}, not KITTI's"
 
 
 def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:

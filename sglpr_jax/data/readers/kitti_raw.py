@@ -18,7 +18,7 @@ from jaxtyping import Float
 from sglpr_jax.data.formats.pose_files import numbers_of
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.data.recording import Recording, scan_of_file
 from sglpr_jax.files import in_short
 
 EARTH_M = 6378137.0
@@ -41,7 +41,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         name=name,
         ids=tuple(path.stem for path in paths),
         paths=paths,
-        read=partial(scan_record, format="kitti"),
+        read=partial(scan_of_file, format="kitti"),
         positions=_positions(oxts) if has_gps else None,
         times=_times(folder / "velodyne_points" / "timestamps.txt", paths),
         pose_source="oxts (GPS)" if has_gps else None,

@@ -21,7 +21,7 @@ from sglpr_jax.data.formats.pose_files import rotations_of
 from sglpr_jax.data.formats.scan_files import scan_id
 from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.data.recording import Recording, scan_of_file
 from sglpr_jax.files import in_short, naming, path_inside
 
 CHANNEL = "LIDAR_TOP"
@@ -57,7 +57,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
             name=name,
             ids=tuple(map(scan_id, paths)),
             paths=paths,
-            read=scan_record,
+            read=scan_of_file,
             positions=positions,
             times=ticks[order] / 1e6,
             pose_source=f"{tables.name}/ego_pose.json",

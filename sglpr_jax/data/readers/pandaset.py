@@ -21,8 +21,8 @@ from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.readers.listing import files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.times import check_order
 from sglpr_jax.files import read_json
 
@@ -97,11 +97,11 @@ def _times(path: Path) -> Float[np.ndarray, " n"]:
 
 def _read(
     path: Path, labels: Path | None, lasers: bool, *, poses: dict[Path, Float[np.ndarray, "4 4"]], poses_hash: str
-) -> Record:
+) -> Scan:
     """Read a scan. Caches of its points use `poses_hash` to detect changed poses."""
     world_from_lidar = poses[path]
     x, y, z = ((read_scan(path, format="npy") - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]).T
-    return Record(points=np.stack([y, -x, z], axis=1).astype(np.float32))
+    return Scan(points=np.stack([y, -x, z], axis=1).astype(np.float32))
 
 
 READER = Reader(

@@ -25,10 +25,10 @@ from sglpr_jax.data.formats.ros_messages import (
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, interpolate_poses, left_out
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.times import doubt
+from sglpr_jax.data.times import time_unit_problem
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import naming
 
@@ -78,7 +78,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
     """Times of the scans in seconds, or None with a warning if neither headers nor recorder have seconds."""
-    if found := doubt(stamps.seconds, numbers=False):
+    if found := time_unit_problem(stamps.seconds, numbers=False):
         warn(f"{source}: expected times in seconds in the headers or of the recorder, found {found}; not used")
         return None
     return stamps.seconds
@@ -241,7 +241,7 @@ def _ups(
 
 def _read(
     path: Path, labels: Path | None, lasers: bool, *, bag: RosBag, topic: str, where: dict[str, tuple[int, int]]
-) -> Record:
+) -> Scan:
     with naming(f"scan {path.name}"):
         return bag.cloud(topic, *where[path.name])
 

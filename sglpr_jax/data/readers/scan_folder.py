@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import check_record, described, find_record, is_record
+from sglpr_jax.data.formats.bin_records import check_record, described, detect_point_format, is_record
 from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id
 from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.readers.listing import files_in, left_aside, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.data.recording import Recording, scan_of_file
 
 POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
 """Pose files beside the scans. 12 numbers a line are poses of the LiDAR, z up."""
@@ -47,7 +47,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         name=root.resolve().name,
         ids=ids,
         paths=paths,
-        read=partial(scan_record, format=options.format, records=records),
+        read=partial(scan_of_file, format=options.format, records=records),
         positions=positions,
         times=seconds,
         pose_source=source,
@@ -102,7 +102,7 @@ def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
 def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
     """Record of the .bin files whose name does not define it, and a description of all formats."""
     unsaid = [path for path in paths if named_format(path) is None] if format == "auto" else []
-    found, how = find_record(unsaid) if unsaid else (None, "")
+    found, how = detect_point_format(unsaid) if unsaid else (None, "")
     if is_record(format):
         check_record(paths, format)
     records: RecordFormat = found or "kitti"

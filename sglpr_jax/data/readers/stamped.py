@@ -23,8 +23,8 @@ from jaxtyping import Float, Int64
 from sglpr_jax.data.formats.bin_records import described, read_records
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.record import Record, TimeField, time_field_of
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import Scan, TimeField, time_field_of
 from sglpr_jax.data.times import check_unit, nearest_rows
 
 MAX_GAP_S = 0.1
@@ -50,7 +50,7 @@ AEVA_CHANGED = 1691936557946849179
 """Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
 
 
-def read_helipr(path: Path, *, sensor: str) -> Record:
+def read_helipr(path: Path, *, sensor: str) -> Scan:
     """Read the points of a scan, their line numbers and their times. Raises ValueError if the file has a wrong size."""
     before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
     record = AEVA_BEFORE if before else HELIPR[sensor]
@@ -61,7 +61,7 @@ def read_helipr(path: Path, *, sensor: str) -> Record:
     time = time_field_of(record.names or ())
     times = None if time is None else TimeField(time, found[time].copy())
     lasers = found["line"].astype(np.int32)
-    return Record(points=np.ascontiguousarray(found["xyz"], np.float32), lasers=lasers, time_field=times)
+    return Scan(points=np.ascontiguousarray(found["xyz"], np.float32), lasers=lasers, time_field=times)
 
 
 def _ouster_positions(numbers: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 3"]:
@@ -79,7 +79,7 @@ class Layout(NamedTuple):
     """Number of columns of the table of poses."""
     tick_s: float
     """Unit of the names and times, in seconds."""
-    read: Callable[[Path], Record]
+    read: Callable[[Path], Scan]
     found: str
     """Format in words."""
     positions: Callable[[np.ndarray], np.ndarray] = lambda numbers: numbers[:, :3]
@@ -96,7 +96,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             "global_pose.csv",
             13,
             1e-9,
-            lambda path: Record(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
+            lambda path: Scan(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
             f"MulRan, {described('kitti')}, rotated to x forward",
             _ouster_positions,
         ),
@@ -168,7 +168,7 @@ def stamped_recording(
     positions: Float[np.ndarray, "n 3"],
     pose_file: Path,
     tick_s: float,
-    read_points: Callable[[Path], Record],
+    read_points: Callable[[Path], Scan],
     max_gap_s: float = MAX_GAP_S,
     **fields: Any,
 ) -> Recording:

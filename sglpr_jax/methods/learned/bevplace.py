@@ -14,7 +14,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Float64, Int32, Num, UInt8
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.data.views import check_ready_made, picture
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_SIZE
 from sglpr_jax.methods.learned.layers import (
@@ -177,16 +177,16 @@ def resized(maps: Float[Array, "b h h c"], size: int) -> Float[Array, "b {size} 
     return jnp.einsum("ip,jq,bpqc->bijc", along, along, maps)
 
 
-def grey_image(record: Record) -> UInt8[np.ndarray, "151 151"]:
+def grey_image(scan: Scan) -> UInt8[np.ndarray, "151 151"]:
     """Return the ready-made density image of a record, or the density image of a scan, as grey values. Raises
     ValueError for another image, or for a scan that shows no place."""
-    if record.points is not None:
-        check_cloud(record.points, name=record.name)
-    check_ready_made(record, "density")
-    counts = picture(record, None)[0]
+    if scan.points is not None:
+        check_cloud(scan.points, name=scan.name)
+    check_ready_made(scan, "density")
+    counts = picture(scan, None)[0]
     if counts.shape != (DENSITY_SIZE, DENSITY_SIZE):
         raise ValueError(
-            f"{record.name}: expected a density image of {DENSITY_SIZE} x {DENSITY_SIZE} pixels, found {counts.shape}"
+            f"{scan.name}: expected a density image of {DENSITY_SIZE} x {DENSITY_SIZE} pixels, found {counts.shape}"
         )
     return np.rint(counts * (255 / DENSITY_MAX_COUNT)).clip(0, 255).astype(np.uint8)
 

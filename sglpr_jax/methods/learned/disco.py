@@ -11,7 +11,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Shaped, UInt8
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.cells import polar
 from sglpr_jax.methods.learned.layers import Convolution, batch_norm, max_pool
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rolled
@@ -26,7 +26,7 @@ KEPT = 32
 """Number of lowest frequencies that are kept along the rings and along the sectors."""
 
 
-def occupancy(record: Record) -> UInt8[np.ndarray, "40 120 20"]:
+def occupancy(scan: Scan) -> UInt8[np.ndarray, "40 120 20"]:
     """Return the occupied cells of a polar grid as 1: rings of 1.75 m, sectors of 3 degrees and layers of 0.5 m.
 
     Sectors are counter-clockwise from x. The layers reach from 0.23 m to 10.23 m above the ground of a sensor at 1.73
@@ -34,7 +34,7 @@ def occupancy(record: Record) -> UInt8[np.ndarray, "40 120 20"]:
     above the zero of NCLT's vehicle. Points beyond 70 m are dropped; the published grid adds the corners of a square to
     its last ring. Raises ValueError if the scan shows no place.
     """
-    radius, angle, z = polar(finite_points(record))
+    radius, angle, z = polar(finite_points(scan))
     layer = np.floor((z - LOWEST_M) / LAYER_M)
     inside = (radius >= NEAREST_M) & (radius < FARTHEST_M) & (layer >= 0) & (layer < LAYERS)
     ring, sector = radius * (RINGS / FARTHEST_M), angle % (2 * np.pi) * (SECTORS / (2 * np.pi))

@@ -11,7 +11,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Shaped
 
 from sglpr_jax.bev import rotate_points
-from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.losses import descriptor_distance, lazy_triplet
 from sglpr_jax.methods.method import Takes
 from sglpr_jax.methods.recipe import Recipe
@@ -50,7 +50,7 @@ class LearnedMethod:
     weights: int
     """Number of trained weights."""
     network: nn.Module
-    prepare: Callable[[Record], Shaped[np.ndarray, "..."]]
+    prepare: Callable[[Scan], Shaped[np.ndarray, "..."]]
     """Makes the input of the network from a record. All inputs have one shape and type."""
     turned: Callable[[Array, Shaped[Array, "b ..."]], Shaped[Array, "b ..."]]
     """`turned(key, inputs)` rotates each input about the vertical axis by its own random angle, for the training."""
@@ -62,10 +62,10 @@ class LearnedMethod:
     """Changes random weights before the first step, given the inputs of random training places."""
 
 
-def finite_points(record: Record) -> Float32[np.ndarray, "n 3"]:
+def finite_points(scan: Scan) -> Float32[np.ndarray, "n 3"]:
     """Return the finite points of a scan, gravity-aligned. Raises ValueError if the scan shows no place."""
-    points = record.upright_points
-    check_cloud(points, name=record.name)
+    points = scan.upright_points
+    check_cloud(points, name=scan.name)
     return points[np.isfinite(points).all(axis=1)]
 
 

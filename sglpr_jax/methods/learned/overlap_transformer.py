@@ -11,7 +11,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.learned.layers import HE, NetVLAD
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, rolled, triplet
@@ -30,14 +30,14 @@ CHANNELS, HEADS, HIDDEN, CLUSTERS = 256, 4, 1024, 64
 MARGIN = 0.5
 
 
-def range_image(record: Record) -> Float32[np.ndarray, "64 900"]:
+def range_image(scan: Scan) -> Float32[np.ndarray, "64 900"]:
     """Return the distance of the nearest point of each pixel, divided by 80 m. Pixels without points are 0.
 
     Rows are elevations from 15 degrees down to -25, in steps of 0.625 degrees. They contain the beams of HDL-64E and
     VLP-16, and all but the lowest beams of HDL-32E. Points at other elevations are dropped. Columns are azimuths of 0.4
     degrees, counter-clockwise from x. Raises ValueError if the scan shows no place.
     """
-    points = finite_points(record)
+    points = finite_points(scan)
     radius, angle, z = polar(points)
     distance = np.sqrt(np.sum(points.astype(np.float64) ** 2, axis=1))
     row = np.floor((HIGHEST_DEG - np.degrees(np.arctan2(z, radius))) * (ROWS / (HIGHEST_DEG - LOWEST_DEG)))

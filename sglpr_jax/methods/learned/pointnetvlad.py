@@ -12,7 +12,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.cells import voxel_means
 from sglpr_jax.methods.learned.layers import maximum
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rotated_points
@@ -103,18 +103,18 @@ class PointNetVlad(nn.Module):
         return l2_normalize(Vlad()(l2_normalize(features).reshape(b, n, -1), train=train))
 
 
-def scaled_points(record: Record) -> Float32[np.ndarray, "4096 3"]:
+def scaled_points(scan: Scan) -> Float32[np.ndarray, "4096 3"]:
     """Return 4096 points above the ground, with coordinates between -1 and 1.
 
     The points are the means of the voxels of 0.4 m. They are drawn without replacement with the same seed for every
     scan. If a scan has fewer voxels, all are used, and some of them are drawn again. Raises ValueError if the scan
     shows no place, or has no points above the ground within 40 m.
     """
-    points = finite_points(record)
+    points = finite_points(scan)
     near = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]
     if len(near) == 0:
         raise ValueError(
-            f"{record.name}: expected points within {RANGE_M:g} m and above {GROUND_M:g} m, found none of {len(points)}"
+            f"{scan.name}: expected points within {RANGE_M:g} m and above {GROUND_M:g} m, found none of {len(points)}"
         )
     means, rng = voxel_means(near, VOXEL_M), np.random.default_rng(0)
     if len(means) >= POINTS:

@@ -11,7 +11,7 @@ import optax
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.losses import descriptor_distance
 from sglpr_jax.methods.cells import extreme, polar
@@ -39,13 +39,13 @@ MARGIN = 0.2
 LOST_COLUMNS = 60
 
 
-def ring_image(record: Record) -> Float32[np.ndarray, "12 360"]:
+def ring_image(scan: Scan) -> Float32[np.ndarray, "12 360"]:
     """Return the horizontal range of one point of each of the `CLASSES` in each degree, divided by 50 m.
 
     Columns are degrees from -180, counter-clockwise. Cells without points within 50 m are 0. Raises ValueError if the
     scan has no labels.
     """
-    points, classes = record.upright_points, classes_of(record, 20)
+    points, classes = scan.upright_points, classes_of(scan, 20)
     row_of = np.full(20, -1)
     row_of[list(CLASSES)] = np.arange(len(CLASSES))
     reach, angle, _ = polar(np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.inf))

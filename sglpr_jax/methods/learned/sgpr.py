@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from sglpr_jax.data.record import Record, check_cloud
+from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.methods.cells import means, voxels
 from sglpr_jax.methods.learned.layers import batch_norm, maximum
@@ -52,23 +52,21 @@ FINER = 4
 """Points are first merged into voxels whose side is the gap divided by this number."""
 
 
-def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
+def semantic_graph(scan: Scan) -> Float32[np.ndarray, "100 15"]:
     """Return up to 100 nodes: x, y, z of the centre in metres, and the class as 12 numbers, one 1 and eleven 0.
 
     Missing nodes are zeros. Of more than 100 clusters, those with the most points remain. The published graph has 100
     random ones, and takes clusters from the instances of SemanticKITTI where a scan has them. Raises ValueError if the
     scan shows no place, or has no labels or no cluster.
     """
-    points, classes = record.upright_points, classes_of(record, 20)
-    check_cloud(points, name=record.name)
+    points, classes = scan.upright_points, classes_of(scan, 20)
+    check_cloud(points, name=scan.name)
     finite = np.isfinite(points).all(axis=1)
     points, classes = points[finite], classes[finite]
     found = [_nodes(points[classes == kind], column, *rule) for column, (kind, rule) in enumerate(RULES.items())]
     counts, nodes = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if len(nodes) == 0:
-        raise ValueError(
-            f"{record.name}: expected clusters of {len(RULES)} classes, found none in {len(points)} points"
-        )
+        raise ValueError(f"{scan.name}: expected clusters of {len(RULES)} classes, found none in {len(points)} points")
     largest = np.sort(np.argsort(-counts, kind="stable")[:NODES])
     return np.pad(nodes[largest], ((0, NODES - len(largest)), (0, 0)))
 

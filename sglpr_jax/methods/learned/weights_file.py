@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import read_json
 from sglpr_jax.methods.learned.method import LearnedMethod, Variables
 from sglpr_jax.models.weights import as_tree, by_name, hash_of
@@ -30,7 +30,7 @@ def example_inputs(method: LearnedMethod) -> np.ndarray:
     rng = np.random.default_rng(0)
     points = rng.uniform((-40, -40, -1.5), (40, 40, 5), (5000, 3)).astype(np.float32)
     labels = np.full(len(points), 50, np.int32)  # buildings
-    return method.prepare(Record(points=points, labels=labels, name="the artificial scan"))[None]
+    return method.prepare(Scan(points=points, labels=labels, name="the artificial scan"))[None]
 
 
 def random_variables(method: LearnedMethod, *, seed: int) -> Variables:

@@ -7,8 +7,8 @@ import numpy as np
 from sglpr_jax.sim.drive import shifted
 from sglpr_jax.sim.ground import Ground, Relief
 from sglpr_jax.sim.labels import BUILDING, FENCE, OTHER_OBJECT, POLE, ROAD, SIDEWALK, TERRAIN, TRUNK, VEGETATION
-from sglpr_jax.sim.objects import House, Thing, ball, bicycle, block, bush, hedge, house, parked, post, tree
-from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.objects import House, ObjectModel, ball, bicycle, block, bush, hedge, house, parked, post, tree
+from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import (
     STEP_M,
@@ -47,7 +47,7 @@ def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(plan.line, [*houses, *jittered(rng, bays, 0.2, keep=rng.uniform(0.2, 0.5)), *lamps], ground)
 
 
-def _module(rng: np.random.Generator, wide: float) -> Thing:
+def _module(rng: np.random.Generator, wide: float) -> ObjectModel:
     """House with its front garden. The y axis points from the middle of the street to the house."""
     garden, deep, high, recess = rng.uniform((3, 8, 5.5, 0.5), (7, 11, 9, 2.5)).tolist()
     front, main = HOUSES_WALK_M + garden, rng.choice((1.0, 0.7)) * wide
@@ -86,12 +86,12 @@ def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(plan.line, spots, _street(plan.line, SLABS_WALK_M, rolling(rng)))
 
 
-def _plant(rng: np.random.Generator, widest: float) -> Thing:
+def _plant(rng: np.random.Generator, widest: float) -> ObjectModel:
     """Tree with a crown of 2.5 to `widest` metres or, with probability 0.3, a bush."""
     return tree(rng, (2.5, widest)) if rng.random() < 0.7 else bush(rng)
 
 
-def _slab(long: float, deep: float, high: float) -> Thing:
+def _slab(long: float, deep: float, high: float) -> ObjectModel:
     """Building along x with windows, and porches and balconies at equal distances."""
     body = block(BUILDING, long, deep, high + 1, bottom=-1.0, roughness=0.05, glass=0.25)
     entrances = np.arange(-long / 2 + 5, long / 2 - 4, 10.0).tolist()
@@ -133,7 +133,7 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(line, spots, painted_ground(TERRAIN, paths, rolling(rng)))
 
 
-def _building(rng: np.random.Generator, pitch: float) -> Thing:
+def _building(rng: np.random.Generator, pitch: float) -> ObjectModel:
     """Building around the origin, six of ten with a wing at the back, and a bicycle stand in front of it."""
     room = pitch - 2 * LAWN_M
     wide, deep, high, glass = (rng.uniform((0.55, 0.3, 7, 0.2), (0.95, 0.55, 18, 0.5)) * (room, room, 1, 1)).tolist()

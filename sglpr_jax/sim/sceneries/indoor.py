@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT
-from sglpr_jax.sim.objects import Part, Thing, block
-from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.objects import ObjectModel, Primitive, block
+from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded
 
@@ -96,7 +96,7 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
     return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
-def _room_walls(pitch: float, size: float, deep: float, height: float) -> Thing:
+def _room_walls(pitch: float, size: float, deep: float, height: float) -> ObjectModel:
     """Walls of a room with its door at x = 0, and the block between it and the next room."""
     front, between, jamb = ROOMS_HALF_M + WALL_M / 2, pitch - size, (size - ROOMS_DOOR_M) / 2
     outer = (ROOMS_DOOR_M + jamb) / 2
@@ -107,7 +107,7 @@ def _room_walls(pitch: float, size: float, deep: float, height: float) -> Thing:
     )
 
 
-def _room_furniture(rng: np.random.Generator, size: float, deep: float) -> Thing:
+def _room_furniture(rng: np.random.Generator, size: float, deep: float) -> ObjectModel:
     """Cupboards, desks and shelves along the walls of a room: two on each side and two at the back."""
     parts = []
     for low in (0.1, 0.5):
@@ -142,7 +142,7 @@ class Room(NamedTuple):
     wide_m: float
     side: int
     front: str  # of `FRONTS`
-    furniture: list[Part]
+    furniture: list[Primitive]
 
 
 def indoor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -184,7 +184,7 @@ def _wing(rng: np.random.Generator, floor: Floor) -> list[Room]:
     return wing
 
 
-def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Part]:
+def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Primitive]:
     """Furniture along the walls, and a desk, in a room that begins at y = 0 with its door at x = 0."""
     parts = []
     for side in (-1, 1):
@@ -212,7 +212,7 @@ def _tour(floor: Floor, visited: list[Room], length_m: float, closed: bool) -> L
     return rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
 
 
-def _walls(floor: Floor, room: Room) -> Thing:
+def _walls(floor: Floor, room: Room) -> ObjectModel:
     """Front, back and side walls of a room."""
     wide, high, front, begin = room.wide_m, floor.height_m, floor.half_m + WALL_M / 2, floor.half_m + WALL_M
     middle, aside = begin + floor.deep_m / 2, wide / 2 - WALL_M / 4

@@ -8,8 +8,8 @@ import numpy as np
 from sglpr_jax.sim.drive import shifted
 from sglpr_jax.sim.ground import draw_relief
 from sglpr_jax.sim.labels import POLE, TRUNK, VEGETATION
-from sglpr_jax.sim.objects import Range, Thing, ball, bush, garage, post, tree
-from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.objects import ObjectModel, Range, ball, bush, garage, post, tree
+from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, along, road, rolling, rounded, track
 from sglpr_jax.sim.styles import TOWN
@@ -25,7 +25,7 @@ def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     posts = along(shifted(whole, beside), ((post(POLE, thick, high),), every))
     bushes = _beside(rng, whole, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
 
-    def tree_or_shed() -> Thing:
+    def tree_or_shed() -> ObjectModel:
         return garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
 
     far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), tree_or_shed)
@@ -34,7 +34,7 @@ def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _beside(
-    rng: np.random.Generator, line: Line, every_m: float, away_m: Range, make: Callable[[], Thing]
+    rng: np.random.Generator, line: Line, every_m: float, away_m: Range, make: Callable[[], ObjectModel]
 ) -> Iterator[Spot]:
     """Yields things at random positions beside a line, on average one per `every_m` metres."""
     for _ in range(round(len(line) * STEP_M / every_m)):
@@ -78,7 +78,7 @@ def _scattered(rng: np.random.Generator, line: Line, density: float) -> list[tup
     return [(float(x), float(y)) for x, y in points[near]]
 
 
-def _tree(rng: np.random.Generator, thick: float, branches: float) -> Thing:
+def _tree(rng: np.random.Generator, thick: float, branches: float) -> ObjectModel:
     """Trunk, and a crown that begins at about `branches` metres. The thickness has a log-normal distribution."""
     thick = float(thick * np.exp(rng.normal(scale=0.35)))
     wide, bottom = 10 * thick * rng.uniform(0.7, 1.3), branches * rng.uniform(0.7, 1.3)

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.sim.labels import BUILDING, PARKING, POLE
-from sglpr_jax.sim.objects import Thing, block, car, parked, post
-from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.objects import ObjectModel, block, car, parked, post
+from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.sceneries.site import (
     Site,
     closed_box,
@@ -57,7 +57,7 @@ def _floor(
     return cars + grid(xs[::3] - stall / 2, np.concatenate([aisles - PILLAR_M, aisles + PILLAR_M]), lambda: pillar)
 
 
-def _shell(count: int, run_m: float, height: float, closed: bool) -> Thing:
+def _shell(count: int, run_m: float, height: float, closed: bool) -> ObjectModel:
     """Ceiling, outer walls, and a wall between each two rows. The wall is open at the end where the path passes."""
     low, high = -HALF_M, (count - 1) * PITCH_M + HALF_M
     left, right = -TURN_M, run_m + TURN_M

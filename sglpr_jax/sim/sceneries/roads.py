@@ -14,8 +14,8 @@ from sglpr_jax.sim.labels import (
     TERRAIN,
     TRAFFIC_SIGN,
 )
-from sglpr_jax.sim.objects import Thing, block, car, moving, post, truck, van
-from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.objects import ObjectModel, block, car, moving, post, truck, van
+from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, Strip, along, mirrored, painted_ground, road, rolling
 
@@ -44,7 +44,7 @@ def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(driven, [*pieces, *along(whole, (lamp, rng.uniform(8, 14)))], painted_ground(ROAD))
 
 
-def _tube(half: float, height: float, niche: float) -> Thing:
+def _tube(half: float, height: float, niche: float) -> ObjectModel:
     long, away = OVERLAP * TUNNEL_M, half + THICK_M / 2
     wall = block(BUILDING, long, THICK_M, height + 0.5, y=away, roughness=0.02)
     ceiling = block(BUILDING, long, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
@@ -100,7 +100,7 @@ def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]
     return spots
 
 
-def _drive(thing: Thing, lane: Line, start: float, speed: float) -> list[Spot]:
+def _drive(thing: ObjectModel, lane: Line, start: float, speed: float) -> list[Spot]:
     """Drive along the whole lane, as pieces of straight motion of 1.5 s."""
     times = np.arange(start, start + len(lane) * STEP_M / speed, 1.5)
     at = ((times - start) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT, PARKING, POLE, TRUNK, VEGETATION
-from sglpr_jax.sim.objects import Thing, ball, block, post
-from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.objects import ObjectModel, ball, block, post
+from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.sceneries.site import Rows, Site, grid, jittered, painted_ground, rolling, rows, track
 
 APART_M = 22.0  # minimum distance between passes in open land, in metres, for which the vehicle skips rows
@@ -28,7 +28,7 @@ def orchard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     pitch, spacing, crown = rng.uniform(5, 6.5), rng.uniform(3, 4.5), rng.uniform(2.0, 2.7)
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
 
-    def fruit_tree() -> Thing:
+    def fruit_tree() -> ObjectModel:
         wide, high = crown * rng.uniform(0.9, 1.1), crown * rng.uniform(1.0, 1.3)
         leaves = ball(VEGETATION, wide, high, bottom=0.8, roughness=0.5, porosity=0.5)
         return post(TRUNK, rng.uniform(0.12, 0.2), 1.8), leaves
@@ -43,7 +43,7 @@ def vineyard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     pitch, every, high, thick = rng.uniform((2.8, 4, 1.6, 0.35), (3.4, 6, 2.2, 0.6)).tolist()
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
 
-    def vines() -> Thing:  # leaves between two posts, and the first post
+    def vines() -> ObjectModel:  # leaves between two posts, and the first post
         top, wide = high * rng.uniform(0.9, 1.05), thick * rng.uniform(0.8, 1.2)
         leaves = block(VEGETATION, every, wide, top - 0.6, bottom=0.6, roughness=0.2, porosity=rng.uniform(0.3, 0.6))
         return leaves, post(POLE, 0.1, high + 0.15, -every / 2)
@@ -80,7 +80,7 @@ def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(plan.line, [*spots, Spot((*walls, ceiling), x, y)], painted_ground(OTHER_GROUND))
 
 
-def _shelf(rng: np.random.Generator, bay: float, deep: float, full: float) -> Thing:
+def _shelf(rng: np.random.Generator, bay: float, deep: float, full: float) -> ObjectModel:
     """One bay of a double shelf: a frame, two boards, and pallets on three levels on both sides."""
     parts = [block(POLE, 0.12, 0.12, 3.4 * LEVEL_M, -bay / 2, side * (deep / 2 - 0.06)) for side in (-1, 1)]
     parts += [block(OTHER_OBJECT, bay, deep, 0.14, bottom=level * LEVEL_M) for level in (1, 2)]

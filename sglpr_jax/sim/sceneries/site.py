@@ -13,8 +13,8 @@ from scipy.ndimage import gaussian_filter1d
 from sglpr_jax.sim.drive import shifted, waves
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief, draw_relief
 from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, TERRAIN
-from sglpr_jax.sim.objects import Part, Thing, block
-from sglpr_jax.sim.placing import HEAD_ROOM_M, Spot, distances, place, to_scene
+from sglpr_jax.sim.objects import ObjectModel, Primitive, block
+from sglpr_jax.sim.placement import HEAD_ROOM_M, Spot, distances, place, to_scene
 from sglpr_jax.sim.routes import Line, Revisit, resampled, travelled
 from sglpr_jax.sim.styles import TOWN
 from sglpr_jax.sim.world import Levels, World
@@ -48,7 +48,7 @@ class Strip(NamedTuple):
     dash_m: float | None = None  # length of dashes and gaps
 
 
-def along(line: Line, *things: tuple[Thing, float]) -> list[Spot]:
+def along(line: Line, *things: tuple[ObjectModel, float]) -> list[Spot]:
     """Places each thing along a line, with its x axis along the line, at equal distances in metres."""
     spots, directions = [], np.gradient(line, axis=0)
     for thing, every_m in things:
@@ -58,13 +58,17 @@ def along(line: Line, *things: tuple[Thing, float]) -> list[Spot]:
     return spots
 
 
-def grid(xs: Iterable[float], ys: Iterable[float], make: Callable[[], Thing]) -> list[Spot]:
+def grid(xs: Iterable[float], ys: Iterable[float], make: Callable[[], ObjectModel]) -> list[Spot]:
     """Places a thing at each combination of x and y."""
     return [Spot(make(), float(x), float(y)) for x, y in itertools.product(xs, ys)]
 
 
 def on_both_sides(
-    xs: Iterable[float], lines: Float[np.ndarray, " _"], away_m: float, make: Callable[[], Thing], heading: float = 0.0
+    xs: Iterable[float],
+    lines: Float[np.ndarray, " _"],
+    away_m: float,
+    make: Callable[[], ObjectModel],
+    heading: float = 0.0,
 ) -> list[Spot]:
     """Places things on the left of all lines along x, at their y, then mirrored things on the right."""
     return [
@@ -74,7 +78,7 @@ def on_both_sides(
     ]
 
 
-def mirrored(*parts: Part) -> Thing:
+def mirrored(*parts: Primitive) -> ObjectModel:
     """Parts and their mirror images on the other side of the x axis."""
     return *parts, *(part._replace(y=-part.y) for part in parts)
 
@@ -117,13 +121,13 @@ def track(line: Line, half_m: float, relief: Relief) -> Ground:
     return painted_ground(TERRAIN, [Strip(line, -half_m, half_m, OTHER_GROUND)], relief)
 
 
-def wall(start: tuple[float, float], stop: tuple[float, float], height_m: float) -> Part:
+def wall(start: tuple[float, float], stop: tuple[float, float], height_m: float) -> Primitive:
     """Wall of a building along x or y."""
     long, wide = (abs(b - a) + WALL_M for a, b in zip(start, stop, strict=True))
     return block(BUILDING, long, wide, height_m, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)
 
 
-def closed_box(left: float, right: float, low: float, high: float, height_m: float) -> Thing:
+def closed_box(left: float, right: float, low: float, high: float, height_m: float) -> ObjectModel:
     """Four outer walls of a building and its ceiling."""
     corners = [(left, low), (right, low), (right, high), (left, high)]
     x, y = (left + right) / 2, (low + high) / 2

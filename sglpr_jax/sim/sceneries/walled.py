@@ -3,8 +3,8 @@
 import numpy as np
 
 from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, OTHER_OBJECT, PARKING, POLE
-from sglpr_jax.sim.objects import Thing, bicycle, block, bush, car, post, tree
-from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.objects import ObjectModel, bicycle, block, bush, car, post, tree
+from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import Site, grid, painted_ground, rounded, wall
 
@@ -15,7 +15,7 @@ BEND = 0.15  # maximum distance of gates and bends from the middle of a place, a
 
 def _places(
     rng: np.random.Generator, length_m: float, closed: bool, *, long_m: float, wide_m: float, height_m: float
-) -> tuple[Line, Thing, int]:
+) -> tuple[Line, ObjectModel, int]:
     """Path, walls and number of places along x that are joined by gates. A closed path stays in a single one."""
     if closed:
         line, gates = _criss_cross(rng, length_m, long_m, wide_m), []
@@ -74,7 +74,7 @@ def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(line, spots, painted_ground(PARKING))
 
 
-def _lumber(rng: np.random.Generator) -> Thing:
+def _lumber(rng: np.random.Generator) -> ObjectModel:
     """Crate, bin, barrel, pole, plant or vehicle."""
     long, wide, high = rng.uniform((0.4, 0.4, 0.6), (1.8, 1.4, 2.6)).tolist()
     kinds = (
@@ -103,7 +103,7 @@ def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
-def _machine(rng: np.random.Generator) -> Thing:
+def _machine(rng: np.random.Generator) -> ObjectModel:
     """Machine, shelf or stack of crates."""
     match rng.integers(3):
         case 0:

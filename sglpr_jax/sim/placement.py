@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import Ground, surface_height
-from sglpr_jax.sim.objects import KINDS, Part, Thing
+from sglpr_jax.sim.objects import KINDS, ObjectModel, Primitive
 from sglpr_jax.sim.shapes import Scene, Shapes
 
 CLEARANCE_M = 1.6  # minimum distance of standing things from the vehicle's path, in metres
@@ -21,7 +21,7 @@ Zone = Literal["bay", "verge", "plot"]
 class Spot(NamedTuple):
     """Thing and its pose in the world. If `side` is -1, its y axis is mirrored."""
 
-    thing: Thing
+    thing: ObjectModel
     x: float  # metres, at `time`
     y: float
     heading: float = 0.0  # radians
@@ -33,15 +33,15 @@ class Spot(NamedTuple):
     zone: Zone = "plot"
 
 
-class Placed(NamedTuple):
+class PlacedObjects(NamedTuple):
     """Shapes of all parts of all things, one row per part."""
 
     shapes: Shapes
-    parts: list[Part]
+    parts: list[Primitive]
     owner: np.ndarray  # (n,) index of the spot of each part
 
 
-def place(spots: Sequence[Spot], ground: Ground) -> Placed:
+def place(spots: Sequence[Spot], ground: Ground) -> PlacedObjects:
     """Converts things to shapes in the world. Things stand on the ground at x and y."""
     parts = [part for spot in spots for part in spot.thing]
     owner = np.repeat(np.arange(len(spots)), [len(spot.thing) for spot in spots])
@@ -65,10 +65,10 @@ def place(spots: Sequence[Spot], ground: Ground) -> Placed:
         since=since,
         until=until,
     )
-    return Placed(shapes, parts, owner)
+    return PlacedObjects(shapes, parts, owner)
 
 
-def to_scene(placed: Placed, keep: np.ndarray) -> Scene:
+def to_scene(placed: PlacedObjects, keep: np.ndarray) -> Scene:
     """Boxes, cylinders and ellipsoids among the rows of `placed` where `keep` is true."""
     kinds = np.array([part.kind for part in placed.parts])
     return Scene(*(Shapes(*(leaf[keep & (kinds == kind)] for leaf in placed.shapes)) for kind in KINDS))

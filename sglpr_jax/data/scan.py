@@ -97,7 +97,7 @@ class TimeField(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class Scan:
     """One scan (`points`) or one ready-made image (`image`). Missing or unrequested fields hold None."""
 
     points: Float32[np.ndarray, "n 3"] | None = None
@@ -139,7 +139,7 @@ class Record:
         with naming(self.name):
             return self.time_field.seconds(valid=valid, scan_time=self.time)
 
-    def only(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Record":
+    def only(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Scan":
         """Return the scan with some of its points, their labels and laser numbers, but without times of the points."""
         labels = None if self.labels is None else self.labels[rows]
         lasers = None if self.lasers is None else self.lasers[rows]
