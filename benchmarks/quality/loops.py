@@ -21,7 +21,7 @@ from benchmarks.timing import run_command
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.evaluation.protocols.source import TopK
+from sglpr_jax.evaluation.protocols.protocol import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.candidates import CandidateSearch
