@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
-from sglpr_jax.data.formats.bin_records import record_of_scan
+from sglpr_jax.data.formats.bin_records import unusual_record
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rotations_of
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_of_file
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
-from sglpr_jax.data.recording import scan_of_file
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import LiveFrame, Report
@@ -105,7 +104,7 @@ class FolderSource:
         """Read a scan and wait for its pose. A scan that cannot be read is reported."""
         try:
             if self._records is None and self._options.format == "auto" and named_format(path) is None:
-                self._records = record_of_scan(path)
+                self._records = unusual_record([path]) or "kitti"
             scan = scan_of_file(path, format=self._options.format, records=self._records or "kitti")
             seconds = _time_in_name(path)
             written = path.stat().st_mtime

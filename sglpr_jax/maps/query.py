@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.data.formats.scan_files import found_format
+from sglpr_jax.data.formats.scan_files import found_format, scan_of_file
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.pose_graph.odometry_files import BAGS

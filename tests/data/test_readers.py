@@ -8,8 +8,9 @@ from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.warning import DataWarning
 
 MULE = """
+from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.readers.reader import Reader
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 
 
 def names(root):

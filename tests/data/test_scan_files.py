@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.data.formats import clouds as limits
-from sglpr_jax.data.formats.pcd import decompress_lzf
+from sglpr_jax.data.formats.pcd_ply import decompress_lzf
 from sglpr_jax.data.formats.scan_files import (
     cloud_blocks,
     named_format,
@@ -137,7 +137,7 @@ BROKEN = [
     ("a.ply", TEXT.replace(b"vertex 3", b"vertex 2"), "expected at most 2 lines after the header, found 3"),
     ("a.ply", TEXT.replace(b"vertex 3", b"vertex x"), "expected a whole number as number of vertex, found 'x'"),
     ("a.ply", TEXT.replace(b"property float i", b"propesty float i"), "found 'propesty float i'"),
-    ("a.ply", TEXT.replace(b"float y", b"float x"), "expected vertices with x, y and z, found x x z i"),
+    ("a.ply", TEXT.replace(b"float y", b"float x"), "expected the fields x, y and z, found x x z i"),
     ("a.ply", ply(PLAIN, "<").replace(b"float i", b"list uchar int i"), "expected numbers for i of vertex, found list"),
     ("a.npy", b"\x93NUMPY\x01\x00cut", "expected a readable .npy file"),
     ("a.npy", stream_of(np.save, np.array([{}]), allow_pickle=True), "allow_pickle=False"),

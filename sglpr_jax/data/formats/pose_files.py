@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.poses import poses_of
@@ -122,20 +122,51 @@ def read_rows(
     return values
 
 
-def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.ndarray, " {columns}"]:
-    """Convert words to numbers. Raises ValueError, prefixed by `where`, unless they are `columns` finite numbers."""
+def read_stamped_rows(
+    path: Path, *, columns: int, header_lines: int = 0, finite: bool = True
+) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n {columns-1}"]]:
+    """Return the first column of a table, times as integers of up to 19 digits, and the other columns.
+
+    Columns are separated by commas or white space. With `finite=False`, NaN and infinity are allowed.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a table of poses, found none")
+    times, rows = [], []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines()):
+        words, where = line.replace(",", " ").split(), f"{path}, line {number + 1}"
+        if number >= header_lines and words:
+            rows.append(numbers_of(words, columns=columns, where=where, finite=finite))
+            times.append(_whole_number(words[0], where=where))
+    if not rows:
+        raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
+    return np.array(times), np.array(rows)[:, 1:]
+
+
+def _whole_number(word: str, *, where: str) -> np.int64:
+    """Convert a word such as 1561000444390857630 or 15.0 without loss of digits."""
+    whole, _, fraction = word.partition(".")
+    try:
+        return np.int64(round(float(word)) if fraction.strip("0") else int(whole))
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{where}: expected a time of up to 19 digits, found {word!r:.40}") from error
+
+
+def numbers_of(
+    words: Sequence[str], *, columns: int, where: str, finite: bool = True
+) -> Float[np.ndarray, " {columns}"]:
+    """Convert words to numbers, by default finite ones. Raises ValueError, prefixed by `where`, for other words."""
     if len(words) != columns:
         raise ValueError(f"{where}: expected {columns} numbers, found {len(words)}")
     text = " ".join(words)
     try:
         values = np.array(words, dtype=np.float64)
+        if "_" in text or not text.isascii():  # Python parses 1_0 as 10
+            raise ValueError("expected digits")
     except ValueError as error:
         raise ValueError(f"{where}: expected numbers, found {text!r:.200}") from error
-    if "_" in text or not text.isascii():  # Python parses 1_0 as 10
-        raise ValueError(f"{where}: expected numbers, found {text!r:.200}")
-    finite = np.isfinite(values)
-    if not finite.all():
-        raise ValueError(f"{where}: expected finite numbers, found {words[int(finite.argmin())]!r:.40}")
+    if finite and not np.isfinite(values).all():
+        word = words[int(np.isfinite(values).argmin())]
+        raise ValueError(f"{where}: expected finite numbers, found {word!r:.40}")
     return values
 
 

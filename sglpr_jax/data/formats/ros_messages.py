@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.clouds import check_points, cloud_scan, packed_type
+from sglpr_jax.data.formats.clouds import check_points, cloud_scan
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
 from sglpr_jax.data.scan import TIME_FIELDS, Scan, time_field_of
@@ -54,12 +54,13 @@ class RosMessage:
 
     def numbers(self, kind: str, count: int = 1) -> np.ndarray:
         """Read the next `count` numbers of a type such as "f8"."""
-        return self._next(np.dtype(f"{self._order}{kind}"), count)
+        dtype = np.dtype(f"{self._order}{kind}")
+        return np.frombuffer(self._bytes(dtype.itemsize, count * dtype.itemsize), dtype)
 
     def text(self) -> str:
         """Read the next string."""
         length = int(self.numbers("u4")[0])
-        return self.numbers("u1", length).tobytes().rstrip(b"\0").decode(errors="replace")
+        return self._bytes(1, length).rstrip(b"\0").decode(errors="replace")
 
     def header(self) -> Header:
         """Read the header at the start of a sensor message."""
@@ -71,22 +72,19 @@ class RosMessage:
     def records(self, fields: dict[str, str]) -> np.ndarray:
         """Read the next sequence of records. Fields of 4 bytes must precede fields of 1 byte."""
         count = int(self.numbers("u4")[0])
-        layout = [(name, f"{self._order}{kind}", int(kind[1:])) for name, kind in fields.items()]
-        packed = packed_type(layout, list(fields))
-        padding = -packed.itemsize % 4 if self._cdr else 0
-        padded = packed_type([*layout, ("", "u1", padding)], list(fields))
-        found = self._next(padded, max(count - 1, 0))  # the last record has no padding
-        return np.concatenate([found, self._next(packed, min(count, 1)).astype(found.dtype)])
+        layout = [(name, f"{self._order}{kind}") for name, kind in fields.items()]
+        padding = -np.dtype(layout).itemsize % 4 if self._cdr else 0
+        padded = np.dtype([*layout, ("padding", f"V{padding}")])
+        content = self._bytes(4, max(count * padded.itemsize - padding, 0))  # the last record has no padding
+        return np.frombuffer(content + bytes(padding if count else 0), padded)
 
-    def _next(self, kind: np.dtype, count: int) -> np.ndarray:
-        size = 1 if kind.names else kind.itemsize
-        self._at += -(self._at - 4) % size if self._cdr else 0
-        end = self._at + count * kind.itemsize
-        if end > len(self.raw):
-            raise ValueError(f"expected {count} times {kind.itemsize} bytes, found {len(self.raw) - self._at}")
-        found = np.frombuffer(self.raw, kind, count, self._at) if count else np.zeros(0, kind)
-        self._at = end
-        return found
+    def _bytes(self, alignment: int, size: int) -> bytes:
+        """Read the next bytes, in CDR from a multiple of `alignment` on."""
+        start = self._at - ((self._at - 4) % -alignment if self._cdr else 0)
+        self._at = start + size
+        if self._at > len(self.raw):
+            raise ValueError(f"expected a message of at least {self._at} bytes, found {len(self.raw)}")
+        return self.raw[start : self._at]
 
 
 def read_point_cloud2(message: Any, *, name: str = "cloud") -> Scan:

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from sglpr_jax.data.density_image import as_counts
-from sglpr_jax.data.formats.png import read_grey_png
+from sglpr_jax.data.formats.png import image_scan, read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, image_scan
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 

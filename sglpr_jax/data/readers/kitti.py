@@ -15,10 +15,11 @@ from pathlib import Path
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import described, unusual_record
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import ReadRecord, Recording, scan_of_file
+from sglpr_jax.data.recording import ReadRecord, Recording
 from sglpr_jax.files import naming, read_json
 from sglpr_jax.se3 import positions_from_camera
 

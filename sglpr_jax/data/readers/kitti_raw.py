@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import numbers_of
+from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import in_short
 
 EARTH_M = 6378137.0

@@ -19,10 +19,11 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, read_records
+from sglpr_jax.data.formats.pose_files import read_stamped_rows
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.listing import names_of
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.readers.stamped import read_table, stamped_recording
+from sglpr_jax.data.readers.stamped import stamped_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_order
 
@@ -58,7 +59,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """Read times in microseconds and positions in metres (north, west, up). Rows with NaN are dropped."""
-    stamps, numbers = read_table(path, columns=7, finite=False)
+    stamps, numbers = read_stamped_rows(path, columns=7, finite=False)
     known = np.isfinite(numbers).all(axis=1)
     if not known.any():
         raise ValueError(f"{path}: expected poses, found NaN in all {len(numbers)} rows")

@@ -18,10 +18,10 @@ from jaxtyping import Float
 
 from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.pose_files import rotations_of
-from sglpr_jax.data.formats.scan_files import scan_id
+from sglpr_jax.data.formats.scan_files import scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import in_short, naming, path_inside
 
 CHANNEL = "LIDAR_TOP"

@@ -15,11 +15,11 @@ from jaxtyping import Float
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.bin_records import check_record, described, detect_point_format, is_record
 from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.readers.listing import files_in, left_aside, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 
 POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
 """Pose files beside the scans. 12 numbers a line are poses of the LiDAR, z up."""

@@ -20,11 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sglpr_jax.data.formats.bin_records import described, read_records
+from sglpr_jax.data.formats.bin_records import described, read_record_file, read_records
+from sglpr_jax.data.formats.pose_files import read_stamped_rows
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan import Scan, TimeField, time_field_of
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.times import check_unit, nearest_rows
 
 MAX_GAP_S = 0.1
@@ -45,23 +46,16 @@ HELIPR = {
     "Velodyne": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("line", "<u2"), ("time", "<f4")]),
 }
 """Record of one point, for each sensor."""
+BOREAS = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("time", "<f4")])
 AEVA_BEFORE = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1")])
 AEVA_CHANGED = 1691936557946849179
 """Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
 
 
 def read_helipr(path: Path, *, sensor: str) -> Scan:
-    """Read the points of a scan, their line numbers and their times. Raises ValueError if the file has a wrong size."""
+    """Read the points of a scan, their line numbers and their times."""
     before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
-    record = AEVA_BEFORE if before else HELIPR[sensor]
-    size = path.stat().st_size
-    if size == 0 or size % record.itemsize:
-        raise ValueError(f"{path}: expected {record.itemsize} bytes a point ({sensor}), found {size} bytes in total")
-    found = np.fromfile(path, record)
-    time = time_field_of(record.names or ())
-    times = None if time is None else TimeField(time, found[time].copy())
-    lasers = found["line"].astype(np.int32)
-    return Scan(points=np.ascontiguousarray(found["xyz"], np.float32), lasers=lasers, time_field=times)
+    return read_record_file(path, AEVA_BEFORE if before else HELIPR[sensor], format=sensor)
 
 
 def _ouster_positions(numbers: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 3"]:
@@ -119,7 +113,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             "applanix/lidar_poses.csv",
             13,
             1e-6,
-            partial(read_records, format="float32x6", last_is_time=True),
+            partial(read_record_file, record=BOREAS, format="float32x6"),
             f"Boreas, {described('float32x6')}",
             header_lines=1,
         ),
@@ -147,7 +141,7 @@ def open_recording(root: Path, name: str, options: ReadOptions, *, dataset: str)
     """Open a recording."""
     folder, layout = _recordings(root, dataset)[name]
     poses = folder / layout.poses
-    stamps, numbers = read_table(poses, columns=layout.columns, header_lines=layout.header_lines)
+    stamps, numbers = read_stamped_rows(poses, columns=layout.columns, header_lines=layout.header_lines)
     return stamped_recording(
         folder / layout.scans,
         name,
@@ -214,36 +208,6 @@ def stamped_recording(
         rows=rows,
         **fields,
     )
-
-
-def read_table(
-    path: Path, *, columns: int, header_lines: int = 0, finite: bool = True
-) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:
-    """Read the first column, times as integers of up to 19 digits, and the other columns (float64) of a table of poses.
-
-    Columns are separated by commas or white space. With `finite`, NaN is an error.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a table of poses, found none")
-    times, rows = [], []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines()):
-        words = line.replace(",", " ").split()
-        if number < header_lines or not words:
-            continue
-        try:
-            whole, _, fraction = words[0].partition(".")
-            times.append(int(whole) if not fraction.strip("0") else round(float(words[0])))
-            rows.append([float(word) for word in words[1:]])
-        except (ValueError, OverflowError):
-            words = []
-        # Python parses 1_0 as 10.
-        valid = len(words) == columns and "_" not in line and line.isascii() and abs(times[-1]) < 2**63
-        if not valid or (finite and not np.isfinite(rows[-1]).all()):
-            expected = f"{path}, line {number + 1}: expected a time and {columns - 1} finite numbers"
-            raise ValueError(f"{expected}, found {line[:60]!r}")
-    if not rows:
-        raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
-    return np.array(times, np.int64), np.array(rows, np.float64)
 
 
 READERS = tuple(
