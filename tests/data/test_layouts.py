@@ -216,7 +216,7 @@ BROKEN = [
     ("kitti raw", edited(f"{DRIVE}/oxts/data/0000000002.txt", "49 8 112"), r"02\.txt: expected 30 numbers, found 3"),
     ("nclt", edited(TRUTH, ""), "expected rows of a time and 6 numbers, found none"),
     ("nclt", edited(TRUTH, f"{US},1,2,3,0,0,0\n{US - 1},1,2,3,0,0,0\n"), r"row 2: expected a time >= 13"),
-    ("nuscenes", row_of("sample_data", 0, timestamp="noon"), "expected 1 numbers as 'timestamp', found others"),
+    ("nuscenes", row_of("sample_data", 0, timestamp="noon"), "expected numbers t as 'timestamp', found others"),
     ("nuscenes", row_of("calibrated_sensor", 1, rotation=[2, 0, 0, 0]), "a rotation qx qy qz qw of length 1 in row 1"),
     ("nuscenes", row_of("sample_data", 0, filename="../LIDAR_TOP/a.pcd.bin"), "expected paths of files inside"),
     (
@@ -227,7 +227,7 @@ BROKEN = [
     (
         "pandaset",
         edited("001/lidar/poses.json", [{"position": {"x": 1}}]),
-        "expected a list of poses, each with position",
+        r"poses\.json: expected numbers x, y, z as 'position', found others",
     ),
 ]
 
