@@ -28,7 +28,6 @@ TIME_COLUMNS = ("t", "time", "timestamp")
 """Names of the csv column with the times in seconds."""
 TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
 """Names with a unit, used if none of `TIME_COLUMNS` exists."""
-KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
@@ -223,18 +222,18 @@ def read_trajectory(
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     unit = "s" if times is not None and time_unit == "auto" else time_unit  # times that are replaced are not judged
     known = format_of(path, twelve_numbers=twelve_numbers) if format == "auto" else format
-    said, read = FORMATS[known]
-    poses, clock = read(path, unit)
+    description, read = FORMATS[known]
+    poses, seconds = read(path, unit)
     positions = poses[:, :3, 3]
     if not len(positions):
         raise ValueError(f"{path}: expected at least one pose, found none")
     check_height(positions, path=path)
     if times is not None:
-        clock = read_times(times, unit=time_unit)
-        if clock is not None and len(clock) != len(positions):
-            raise ValueError(f"{times}: expected {len(positions)} times, one per pose, found {len(clock)}")
-    rotations, source = None if known == "csv" else poses[:, :3, :3], f"{Path(*path.parts[-2:])} ({said})"
-    return Trajectory(positions, clock, source, times is not None, rotations)
+        seconds = read_times(times, unit=time_unit)
+        if seconds is not None and len(seconds) != len(positions):
+            raise ValueError(f"{times}: expected {len(positions)} times, one per pose, found {len(seconds)}")
+    rotations = None if known == "csv" else poses[:, :3, :3]
+    return Trajectory(positions, seconds, f"{Path(*path.parts[-2:])} ({description})", times is not None, rotations)
 
 
 def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
@@ -285,26 +284,20 @@ def format_of(path: Path, *, twelve_numbers: Literal["kitti", "lidar"] | None = 
 
 
 def _read_csv(path: Path, unit: TimeUnit) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
-    names, clock = _header(path)
-    columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
-    times = None if clock is None else times_of(columns[clock], source=path, unit=unit)
-    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    check_positions(path, positions)
-    return poses_of(positions), times
-
-
-def _header(path: Path) -> tuple[list[str], str | None]:
-    """Return the column names of a csv file, and the name of the time column or None."""
+    """Read the columns x, y, z and the times of a csv file, whose first line names the columns."""
     header = path.read_text(errors="replace").partition("\n")[0]
     names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt begins it with #
     clocks = [name for name in names if name in TIME_COLUMNS] or [name for name in names if name in TIME_COLUMNS_S]
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
+    expected = f"one of {', '.join((*TIME_COLUMNS, *TIME_COLUMNS_S))}"
     if len(set(names)) < len(names) or len(clocks) > 1:
-        raise ValueError(
-            f"{path}: expected every column once, and one of {', '.join(KNOWN_CLOCKS)}, found {header[:80]!r}"
-        )
+        raise ValueError(f"{path}: expected every column once, and {expected}, found {header[:80]!r}")
     unused = [name for name in names if ("time" in name or "stamp" in name) and name not in clocks]
     if unused:
-        warn(f"{path}: expected seconds in one of {', '.join(KNOWN_CLOCKS)}, found {', '.join(unused)}, not used")
-    return names, clocks[0] if clocks else None
+        warn(f"{path}: expected seconds in {expected}, found {', '.join(unused)}, not used")
+    columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
+    times = times_of(columns[clocks[0]], source=path, unit=unit) if clocks else None
+    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    check_positions(path, positions)
+    return poses_of(positions), times

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import numbers_of
+from sglpr_jax.data.formats.pose_files import read_rows
 from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -60,10 +60,8 @@ def _drives(root: Path) -> tuple[Path, ...]:
 
 def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
     """Positions relative to the first GPS position, in metres east, north and up."""
-    numbers = [
-        numbers_of(file.read_text(errors="replace").split(), columns=OXTS_COLUMNS, where=str(file)) for file in files
-    ]
-    latitude, longitude, altitude = np.array(numbers)[:, :3].T
+    rows = [read_rows(file, columns=OXTS_COLUMNS)[:1] for file in files]
+    latitude, longitude, altitude = np.concatenate(rows)[:, :3].T
     wrong = np.flatnonzero(np.abs(latitude) >= POLE_DEG)
     if wrong.size:
         raise ValueError(
