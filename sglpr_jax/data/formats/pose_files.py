@@ -88,18 +88,19 @@ def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]
     return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
 
 
-def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
-    """Return the row of each frame in a file with a number of `rows`. Frame "000052" is row 52.
+def frame_rows(rows: Float[np.ndarray, "m ..."], ids: Sequence[str], *, path: Path) -> Float[np.ndarray, "n ..."]:
+    """Return the row of each frame among the rows of the file `path`. Frame "000052" has row 52.
 
     Raises ValueError if an id is not a number, or the file has too few rows.
     """
-    strange = [name for name in ids if not name.isdecimal()]
-    if strange:
-        raise ValueError(f"{path}: expected frames named by their row, such as 000052, found {strange[0]!r}")
+    misnamed = next((name for name in ids if not name.isdecimal()), None)
+    if misnamed is not None:
+        raise ValueError(f"{path}: expected frames named by their row, such as 000052, found {misnamed!r}")
     numbers = [int(name) for name in ids]
-    if max(numbers, default=-1) >= rows:
-        raise ValueError(f"{path}: expected at least {max(numbers) + 1} rows (frame {max(numbers)}), found {rows}")
-    return numbers
+    last = max(numbers, default=-1)
+    if last >= len(rows):
+        raise ValueError(f"{path}: expected at least {last + 1} rows (frame {last}), found {len(rows)}")
+    return rows[numbers]
 
 
 def read_rows(

@@ -64,9 +64,8 @@ def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
     latitude, longitude, altitude = np.concatenate(rows)[:, :3].T
     wrong = np.flatnonzero(np.abs(latitude) >= POLE_DEG)
     if wrong.size:
-        raise ValueError(
-            f"{files[wrong[0]]}: expected a latitude below {POLE_DEG:g} degrees, found {latitude[wrong[0]]}"
-        )
+        found = f"found {latitude[wrong[0]]}"
+        raise ValueError(f"{files[wrong[0]]}: expected a latitude below {POLE_DEG:g} degrees, {found}")
     scale = math.cos(math.radians(latitude[0]))
     east = scale * EARTH_M * np.radians(longitude)
     north = scale * EARTH_M * np.log(np.tan(np.radians(90 + latitude) / 2))
@@ -80,19 +79,15 @@ def _times(file: Path, paths: tuple[Path, ...]) -> Float[np.ndarray, " n"] | Non
         return None
     lines = file.read_text(errors="replace").splitlines()  # blank lines count, too: scan i is line i
     try:
-        return np.array([_seconds(lines[int(path.stem)]) for path in paths])
+        stamps = np.array([lines[int(path.stem)].strip().replace(" ", "T") for path in paths], "datetime64[ns]")
+        if np.isnat(stamps).any():  # numpy converts a blank line to NaT
+            raise ValueError(f"the line of scan {paths[int(np.isnat(stamps).argmax())].stem} is blank")
     except (ValueError, IndexError) as error:
         raise ValueError(
             f"{file}: expected a date and time such as 2011-09-26 13:02:25.951199337 for each of {len(paths)} scans,"
             f" found {len(lines)} lines or malformed ones ({in_short(error)})"
         ) from error
-
-
-def _seconds(line: str) -> float:
-    stamp = np.datetime64(line.strip().replace(" ", "T"), "ns")
-    if np.isnat(stamp):  # numpy converts a blank line to NaT
-        raise ValueError(f"the line of a scan is {line.strip()!r}")
-    return float(stamp.astype(np.int64) / 1e9)
+    return stamps.astype(np.int64) / 1e9
 
 
 READER = Reader("DATE/DRIVE/velodyne_points/data/*.bin (KITTI raw)", recording_names, open_recording, rank=6)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.json_tables import poses_in_table, read_table
-from sglpr_jax.data.formats.pose_files import rows_of
+from sglpr_jax.data.formats.pose_files import frame_rows
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers.listing import files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -48,13 +48,12 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         )
     paths = scans_in(folder, ".npy")
     ids = tuple(path.stem for path in paths)
-    pose_file, clock = folder / "poses.json", folder / "timestamps.json"
+    pose_file, times_file = folder / "poses.json", folder / "timestamps.json"
     poses = poses_in_table(pose_file, read_table(pose_file), position="position", rotation="heading")
-    times = _times(clock)
-    poses = poses[rows_of(ids, rows=len(poses), path=pose_file)]
-    seconds = times[rows_of(ids, rows=len(times), path=clock)]
-    check_order(seconds, source=clock)
-    left = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
+    poses = frame_rows(poses, ids, path=pose_file)
+    times = frame_rows(_times(times_file), ids, path=times_file)
+    check_order(times, source=times_file)
+    missing = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
     digest = hashlib.sha256(pose_file.read_bytes()).hexdigest()
     return Recording(
         name=name,
@@ -62,9 +61,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         paths=paths,
         read=partial(_read, poses=dict(zip(paths, poses, strict=True)), poses_hash=digest),
         positions=poses[:, :3, 3],
-        times=seconds,
+        times=times,
         pose_source=str(POSES),
-        found=(f"format: PandaSet as npy, transformed from the world frame to the LiDAR frame, x forward{left}",),
+        found=(f"format: PandaSet as npy, transformed from the world frame to the LiDAR frame, x forward{missing}",),
     )
 
 
