@@ -51,11 +51,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def _drives(root: Path) -> tuple[Path, ...]:
-    if not root.is_dir():
-        return ()
-    found = [root] if (root / "velodyne_points").is_dir() else []
-    found += [path.parent for pattern in ("*", "*/*") for path in root.glob(f"{pattern}/velodyne_points")]
-    return tuple(sorted((folder.resolve() for folder in found), key=lambda folder: folder.name))
+    """Folders of the drives, in order of their names."""
+    scans = (path for pattern in ("", "*/", "*/*/") for path in root.glob(f"{pattern}velodyne_points"))
+    return tuple(sorted((path.parent.resolve() for path in scans), key=lambda folder: folder.name))
 
 
 def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
