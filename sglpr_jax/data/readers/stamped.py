@@ -38,21 +38,22 @@ StampedPositions = tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
 OUSTER_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
 """Position of MulRan's Ouster in the car's frame by the dataset's calibration, in metres."""
 FORWARD_FROM_OUSTER = np.array([-1, -1, 1], np.float32)
-BOREAS = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("time", "<f4")])
+
+
+def _record(fields: str) -> np.dtype:
+    """Numpy type of a point of three float32 coordinates and more fields, little-endian without padding."""
+    return np.dtype([("xyz", "<f4", 3), *((name, f"<{kind}") for name, kind in map(str.split, fields.split(",")))])
+
+
+BOREAS = _record("intensity f4, ring f4, time f4")
 HELIPR = {
-    "Avia": np.dtype(
-        [("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"), ("offset_time", "<u4")]
-    ),
-    "Aeva": np.dtype(
-        [("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1"), ("intensity", "<f4")]
-    ),
-    "Ouster": np.dtype(
-        [("xyz", "<f4", 3), ("intensity", "<f4"), ("t", "<u4"), ("reflectivity", "<u2"), ("line", "<u2"), ("a", "<u2")]
-    ),
-    "Velodyne": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("line", "<u2"), ("time", "<f4")]),
+    "Avia": _record("reflectivity u1, tag u1, line u1, offset_time u4"),
+    "Aeva": _record("reflectivity f4, velocity f4, offset_time i4, line u1, intensity f4"),
+    "Ouster": _record("intensity f4, t u4, reflectivity u2, line u2, ambient u2"),
+    "Velodyne": _record("intensity f4, line u2, time f4"),
 }
 """Record of one point, for each sensor."""
-AEVA_BEFORE = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1")])
+AEVA_BEFORE = _record("reflectivity f4, velocity f4, offset_time i4, line u1")
 AEVA_CHANGED = 1691936557946849179
 """Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
 
