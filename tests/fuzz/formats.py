@@ -41,7 +41,6 @@ RNG = np.random.default_rng(0)
 POSITIONS, TIMES = np.round(RNG.normal(scale=30, size=(N, 3)), 3), np.arange(N) * 0.5
 DESCRIPTORS = RNG.normal(size=(N, 4)).astype(np.float32)
 POINTS = RNG.normal(scale=9, size=(N, 4)).astype("<f4")
-PCD = ("binary", "ascii", "binary_compressed")
 RECORDS = records_of(POINTS[:, :3], i=POINTS[:, 3])
 TRAJECTORY = Trajectory(POSITIONS, TIMES, "poses")
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import check_positions, rotations_of
-from sglpr_jax.data.poses import poses_of
+from sglpr_jax.data.formats.pose_files import quaternion_poses
 from sglpr_jax.files import in_short
 
 Rows = Sequence[dict[str, Any]]
@@ -65,7 +64,5 @@ def vectors_of(path: Path, rows: Rows, name: str, axes: str) -> Float[np.ndarray
 
 def poses_in_table(path: Path, rows: Rows, *, position: str, rotation: str) -> Float[np.ndarray, "n 4 4"]:
     """Return poses from a column of positions in metres and one of quaternions w, x, y, z."""
-    positions = vectors_of(path, rows, position, "xyz")
-    check_positions(path, positions)
     quaternions = vectors_of(path, rows, rotation, "wxyz")[:, [1, 2, 3, 0]]
-    return poses_of(positions, rotations_of(path, quaternions))
+    return quaternion_poses(path, vectors_of(path, rows, position, "xyz"), quaternions)

@@ -89,8 +89,8 @@ def table_blocks(path: Path, *, parse: Parser) -> Iterator[Float64[np.ndarray, "
 
 def _binary_records(table: PointTable, names: Sequence[str]) -> np.ndarray:
     starts = np.cumsum([0, *(field.width for field in table.fields)]).tolist()
-    wanted = {field.name: (field.kind, at) for field, at in zip(table.fields, starts, strict=False)}
-    formats, offsets = zip(*(wanted[name] for name in names), strict=True)
+    by_name = {field.name: (field.kind, start) for field, start in zip(table.fields, starts, strict=False)}
+    formats, offsets = zip(*(by_name[name] for name in names), strict=True)
     row = np.dtype({"names": list(names), "formats": formats, "offsets": offsets, "itemsize": table.row_bytes})
     end = table.points * row.itemsize
     if len(table.body) < end or _holds_more(table.body[end:]):

@@ -52,15 +52,18 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
         raise ValueError(f"{path}: expected positions in metres, up to {FARTHEST_M:g}, found {found}")
 
 
-def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Convert quaternions qx qy qz qw of length 1 to rotation matrices. An error names the row in `path`."""
+def quaternion_poses(
+    path: Path, positions: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Return poses from positions in metres and quaternions x, y, z, w. An error names the row in `path`."""
+    check_positions(path, positions)
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
     if wrong.size:
         found = " ".join(f"{value:g}" for value in quaternions[wrong[0]])
         raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
-    return from_quaternions(np.zeros((len(quaternions), 3)), quaternions)[:, :3, :3]
+    return from_quaternions(positions, quaternions)
 
 
 def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
@@ -77,8 +80,7 @@ def read_tum(
     """Read the poses of a TUM file (`time x y z qx qy qz qw`), and their times in seconds or None (`times_of`)."""
     rows = read_rows(path, columns=8)
     times = times_of(rows[:, 0], source=path, unit=time_unit)
-    check_positions(path, rows[:, 1:4])
-    return poses_of(rows[:, 1:4], rotations_of(path, rows[:, 4:])), times
+    return quaternion_poses(path, rows[:, 1:4], rows[:, 4:]), times
 
 
 def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
@@ -136,14 +138,14 @@ def read_stamped_rows(
         words, where = line.replace(",", " ").split(), f"{path}, line {number + 1}"
         if number >= header_lines and words:
             rows.append(numbers_of(words, columns=columns, where=where, finite=finite))
-            times.append(_whole_number(words[0], where=where))
+            times.append(_ticks(words[0], where=where))
     if not rows:
         raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
     return np.array(times), np.array(rows)[:, 1:]
 
 
-def _whole_number(word: str, *, where: str) -> np.int64:
-    """Convert a word such as 1561000444390857630 or 15.0 without loss of digits."""
+def _ticks(word: str, *, where: str) -> np.int64:
+    """Convert a time such as 1561000444390857630 or 15.0 without loss of digits."""
     whole, _, fraction = word.partition(".")
     try:
         return np.int64(round(float(word)) if fraction.strip("0") else int(whole))
