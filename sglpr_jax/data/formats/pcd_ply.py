@@ -177,7 +177,7 @@ def decompress_lzf(data: bytes, *, size: int) -> bytes:
 
 
 def _split(content: Content, last_line: bytes) -> tuple[list[str], Content]:
-    """Lines of the header, which ends with a line that begins with a word, and the bytes after it."""
+    """Return the lines of the header, up to the one that begins with `last_line`, and the bytes after it."""
     end = re.search(rb"^%b\b[^\n]*\n" % last_line, content, flags=re.MULTILINE)
     if end is None:
         raise ValueError(f"expected a header that ends with {last_line.decode()}, found none")
