@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.data.formats.scan_files import found_format, scan_of_file
+from sglpr_jax.data.formats.scan_files import detect_format, scan_of_file
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.recording import Recording
@@ -40,7 +40,7 @@ def read_query(
         raise ValueError(f"{path}: expected one scan or image, found a bag; use --frame")
     if path.suffix == ".png":
         return Scan(image=read_image(path))
-    scan = scan_of_file(path, format=found_format(path) if format == "auto" else format)
+    scan = scan_of_file(path, format=detect_format(path) if format == "auto" else format)
     assert scan.points is not None
     if sensor_height == "auto":
         return dataclasses.replace(scan, mounting=places.query_mounting(scan.points))

@@ -12,7 +12,7 @@ from typing import TypeGuard, get_args
 import numpy as np
 from jaxtyping import Float, Num
 
-from sglpr_jax.data.choices import RecordFormat
+from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.clouds import check_points
 from sglpr_jax.data.scan import Scan, TimeField, time_field_of
 from sglpr_jax.data.warning import warn
@@ -48,9 +48,9 @@ def record_type(format: RecordFormat) -> np.dtype:
     return np.dtype([("xyz", kind, 3), ("more", kind, (int(columns) - 3,))])
 
 
-def described(format: RecordFormat) -> str:
-    """Return a description of a format: "float32x6 (24 bytes a point)"."""
-    return f"{format} ({record_type(format).itemsize} bytes a point)"
+def describe_format(format: ScanFormat) -> str:
+    """Return a description of a format: "float32x6 (24 bytes a point)", or "pcd"."""
+    return f"{format} ({record_type(format).itemsize} bytes a point)" if is_record(format) else format
 
 
 def read_records(path: Path, format: RecordFormat) -> Scan:
@@ -130,7 +130,7 @@ def detect_point_format(paths: Sequence[Path]) -> tuple[RecordFormat | None, str
     simplest: list[RecordFormat] = [name for name in fits if HALF_RECORDS.get(name) not in fits]
     if len(simplest) == 1:
         return simplest[0], f"found from {len(samples)} of {len(paths)} scans"
-    tried = "; ".join(f"{described(name)}: {misfits[name] or 'fits'}" for name in CANDIDATES)
+    tried = "; ".join(f"{describe_format(name)}: {misfits[name] or 'fits'}" for name in CANDIDATES)
     raise ValueError(
         f"{paths[0] if len(paths) == 1 else paths[0].parent}: expected scans that fit exactly one format, found"
         f" {len(simplest)}; pass --format {' or '.join(simplest) or 'one of these'}, or nuscenes or nclt ({tried})"
@@ -150,7 +150,7 @@ def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
     """Warn if the files have enough points and do not look like scans in the given format."""
     samples = _samples(paths)
     if _has_enough(samples, format) and (misfit := _misfit(samples, format)):
-        warn(f"{paths[0].parent}: expected scans of {described(format)}, found {misfit}")
+        warn(f"{paths[0].parent}: expected scans of {describe_format(format)}, found {misfit}")
 
 
 def _samples(paths: Sequence[Path]) -> list[Path]:

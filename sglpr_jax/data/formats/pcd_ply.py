@@ -293,17 +293,17 @@ def parse_ply(content: Content) -> PointTable:
     vertices, behind = elements[at], elements[at + 1 :]
     fields = vertices.fields(order)
     _check_axes([field.name for field in fields])
-    sizes = [element.size(binary=binary) for element in elements[: at + 1]]
-    data = body if binary else _lines(body)
+    start = sum(element.size(binary=binary) for element in elements[:at])
+    end = start + vertices.size(binary=binary)
+    text = [] if binary else _lines(body)
     if not (binary and any(kind.startswith("list ") for element in behind for _, kind in element.properties)):
-        most = sum(sizes) + sum(element.size(binary=binary) for element in behind)  # not known for lists of numbers
-        if len(data) > most:
-            unit = "bytes" if binary else "lines"
-            raise ValueError(f"expected at most {most} {unit} after the header, found {len(data)}")
-    vertex_data = data[sum(sizes[:-1]) : sum(sizes)]
+        most = end + sum(element.size(binary=binary) for element in behind)  # not known for lists of numbers
+        found, unit = (len(body), "bytes") if binary else (len(text), "lines")
+        if found > most:
+            raise ValueError(f"expected at most {most} {unit} after the header, found {found}")
     if binary:
-        return PointTable(vertices.count, fields, "binary", vertex_data)
-    return PointTable(vertices.count, fields, "ascii", b"\n".join(vertex_data))
+        return PointTable(vertices.count, fields, "binary", body[start:end])
+    return PointTable(vertices.count, fields, "ascii", b"\n".join(text[start:end]))
 
 
 def _ply_elements(lines: Sequence[str]) -> tuple[str, list[_Element]]:

@@ -97,7 +97,7 @@ def named_format(path: Path) -> ScanFormat | None:
     return "nclt" if path.parent.name == "velodyne_sync" else None
 
 
-def found_format(path: Path) -> ScanFormat:
+def detect_format(path: Path) -> ScanFormat:
     """Return the format of one scan by its name or its content."""
     return named_format(path) or unusual_record([path]) or "kitti"
 
@@ -116,7 +116,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
 
     Arguments:
       path: File of the scan.
-      format: Format of the scan. "auto" uses the name of the file, or the content of a .bin file (`found_format`).
+      format: Format of the scan. "auto" uses the name of the file, or the content of a .bin file (`detect_format`).
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -124,7 +124,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
       ImportError: If the file is a .las file and the extra `las` is not installed.
     """
     path = Path(path)
-    return read_scan_file(path, format=found_format(path) if format == "auto" else format).cloud
+    return read_scan_file(path, format=detect_format(path) if format == "auto" else format).cloud
 
 
 def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Scan:

@@ -11,7 +11,7 @@ from pathlib import Path
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
-from sglpr_jax.data.readers.listing import left_aside
+from sglpr_jax.data.readers.listing import other_contents
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
@@ -112,5 +112,5 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: expected the folder of a recording, or a bag, found no such folder")
     *layouts, last = (reader.layout for reader in readers() if reader.layout)
-    contents = left_aside(root, ()) or "no files"
+    contents = other_contents(root, ()) or "no files"
     raise FileNotFoundError(f"{root}: found no known layout: {contents}; expected {', '.join(layouts)} or {last}")

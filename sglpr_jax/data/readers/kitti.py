@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
-from sglpr_jax.data.formats.bin_records import described, unusual_record
+from sglpr_jax.data.formats.bin_records import describe_format, unusual_record
 from sglpr_jax.data.formats.pose_files import frame_rows, read_poses, read_times
 from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
@@ -80,8 +80,8 @@ def _format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, st
     with contextlib.suppress(ValueError):  # scans that fit no format are read as KITTI's
         unusual = unusual_record(paths)
     if unusual is None:
-        return scan_of_file, described("kitti")
-    return partial(scan_of_file, format=unusual), f"{described(unusual)}, not KITTI's"
+        return scan_of_file, describe_format("kitti")
+    return partial(scan_of_file, format=unusual), f"{describe_format(unusual)}, not KITTI's"
 
 
 def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:

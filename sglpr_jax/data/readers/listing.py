@@ -17,7 +17,9 @@ def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
     """
     if not folder.is_dir():
         return ()
-    return in_order(path for path in folder.iterdir() if path.name.lower().endswith(endings) and not hidden(path))
+    return in_order(
+        path for path in folder.iterdir() if path.name.lower().endswith(endings) and not path.name.startswith(".")
+    )
 
 
 def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ...]:
@@ -47,15 +49,10 @@ def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
     return tuple(sorted(files, key=lambda path: _natural(path.name)))
 
 
-def hidden(path: Path) -> bool:
-    """Return whether the name begins with a dot."""
-    return path.name.startswith(".")
-
-
-def left_aside(folder: Path, taken: Iterable[Path]) -> str:
+def other_contents(folder: Path, taken: Iterable[Path]) -> str:
     """Return a summary of the other contents of a folder: numbers of files by extension, and subfolders."""
     known = set(taken)
-    others = [path for path in folder.iterdir() if path not in known and not hidden(path)]
+    others = [path for path in folder.iterdir() if path not in known and not path.name.startswith(".")]
     folders = in_order(path for path in others if path.is_dir())
     endings = Counter(path.suffix or path.name for path in others if not path.is_dir())
     contents = [f"{count} {ending}" for ending, count in sorted(endings.items())]

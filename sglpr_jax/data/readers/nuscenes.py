@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.bin_records import described
+from sglpr_jax.data.formats.bin_records import describe_format
 from sglpr_jax.data.formats.json_tables import column_of, poses_in_table, read_table, texts_of, vectors_of
 from sglpr_jax.data.formats.scan_files import scan_id, scan_of_file
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -60,7 +60,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
             times=ticks[order] / 1e6,
             pose_source=f"{tables.name}/ego_pose.json",
             found=(
-                f"format: {described('nuscenes')}, rotated to x forward",
+                f"format: {describe_format('nuscenes')}, rotated to x forward",
                 f"{keys} key frames and {len(paths) - keys} sweeps{missing}",
             ),
         )

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import check_record, described, detect_point_format, is_record
+from sglpr_jax.data.formats.bin_records import check_record, describe_format, detect_point_format, is_record
 from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_at_scans, poses_of
-from sglpr_jax.data.readers.listing import files_in, left_aside, scans_in
+from sglpr_jax.data.readers.listing import files_in, other_contents, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 
@@ -45,7 +45,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     ids = tuple(map(scan_id, paths))
     positions, times, source = _trajectory(root, len(paths), options)
     records, format = _formats(paths, options.format)
-    aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
+    aside = other_contents(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
     if positions is not None:
         check_order(positions, ids, path=options.poses or root / str(source))
     return Recording(
@@ -98,13 +98,13 @@ def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat,
     if format != "auto":
         if is_record(format):
             check_record(paths, format)
-        return "kitti", described(format) if is_record(format) else format
+        return "kitti", describe_format(format)
     names = [named_format(path) for path in paths]
     unnamed = [path for path, name in zip(paths, names, strict=True) if name is None]
     detected, how = detect_point_format(unnamed) if unnamed else (None, "")
     records: RecordFormat = detected or "kitti"
     counts = Counter(name or records for name in names)
-    texts = {name: described(name) if is_record(name) else name for name in counts}
+    texts = {name: describe_format(name) for name in counts}
     kinds = ", ".join(texts[name] if len(counts) == 1 else f"{count} {texts[name]}" for name, count in counts.items())
     return records, f"{kinds}, {how}" if unnamed else kinds
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, described, read_record_file, read_records
+from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, describe_format, read_record_file, read_records
 from sglpr_jax.data.formats.pose_files import read_stamped_rows
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.listing import scans_in
@@ -141,7 +141,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             tick_s=1e-9,
             read_scan=lambda path: Scan(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
             read_poses=read_mulran_poses,
-            found=f"format: MulRan, {described('kitti')}, rotated to x forward",
+            found=f"format: MulRan, {describe_format('kitti')}, rotated to x forward",
         ),
     ),
     "NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)": tuple(
@@ -163,7 +163,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             tick_s=1e-6,
             read_scan=partial(read_record_file, record=BOREAS, format="float32x6"),
             read_poses=partial(read_positions, columns=13, header_lines=1),
-            found=f"format: Boreas, {described('float32x6')}",
+            found=f"format: Boreas, {describe_format('float32x6')}",
         ),
     ),
 }
