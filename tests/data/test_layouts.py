@@ -231,7 +231,7 @@ BROKEN = [
     (
         "pandaset",
         edited("001/lidar/poses.json", [{"position": {"x": 1}}]),
-        r"poses\.json: expected numbers x, y, z as 'position', found others",
+        r"poses\.json: expected 'heading' in every row",
     ),
 ]
 

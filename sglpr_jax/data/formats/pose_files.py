@@ -1,6 +1,6 @@
 """Reads text files with one row of numbers per frame: poses (KITTI, TUM, csv) and timestamps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -112,16 +112,9 @@ def read_rows(
 
     Columns are separated by white space or by `separator`. Raises FileNotFoundError, or ValueError, with the line.
     """
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: expected a file with {columns} numbers a line, one line per frame, found none"
-        )
-    lines = path.read_text(errors="replace").rstrip().splitlines()
-    numbers = [i for i, line in enumerate(lines) if i >= header_lines and not line.startswith("#")]
-    values = np.empty((len(numbers), columns))
-    for row, i in enumerate(numbers):
-        values[row] = numbers_of(lines[i].split(separator), columns=columns, where=f"{path}, line {i + 1}")
-    return values
+    lines = _lines(path, expected=f"a file with {columns} numbers a line, one line per frame", skip=header_lines)
+    rows = [numbers_of(line.split(separator), columns=columns, where=where) for where, line in lines]
+    return np.array(rows, np.float64).reshape(-1, columns)
 
 
 def read_stamped_rows(
@@ -131,17 +124,23 @@ def read_stamped_rows(
 
     Columns are separated by commas or white space. With `finite=False`, NaN and infinity are allowed.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a table of poses, found none")
     times, rows = [], []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines()):
-        words, where = line.replace(",", " ").split(), f"{path}, line {number + 1}"
-        if number >= header_lines and words:
+    for where, line in _lines(path, expected="a table of poses", skip=header_lines):
+        if words := line.replace(",", " ").split():
             rows.append(numbers_of(words, columns=columns, where=where, finite=finite))
             times.append(_ticks(words[0], where=where))
     if not rows:
         raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
     return np.array(times), np.array(rows)[:, 1:]
+
+
+def _lines(path: Path, *, expected: str, skip: int) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a file after a header, without those that start with #, each with its place for messages."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected {expected}, found none")
+    for number, line in enumerate(path.read_text(errors="replace").rstrip().splitlines(), start=1):
+        if number > skip and not line.startswith("#"):
+            yield f"{path}, line {number}", line
 
 
 def _ticks(word: str, *, where: str) -> np.int64:

@@ -64,12 +64,13 @@ def _mounting(root: Path) -> Mounting | None:
     if not path.is_file():
         return None
     settings = read_json(path)
-    sensor = settings.get("sensor") if isinstance(settings, dict) else None
-    height = sensor.get("height_m") if isinstance(sensor, dict) else None
-    if not isinstance(height, int | float):
-        raise ValueError(f"{path}: expected the settings of a simulated dataset with sensor.height_m, found none")
+    try:
+        height = float(settings["sensor"]["height_m"])
+    except (TypeError, KeyError, ValueError) as error:
+        expected = "the settings of a simulated dataset with sensor.height_m"
+        raise ValueError(f"{path}: expected {expected}, found none") from error
     with naming(path):
-        return None if height == MODEL_HEIGHT_M else Mounting(float(height))
+        return None if height == MODEL_HEIGHT_M else Mounting(height)
 
 
 def _format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:
