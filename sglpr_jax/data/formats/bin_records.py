@@ -75,7 +75,7 @@ def read_record_file(path: Path, record: np.dtype, *, format: str) -> Scan:
         )
     with naming(path):
         check_points(size // record.itemsize, bytes_each=record.itemsize)
-    records, names = np.fromfile(path, record), record.names or ()
+    records, names = np.fromfile(path, dtype=record), record.names or ()
     laser = next((name for name in ("laser", "line") if name in names), None)
     time = time_field_of(names)
     with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers
@@ -119,8 +119,8 @@ HALF_RECORDS = {"float32x6": "float32x3", "float32x8": "kitti", "float64x6": "fl
 def detect_point_format(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
-    Fewer than half of the files may be broken. With too few points, the format is None. Raises ValueError if no format
-    fits, or several do.
+    Fewer than half of the files may be broken. With too few points, returns None as the format. Raises ValueError if no
+    format fits, or several do.
     """
     samples = _samples(paths)
     if not _has_enough(samples, "kitti"):
