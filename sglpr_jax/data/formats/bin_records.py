@@ -12,7 +12,7 @@ from typing import TypeGuard, get_args
 import numpy as np
 from jaxtyping import Float, Num
 
-from sglpr_jax.data.choices import RecordFormat, ScanFormat
+from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.clouds import check_points
 from sglpr_jax.data.scan import Scan, TimeField, time_field_of
 from sglpr_jax.data.warning import warn
@@ -48,7 +48,7 @@ def record_type(format: RecordFormat) -> np.dtype:
     return np.dtype([("xyz", kind, 3), ("more", kind, (int(columns) - 3,))])
 
 
-def describe_format(format: ScanFormat) -> str:
+def describe_format(format: str) -> str:
     """Return a description of a format: "float32x6 (24 bytes a point)", or "pcd"."""
     return f"{format} ({record_type(format).itemsize} bytes a point)" if is_record(format) else format
 

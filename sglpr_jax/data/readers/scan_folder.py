@@ -103,8 +103,7 @@ def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat,
     unnamed = [path for path, name in zip(paths, names, strict=True) if name is None]
     detected, how = detect_point_format(unnamed) if unnamed else (None, "")
     records: RecordFormat = detected or "kitti"
-    formats: list[ScanFormat] = [name or records for name in names]
-    counts = Counter(formats)
+    counts = Counter(name or records for name in names)
     texts = {name: describe_format(name) for name in counts}
     kinds = ", ".join(texts[name] if len(counts) == 1 else f"{count} {texts[name]}" for name, count in counts.items())
     return records, f"{kinds}, {how}" if unnamed else kinds
