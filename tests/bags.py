@@ -11,10 +11,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-LIVOX = (
-    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
-)
+from sglpr_jax.live.ros_messages import LIVOX, LIVOX_POINT
+
 LIVOX_DRIVERS = ("livox_ros_driver", "livox_ros_driver2")
 CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7, "f8": 8}
 """Codes of PointField by numpy type."""

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from sglpr_jax.data.formats.png import image_scan
 from sglpr_jax.data.formats.pose_files import read_poses, read_times
 from sglpr_jax.data.formats.scan_files import read_labels
-from sglpr_jax.data.recording import Recording, image_scan
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.se3 import positions_from_camera
 

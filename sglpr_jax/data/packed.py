@@ -14,7 +14,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from sglpr_jax.data.recording import Recording, image_scan
+from sglpr_jax.data.formats.png import image_scan
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import file_name, in_short, read_json, replacing, writing
 

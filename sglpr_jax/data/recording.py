@@ -1,4 +1,4 @@
-"""Recordings: what a reader returns, and how a scan is read from its files."""
+"""Recordings: what a reader of a dataset returns."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -10,42 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
-from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.png import read_label_image
-from sglpr_jax.data.formats.scan_files import read_labels, read_scan_file
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan import Scan
 
 ReadRecord = Callable[[Path, Path | None, bool], Scan]
 """Reads a record from the file of a scan or image, its label file (None: no labels), and whether to read lasers."""
-
-
-def scan_of_file(
-    path: Path,
-    labels: Path | None = None,
-    lasers: bool = False,
-    *,
-    format: ScanFormat = "auto",
-    records: RecordFormat = "kitti",
-) -> Scan:
-    """Read a scan and its labels, each file once. `lasers` is ignored: the laser numbers are in the file of the points.
-
-    `format` and `records` are those of `read_scan_file`.
-    """
-    found = read_scan_file(path, format=format, records=records)
-    if labels is None:
-        return found
-    return dataclasses.replace(found, labels=read_labels(labels, points=len(found.cloud)), labels_file=labels)
-
-
-def image_scan(
-    path: Path, labels: Path | None = None, lasers: bool = False, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]
-) -> Scan:
-    """Read a ready-made image with `read`, and its label image. Images have no lasers."""
-    image = read(path)
-    return Scan(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
-
-
 ReadUps = Callable[[], tuple[Float[np.ndarray, "n 3"], str] | None]
 """Reads up in the LiDAR frame at each scan, NaN where unknown, and its source in words; None if there is no gravity."""
 

@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
-from sglpr_jax.data.formats.bin_records import record_of_scan
-from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rotations_of
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
+from sglpr_jax.data.formats.bin_records import unusual_record
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, quaternion_poses
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_of_file
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
-from sglpr_jax.data.recording import scan_of_file
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import LiveFrame, Report
@@ -106,7 +105,7 @@ class FolderSource:
         """Read a scan and wait for its pose. A scan that cannot be read is reported."""
         try:
             if self._records is None and self._options.format == "auto" and named_format(path) is None:
-                self._records = record_of_scan(path)
+                self._records = unusual_record([path]) or "kitti"
             scan = scan_of_file(path, format=self._options.format, records=self._records or "kitti")
             stamp, written = _time_in_name(path), path.stat().st_mtime
         except (ValueError, OSError, ImportError) as error:
@@ -204,7 +203,7 @@ class GrowingPoses:
         self._poses.append(None)  # also if the line is invalid: the next line is that of the next scan
         if self._format in ("auto", "tum"):
             numbers = numbers_of(words, columns=8, where=where)
-            pose = poses_of(numbers[None, 1:4], rotations_of(self._path, numbers[None, 4:]))[0]
+            pose = quaternion_poses(self._path, numbers[None, 1:4], numbers[None, 4:])[0]
             self._times[-1] = float(numbers[0] / self._unit)
         else:
             matrix = numbers_of(words, columns=12, where=where).reshape(1, 3, 4)

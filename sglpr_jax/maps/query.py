@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.data.formats.scan_files import found_format
+from sglpr_jax.data.formats.scan_files import detect_format, scan_of_file
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.readers.ros import ENDINGS
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.maps.place_map import PlaceMap
 
@@ -39,7 +39,7 @@ def read_query(
         raise ValueError(f"{expected}, found a bag; use --frame")
     if path.suffix == ".png":
         return Scan(image=read_image(path))
-    scan = scan_of_file(path, format=found_format(path) if format == "auto" else format)
+    scan = scan_of_file(path, format=detect_format(path) if format == "auto" else format)
     if sensor_height == "auto":
         mounting = places.query_mounting(scan.cloud)
     elif sensor_height == "estimate":

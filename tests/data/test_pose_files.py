@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.pose_files import read_poses, read_rows, read_times, read_trajectory, read_tum, rows_of
+from sglpr_jax.data.formats.pose_files import frame_rows, read_poses, read_rows, read_times, read_trajectory
 from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, time_unit_problem, times_of, unit_change
 from sglpr_jax.data.warning import DataWarning
 
@@ -105,11 +105,12 @@ def test_heights_that_run_as_far_as_a_road_are_told(write, recwarn):
 def test_frames_are_rows(write):
     path = write("rows.txt", "# t,x\n1,2\n# a stop\n3,4\n")
     assert read_rows(path, columns=2, separator=",").tolist() == [[1, 2], [3, 4]]
-    assert rows_of(["000000", "000052"], rows=53, path=path) == [0, 52]
+    rows = np.arange(53.0)
+    assert frame_rows(rows, ["000000", "000052"], path=path).tolist() == [0, 52]
     with pytest.raises(ValueError, match=r"rows\.txt: expected at least 53 rows \(frame 52\), found 52"):
-        rows_of(["000000", "000052"], rows=52, path=path)
+        frame_rows(rows[:52], ["000000", "000052"], path=path)
     with pytest.raises(ValueError, match="such as 000052, found 'front'"):
-        rows_of(["front"], rows=52, path=path)
+        frame_rows(rows, ["front"], path=path)
 
 
 @pytest.mark.parametrize("start", [0.0, 12.5, 1.7e9])
@@ -163,20 +164,15 @@ def test_a_unit_that_changes_in_the_middle_is_refused_whatever_unit_is_stated(st
             times_of(times, source="a.txt", unit=unit)
 
 
-@pytest.mark.parametrize("unit", ["ms", "ns"])
-def test_every_file_of_times_follows_the_rule(tmp_path, unit):
-    rows, table, tum = (tmp_path / name for name in ("times.txt", "poses.csv", "poses.tum"))
-    stamps, zeros = SECONDS * PER_SECOND[unit], np.zeros((280, 3))
-    np.savetxt(rows, stamps)
-    np.savetxt(table, np.column_stack([stamps, zeros]), header="t,x,y,z", comments="", delimiter=",")
-    np.savetxt(tum, np.column_stack([stamps, zeros, zeros, np.ones(280)]))
-    for read, path in ((read_times, rows), (read_tum, tum), (read_trajectory, tum), (read_trajectory, table)):
+def test_every_file_of_times_follows_the_rule(write):
+    numbers = "".join(f"{100 * i}\n" for i in range(9))
+    rows, tum = write("times.txt", numbers), write("poses.tum", numbers.replace("\n", " 0 0 0 0 0 0 1\n"))
+    table = write("poses.csv", "t,x,y,z\n" + numbers.replace("\n", ",0,0,0\n"))
+    for read, path in ((read_times, rows), (read_trajectory, tum), (read_trajectory, table)):
         with pytest.raises(ValueError, match=rf"{path.name}: expected times in seconds, found steps"):
             read(path)
-    np.testing.assert_allclose(read_times(rows, unit=unit), SECONDS)
-    np.testing.assert_allclose(read_tum(tum, time_unit=unit)[1], SECONDS)
-    np.testing.assert_allclose(read_trajectory(table, time_unit=unit).times, SECONDS)
-    np.testing.assert_allclose(read_trajectory(table, times=rows, time_unit=unit).times, SECONDS)
-    np.savetxt(rows, np.arange(280))
-    with pytest.warns(DataWarning, match=r"times\.txt: expected times, found row numbers .*not used; state the unit"):
-        assert read_times(rows) is None
+    np.testing.assert_allclose(read_times(rows, unit="ms"), np.arange(9) / 10)
+    for path in (tum, table):
+        np.testing.assert_allclose(read_trajectory(path, times=rows, time_unit="ms").times, np.arange(9) / 10)
+    with pytest.warns(DataWarning, match=r"n\.txt: expected times, found row numbers .*not used; state the unit"):
+        assert read_times(write("n.txt", "0\n1\n2\n")) is None

@@ -8,8 +8,9 @@ from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.warning import DataWarning
 
 MULE = """
+from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.readers.reader import Reader
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 
 
 def names(root):
@@ -94,16 +95,6 @@ def write_poses(path, positions):
     np.savetxt(path, rows.reshape(-1, 12))
 
 
-def test_scans_without_poses(tmp_path):
-    folder = write_scans(tmp_path / "scans", "b.bin", "a.bin")
-    found = open_recording(folder)
-    assert (found.name, found.ids, found.positions, found.times, found.pose_source) == (
-        *("scans", ("a", "b")),
-        *(None, None, None),
-    )
-    np.testing.assert_array_equal(found.points(0), np.ones((3, 3)))  # a.bin was written second
-
-
 @pytest.mark.parametrize(
     ("names", "ids"),
     [
@@ -166,7 +157,9 @@ def test_what_is_left_aside_is_said(tmp_path):
     (folder / "more").mkdir()
     aside = "left aside: 1 .bak, 1 .jpg, 1 .xyz, 1 folder (more)"
     format = "format: kitti (16 bytes a point), too few points to detect it"
-    assert open_recording(folder, sensor_height=1.7).found[:2] == (format, aside)
+    recording = open_recording(folder, sensor_height=1.7)
+    assert recording.found[:2] == (format, aside)
+    assert (recording.name, recording.positions, recording.times, recording.pose_source) == ("scans", None, None, None)
 
 
 def test_consecutive_poses_far_apart_and_a_change_of_the_clock_are_told(tmp_path, recwarn):

@@ -73,7 +73,7 @@ def test_points_and_lines_of_livox_are_those_of_rosbags(n, frame, kind):
         swapped = bytes(types.serialize_cdr(message, name, little_endian=False))
         np.testing.assert_array_equal(read_custom_msg(RosMessage(swapped, cdr=True)).points, points)
     for length in (5, 20, len(raw) // 2, len(raw) - 2):
-        with pytest.raises(ValueError, match=r"expected \d+ times \d+ bytes, found"):
+        with pytest.raises(ValueError, match=r"expected a message of at least \d+ bytes, found"):
             read_custom_msg(RosMessage(raw[:length], cdr=kind == "ros2"))
 
 

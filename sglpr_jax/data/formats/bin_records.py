@@ -5,19 +5,88 @@ nearly all coordinates are plausible, and if the rows do not differ periodically
 float32x4, for example, only every third row begins with x. If several formats fit, the user has to name one.
 """
 
-import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeGuard, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.clouds import check_points
-from sglpr_jax.data.scan import Scan, TimeField
+from sglpr_jax.data.scan import Scan, TimeField, time_field_of
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import naming
+
+NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+NCLT_UNIT_M = 0.005
+NCLT_OFFSET_M = -100.0
+"""Scale and offset of NCLT's integers: metres = value * unit + offset."""
+Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
+"""Rotation by 180 degrees about x: from forward, right, down to forward, left, up. Negating only z would mirror
+scans."""
+AXES: dict[str, Callable[[Num[np.ndarray, "n 3"]], Num[np.ndarray, "n 3"]]] = {
+    "nuscenes": lambda xyz: np.stack([xyz[:, 1], -xyz[:, 0], xyz[:, 2]], axis=1),
+    "nclt": lambda xyz: (xyz.astype(np.float64) * NCLT_UNIT_M + NCLT_OFFSET_M) * Z_UP_FROM_Z_DOWN,
+}
+"""Functions that convert the numbers of a format to metres, x forward, y left, z up."""
+
+
+def is_record(format: str) -> TypeGuard[RecordFormat]:
+    """Whether scans of this format are records without a header."""
+    return format in get_args(RecordFormat)
+
+
+def record_type(format: RecordFormat) -> np.dtype:
+    """Return the numpy type of one point. The field "xyz" comes first."""
+    if format == "nclt":
+        return NCLT_RECORD
+    if format == "nuscenes":
+        return np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("laser", "<f4")])
+    number, columns = ("float32", "4") if format == "kitti" else format.split("x")
+    kind = {"float32": "<f4", "float64": "<f8"}[number]
+    return np.dtype([("xyz", kind, 3), ("more", kind, (int(columns) - 3,))])
+
+
+def describe_format(format: str) -> str:
+    """Return a description of a format: "float32x6 (24 bytes a point)", or "pcd"."""
+    return f"{format} ({record_type(format).itemsize} bytes a point)" if is_record(format) else format
+
+
+def read_records(path: Path, format: RecordFormat) -> Scan:
+    """Read a scan in one of the formats without a header."""
+    return read_record_file(path, record_type(format), format=format)
+
+
+def read_record_file(path: Path, record: np.dtype, *, format: str) -> Scan:
+    """Read a scan of packed records, with the laser numbers and times of its points if the record has them.
+
+    Arguments:
+      path: File of the scan.
+      record: Numpy type of one point: "xyz", and perhaps "laser" or "line" and a field of `TIME_FIELDS`.
+      format: Name of the format, for messages and `AXES`.
+    """
+    size = path.stat().st_size
+    if size == 0 or size % record.itemsize:
+        others = ", ".join(f"{name} has {record_type(name).itemsize}" for name in ("kitti", "nuscenes", "nclt"))
+        raise ValueError(
+            f"{path}: expected {record.itemsize} bytes for each point ({format}), found {size} bytes in total; the file"
+            f" is truncated, or has another format ({others} bytes a point; pcd has a header)"
+        )
+    with naming(path):
+        check_points(size // record.itemsize, bytes_each=record.itemsize)
+    records, names = np.fromfile(path, dtype=record), record.names or ()
+    laser = next((name for name in ("laser", "line") if name in names), None)
+    time = time_field_of(names)
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers
+        xyz = AXES.get(format, lambda xyz: xyz)(records["xyz"])
+        return Scan(
+            # Column-major order: the copy takes half the time, and later steps work along the axes.
+            points=np.asfortranarray(xyz, dtype=np.float32),
+            lasers=None if laser is None else records[laser].astype(np.int32),
+            time_field=None if time is None else TimeField(time, records[time].copy()),
+        )
+
 
 MOST_M = 300.0
 """Maximum absolute coordinate in metres, for all points but a fraction of `STRANGE`."""
@@ -43,87 +112,73 @@ CANDIDATES: tuple[RecordFormat, ...] = tuple(
     name for name in get_args(RecordFormat) if name not in ("nuscenes", "nclt", "float32x4")
 )
 """Formats that are tried. kitti covers float32x4, and float32x5 covers nuscenes. nclt would fit almost any file."""
-NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
-NCLT_UNIT_M = 0.005
-NCLT_OFFSET_M = -100.0
-"""Scale and offset of NCLT's integers: metres = value * unit + offset."""
-Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
-"""Rotation by 180 degrees about x: from forward, right, down to forward, left, up. Negating only z would mirror
-scans."""
+HALF_RECORDS = {"float32x6": "float32x3", "float32x8": "kitti", "float64x6": "float64x3"}
+"""Formats whose record consists of two records of another format. If both fit, only the other one counts."""
 
 
 def detect_point_format(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Detect the format of headerless scans from a few files, and return it with a description of how it was detected.
 
-    Fewer than half of the files may be broken. A format whose record consists of several records of another one that
-    fits does not count. With too few points, it returns None. Raises ValueError if no format fits, or several do.
+    Fewer than half of the files may be broken. With too few points, returns None as the format. Raises ValueError if no
+    format fits, or several do.
     """
-    chosen = _some(paths)
-    if not _enough(chosen, "kitti"):
+    samples = _samples(paths)
+    if not _has_enough(samples, "kitti"):
         return None, "too few points to detect it"
-    misfits: dict[RecordFormat, str] = {name: _misfit(chosen, name) for name in CANDIDATES}
+    misfits: dict[RecordFormat, str] = {name: _misfit(samples, name) for name in CANDIDATES}
     fits: list[RecordFormat] = [name for name in CANDIDATES if not misfits[name]]
-    simplest: list[RecordFormat] = [
-        name for name in fits if not any(_repeats(name, other) for other in fits if other != name)
-    ]
+    simplest: list[RecordFormat] = [name for name in fits if HALF_RECORDS.get(name) not in fits]
     if len(simplest) == 1:
-        return simplest[0], f"found from {len(chosen)} of {len(paths)} scans"
-    tried = "; ".join(f"{described(name)}: {misfits[name] or 'fits'}" for name in CANDIDATES)
+        return simplest[0], f"found from {len(samples)} of {len(paths)} scans"
+    tried = "; ".join(f"{describe_format(name)}: {misfits[name] or 'fits'}" for name in CANDIDATES)
     raise ValueError(
         f"{paths[0] if len(paths) == 1 else paths[0].parent}: expected scans that fit exactly one format, found"
         f" {len(simplest)}; pass --format {' or '.join(simplest) or 'one of these'}, or nuscenes or nclt ({tried})"
     )
 
 
-def record_of_scan(path: Path) -> RecordFormat:
-    """Detect the format of one headerless scan: KITTI's if the scan fits it or has too few points, or else another."""
-    return "kitti" if _fits_kitti([path]) else detect_point_format([path])[0] or "kitti"
-
-
 def unusual_record(paths: Sequence[Path]) -> RecordFormat | None:
-    """Return the format of scans in KITTI's layout if it is clearly another one, as of users' own scans."""
-    with contextlib.suppress(ValueError):
-        return None if _fits_kitti(paths) else detect_point_format(paths)[0]
-    return None
+    """Return the format of scans that are clearly not in KITTI's, or None if they fit it or have too few points.
 
-
-def _fits_kitti(paths: Sequence[Path]) -> bool:
-    """Whether the files look like scans in KITTI's format, or tell nothing."""
-    chosen = _some(paths)
-    return not chosen or not _misfit(chosen, "kitti")
+    Raises ValueError if they fit no format, or several others.
+    """
+    samples = _samples(paths)
+    return detect_point_format(paths)[0] if samples and _misfit(samples, "kitti") else None
 
 
 def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
     """Warn if the files have enough points and do not look like scans in the given format."""
-    chosen = _some(paths)
-    if _enough(chosen, format) and (misfit := _misfit(chosen, format)):
-        warn(f"{paths[0].parent}: expected scans of {described(format)}, found {misfit}")
+    samples = _samples(paths)
+    if _has_enough(samples, format) and (misfit := _misfit(samples, format)):
+        warn(f"{paths[0].parent}: expected scans of {describe_format(format)}, found {misfit}")
 
 
-def _enough(paths: Sequence[Path], format: RecordFormat) -> bool:
-    return sum(path.stat().st_size for path in paths) >= FEWEST * record_type(format).itemsize
-
-
-def _some(paths: Sequence[Path]) -> list[Path]:
+def _samples(paths: Sequence[Path]) -> list[Path]:
     """A few files, spread over the recording, without empty and unreadable ones. A crash leaves the last file empty."""
-    chosen = (paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int)))
-    return [path for path in chosen if path.is_file() and path.stat().st_size]
+    spread = (paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int)))
+    return [path for path in spread if path.is_file() and path.stat().st_size]
+
+
+def _has_enough(paths: Sequence[Path], format: RecordFormat) -> bool:
+    return sum(path.stat().st_size for path in paths) >= FEWEST * record_type(format).itemsize
 
 
 def _misfit(paths: Sequence[Path], format: RecordFormat) -> str:
     """Why most files do not look like scans in this format, or ""."""
-    width, clouds, reasons = record_type(format).itemsize, [], []
+    clouds, reasons = [], []
     for path in paths:
         try:
             with np.errstate(invalid="ignore"):  # of numbers of another type
                 points = read_records(path, format).cloud[:MOST].astype(np.float64)
         except (OSError, ValueError):
+            width = record_type(format).itemsize
             reasons.append(f"a size that is not a multiple of {width} bytes, or an unreadable file")
             continue
-        points[np.isnan(points).all(axis=1) | (points == 0).all(axis=1)] = np.nan
-        reason = _implausible(points[~np.isnan(points).all(axis=1)])
-        reasons += [reason] if reason else []
-        clouds += [] if reason else [points]
+        points[(points == 0).all(axis=1)] = np.nan
+        if reason := _implausible(points[~np.isnan(points).all(axis=1)]):
+            reasons.append(reason)
+        else:
+            clouds.append(points)
     if 2 * len(reasons) >= len(paths):
         return max(set(reasons), key=reasons.count)
     return next((reason for period in PERIODS if (reason := _periodic(clouds, period))), "")
@@ -149,75 +204,23 @@ def _implausible(points: Float[np.ndarray, "n 3"]) -> str:
 
 def _periodic(clouds: Sequence[Float[np.ndarray, "_ 3"]], period: int) -> str:
     """Why every `period`-th row differs from the others, or ""."""
-    rows = [np.concatenate([points[start::period] for points in clouds]) for start in range(period)]
-    x, y = zip(*(points[~np.isnan(points).any(axis=1), :2].T for points in rows), strict=True)
-    fewest = min(map(len, x))
+    phases = [np.concatenate([points[start::period] for points in clouds]) for start in range(period)]
+    phases = [points[~np.isnan(points).any(axis=1), :2].T for points in phases]
+    fewest = min(xy.shape[1] for xy in phases)
     if fewest < FEWEST / 2 / period:
         return f"every {period}th point missing"
-    apart = DIRECTIONS_APART + 1.6 * np.sqrt(2 / fewest)
-    for angles in (list(map(np.arctan2, y, x)), [np.arctan2(np.abs(b), np.abs(a)) for a, b in zip(x, y, strict=True)]):
-        if max(_apart(angles[0], other) for other in angles[1:]) > apart:
+    most = DIRECTIONS_APART + 1.6 * np.sqrt(2 / fewest)
+    for fold in (np.asarray, np.abs):  # all directions, and those of one quadrant
+        first, *others = (np.sort(np.arctan2(fold(y), fold(x))) for x, y in phases)
+        if max(_kolmogorov_smirnov(first, other) for other in others) > most:
             return f"every {period}th point in another direction"
-    usual = [np.median(np.hypot(a, b)) for a, b in zip(x, y, strict=True)]
-    return f"every {period}th point at another distance" if max(usual) > TIMES_AS_FAR * min(usual) else ""
+    distances_m = [np.median(np.hypot(x, y)) for x, y in phases]
+    far_apart = max(distances_m) > TIMES_AS_FAR * min(distances_m)
+    return f"every {period}th point at another distance" if far_apart else ""
 
 
-def _apart(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> float:
-    """Maximum difference of two empirical distribution functions."""
-    a, b = np.sort(a), np.sort(b)
-    both = np.concatenate([a, b])  # both halves are sorted, which makes searchsorted fast
-    a_below, b_below = (np.searchsorted(x, both, side="right") / len(x) for x in (a, b))
+def _kolmogorov_smirnov(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> float:
+    """Maximum difference of the empirical distribution functions of two sorted samples."""
+    values = np.concatenate([a, b])
+    a_below, b_below = (np.searchsorted(x, values, side="right") / len(x) for x in (a, b))
     return float(np.abs(a_below - b_below).max())
-
-
-def _repeats(name: RecordFormat, other: RecordFormat) -> bool:
-    """Whether a record consists of several records of `other`."""
-    this, smaller = record_type(name), record_type(other)
-    return this["xyz"].base == smaller["xyz"].base and this.itemsize % smaller.itemsize == 0
-
-
-def is_record(format: str) -> TypeGuard[RecordFormat]:
-    """Whether scans of this format are records without a header."""
-    return format in get_args(RecordFormat)
-
-
-def record_type(format: RecordFormat) -> np.dtype:
-    """Return the numpy type of one point. The field "xyz" comes first."""
-    if format == "nclt":
-        return NCLT_RECORD
-    if format == "nuscenes":
-        return np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("laser", "<f4")])
-    number, columns = ("float32", "4") if format == "kitti" else format.split("x")
-    letter = {"float32": "<f4", "float64": "<f8"}[number]
-    more = int(columns) - 3
-    return np.dtype([("xyz", letter, 3), *([("more", letter, more)] if more else [])])
-
-
-def described(format: RecordFormat) -> str:
-    """Return a description of a format: "float32x6 (24 bytes a point)"."""
-    return f"{format} ({record_type(format).itemsize} bytes a point)"
-
-
-def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Scan:
-    """Read a file of records. With `last_is_time`, the last column is the time of the point."""
-    dtype = record_type(format)
-    size = path.stat().st_size
-    if size == 0 or size % dtype.itemsize:
-        others = ", ".join(f"{name} has {record_type(name).itemsize}" for name in ("kitti", "nuscenes", "nclt"))
-        raise ValueError(
-            f"{path}: expected {dtype.itemsize} bytes for each point ({format}), found {size} bytes in total; the file"
-            f" is truncated, or has another format ({others} bytes a point; pcd has a header)"
-        )
-    with naming(path):
-        check_points(size // dtype.itemsize, bytes_each=dtype.itemsize)
-    records = np.fromfile(path, dtype=dtype)
-    times = TimeField("time", records["more"][:, -1].copy()) if last_is_time else None
-    lasers = records["laser"].astype(np.int32) if "laser" in (dtype.names or ()) else None
-    xyz = records["xyz"]
-    with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers
-        if format == "nuscenes":
-            xyz = np.stack([xyz[:, 1], -xyz[:, 0], xyz[:, 2]], axis=1)
-        elif format == "nclt":
-            xyz = (xyz.astype(np.float64) * NCLT_UNIT_M + NCLT_OFFSET_M) * Z_UP_FROM_Z_DOWN
-        # Column-major order: the copy takes half the time, and later steps work along the axes.
-        return Scan(points=np.asfortranarray(xyz, dtype=np.float32), lasers=lasers, time_field=times)

@@ -20,14 +20,14 @@ _COMPRESSED = 0x80
 def las_scan(path: Path) -> Scan:
     """Read the points of a .las file in metres, scaled by the header, and their times. The axes are not changed."""
     with _laspy(path, one_scan=True).open(path) as stream:
-        found = stream.read()
-    time = time_field_of(list(found.point_format.dimension_names))
-    columns = {"x": found.x, "y": found.y, "z": found.z} | ({} if time is None else {time: found[time]})
-    return cloud_scan({name: np.asarray(column) for name, column in columns.items()}, time=time)
+        points = stream.read()
+    time = time_field_of(list(points.point_format.dimension_names))
+    names = ("x", "y", "z") if time is None else ("x", "y", "z", time)
+    return cloud_scan({name: np.asarray(points[name]) for name in names}, time=time)
 
 
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the points of a .las or .laz file of any size in parts. .laz files need lazrs."""
+    """Yield the points of a .las or .laz file of any size in parts, in metres. .laz files need lazrs."""
     laspy = _laspy(path, one_scan=False)
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
         raise ImportError(".laz files need lazrs (pip install 'sglpr-jax[las]')")
@@ -37,7 +37,7 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
 
 
 def _laspy(path: Path, *, one_scan: bool) -> ModuleType:
-    """The library, after a check of the sizes in the header. laspy would read 2**32 missing records.
+    """Return the library after a check of the sizes in the header: laspy would read 2**32 missing records.
 
     Raises ValueError if the file is shorter than its header declares, or larger than a scan if it is one.
     """
@@ -59,8 +59,8 @@ def _laspy(path: Path, *, one_scan: bool) -> ModuleType:
         raise ValueError(f"expected {records} and {extended} records by the header, found {size} bytes in total")
     if one_scan:
         check_points(points, bytes_each=width)
-    held = max(size - start, 0) // max(width, 1)
+    available = max(size - start, 0) // max(width, 1)
     # The size of compressed points is not known. Versions from 1.3 on may have records behind the points.
-    if not kind & _COMPRESSED and (points > held or (points < held and header[25] < 3)):
-        raise ValueError(f"expected {points} points by the header, found {held}")
+    if not kind & _COMPRESSED and (points > available or (points < available and header[25] < 3)):
+        raise ValueError(f"expected {points} points by the header, found {available}")
     return laspy

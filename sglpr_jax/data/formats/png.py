@@ -4,12 +4,14 @@ The images are rotated to the orientation of eq. 1, with x (forward) to the righ
 """
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int, Int32, UInt, UInt16
+from jaxtyping import Float32, Int, Int32, UInt, UInt16
 from PIL import Image
 
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short, naming
 from sglpr_jax.labels import to_classes
 
@@ -37,6 +39,14 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
     if mode != _MODES[bits]:
         raise ValueError(f"{path}: expected {expected} (mode {_MODES[bits]}), found mode {mode}")
     return np.rot90(grey, -1)
+
+
+def image_scan(
+    path: Path, labels: Path | None = None, lasers: bool = False, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]
+) -> Scan:
+    """Read a ready-made image with `read`, and its label image, for a `Recording`. Images have no lasers."""
+    image = read(path)
+    return Scan(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
 
 
 def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:

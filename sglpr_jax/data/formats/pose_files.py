@@ -1,12 +1,12 @@
 """Reads text files with one row of numbers per frame: poses (KITTI, TUM, csv) and timestamps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.poses import poses_of
@@ -28,7 +28,6 @@ TIME_COLUMNS = ("t", "time", "timestamp")
 """Names of the csv column with the times in seconds."""
 TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
 """Names with a unit, used if none of `TIME_COLUMNS` exists."""
-KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
@@ -53,15 +52,18 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
         raise ValueError(f"{path}: expected positions in metres, up to {FARTHEST_M:g}, found {found}")
 
 
-def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Convert quaternions qx qy qz qw of length 1 to rotation matrices. An error names the row in `path`."""
+def quaternion_poses(
+    path: Path, positions: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Return poses from positions in metres and quaternions x, y, z, w. An error names the row in `path`."""
+    check_positions(path, positions)
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
     if wrong.size:
         found = " ".join(f"{value:g}" for value in quaternions[wrong[0]])
         raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
-    return from_quaternions(np.zeros((len(quaternions), 3)), quaternions)[:, :3, :3]
+    return from_quaternions(positions, quaternions)
 
 
 def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
@@ -78,8 +80,7 @@ def read_tum(
     """Read the poses of a TUM file (`time x y z qx qy qz qw`), and their times in seconds or None (`times_of`)."""
     rows = read_rows(path, columns=8)
     times = times_of(rows[:, 0], source=path, unit=time_unit)
-    check_positions(path, rows[:, 1:4])
-    return poses_of(rows[:, 1:4], rotations_of(path, rows[:, 4:])), times
+    return quaternion_poses(path, rows[:, 1:4], rows[:, 4:]), times
 
 
 def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
@@ -89,18 +90,19 @@ def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]
     return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
 
 
-def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
-    """Return the row of each frame in a file with a number of `rows`. Frame "000052" is row 52.
+def frame_rows(rows: Float[np.ndarray, "m ..."], ids: Sequence[str], *, path: Path) -> Float[np.ndarray, "n ..."]:
+    """Return the row of each frame among the rows of the file `path`. Frame "000052" has row 52.
 
     Raises ValueError if an id is not a number, or the file has too few rows.
     """
-    strange = [name for name in ids if not name.isdecimal()]
-    if strange:
-        raise ValueError(f"{path}: expected frames named by their row, such as 000052, found {strange[0]!r}")
+    misnamed = next((name for name in ids if not name.isdecimal()), None)
+    if misnamed is not None:
+        raise ValueError(f"{path}: expected frames named by their row, such as 000052, found {misnamed!r}")
     numbers = [int(name) for name in ids]
-    if max(numbers, default=-1) >= rows:
-        raise ValueError(f"{path}: expected at least {max(numbers) + 1} rows (frame {max(numbers)}), found {rows}")
-    return numbers
+    last = max(numbers, default=-1)
+    if last >= len(rows):
+        raise ValueError(f"{path}: expected at least {last + 1} rows (frame {last}), found {len(rows)}")
+    return rows[numbers]
 
 
 def read_rows(
@@ -110,32 +112,62 @@ def read_rows(
 
     Columns are separated by white space or by `separator`. Raises FileNotFoundError, or ValueError, with the line.
     """
+    lines = _lines(path, expected=f"a file with {columns} numbers a line, one line per frame", skip=header_lines)
+    rows = [numbers_of(line.split(separator), columns=columns, where=where) for where, line in lines]
+    return np.array(rows, np.float64).reshape(-1, columns)
+
+
+def read_stamped_rows(
+    path: Path, *, columns: int, header_lines: int = 0, finite: bool = True
+) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n {columns-1}"]]:
+    """Return the first column of a table, times as integers of up to 19 digits, and the other columns.
+
+    Columns are separated by commas or white space. With `finite=False`, NaN and infinity are allowed.
+    """
+    times, rows = [], []
+    for where, line in _lines(path, expected="a table of poses", skip=header_lines):
+        if words := line.replace(",", " ").split():
+            rows.append(numbers_of(words, columns=columns, where=where, finite=finite))
+            times.append(_ticks(words[0], where=where))
+    if not rows:
+        raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
+    return np.array(times), np.array(rows)[:, 1:]
+
+
+def _lines(path: Path, *, expected: str, skip: int) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a file after a header, without those that start with #, each with its place for messages."""
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: expected a file with {columns} numbers a line, one line per frame, found none"
-        )
-    lines = path.read_text(errors="replace").rstrip().splitlines()
-    numbers = [i for i, line in enumerate(lines) if i >= header_lines and not line.startswith("#")]
-    values = np.empty((len(numbers), columns))
-    for row, i in enumerate(numbers):
-        values[row] = numbers_of(lines[i].split(separator), columns=columns, where=f"{path}, line {i + 1}")
-    return values
+        raise FileNotFoundError(f"{path}: expected {expected}, found none")
+    for number, line in enumerate(path.read_text(errors="replace").rstrip().splitlines(), start=1):
+        if number > skip and not line.startswith("#"):
+            yield f"{path}, line {number}", line
 
 
-def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.ndarray, " {columns}"]:
-    """Convert words to numbers. Raises ValueError, prefixed by `where`, unless they are `columns` finite numbers."""
+def _ticks(word: str, *, where: str) -> np.int64:
+    """Convert a time such as 1561000444390857630 or 15.0 without loss of digits."""
+    whole, _, fraction = word.partition(".")
+    try:
+        return np.int64(round(float(word)) if fraction.strip("0") else int(whole))
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{where}: expected a time of up to 19 digits, found {word!r:.40}") from error
+
+
+def numbers_of(
+    words: Sequence[str], *, columns: int, where: str, finite: bool = True
+) -> Float[np.ndarray, " {columns}"]:
+    """Convert words to numbers, by default finite ones. Raises ValueError, prefixed by `where`, for other words."""
     if len(words) != columns:
         raise ValueError(f"{where}: expected {columns} numbers, found {len(words)}")
     text = " ".join(words)
     try:
         values = np.array(words, dtype=np.float64)
+        if "_" in text or not text.isascii():  # Python parses 1_0 as 10
+            raise ValueError("expected digits")
     except ValueError as error:
         raise ValueError(f"{where}: expected numbers, found {text!r:.200}") from error
-    if "_" in text or not text.isascii():  # Python parses 1_0 as 10
-        raise ValueError(f"{where}: expected numbers, found {text!r:.200}")
-    finite = np.isfinite(values)
-    if not finite.all():
-        raise ValueError(f"{where}: expected finite numbers, found {words[int(finite.argmin())]!r:.40}")
+    if finite and not np.isfinite(values).all():
+        word = words[int(np.isfinite(values).argmin())]
+        raise ValueError(f"{where}: expected finite numbers, found {word!r:.40}")
     return values
 
 
@@ -192,18 +224,18 @@ def read_trajectory(
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     unit = "s" if times is not None and time_unit == "auto" else time_unit  # times that are replaced are not judged
     known = format_of(path, twelve_numbers=twelve_numbers) if format == "auto" else format
-    said, read = FORMATS[known]
-    poses, clock = read(path, unit)
+    description, read = FORMATS[known]
+    poses, seconds = read(path, unit)
     positions = poses[:, :3, 3]
     if not len(positions):
         raise ValueError(f"{path}: expected at least one pose, found none")
     check_height(positions, path=path)
     if times is not None:
-        clock = read_times(times, unit=time_unit)
-        if clock is not None and len(clock) != len(positions):
-            raise ValueError(f"{times}: expected {len(positions)} times, one per pose, found {len(clock)}")
-    rotations, source = None if known == "csv" else poses[:, :3, :3], f"{Path(*path.parts[-2:])} ({said})"
-    return Trajectory(positions, clock, source, times is not None, rotations)
+        seconds = read_times(times, unit=time_unit)
+        if seconds is not None and len(seconds) != len(positions):
+            raise ValueError(f"{times}: expected {len(positions)} times, one per pose, found {len(seconds)}")
+    rotations = None if known == "csv" else poses[:, :3, :3]
+    return Trajectory(positions, seconds, f"{Path(*path.parts[-2:])} ({description})", times is not None, rotations)
 
 
 def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
@@ -254,26 +286,20 @@ def format_of(path: Path, *, twelve_numbers: Literal["kitti", "lidar"] | None = 
 
 
 def _read_csv(path: Path, unit: TimeUnit) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
-    names, clock = _header(path)
-    columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
-    times = None if clock is None else times_of(columns[clock], source=path, unit=unit)
-    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    check_positions(path, positions)
-    return poses_of(positions), times
-
-
-def _header(path: Path) -> tuple[list[str], str | None]:
-    """Return the column names of a csv file, and the name of the time column or None."""
+    """Read the columns x, y, z and the times of a csv file, whose first line names the columns."""
     header = path.read_text(errors="replace").partition("\n")[0]
     names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt begins it with #
     clocks = [name for name in names if name in TIME_COLUMNS] or [name for name in names if name in TIME_COLUMNS_S]
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
+    expected = f"one of {', '.join((*TIME_COLUMNS, *TIME_COLUMNS_S))}"
     if len(set(names)) < len(names) or len(clocks) > 1:
-        raise ValueError(
-            f"{path}: expected every column once, and one of {', '.join(KNOWN_CLOCKS)}, found {header[:80]!r}"
-        )
+        raise ValueError(f"{path}: expected every column once, and {expected}, found {header[:80]!r}")
     unused = [name for name in names if ("time" in name or "stamp" in name) and name not in clocks]
     if unused:
-        warn(f"{path}: expected seconds in one of {', '.join(KNOWN_CLOCKS)}, found {', '.join(unused)}, not used")
-    return names, clocks[0] if clocks else None
+        warn(f"{path}: expected seconds in {expected}, found {', '.join(unused)}, not used")
+    columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
+    times = times_of(columns[clocks[0]], source=path, unit=unit) if clocks else None
+    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    check_positions(path, positions)
+    return poses_of(positions), times

@@ -18,7 +18,6 @@ METADATA = "metadata.yaml"
 """File that describes a ROS 2 recording. The recorder writes it at the end."""
 COMPRESSED = (".db3.zstd", ".mcap.zstd")
 """Endings of compressed files, which only their metadata describe."""
-REINDEX = "ros2 bag reindex writes it"
 T = TypeVar("T")
 
 
@@ -60,10 +59,9 @@ class RosBag:
         """Point cloud topics. Raises ValueError, with a list of all topics, if the bag has no point clouds."""
         clouds = self.topics_of(CLOUDS)
         if not clouds:
-            found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.topics.items())) or "no topics"
-            raise ValueError(
-                f"{self.paths[0]}: expected a topic of point clouds ({' or '.join(CLOUDS)}), found {found}"
-            )
+            topics = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.topics.items())) or "no topics"
+            expected = f"a topic of point clouds ({' or '.join(CLOUDS)})"
+            raise ValueError(f"{self.paths[0]}: expected {expected}, found {topics}")
         return clouds
 
     def cloud(self, topic: str, time: int, nth: int) -> Scan:
@@ -74,15 +72,14 @@ class RosBag:
                 return read_custom_msg(message)
             return read_point_cloud2(self._reader.deserialize(message.raw, kind), name=str(self.paths[0]))
         except Exception as error:  # the bag defines the types and names of the fields
-            raise ValueError(
-                f"{self.paths[0]}: expected a cloud with points on {topic}, found an invalid one ({in_short(error)})"
-            ) from error
+            found = f"found an invalid one ({in_short(error)})"
+            raise ValueError(f"{self.paths[0]}: expected a cloud with points on {topic}, {found}") from error
 
     def fields(self, topic: str, time: int) -> str:
         """Return a description of the fields of a cloud: "x y z intensity ring (22 bytes a point)"."""
         if self.topics[topic] in CUSTOM_MSG:
             return f"Livox, {' '.join(POINT)}"
-        with _broken(self.paths[0]):
+        with _naming(self.paths[0]):
             cloud = self._reader.deserialize(self.message(topic, time).raw, self.topics[topic])
         return f"{' '.join(field.name for field in cloud.fields)} ({cloud.point_step} bytes a point)"
 
@@ -92,43 +89,59 @@ class RosBag:
 
     def read(self, topic: str, decode: Callable[[Iterator[tuple[int, RosMessage]]], T], time: int | None = None) -> T:
         """Decode the messages of a topic with their times (ns), or only those recorded at one time."""
-        with self._lock, _broken(self.paths[0]):
+        with self._lock, _naming(self.paths[0]):
             return decode(self._messages(topic, time))
 
     def _messages(self, topic: str, time: int | None) -> Iterator[tuple[int, RosMessage]]:
         """Messages with their times. Raises ValueError after the last message if the bag declares more."""
         connections = [connection for connection in self._reader.connections if connection.topic == topic]
         stop = None if time is None else time + 1
-        found = 0
+        count = 0
         for _, recorded, raw in self._reader.messages(connections=connections, start=time, stop=stop):
-            found += 1
+            count += 1
             yield recorded, RosMessage(raw, cdr=self._reader.is2)
         declared = sum(connection.msgcount for connection in connections)
-        if time is None and found < declared:
-            raise ValueError(f"expected {declared} messages on {topic} by its statistics, found {found}")
+        if time is None and count < declared:
+            raise ValueError(f"expected {declared} messages on {topic} by its statistics, found {count}")
+
+
+def _open(paths: tuple[Path, ...]) -> Any:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError(f"{paths[0]}: bags need the extra `ros` (pip install 'sglpr-jax[ros]')") from error
+    if paths[0].name.endswith(COMPRESSED):
+        raise ValueError(f"{paths[0]}: expected a file that is not compressed{_metadata_hint(paths[0])}")
+    for path in paths:
+        _check_closed(path)
+    with _naming(paths[0]):
+        reader = AnyReader(list(paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+        return reader
 
 
 @contextlib.contextmanager
-def _broken(path: Path) -> Iterator[None]:
+def _naming(path: Path) -> Iterator[None]:
     """Convert exceptions of rosbags to a ValueError that names the bag."""
     try:
         yield
     except (ImportError, FileNotFoundError):
         raise
     except Exception as error:
-        raise ValueError(
-            f"{path}: expected an intact ROS bag, found a broken one ({in_short(error)}){_about_metadata(path)}"
-        ) from error
+        found = f"found a broken one ({in_short(error)}){_metadata_hint(path)}"
+        raise ValueError(f"{path}: expected an intact ROS bag, {found}") from error
 
 
-def _about_metadata(path: Path) -> str:
+def _metadata_hint(path: Path) -> str:
     """Hint about the metadata of a broken ROS 2 recording. A recorder that is killed writes none."""
     metadata = path.parent / METADATA
     if path.is_dir():
         return f"; {METADATA} or a file that it lists is damaged"
     if path.suffix == ".bag":
         return ""
-    return f"; open the folder with {metadata}" if metadata.is_file() else f"; {metadata} is missing ({REINDEX})"
+    missing = f"; {metadata} is missing (ros2 bag reindex writes it)"
+    return f"; open the folder with {metadata}" if metadata.is_file() else missing
 
 
 def _check_closed(path: Path) -> None:
@@ -140,19 +153,3 @@ def _check_closed(path: Path) -> None:
                     f"{file}: expected a bag that its recorder has closed, found {log.name} beside it, with changes "
                     f"that are not in the bag; `sqlite3 {file.name} 'PRAGMA wal_checkpoint(TRUNCATE)'` merges them"
                 )
-
-
-def _open(paths: tuple[Path, ...]) -> Any:
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError(f"{paths[0]}: bags need the extra `ros` (pip install 'sglpr-jax[ros]')") from error
-    if paths[0].name.endswith(COMPRESSED):
-        raise ValueError(f"{paths[0]}: expected a file that is not compressed{_about_metadata(paths[0])}")
-    for path in paths:
-        _check_closed(path)
-    with _broken(paths[0]):
-        reader = AnyReader(list(paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-        return reader

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
-from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.clouds import check_points, cloud_scan, packed_type
+from sglpr_jax.data.formats.clouds import check_points, cloud_scan
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
 from sglpr_jax.data.scan import TIME_FIELDS, Scan, time_field_of
@@ -54,12 +53,13 @@ class RosMessage:
 
     def numbers(self, kind: str, count: int = 1) -> np.ndarray:
         """Read the next `count` numbers of a type such as "f8"."""
-        return self._next(np.dtype(f"{self._order}{kind}"), count)
+        dtype = np.dtype(f"{self._order}{kind}")
+        return np.frombuffer(self._bytes(dtype.itemsize, count * dtype.itemsize), dtype)
 
     def text(self) -> str:
         """Read the next string."""
         length = int(self.numbers("u4")[0])
-        return self.numbers("u1", length).tobytes().rstrip(b"\0").decode(errors="replace")
+        return self._bytes(1, length).rstrip(b"\0").decode(errors="replace")
 
     def header(self) -> Header:
         """Read the header at the start of a sensor message."""
@@ -71,22 +71,19 @@ class RosMessage:
     def records(self, fields: dict[str, str]) -> np.ndarray:
         """Read the next sequence of records. Fields of 4 bytes must precede fields of 1 byte."""
         count = int(self.numbers("u4")[0])
-        layout = [(name, f"{self._order}{kind}", int(kind[1:])) for name, kind in fields.items()]
-        packed = packed_type(layout, list(fields))
-        padding = -packed.itemsize % 4 if self._cdr else 0
-        padded = packed_type([*layout, ("", "u1", padding)], list(fields))
-        found = self._next(padded, max(count - 1, 0))  # the last record has no padding
-        return np.concatenate([found, self._next(packed, min(count, 1)).astype(found.dtype)])
+        layout = [(name, f"{self._order}{kind}") for name, kind in fields.items()]
+        padding = -np.dtype(layout).itemsize % 4 if self._cdr else 0
+        padded = np.dtype([*layout, ("padding", f"V{padding}")])
+        content = self._bytes(4, max(count * padded.itemsize - padding, 0))  # the last record has no padding
+        return np.frombuffer(content + bytes(padding if count else 0), padded)
 
-    def _next(self, kind: np.dtype, count: int) -> np.ndarray:
-        size = 1 if kind.names else kind.itemsize
-        self._at += -(self._at - 4) % size if self._cdr else 0
-        end = self._at + count * kind.itemsize
-        if end > len(self.raw):
-            raise ValueError(f"expected {count} times {kind.itemsize} bytes, found {len(self.raw) - self._at}")
-        found = np.frombuffer(self.raw, kind, count, self._at) if count else np.zeros(0, kind)
-        self._at = end
-        return found
+    def _bytes(self, alignment: int, size: int) -> bytes:
+        """Read the next bytes, in CDR from a multiple of `alignment` on."""
+        start = self._at - ((self._at - 4) % -alignment if self._cdr else 0)
+        self._at = start + size
+        if self._at > len(self.raw):
+            raise ValueError(f"expected a message of at least {self._at} bytes, found {len(self.raw)}")
+        return self.raw[start : self._at]
 
 
 def read_point_cloud2(message: Any, *, name: str = "cloud") -> Scan:
@@ -126,17 +123,18 @@ def _in_metres(records: np.ndarray) -> bool:
 
 
 def _record(message: Any, order: str) -> np.dtype:
+    """Numpy type of a point with the coordinates, lasers and times of a PointCloud2, in a byte order."""
     fields = {field.name: field for field in message.fields}
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
-    wanted = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
-    wanted += [name for name in TIME_FIELDS if name in fields and fields[name].datatype in _TYPES]
-    types = [_TYPES.get(fields[name].datatype) for name in wanted]
+    names = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
+    names += [name for name in TIME_FIELDS if name in fields and fields[name].datatype in _TYPES]
+    types = [_TYPES.get(fields[name].datatype) for name in names]
     if None in types:
-        raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in wanted]}")
-    formats, offsets = [f"{order}{kind}" for kind in types], [fields[name].offset for name in wanted]
+        raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in names]}")
+    formats, offsets = [f"{order}{kind}" for kind in types], [fields[name].offset for name in names]
     try:
-        return np.dtype({"names": wanted, "formats": formats, "offsets": offsets, "itemsize": message.point_step})
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step})
     except (ValueError, OverflowError) as error:
         raise ValueError(f"expected fields within {message.point_step} bytes, found others ({error})") from error
 
@@ -194,10 +192,10 @@ class Stamps(NamedTuple):
     """Times in the headers of the messages, in seconds."""
 
     @classmethod
-    def of(cls, found: Iterable[tuple[int, float]]) -> "Stamps":
+    def of(cls, times: Iterable[tuple[int, float]]) -> "Stamps":
         """Stamps of messages from recorder times (ns) and header times (s)."""
-        both = np.array(list(found), [("recorded", np.int64), ("own", np.float64)])
-        return cls(both["recorded"].copy(), both["own"].copy())
+        pairs = list(times)
+        return cls(np.array([time for time, _ in pairs], np.int64), np.array([time for _, time in pairs], np.float64))
 
     @property
     def orderly(self) -> bool:
@@ -216,10 +214,8 @@ class Track:
     """Poses of a topic."""
 
     stamps: Stamps
-    positions: Float[np.ndarray, "n 3"]
-    """Positions in metres."""
-    quaternions: Float[np.ndarray, "n 4"]
-    """Quaternions x, y, z, w. The quaternions are not normalised and may be invalid (see `turned`)."""
+    numbers: Float[np.ndarray, "n 7"]
+    """Positions in metres, and quaternions x, y, z, w. Quaternions are not normalised and may be invalid."""
     child: str
     """Child frame, such as "base_link". Empty if the messages do not name it."""
     frame: str
@@ -228,65 +224,61 @@ class Track:
     """Number of messages without a valid pose, which are not part of the track."""
 
     @classmethod
-    def of(cls, found: Iterable[tuple[int, StampedPose]]) -> "Track":
+    def of(cls, messages: Iterable[tuple[int, StampedPose]]) -> "Track":
         """Create a track from recorder times (ns) and poses, without poses with non-finite positions.
 
         If most poses have a rotation, those without one are dropped, too.
         """
-        given = list(found)
-        placed = [(time, pose) for time, pose in given if np.isfinite(pose.numbers[:3]).all()]
-        valid = are_unit([pose.numbers[3:] for _, pose in placed])
-        turned = [one for one, fits in zip(placed, valid, strict=True) if fits]
-        kept = turned if 2 * len(turned) > len(placed) else placed
-        numbers = np.array([pose.numbers for _, pose in kept], np.float64).reshape(-1, 7)
-        stamps = Stamps.of((time, pose.time) for time, pose in kept)
-        child, frame = (kept[0][1].child, kept[0][1].frame) if kept else ("", "")
-        return cls(stamps, numbers[:, :3], numbers[:, 3:], child, frame, len(given) - len(kept))
+        pairs = list(messages)
+        numbers = np.array([pose.numbers for _, pose in pairs], np.float64).reshape(-1, 7)
+        valid = np.isfinite(numbers[:, :3]).all(axis=1)
+        rotated = valid & _are_unit(numbers[:, 3:])
+        rows = np.flatnonzero(rotated if 2 * rotated.sum() > valid.sum() else valid)
+        stamps = Stamps.of((pairs[row][0], pairs[row][1].time) for row in rows)
+        child, frame = (pairs[rows[0]][1].child, pairs[rows[0]][1].frame) if len(rows) else ("", "")
+        return cls(stamps, numbers[rows], child, frame, len(pairs) - len(rows))
 
     def __len__(self) -> int:
-        return len(self.positions)
+        return len(self.numbers)
 
     @property
     def turned(self) -> bool:
-        """Whether the messages contain rotations (`_turn`). A GPS receiver writes zeros or a constant."""
-        return _turn(self.quaternions)
+        """Whether the messages contain rotations that change. A GPS receiver writes zeros or a constant."""
+        return _turn(self.numbers[:, 3:])
 
     @property
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
         """Poses, with identity rotations if not all quaternions are valid."""
-        if are_unit(self.quaternions).all():
-            return from_quaternions(self.positions, self.quaternions)
-        return poses_of(self.positions)
+        positions, quaternions = self.numbers[:, :3], self.numbers[:, 3:]
+        return from_quaternions(positions, quaternions) if _are_unit(quaternions).all() else poses_of(positions)
 
     @property
     def moves(self) -> bool:
         """Whether any pose differs from the first."""
-        numbers = np.concatenate([self.positions, self.quaternions], axis=1)
-        return bool(len(self) and (numbers != numbers[0]).any())
+        return bool(len(self) and (self.numbers != self.numbers[0]).any())
 
     def __str__(self) -> str:
         return f"{len(self)} poses of {self.child or 'a body'} in {self.frame or 'a frame'}"
 
 
-def are_unit(quaternions: ArrayLike) -> Bool[np.ndarray, " n"]:
+def _are_unit(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
     """Whether each quaternion has length 1."""
     with np.errstate(invalid="ignore", over="ignore"):
-        lengths = np.linalg.norm(np.reshape(np.asarray(quaternions, np.float64), (-1, 4)), axis=1)
-        return np.abs(lengths - 1) <= UNIT
+        return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= UNIT
 
 
 def _turn(quaternions: Float[np.ndarray, "n 4"]) -> bool:
     """Whether the quaternions are valid rotations that change."""
-    return bool(len(quaternions) and are_unit(quaternions).all() and np.ptp(quaternions, axis=0).any())
+    return bool(len(quaternions) and _are_unit(quaternions).all() and np.ptp(quaternions, axis=0).any())
 
 
 def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
     """Group tf transforms into one track for each pair of child and parent frame."""
-    found: dict[tuple[str, str], list[tuple[int, StampedPose]]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[tuple[int, StampedPose]]] = defaultdict(list)
     for time, pose in transforms:
-        named = pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
-        found[named.child, named.frame].append((time, named))
-    return [Track.of(poses) for _, poses in sorted(found.items())]
+        child, frame = pose.child.strip("/"), pose.frame.strip("/")
+        groups[child, frame].append((time, pose._replace(child=child, frame=frame)))
+    return [Track.of(poses) for _, poses in sorted(groups.items())]
 
 
 def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
@@ -298,15 +290,15 @@ def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray,
 
 def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
     """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
-    steps: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
+    neighbours: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:
-        if len(track) and not track.moves and are_unit(track.quaternions[0]).all():
+        if len(track) and not track.moves and _are_unit(track.numbers[:, 3:]).all():
             frame_from_child = track.poses[0]
-            steps[track.frame].append((track.child, frame_from_child))
-            steps[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
+            neighbours[track.frame].append((track.child, frame_from_child))
+            neighbours[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
     reached, queue = {frame: np.eye(4)}, [frame]
     for here in queue:
-        for there, here_from_there in steps[here]:
+        for there, here_from_there in neighbours[here]:
             if there not in reached:
                 reached[there] = reached[here] @ here_from_there
                 queue.append(there)
@@ -316,9 +308,9 @@ def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np
 def read_imu(messages: Iterable[tuple[int, RosMessage]]) -> tuple[Stamps, str, Imu]:
     """Decode timestamps, frame and samples of an IMU from its messages and the times (ns) of their recorder."""
     samples = [(time, message.header(), message.numbers("f8", 37)) for time, message in messages]
-    found = np.array([numbers for _, _, numbers in samples], np.float64).reshape(-1, 37)
-    turned, covariance, rates, accelerations = found[:, :4], found[:, 4], found[:, 13:16], found[:, 25:28]
-    known = _turn(turned) and covariance[0] != -1
+    numbers = np.array([numbers for _, _, numbers in samples], np.float64).reshape(-1, 37)
+    quaternions, rates, accelerations = numbers[:, :4], numbers[:, 13:16], numbers[:, 25:28]
+    known = _turn(quaternions) and numbers[0, 4] != -1  # the first covariance is -1 without orientation
     stamps = Stamps.of((time, header.time) for time, header, _ in samples)
     frame = next((header.frame for _, header, _ in samples if header.frame), "")
-    return stamps, frame, Imu(stamps.own, rates, accelerations, turned if known else None)
+    return stamps, frame, Imu(stamps.own, rates, accelerations, quaternions if known else None)

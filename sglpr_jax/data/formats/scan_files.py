@@ -1,34 +1,74 @@
 """Reads single scans in all supported formats, point cloud maps in parts, and SemanticKITTI labels."""
 
 import contextlib
+import dataclasses
+import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.arrays import array_scan
-from sglpr_jax.data.formats.bin_records import is_record, read_records, record_of_scan
-from sglpr_jax.data.formats.clouds import check_bytes
+from sglpr_jax.data.formats.bin_records import is_record, read_records, unusual_record
+from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_scan
 from sglpr_jax.data.formats.las import las_blocks, las_scan
-from sglpr_jax.data.formats.pcd import pcd_blocks, pcd_scan
-from sglpr_jax.data.formats.ply import ply_blocks, ply_scan
+from sglpr_jax.data.formats.pcd_ply import parse_pcd, parse_ply, table_blocks, table_scan
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import in_short
+from sglpr_jax.numpy_files import read_array
+
+ARRAY_NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
+"""Names of the array with the points in an .npz file with several arrays, in order of preference."""
+
+
+def array_scan(path: Path) -> Scan:
+    """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields.
+
+    In an .npz file, they are the first array of `ARRAY_NAMES`, or the only one. Pickled objects are not read.
+    """
+    if path.suffix.lower() == ".npz":
+        array = _archived_array(path)
+    else:
+        with path.open("rb") as stream:
+            array = read_array(stream, size=path.stat().st_size)
+    if {"x", "y", "z"} <= set(array.dtype.names or ()):
+        array = np.stack([array[axis].reshape(-1) for axis in "xyz"], axis=1)
+    numbers = array.dtype.kind in "fiu"
+    if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not 0 < len(array) <= MOST_POINTS:
+        raise ValueError(f"expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}")
+    return cloud_scan(dict(zip("xyz", array.T, strict=False)))
+
+
+def _archived_array(path: Path) -> np.ndarray:
+    with zipfile.ZipFile(path) as archive:
+        members = {
+            file.filename.removesuffix(".npy"): file for file in archive.infolist() if file.filename.endswith(".npy")
+        }
+        named = [name for name in ARRAY_NAMES if name in members]
+        if not named and len(members) != 1:
+            raise ValueError(
+                f"expected one array, or one named {', '.join(ARRAY_NAMES)}, found {', '.join(members) or 'none'}"
+            )
+        member = members[(named or list(members))[0]]
+        check_bytes(member.file_size)
+        with archive.open(member) as stream:
+            return read_array(stream, size=member.file_size)
+
 
 READERS: dict[ScanFormat, Callable[[Path], Scan]] = {
-    "pcd": pcd_scan,
-    "ply": ply_scan,
+    "pcd": partial(table_scan, parse=parse_pcd),
+    "ply": partial(table_scan, parse=parse_ply),
     "npy": array_scan,
     "npz": array_scan,
     "las": las_scan,
 }
 """Readers of formats with a header. The name of each format is also its file ending."""
 BLOCKS: dict[str, Callable[[Path], Iterator[Float64[np.ndarray, "_ 3"]]]] = {
-    ".pcd": pcd_blocks,
-    ".ply": ply_blocks,
+    ".pcd": partial(table_blocks, parse=parse_pcd),
+    ".ply": partial(table_blocks, parse=parse_ply),
     ".las": las_blocks,
     ".laz": las_blocks,
 }
@@ -57,9 +97,9 @@ def named_format(path: Path) -> ScanFormat | None:
     return "nclt" if path.parent.name == "velodyne_sync" else None
 
 
-def found_format(path: Path) -> ScanFormat:
+def detect_format(path: Path) -> ScanFormat:
     """Return the format of one scan by its name or its content."""
-    return named_format(path) or record_of_scan(path)
+    return named_format(path) or unusual_record([path]) or "kitti"
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
@@ -76,7 +116,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
 
     Arguments:
       path: File of the scan.
-      format: Format of the scan. "auto" uses the name of the file, or the content of a .bin file (`found_format`).
+      format: Format of the scan. "auto" uses the name of the file, or the content of a .bin file (`detect_format`).
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -84,7 +124,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
       ImportError: If the file is a .las file and the extra `las` is not installed.
     """
     path = Path(path)
-    return read_scan_file(path, format=found_format(path) if format == "auto" else format).cloud
+    return read_scan_file(path, format=detect_format(path) if format == "auto" else format).cloud
 
 
 def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Scan:
@@ -101,6 +141,34 @@ def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFo
     with _naming(path, known):
         check_bytes(path.stat().st_size)
         return READERS[known](path)
+
+
+def scan_of_file(
+    path: Path,
+    labels: Path | None = None,
+    lasers: bool = False,
+    *,
+    format: ScanFormat = "auto",
+    records: RecordFormat = "kitti",
+) -> Scan:
+    """Read a scan and its labels for a `Recording`, each file once. The scan always has its laser numbers.
+
+    `format` and `records` are those of `read_scan_file`.
+    """
+    scan = read_scan_file(path, format=format, records=records)
+    if labels is None:
+        return scan
+    return dataclasses.replace(scan, labels=read_labels(labels, points=len(scan.cloud)), labels_file=labels)
+
+
+def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:
+    """Return the raw SemanticKITTI ids (n,) of a .label file. The instance number in the upper 16 bits is dropped."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected labels, found none")
+    size = path.stat().st_size
+    if size != 4 * points:
+        raise ValueError(f"{path}: expected {points} labels of 4 bytes, one per point of its scan, found {size} bytes")
+    return (np.fromfile(path, dtype="<u4") & 0xFFFF).astype(np.int32)
 
 
 def is_cloud_file(path: Path) -> bool:
@@ -124,13 +192,3 @@ def _naming(path: Path, format: str) -> Iterator[None]:
     except Exception as error:
         why = in_short(error, most=300)
         raise ValueError(f"{path}: expected a readable .{format} file, found an invalid one: {why}") from error
-
-
-def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:
-    """Return the raw SemanticKITTI ids (n,) of a .label file. The instance number in the upper 16 bits is dropped."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected labels, found none")
-    size = path.stat().st_size
-    if size != 4 * points:
-        raise ValueError(f"{path}: expected {points} labels of 4 bytes, one per point of its scan, found {size} bytes")
-    return (np.fromfile(path, dtype="<u4") & 0xFFFF).astype(np.int32)

@@ -11,7 +11,7 @@ from pathlib import Path
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
-from sglpr_jax.data.readers.listing import left_aside
+from sglpr_jax.data.readers.listing import other_contents
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
@@ -20,10 +20,12 @@ from sglpr_jax.data.times import check_jumps, check_order
 @functools.cache
 def readers() -> tuple[Reader, ...]:
     """Return all readers, in the order in which they are tried."""
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
-    found = [reader for module in modules for reader in getattr(module, "READERS", [getattr(module, "READER", None)])]
-    return tuple(sorted(filter(None, found), key=lambda reader: reader.rank))
+    readers = []
+    for name in sorted(module.name for module in pkgutil.iter_modules(__path__)):
+        module = importlib.import_module(f"{__name__}.{name}")
+        readers += getattr(module, "READERS", ())
+        readers += [module.READER] if hasattr(module, "READER") else []
+    return tuple(sorted(readers, key=lambda reader: reader.rank))
 
 
 def recording_names(root: Path | str) -> tuple[str, ...]:
@@ -82,13 +84,13 @@ def open_recording(
     if name is None or name not in names:
         asked = "the name of one sequence" if name is None else f"sequence {name!r}"
         raise FileNotFoundError(f"{root}: expected {asked}, found {', '.join(names)}")
-    given = next((path for path in (poses, times) if path is not None), None)
-    if given is not None and not reader.takes_poses:
-        raise ValueError(f"{given}: expected poses or times for a plain folder of scans, found {root}: {reader.layout}")
+    pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
+    if (pose_file or times_file) and not reader.takes_poses:
+        expected = "poses or times for a plain folder of scans"
+        raise ValueError(f"{pose_file or times_file}: expected {expected}, found {root}: {reader.layout}")
     for kind, topic in (("pose", pose_topic), ("IMU", imu_topic)):
         if topic is not None and not reader.takes_topics:
             raise ValueError(f"{root}: expected a bag with the {kind} topic {topic}, found {reader.layout}")
-    pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
     options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, time_unit, pose_topic, imu_topic)
     recording = reader.open(root, name, options)
     if recording.times is not None:
@@ -103,16 +105,12 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
         names = reader.recording_names(root)
         if names:
             return reader, names
-    *layouts, last = (reader.layout for reader in readers() if reader.layout)
     if root.is_file():
-        scan = (
-            "; put the scans into a folder, or read a single scan with read_scan"
-            if root.name.endswith((*ENDINGS, *ARRAY_ENDINGS))
-            else ""
-        )
-        raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{scan}")
+        scan_hint = "; put the scans into a folder, or read a single scan with read_scan"
+        hint = scan_hint if root.name.endswith((*ENDINGS, *ARRAY_ENDINGS)) else ""
+        raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{hint}")
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: expected the folder of a recording, or a bag, found no such folder")
-    raise FileNotFoundError(
-        f"{root}: found no known layout: {left_aside(root, ()) or 'no files'}; expected {', '.join(layouts)} or {last}"
-    )
+    *layouts, last = (reader.layout for reader in readers() if reader.layout)
+    contents = other_contents(root, ()) or "no files"
+    raise FileNotFoundError(f"{root}: found no known layout: {contents}; expected {', '.join(layouts)} or {last}")

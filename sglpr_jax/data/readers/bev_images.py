@@ -12,32 +12,29 @@ import numpy as np
 from jaxtyping import Float32
 
 from sglpr_jax.data.density_image import as_counts
-from sglpr_jax.data.formats.png import read_grey_png
-from sglpr_jax.data.formats.pose_files import read_poses, rows_of
+from sglpr_jax.data.formats.png import image_scan, read_grey_png
+from sglpr_jax.data.formats.pose_files import frame_rows, read_poses
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, image_scan
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open `root/<name>`. Raises FileNotFoundError without images, and ValueError if an image has no valid pose."""
     folder = root / name
-    image_paths = scans_in(folder / "imgs", ".png", kind="images")
-    ids = tuple(path.stem for path in image_paths)
+    paths = scans_in(folder / "imgs", ".png", kind="images")
+    ids = tuple(path.stem for path in paths)
     labels = {path.stem: path for path in files_in(folder / "labels", ".png")}
-    poses, positions, source = folder / "pose.txt", None, None
-    if poses.is_file():
-        world_from_lidar = read_poses(poses)
-        positions = world_from_lidar[rows_of(ids, rows=len(world_from_lidar), path=poses), :, 3]
-        source = f"{name}/pose.txt"
+    pose_file = folder / "pose.txt"
+    has_poses = pose_file.is_file()
     return Recording(
         name=name,
         ids=ids,
-        paths=image_paths,
+        paths=paths,
         read=partial(image_scan, read=read_image),
-        positions=positions,
-        pose_source=source,
+        positions=frame_rows(read_poses(pose_file), ids, path=pose_file)[:, :, 3] if has_poses else None,
+        pose_source=f"{name}/pose.txt" if has_poses else None,
         label_paths=tuple(labels.get(image) for image in ids),
         resolution_m=DENSITY_RESOLUTION_M,
     )

@@ -49,26 +49,26 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
             f"{root}: expected a point cloud map with the poses of its LiDAR (--poses trajectory.tum), found no poses;"
             " put single scans into a folder, or read them with read_scan"
         )
-    path = read_trajectory(poses, format=options.pose_format, times=options.times, time_unit=options.time_unit)
-    cloud = tiled_cloud(cloud_blocks(root), positions=path.positions, reach_m=REACH_M, source=root)
-    kept = _with_points(cloud, path.positions, root, poses)
-    world_from_lidar = _raised(cloud, path.poses, np.flatnonzero(kept), poses)
-    ids = tuple(f"{row:06d}" for row in range(len(kept)))
+    track = read_trajectory(poses, format=options.pose_format, times=options.times, time_unit=options.time_unit)
+    cloud = tiled_cloud(cloud_blocks(root), positions=track.positions, reach_m=REACH_M, source=root)
+    has_points = _have_points(cloud, track.positions, root, poses)
+    world_from_lidar = _raise_poses(cloud, track.poses, np.flatnonzero(has_points), poses)
+    ids = tuple(f"{row:06d}" for row in range(len(has_points)))
     used = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
     recording = Recording(
         name=root.stem,
         ids=ids,
         positions=world_from_lidar[:, :3, 3],
-        times=path.times,
-        pose_source=path.source,
-        paths=tuple(Path(scan) for scan in ids),
+        times=track.times,
+        pose_source=track.source,
+        paths=tuple(map(Path, ids)),
         read=partial(_read, cloud=cloud, world_from_lidar=world_from_lidar),
         on_disk=False,
         world_from_lidar=world_from_lidar,
         containers=(root,),
         found=(f"format: point cloud map {root.name}, {used}, {cloud.spacing_m:.2f} m apart; scans computed from it",),
     )
-    return recording if kept.all() else only(recording, np.flatnonzero(kept).tolist())
+    return recording if has_points.all() else only(recording, np.flatnonzero(has_points).tolist())
 
 
 def _read(
@@ -83,29 +83,29 @@ def _points_at(cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "4 4"]) ->
     return cloud.near(world_from_lidar[:3, 3], REACH_M) @ world_from_lidar[:3, :3].astype(np.float32)
 
 
-def _with_points(
+def _have_points(
     cloud: TiledCloud, positions: Float[np.ndarray, "n 3"], root: Path, poses: Path
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the map has points around each position. Warns if it has none around some, raises ValueError if all."""
+    """Whether the map has points around each position. Warns if some have none, raises ValueError if all have none."""
     from scipy.spatial import KDTree  # imported here because the import is slow
 
     cells = np.unique(np.round(cloud.points / AROUND_M).astype(np.int32), axis=0)
-    kept = np.zeros(len(positions), bool)
+    has_points = np.zeros(len(positions), bool)
     if len(cells):
-        kept = KDTree(cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
-    lost, box = np.flatnonzero(~kept), _box(cloud.lowest, cloud.highest)
-    if len(lost) == len(kept):
-        found = _box(positions.min(axis=0), positions.max(axis=0))
-        raise ValueError(
-            f"{poses}: expected poses in the frame of {root.name}, which covers {box}, found poses at {found}"
-        )
+        has_points = KDTree(cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
+    covered, lost = _box(cloud.lowest, cloud.highest), np.flatnonzero(~has_points)
+    if not has_points.any():
+        area = _box(positions.min(axis=0), positions.max(axis=0))
+        expected = f"poses in the frame of {root.name}, which covers {covered}"
+        raise ValueError(f"{poses}: expected {expected}, found poses at {area}")
     if len(lost):
         first = ", ".join(f"{value:.1f}" for value in positions[lost[0]])
         warn(
             f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at {len(lost)} of"
-            f" {len(kept)} poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers {box}"
+            f" {len(positions)} poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers"
+            f" {covered}"
         )
-    return kept
+    return has_points
 
 
 def _box(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, "3"]) -> str:
@@ -113,21 +113,21 @@ def _box(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, "3"]) -> str
     return ", ".join(f"{axis} {low:.0f} to {high:.0f} m" for axis, low, high in ends)
 
 
-def _raised(
+def _raise_poses(
     cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"], rows: np.ndarray, poses: Path
 ) -> Float[np.ndarray, "n 4 4"]:
     """Return the poses, or poses above them with a warning if they are at the height of the ground."""
-    checked = rows[np.unique(np.linspace(0, len(rows) - 1, POSES_CHECKED).astype(int))]
-    found = common_mounting(estimate_mounting(_points_at(cloud, world_from_lidar[row])) for row in checked)
-    if found is None or abs(found.height_m) > LOWEST_M:
+    sample = rows[np.unique(np.linspace(0, len(rows) - 1, POSES_CHECKED).astype(int))]
+    mounting = common_mounting(estimate_mounting(_points_at(cloud, world_from_lidar[row])) for row in sample)
+    if mounting is None or abs(mounting.height_m) > LOWEST_M:
         return world_from_lidar
-    raised_m = MODEL_HEIGHT_M - found.height_m
+    raised_m = MODEL_HEIGHT_M - mounting.height_m
     warn(
-        f"{poses}: expected poses of the LiDAR, found poses {found.height_m:.2f} m above the ground, as of the robot's"
-        f" base; the scans are computed {raised_m:.2f} m above them"
+        f"{poses}: expected poses of the LiDAR, found poses {mounting.height_m:.2f} m above the ground, as of the"
+        f" robot's base; the scans are computed {raised_m:.2f} m above them"
     )
     lidar = np.eye(4)
-    lidar[:3, 3] = raised_m * np.array(found.up)
+    lidar[:3, 3] = raised_m * np.array(mounting.up)
     return world_from_lidar @ lidar
 
 

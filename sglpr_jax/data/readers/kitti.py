@@ -9,16 +9,18 @@
 Both pose files contain poses of the left camera. Positions are computed without `calib.txt`.
 """
 
+import contextlib
 from functools import partial
 from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
-from sglpr_jax.data.formats.bin_records import described, unusual_record
-from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.formats.bin_records import describe_format, unusual_record
+from sglpr_jax.data.formats.pose_files import frame_rows, read_poses, read_times
+from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import ReadRecord, Recording, scan_of_file
+from sglpr_jax.data.recording import ReadRecord, Recording
 from sglpr_jax.files import naming, read_json
 from sglpr_jax.se3 import positions_from_camera
 
@@ -32,24 +34,27 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     Raises FileNotFoundError without scans or the named pose file, and ValueError if a scan is not named by its row.
     """
     folder = root / "sequences" / name
-    scan_paths = scans_in(folder / "velodyne", ".bin")
-    ids = tuple(path.stem for path in scan_paths)
-    poses, clock = _pose_file(root, name, options.pose_source), folder / "times.txt"
-    positions = None if poses is None else positions_from_camera(read_poses(root / poses))
-    times = read_times(clock, unit=options.time_unit) if clock.is_file() else None
+    paths = scans_in(folder / "velodyne", ".bin")
+    ids = tuple(path.stem for path in paths)
+    pose_file, times_file = _pose_file(root, name, options.pose_source), folder / "times.txt"
+    positions = None
+    if pose_file is not None:
+        poses = read_poses(root / pose_file)
+        positions = frame_rows(positions_from_camera(poses), ids, path=root / pose_file)
+    times = read_times(times_file, unit=options.time_unit) if times_file.is_file() else None
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
-    (read, found), mounting = _format(scan_paths, options.format), _mounting(root)
+    (read, format), mounting = _format(paths, options.format), _mounting(root)
     return Recording(
         name=name,
         ids=ids,
-        paths=scan_paths,
+        paths=paths,
         read=read,
-        positions=None if positions is None else positions[rows_of(ids, rows=len(positions), path=root / str(poses))],
-        times=None if times is None else times[rows_of(ids, rows=len(times), path=clock)],
-        pose_source=poses,
+        positions=positions,
+        times=None if times is None else frame_rows(times, ids, path=times_file),
+        pose_source=pose_file,
         label_paths=tuple(labels.get(scan) for scan in ids),
         mounting=mounting,
-        found=(f"format: {found}", *([] if mounting is None else [f"sensor: {mounting}, as simulated"])),
+        found=(f"format: {format}", *([] if mounting is None else [f"sensor: {mounting}, as simulated"])),
     )
 
 
@@ -59,32 +64,35 @@ def _mounting(root: Path) -> Mounting | None:
     if not path.is_file():
         return None
     settings = read_json(path)
-    sensor = settings.get("sensor") if isinstance(settings, dict) else None
-    height = sensor.get("height_m") if isinstance(sensor, dict) else None
-    if not isinstance(height, int | float):
-        raise ValueError(f"{path}: expected the settings of a simulated dataset with sensor.height_m, found none")
+    try:
+        height = float(settings["sensor"]["height_m"])
+    except (TypeError, KeyError, ValueError) as error:
+        expected = "the settings of a simulated dataset with sensor.height_m"
+        raise ValueError(f"{path}: expected {expected}, found none") from error
     with naming(path):
-        return None if height == MODEL_HEIGHT_M else Mounting(float(height))
+        return None if height == MODEL_HEIGHT_M else Mounting(height)
 
 
 def _format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:
     """Function that reads a scan, and its format in words."""
     if format != "auto":
         return partial(scan_of_file, format=format), f"{format}, as given"
-    unusual = unusual_record(paths)
+    unusual = None
+    with contextlib.suppress(ValueError):  # scans that fit no format are read as KITTI's
+        unusual = unusual_record(paths)
     if unusual is None:
-        return scan_of_file, described("kitti")
-    return partial(scan_of_file, format=unusual), f"{described(unusual)}, not KITTI's"
+        return scan_of_file, describe_format("kitti")
+    return partial(scan_of_file, format=unusual), f"{describe_format(unusual)}, not KITTI's"
 
 
 def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
     """Name of the chosen pose file. "auto" prefers SemanticKITTI's, and returns None without any file."""
     files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
-    wanted = list(files.values()) if choice == "auto" else [files[choice]]
-    found = next((file for file in wanted if (root / file).is_file()), None)
-    if found is None and choice != "auto":
-        raise FileNotFoundError(f"{root}: expected poses in {wanted[0]}, found none")
-    return found
+    choices = list(files.values()) if choice == "auto" else [files[choice]]
+    path = next((file for file in choices if (root / file).is_file()), None)
+    if path is None and choice != "auto":
+        raise FileNotFoundError(f"{root}: expected poses in {choices[0]}, found none")
+    return path
 
 
 READER = Reader(

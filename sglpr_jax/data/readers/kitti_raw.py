@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import numbers_of
+from sglpr_jax.data.formats.pose_files import read_rows
+from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import in_short
 
 EARTH_M = 6378137.0
@@ -50,24 +51,19 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def _drives(root: Path) -> tuple[Path, ...]:
-    if not root.is_dir():
-        return ()
-    found = [root] if (root / "velodyne_points").is_dir() else []
-    found += [path.parent for pattern in ("*", "*/*") for path in root.glob(f"{pattern}/velodyne_points")]
-    return tuple(sorted((folder.resolve() for folder in found), key=lambda folder: folder.name))
+    """Folders of the drives, in order of their names."""
+    scans = (path for pattern in ("", "*/", "*/*/") for path in root.glob(f"{pattern}velodyne_points"))
+    return tuple(sorted((path.parent.resolve() for path in scans), key=lambda folder: folder.name))
 
 
 def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
     """Positions relative to the first GPS position, in metres east, north and up."""
-    numbers = [
-        numbers_of(file.read_text(errors="replace").split(), columns=OXTS_COLUMNS, where=str(file)) for file in files
-    ]
-    latitude, longitude, altitude = np.array(numbers)[:, :3].T
+    rows = [read_rows(file, columns=OXTS_COLUMNS)[:1] for file in files]
+    latitude, longitude, altitude = np.concatenate(rows)[:, :3].T
     wrong = np.flatnonzero(np.abs(latitude) >= POLE_DEG)
     if wrong.size:
-        raise ValueError(
-            f"{files[wrong[0]]}: expected a latitude below {POLE_DEG:g} degrees, found {latitude[wrong[0]]}"
-        )
+        found = f"found {latitude[wrong[0]]}"
+        raise ValueError(f"{files[wrong[0]]}: expected a latitude below {POLE_DEG:g} degrees, {found}")
     scale = math.cos(math.radians(latitude[0]))
     east = scale * EARTH_M * np.radians(longitude)
     north = scale * EARTH_M * np.log(np.tan(np.radians(90 + latitude) / 2))
@@ -81,19 +77,15 @@ def _times(file: Path, paths: tuple[Path, ...]) -> Float[np.ndarray, " n"] | Non
         return None
     lines = file.read_text(errors="replace").splitlines()  # blank lines count, too: scan i is line i
     try:
-        return np.array([_seconds(lines[int(path.stem)]) for path in paths])
+        stamps = np.array([lines[int(path.stem)].strip().replace(" ", "T") for path in paths], "datetime64[ns]")
+        if np.isnat(stamps).any():  # numpy converts a blank line to NaT
+            raise ValueError(f"the line of scan {paths[int(np.isnat(stamps).argmax())].stem} is blank")
     except (ValueError, IndexError) as error:
         raise ValueError(
             f"{file}: expected a date and time such as 2011-09-26 13:02:25.951199337 for each of {len(paths)} scans,"
             f" found {len(lines)} lines or malformed ones ({in_short(error)})"
         ) from error
-
-
-def _seconds(line: str) -> float:
-    stamp = np.datetime64(line.strip().replace(" ", "T"), "ns")
-    if np.isnat(stamp):  # numpy converts a blank line to NaT
-        raise ValueError(f"the line of a scan is {line.strip()!r}")
-    return float(stamp.astype(np.int64) / 1e9)
+    return stamps.astype(np.int64) / 1e9
 
 
 READER = Reader("DATE/DRIVE/velodyne_points/data/*.bin (KITTI raw)", recording_names, open_recording, rank=6)

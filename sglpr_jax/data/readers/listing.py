@@ -17,7 +17,9 @@ def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
     """
     if not folder.is_dir():
         return ()
-    return in_order(path for path in folder.iterdir() if path.name.lower().endswith(endings) and not hidden(path))
+    return in_order(
+        path for path in folder.iterdir() if path.name.lower().endswith(endings) and not path.name.startswith(".")
+    )
 
 
 def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ...]:
@@ -32,7 +34,7 @@ def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ..
 def names_of(root: Path, *, pattern: str) -> tuple[str, ...]:
     """Return the names of the folders in `root` that a pattern such as "sequences/*/velodyne/" finds, in order."""
     at = next(i for i, part in enumerate(Path(pattern).parts) if "*" in part or "[" in part)
-    return tuple(sorted({found.relative_to(root).parts[at] for found in root.glob(pattern)}))
+    return tuple(sorted({path.relative_to(root).parts[at] for path in root.glob(pattern)}))
 
 
 def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
@@ -40,29 +42,24 @@ def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
 
     If all names are decimal numbers, such as timestamps, they are compared as decimals: 1.25 before 1.5.
     """
-    found = list(paths)
-    times = {path: time[1] for path in found if (time := _DECIMAL.match(path.name))}
-    if len(times) == len(found):
-        return tuple(sorted(found, key=lambda path: (Decimal(times[path]), path.name)))
-    return tuple(sorted(found, key=lambda path: _natural(path.name)))
+    files = list(paths)
+    times = {path: time[1] for path in files if (time := _DECIMAL.match(path.name))}
+    if len(times) == len(files):
+        return tuple(sorted(files, key=lambda path: (Decimal(times[path]), path.name)))
+    return tuple(sorted(files, key=lambda path: _natural(path.name)))
 
 
-def hidden(path: Path) -> bool:
-    """Return whether the name begins with a dot."""
-    return path.name.startswith(".")
-
-
-def left_aside(folder: Path, taken: Iterable[Path]) -> str:
+def other_contents(folder: Path, taken: Iterable[Path]) -> str:
     """Return a summary of the other contents of a folder: numbers of files by extension, and subfolders."""
     known = set(taken)
-    others = [path for path in folder.iterdir() if path not in known and not hidden(path)]
+    others = [path for path in folder.iterdir() if path not in known and not path.name.startswith(".")]
     folders = in_order(path for path in others if path.is_dir())
     endings = Counter(path.suffix or path.name for path in others if not path.is_dir())
-    said = [f"{count} {ending}" for ending, count in sorted(endings.items())]
+    contents = [f"{count} {ending}" for ending, count in sorted(endings.items())]
     if folders:
-        named = ", ".join(path.name for path in folders[:3]) + (", ..." if len(folders) > 3 else "")
-        said.append(f"{len(folders)} {'folder' if len(folders) == 1 else 'folders'} ({named})")
-    return ", ".join(said)
+        names = ", ".join(path.name for path in folders[:3]) + (", ..." if len(folders) > 3 else "")
+        contents.append(f"{len(folders)} {'folder' if len(folders) == 1 else 'folders'} ({names})")
+    return ", ".join(contents)
 
 
 def _natural(name: str) -> tuple[tuple[int, int, int, str], ...]:

@@ -8,21 +8,19 @@ The tables refer to each other by tokens. Positions are those of the LiDAR in th
 of the car is always 0. The points are rotated so that x points forward.
 """
 
-import json
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.bin_records import described
-from sglpr_jax.data.formats.pose_files import rotations_of
-from sglpr_jax.data.formats.scan_files import scan_id
-from sglpr_jax.data.poses import poses_of
+from sglpr_jax.data.formats.bin_records import describe_format
+from sglpr_jax.data.formats.json_tables import column_of, poses_in_table, read_table, texts_of, vectors_of
+from sglpr_jax.data.formats.scan_files import scan_id, scan_of_file
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_of_file
-from sglpr_jax.files import in_short, naming, path_inside
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import naming, path_inside
 
 CHANNEL = "LIDAR_TOP"
 
@@ -36,17 +34,17 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open a scene: its key frames and sweeps in order of time. Listed scans without a file are skipped."""
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
-    samples = set(_texts(tables / "sample.json", _rows(tables / "sample.json", "scene_token", {scene}), "token"))
+    samples = set(texts_of(tables / "sample.json", read_table(tables / "sample.json", "scene_token", {scene}), "token"))
     table = tables / "sample_data.json"
-    listed = _rows(table, "sample_token", samples)
-    files = [path_inside(root, file, source=table) for file in _column(table, listed, "filename")]
+    listed = read_table(table, "sample_token", samples)
+    files = [path_inside(root, file, source=table) for file in column_of(table, listed, "filename")]
     scans = [(file, row) for file, row in zip(files, listed, strict=True) if file.parent.name == CHANNEL]
     there = [(file, row) for file, row in scans if file.is_file()]
     if not there:
         raise FileNotFoundError(
             f"{root}: expected scans of {name} in samples/{CHANNEL}, found none of the {len(scans)} that {table} lists"
         )
-    ticks = _numbers(table, [row for _, row in there], "timestamp", 1)[:, 0]  # microseconds
+    ticks = vectors_of(table, [row for _, row in there], "timestamp", "t")[:, 0]  # microseconds
     order = np.argsort(ticks, kind="stable")
     paths, rows = zip(*(there[i] for i in order), strict=True)
     keys = sum(path.parent.parent.name == "samples" for path in paths)
@@ -62,7 +60,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
             times=ticks[order] / 1e6,
             pose_source=f"{tables.name}/ego_pose.json",
             found=(
-                f"format: {described('nuscenes')}, rotated to x forward",
+                f"format: {describe_format('nuscenes')}, rotated to x forward",
                 f"{keys} key frames and {len(paths) - keys} sweeps{missing}",
             ),
         )
@@ -76,12 +74,12 @@ def _versions(root: Path) -> tuple[Path, ...]:
 def _scenes(tables: Path) -> dict[str, str]:
     """Token of each scene, by name. Raises ValueError if two scenes have the same name."""
     path = tables / "scene.json"
-    rows = _rows(path)
-    names = _texts(path, rows, "name")
+    rows = read_table(path)
+    names = texts_of(path, rows, "name")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{path}: expected a unique name for each scene, found {twice!r:.80} twice")
-    return dict(zip(names, _texts(path, rows, "token"), strict=True))
+    return dict(zip(names, texts_of(path, rows, "token"), strict=True))
 
 
 def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
@@ -93,62 +91,14 @@ def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray
 
 def _poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> Float[np.ndarray, "n 4 4"]:
     """Poses in the table rows that a column of `rows` refers to."""
-    tokens = _texts(path.with_name("sample_data.json"), rows, column)
-    found = {row["token"]: row for row in _rows(path, "token", set(tokens))}
-    lost = [token for token in tokens if token not in found]
+    tokens = texts_of(path.with_name("sample_data.json"), rows, column)
+    poses = {row["token"]: row for row in read_table(path, "token", set(tokens))}
+    lost = [token for token in tokens if token not in poses]
     if lost:
         raise ValueError(
             f"{path}: expected a row with the token {lost[0]!r}, found none ({len(lost)} broken references)"
         )
-    named = [found[token] for token in tokens]
-    quaternions = _numbers(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
-    return poses_of(_numbers(path, named, "translation", 3), rotations_of(path, quaternions))
-
-
-def _rows(path: Path, column: str = "", among: Container[Any] = ()) -> list[dict[str, Any]]:
-    """Return the rows of a table, or those whose value of `column` is in `among`: some tables have millions of rows."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a table, found none")
-
-    def wanted(row: dict[str, Any]) -> dict[str, Any] | None:
-        return row if not column or row.get(column) in among else None
-
-    try:
-        rows = json.loads(path.read_bytes(), object_hook=wanted)
-    except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path}: expected a table in JSON, found invalid JSON ({in_short(error)})") from error
-    kept = [row for row in rows if row is not None] if isinstance(rows, list) else [rows]
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in kept):
-        raise ValueError(f"{path}: expected a list of rows, each an object, found something else")
-    return kept
-
-
-def _column(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
-    lacking = next((row for row in rows if name not in row), None)
-    if lacking is not None:
-        raise ValueError(f"{path}: expected {name!r} in every row, found a row with {', '.join(lacking) or 'nothing'}")
-    return [row[name] for row in rows]
-
-
-def _texts(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[str]:
-    """Return a column of names or tokens."""
-    values = _column(path, rows, name)
-    for value in values:
-        if not isinstance(value, str) or not value:
-            raise ValueError(f"{path}: expected text as {name!r} in every row, found {value!r:.80}")
-    return values
-
-
-def _numbers(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int) -> Float[np.ndarray, "n {size}"]:
-    """Return a column with `size` finite numbers in each row."""
-    values = _column(path, rows, name)
-    try:
-        numbers = np.array(values, np.float64).reshape(len(rows), size)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"{path}: expected {size} numbers as {name!r}, found others ({in_short(error)})") from error
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"{path}: expected finite numbers as {name!r}, found NaN or infinite ones")
-    return numbers
+    return poses_in_table(path, [poses[token] for token in tokens], position="translation", rotation="rotation")
 
 
 READER = Reader(

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import check_positions, rotations_of, rows_of
+from sglpr_jax.data.formats.json_tables import poses_in_table, read_table
+from sglpr_jax.data.formats.pose_files import frame_rows
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.readers.listing import files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
@@ -48,12 +48,12 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         )
     paths = scans_in(folder, ".npy")
     ids = tuple(path.stem for path in paths)
-    pose_file, clock = folder / "poses.json", folder / "timestamps.json"
-    poses, times = read_poses(pose_file), _times(clock)
-    poses = poses[rows_of(ids, rows=len(poses), path=pose_file)]
-    seconds = times[rows_of(ids, rows=len(times), path=clock)]
-    check_order(seconds, source=clock)
-    left = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
+    pose_file, times_file = folder / "poses.json", folder / "timestamps.json"
+    poses = poses_in_table(pose_file, read_table(pose_file), position="position", rotation="heading")
+    poses = frame_rows(poses, ids, path=pose_file)
+    times = frame_rows(_times(times_file), ids, path=times_file)
+    check_order(times, source=times_file)
+    missing = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
     digest = hashlib.sha256(pose_file.read_bytes()).hexdigest()
     return Recording(
         name=name,
@@ -61,27 +61,10 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         paths=paths,
         read=partial(_read, poses=dict(zip(paths, poses, strict=True)), poses_hash=digest),
         positions=poses[:, :3, 3],
-        times=seconds,
+        times=times,
         pose_source=str(POSES),
-        found=(f"format: PandaSet as npy, transformed from the world frame to the LiDAR frame, x forward{left}",),
+        found=(f"format: PandaSet as npy, transformed from the world frame to the LiDAR frame, x forward{missing}",),
     )
-
-
-def read_poses(path: Path) -> Float[np.ndarray, "n 4 4"]:
-    """Read a file of poses (world from LiDAR)."""
-    rows = read_json(path)
-    try:
-        turned = np.array([[pose["heading"][axis] for axis in "xyzw"] for pose in rows], np.float64).reshape(-1, 4)
-        positions = np.array([[pose["position"][axis] for axis in "xyz"] for pose in rows], np.float64).reshape(-1, 3)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: expected a list of poses, each with position (x, y, z) and heading (w, x, y, z), found another"
-            " structure"
-        ) from error
-    if not np.isfinite(positions).all():
-        raise ValueError(f"{path}: expected finite positions, found NaN or infinite ones")
-    check_positions(path, positions)
-    return poses_of(positions, rotations_of(path, turned))
 
 
 def _times(path: Path) -> Float[np.ndarray, " n"]:

@@ -1,7 +1,7 @@
 """Reader of bags of ROS 1 and ROS 2: point clouds of a topic, with poses and the gravity by an IMU if there are any."""
 
 import dataclasses
-import itertools
+import os
 from functools import partial
 from pathlib import Path
 
@@ -49,39 +49,43 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     broken, the topic has no messages, or a given topic does not exist or does not cover half of the scans.
     """
     bag, topic = _recordings(root)[name]
-    stamps = bag.read(topic, lambda messages: Stamps.of((time, one.header().time) for time, one in messages))
+    stamps = bag.read(topic, lambda messages: Stamps.of((time, message.header().time) for time, message in messages))
     recorded = stamps.recorded
     if not len(recorded):
         raise ValueError(f"{root}: expected point clouds on {topic}, found no message")
+    times: np.ndarray | None = stamps.seconds
+    if problem := time_unit_problem(times, numbers=False):
+        expected = "times in seconds in the headers or of the recorder"
+        warn(f"{root}, {topic}: expected {expected}, found {problem}; not used")
+        times = None
     ids = tuple(f"{i:06d}" for i in range(len(recorded)))
     nth = np.arange(len(recorded)) - np.searchsorted(recorded, recorded)  # number among messages with equal times
     where = dict(zip(ids, zip(recorded.tolist(), nth.tolist(), strict=True), strict=True))
     recording = Recording(
         name=name,
         ids=ids,
-        paths=tuple(Path(scan) for scan in ids),
+        paths=tuple(map(Path, ids)),
         read=partial(_read, bag=bag, topic=topic, where=where),
-        times=_times(stamps, f"{root}, {topic}"),
+        times=times,
         on_disk=False,
         containers=bag.files,
         found=(f"format: {topic} of {bag.name}, {bag.fields(topic, int(recorded[0]))}",),
     )
     lidar = bag.message(topic, int(recorded[0])).header().frame.strip("/")
-    posed = _with_poses(recording, bag, stamps, options.pose_topic, lidar)
+    recording = _with_poses(recording, bag, stamps, options.pose_topic, lidar)
     imu = _imu_topic(bag, topic, options.imu_topic)
     if imu is None:
-        return posed
-    scans = Stamps(*(times[posed.numbers] for times in stamps))
+        return recording
+    scans = Stamps(*(times[recording.numbers] for times in stamps))
     required = options.imu_topic is not None
-    return dataclasses.replace(posed, read_ups=partial(_ups, bag, imu, scans=scans, lidar=lidar, required=required))
+    return dataclasses.replace(recording, read_ups=partial(_ups, bag, imu, scans=scans, lidar=lidar, required=required))
 
 
-def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
-    """Times of the scans in seconds, or None with a warning if neither headers nor recorder have seconds."""
-    if found := time_unit_problem(stamps.seconds, numbers=False):
-        warn(f"{source}: expected times in seconds in the headers or of the recorder, found {found}; not used")
-        return None
-    return stamps.seconds
+def _read(
+    path: Path, labels: Path | None, lasers: bool, *, bag: RosBag, topic: str, where: dict[str, tuple[int, int]]
+) -> Scan:
+    with naming(f"scan {path.name}"):
+        return bag.cloud(topic, *where[path.name])
 
 
 def bag_files(root: Path) -> tuple[Path, ...]:
@@ -98,14 +102,14 @@ def _recordings(root: Path) -> dict[str, tuple[RosBag, str]]:
     """Bag and point cloud topic of each recording, by name."""
     whole = RosBag(bag_files(root))
     drives = [bag for bag in _drives(whole) if bag.topics_of(CLOUDS)] or [whole]
-    lone = root.resolve().stem if root.is_file() else root.resolve().name
-    found = {}
+    recordings = {}
     for bag in drives:
         for topic in bag.cloud_topics:
             parts = [bag.paths[0].stem] if len(drives) > 1 else []
             parts += [topic.strip("/").replace("/", "_")] if len(bag.cloud_topics) > 1 else []
-            found["_".join(parts) or lone] = bag, topic
-    return found
+            parts = parts or [root.resolve().stem if root.is_file() else root.resolve().name]
+            recordings["_".join(parts)] = bag, topic
+    return recordings
 
 
 def _drives(bag: RosBag) -> list[RosBag]:
@@ -123,34 +127,34 @@ def _drives(bag: RosBag) -> list[RosBag]:
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
     """Add the poses of `topic`, or of the topic that covers most scans. `lidar` is the frame of the scans."""
     transforms = _transforms(bag)
-    tracks = {one: _track(bag, one) for one in bag.topics_of(POSES)} | {
+    tracks = {name: _track(bag, name) for name in bag.topics_of(POSES)} | {
         f"/tf/{track.frame}/{track.child}": track
         for track in transforms
         if track.moves and fixed_transform(transforms, track.child, lidar) is not None
     }
-    clocks = {one: times_on_one_clock(track.stamps, scans) for one, track in tracks.items()}
-    kept = {one: have_poses(*clock) for one, clock in clocks.items()}
-    shares = {one: float(found.mean()) for one, found in kept.items()}
-    used = _chosen(shares, topic, bag.paths[0])
-    others = [f"{one} (poses for {share:.0%} of the scans)" for one, share in shares.items() if one != used]
-    said = (*recording.found, *([f"poses not used: {', '.join(others)}"] if others else []))
-    recording = dataclasses.replace(recording, found=said)
+    clocks = {name: times_on_one_clock(track.stamps, scans) for name, track in tracks.items()}
+    covered = {name: have_poses(*clock) for name, clock in clocks.items()}
+    shares = {name: float(rows.mean()) for name, rows in covered.items()}
+    used = _pose_topic(shares, topic, bag.paths[0])
+    others = [f"{name} (poses for {share:.0%} of the scans)" for name, share in shares.items() if name != used]
+    if others:
+        found = (*recording.found, f"poses not used: {', '.join(others)}")
+        recording = dataclasses.replace(recording, found=found)
     if not used:
         return recording
-    track, rows = tracks[used], np.flatnonzero(kept[used])
+    track, rows, (stamps, times) = tracks[used], np.flatnonzero(covered[used]), clocks[used]
     if track.dropped:
         found = f"{track.dropped} of {len(track) + track.dropped} without finite position or without rotation"
         warn(f"{bag.paths[0]}: expected valid poses on {used}, found {found}; these are dropped")
-    stamps, times = clocks[used]
     poses = interpolate_poses(stamps, track.poses, times[rows])
     check_height(poses[:, :3, 3], path=bag.paths[0])
     check_order(poses[:, :3, 3], [recording.ids[i] for i in rows], path=bag.paths[0])
-    child_from_lidar, how = _of_lidar(track, transforms, lidar)
+    child_from_lidar, how = _child_from_lidar(track, transforms, lidar)
     poses = poses @ child_from_lidar
     return dataclasses.replace(
         recording if len(rows) == len(recording) else only(recording, rows.tolist()),
         positions=poses[:, :3, 3],
-        pose_source=f"{used} ({track}, {how}{left_out(kept[used])})",
+        pose_source=f"{used} ({track}, {how}{left_out(covered[used])})",
         world_from_lidar=poses if track.turned else None,
     )
 
@@ -163,17 +167,17 @@ def _track(bag: RosBag, topic: str) -> Track:
 
 def _transforms(bag: RosBag) -> list[Track]:
     """Poses of each frame of tf in its parent frame. This reads each topic of tf once."""
-    read = [
-        bag.read(topic, lambda messages: [(time, [*read_transforms(one)]) for time, one in messages])
-        for topic in bag.topics_of(TRANSFORMS)
-    ]
-    return tracks_of((time, pose) for topic in read for time, poses in topic for pose in poses)
+    transforms = []
+    for topic in bag.topics_of(TRANSFORMS):
+        messages = bag.read(topic, lambda messages: [(time, [*read_transforms(raw)]) for time, raw in messages])
+        transforms += [(time, pose) for time, poses in messages for pose in poses]
+    return tracks_of(transforms)
 
 
-def _chosen(shares: dict[str, float], topic: str | None, bag: Path) -> str:
+def _pose_topic(shares: dict[str, float], topic: str | None, bag: Path) -> str:
     """Return `topic`, or else the topic that covers most scans; "" if it covers less than half of them."""
     if topic is None:
-        best = max(shares, key=lambda one: shares[one], default="")
+        best = max(shares, key=lambda name: shares[name], default="")
         return best if best and shares[best] >= LEAST_SHARE else ""
     if topic not in shares:
         raise ValueError(f"{bag}: expected the pose topic {topic}, found {', '.join(shares) or 'none'}")
@@ -182,7 +186,7 @@ def _chosen(shares: dict[str, float], topic: str | None, bag: Path) -> str:
     return topic
 
 
-def _of_lidar(track: Track, transforms: list[Track], lidar: str) -> tuple[Float[np.ndarray, "4 4"], str]:
+def _child_from_lidar(track: Track, transforms: list[Track], lidar: str) -> tuple[Float[np.ndarray, "4 4"], str]:
     """Transform from the LiDAR to the body of a track, and a description of how the poses were computed."""
     if not track.turned:
         return np.eye(4), "interpolated; its rotations are constant or missing"
@@ -197,16 +201,11 @@ def _of_lidar(track: Track, transforms: list[Track], lidar: str) -> tuple[Float[
 
 
 def _imu_topic(bag: RosBag, lidar_topic: str, imu_topic: str | None) -> str | None:
-    """Return `imu_topic`, or else the IMU topic whose name has most in common with the topic of the LiDAR."""
-
-    def shared(topic: str) -> int:
-        """Number of parts in common: 1 for /livox/imu and /livox/lidar."""
-        parts = (name.strip("/").split("/") for name in (topic, lidar_topic))
-        return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
-
+    """Return `imu_topic`, or else the IMU topic whose name begins most like that of the LiDAR: /livox/imu."""
     topics = bag.topics_of((IMU,))
     if imu_topic is None:
-        return max(topics, key=shared, default=None)
+        lidar = lidar_topic.strip("/")
+        return max(topics, key=lambda topic: len(os.path.commonpath([topic.strip("/"), lidar])), default=None)
     if imu_topic not in topics:
         raise ValueError(f"{bag.paths[0]}: expected the IMU topic {imu_topic}, found {', '.join(topics) or 'none'}")
     return imu_topic
@@ -219,9 +218,9 @@ def _ups(
 
     Without gravity, raises ValueError if the IMU is `required`, or else warns and returns None.
     """
-    found, frame, imu = bag.read(topic, read_imu)
+    recorded, frame, imu = bag.read(topic, read_imu)
     source = f"{bag.paths[0]}, {topic}"
-    stamps, times = times_on_one_clock(found, scans)
+    stamps, times = times_on_one_clock(recorded, scans)
     try:
         with naming(source):
             ups, how = imu.at(stamps).ups(times)
@@ -237,13 +236,6 @@ def _ups(
         warn(f"{source}: expected {expected}, found none; their axes are taken as parallel")
         lidar_from_imu = np.eye(4)
     return ups @ lidar_from_imu[:3, :3].T, f"{topic}, by {how}"
-
-
-def _read(
-    path: Path, labels: Path | None, lasers: bool, *, bag: RosBag, topic: str, where: dict[str, tuple[int, int]]
-) -> Scan:
-    with naming(f"scan {path.name}"):
-        return bag.cloud(topic, *where[path.name])
 
 
 READER = Reader(

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import check_record, described, detect_point_format, is_record
+from sglpr_jax.data.formats.bin_records import check_record, describe_format, detect_point_format, is_record
 from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_at_scans, poses_of
-from sglpr_jax.data.readers.listing import files_in, left_aside, scans_in
+from sglpr_jax.data.readers.listing import files_in, other_contents, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.recording import Recording, scan_of_file
+from sglpr_jax.data.recording import Recording
 
 POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
 """Pose files beside the scans. 12 numbers a line are poses of the LiDAR, z up."""
@@ -37,10 +37,15 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     Raises ValueError if two files differ only by their ending, or if the record of the .bin files cannot be detected.
     """
     paths = _scans(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
-    ids = _ids(root, paths)
-    positions, seconds, source = _trajectory(root, len(paths), options)
-    records, kinds = _formats(paths, options.format)
-    aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
+    files = {scan_id(path): path for path in reversed(paths)}
+    twice = next((path for path in paths if files[scan_id(path)] is not path), None)
+    if twice is not None:
+        first = files[scan_id(twice)]
+        raise ValueError(f"{root}: expected one file for each scan, found {first.name} and {twice.name}")
+    ids = tuple(map(scan_id, paths))
+    positions, times, source = _trajectory(root, len(paths), options)
+    records, format = _formats(paths, options.format)
+    aside = other_contents(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
     if positions is not None:
         check_order(positions, ids, path=options.poses or root / str(source))
     return Recording(
@@ -49,9 +54,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         paths=paths,
         read=partial(scan_of_file, format=options.format, records=records),
         positions=positions,
-        times=seconds,
+        times=times,
         pose_source=source,
-        found=(f"format: {kinds}", *([f"left aside: {aside}"] if aside else [])),
+        found=(f"format: {format}", *([f"left aside: {aside}"] if aside else [])),
     )
 
 
@@ -68,48 +73,40 @@ def _trajectory(
     if options.poses is None and len(beside) > 1:
         raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")
     path = options.poses or next(iter(beside), None)
-    clock = options.times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
-    seconds = None if clock is None else read_times(clock, unit=options.time_unit)
-    if seconds is not None and len(seconds) != scans:
-        raise ValueError(f"{clock}: expected {scans} rows, one per scan, found {len(seconds)}")
+    times_file = options.times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
+    times = None if times_file is None else read_times(times_file, unit=options.time_unit)
+    if times is not None and len(times) != scans:
+        raise ValueError(f"{times_file}: expected {scans} rows, one per scan, found {len(times)}")
     if path is None:
-        return None, seconds, None
+        return None, times, None
     twelve = "lidar" if options.poses is None else None
-    given = read_trajectory(path, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve)
+    track = read_trajectory(path, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve)
     of = f"scan of {root.resolve().name}"
-    found = poses_at_scans(str(path), poses_of(given.positions), given.times, seconds, scans=scans, of=of)
-    if seconds is not None and not found.kept.all():
-        late = seconds[~found.kept]
+    kept, poses, how = poses_at_scans(str(path), poses_of(track.positions), track.times, times, scans=scans, of=of)
+    if times is not None and not kept.all():
+        late = times[~kept]
         raise ValueError(
             f"{path}: expected poses at the times of all {scans} scans, found none for {len(late)}, the first at "
             f"{late[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
         )
-    source = given.source if options.poses is not None else path.name
-    said = f"{source}, {found.said}" if found.said else source
-    return found.poses[:, :3, 3], given.times if seconds is None else seconds, said
-
-
-def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
-    """Names of the scans. Raises ValueError if two files have the same name."""
-    first: dict[str, Path] = {}
-    for path in paths:
-        other = first.setdefault(scan_id(path), path)
-        if other is not path:
-            raise ValueError(f"{root}: expected one file for each scan, found {other.name} and {path.name}")
-    return tuple(first)
+    source = track.source if options.poses is not None else path.name
+    return poses[:, :3, 3], track.times if times is None else times, f"{source}, {how}" if how else source
 
 
 def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
     """Record of the .bin files whose name does not define it, and a description of all formats."""
-    unsaid = [path for path in paths if named_format(path) is None] if format == "auto" else []
-    found, how = detect_point_format(unsaid) if unsaid else (None, "")
-    if is_record(format):
-        check_record(paths, format)
-    records: RecordFormat = found or "kitti"
-    counts = Counter((named_format(path) or records) if format == "auto" else format for path in paths)
-    said = {name: described(name) if is_record(name) else name for name in counts}
-    kinds = ", ".join(said[name] if len(counts) == 1 else f"{count} {said[name]}" for name, count in counts.items())
-    return records, f"{kinds}, {how}" if unsaid else kinds
+    if format != "auto":
+        if is_record(format):
+            check_record(paths, format)
+        return "kitti", describe_format(format)
+    names = [named_format(path) for path in paths]
+    unnamed = [path for path, name in zip(paths, names, strict=True) if name is None]
+    detected, how = detect_point_format(unnamed) if unnamed else (None, "")
+    records: RecordFormat = detected or "kitti"
+    counts = Counter(name or records for name in names)
+    texts = {name: describe_format(name) for name in counts}
+    kinds = ", ".join(texts[name] if len(counts) == 1 else f"{count} {texts[name]}" for name, count in counts.items())
+    return records, f"{kinds}, {how}" if unnamed else kinds
 
 
 READER = Reader(

@@ -1,5 +1,9 @@
-"""Reader of MulRan, HeLiPR and Boreas: scans that are named by their time, and a table of poses with other times.
+"""Reader of NCLT, MulRan, HeLiPR and Boreas: scans that are named by their time, and a table of poses with other times.
 
+- NCLT: `2012-01-15/velodyne_sync/1326652795280148.bin`, in a record of its own; `groundtruth_2012-01-15.csv`, also in
+  the date's folder or in `ground_truth/`: utime, x, y, z, roll, pitch, yaw of the body. World axes are north, east,
+  down with one origin for all sessions, body axes forward, right, down with the origin on the ground. The scans are
+  already in the body frame. The reader turns both frames by 180 degrees about x: positions are north, west, up.
 - MulRan, an Ouster OS1-64: `KAIST01/Ouster/1561000444390857630.bin`, float32 x, y, z, intensity; `global_pose.csv`:
   time and 12 numbers (world_from_base, in axes east, north, up). The Ouster is rotated by 180 degrees about z relative
   to the car (179.67 degrees by its calibration). The points are rotated so that x points forward.
@@ -8,258 +12,222 @@
 - Boreas, a Velodyne Alpha Prime: `boreas-2020-12-01-13-26/lidar/1606847163437292.bin`, float32 x, y, z, intensity,
   laser, time; `applanix/lidar_poses.csv`: GPSTime, easting, northing, altitude and nine other columns.
 
-Names and times of MulRan and HeLiPR are in nanoseconds, those of Boreas in microseconds. Positions are those of the
-LiDAR. A new layout of this kind is one more row of `LAYOUTS`.
+Names and times of MulRan and HeLiPR are in nanoseconds, the others in microseconds. Except for NCLT, positions are
+those of the LiDAR. A new layout of this kind is one more entry of `LAYOUTS`.
 """
 
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sglpr_jax.data.formats.bin_records import described, read_records
+from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, describe_format, read_record_file, read_records
+from sglpr_jax.data.formats.pose_files import read_stamped_rows
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan import Scan, TimeField, time_field_of
-from sglpr_jax.data.times import check_unit, nearest_rows
+from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.times import check_order, check_unit, nearest_rows
 
-MAX_GAP_S = 0.1
-"""Maximum time between a scan and its pose, in seconds: the duration of one sweep."""
+StampedPositions = tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
+"""Times in ticks, and positions in metres, z up."""
 OUSTER_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
 """Position of MulRan's Ouster in the car's frame by the dataset's calibration, in metres."""
 FORWARD_FROM_OUSTER = np.array([-1, -1, 1], np.float32)
+
+
+def _record(fields: str) -> np.dtype:
+    """Numpy type of a point of three float32 coordinates and more fields, little-endian without padding."""
+    return np.dtype([("xyz", "<f4", 3), *((name, f"<{kind}") for name, kind in map(str.split, fields.split(",")))])
+
+
+BOREAS = _record("intensity f4, ring f4, time f4")
 HELIPR = {
-    "Avia": np.dtype(
-        [("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"), ("offset_time", "<u4")]
-    ),
-    "Aeva": np.dtype(
-        [("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1"), ("intensity", "<f4")]
-    ),
-    "Ouster": np.dtype(
-        [("xyz", "<f4", 3), ("intensity", "<f4"), ("t", "<u4"), ("reflectivity", "<u2"), ("line", "<u2"), ("a", "<u2")]
-    ),
-    "Velodyne": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("line", "<u2"), ("time", "<f4")]),
+    "Avia": _record("reflectivity u1, tag u1, line u1, offset_time u4"),
+    "Aeva": _record("reflectivity f4, velocity f4, offset_time i4, line u1, intensity f4"),
+    "Ouster": _record("intensity f4, t u4, reflectivity u2, line u2, ambient u2"),
+    "Velodyne": _record("intensity f4, line u2, time f4"),
 }
 """Record of one point, for each sensor."""
-AEVA_BEFORE = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1")])
+AEVA_BEFORE = _record("reflectivity f4, velocity f4, offset_time i4, line u1")
 AEVA_CHANGED = 1691936557946849179
 """Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
 
 
-def read_helipr(path: Path, *, sensor: str) -> Scan:
-    """Read the points of a scan, their line numbers and their times. Raises ValueError if the file has a wrong size."""
-    before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
-    record = AEVA_BEFORE if before else HELIPR[sensor]
-    size = path.stat().st_size
-    if size == 0 or size % record.itemsize:
-        raise ValueError(f"{path}: expected {record.itemsize} bytes a point ({sensor}), found {size} bytes in total")
-    found = np.fromfile(path, record)
-    time = time_field_of(record.names or ())
-    times = None if time is None else TimeField(time, found[time].copy())
-    lasers = found["line"].astype(np.int32)
-    return Scan(points=np.ascontiguousarray(found["xyz"], np.float32), lasers=lasers, time_field=times)
+def read_ground_truth(path: Path) -> StampedPositions:
+    """Read the poses of a session of NCLT. Rows with NaN are dropped."""
+    stamps, numbers = read_stamped_rows(path, columns=7, finite=False)
+    known = np.isfinite(numbers).all(axis=1)
+    if not known.any():
+        raise ValueError(f"{path}: expected poses, found NaN in all {len(numbers)} rows")
+    check_order(stamps[known] * 1e-6, source=path)
+    return stamps[known], numbers[known, :3] * Z_UP_FROM_Z_DOWN
 
 
-def _ouster_positions(numbers: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 3"]:
+def read_mulran_poses(path: Path) -> StampedPositions:
+    """Read the poses of the car, and return the positions of its Ouster."""
+    stamps, numbers = read_stamped_rows(path, columns=13)
     world_from_base = numbers.reshape(-1, 3, 4)
-    return world_from_base[:, :, :3] @ OUSTER_IN_BASE_M + world_from_base[:, :, 3]
+    return stamps, world_from_base[:, :, :3] @ OUSTER_IN_BASE_M + world_from_base[:, :, 3]
+
+
+def read_positions(path: Path, *, columns: int, header_lines: int = 0) -> StampedPositions:
+    """Read a table of poses whose second to fourth columns are positions of the LiDAR."""
+    stamps, numbers = read_stamped_rows(path, columns=columns, header_lines=header_lines)
+    return stamps, np.ascontiguousarray(numbers[:, :3])
+
+
+def read_helipr(path: Path, *, sensor: str) -> Scan:
+    """Read the points of a scan, their line numbers and their times."""
+    before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
+    return read_record_file(path, AEVA_BEFORE if before else HELIPR[sensor], format=sensor)
 
 
 class Layout(NamedTuple):
     """Files of a sequence, and how they are read."""
 
     scans: str
-    """Folder of the scans."""
-    poses: str
-    columns: int
-    """Number of columns of the table of poses."""
+    """Folder of the scans, in that of the sequence."""
+    poses: tuple[str, ...]
+    """Possible paths of the pose file. `{}` stands for the name of the sequence."""
     tick_s: float
     """Unit of the names and times, in seconds."""
-    read: Callable[[Path], Scan]
+    read_scan: Callable[[Path], Scan]
+    read_poses: Callable[[Path], StampedPositions]
     found: str
     """Format in words."""
-    positions: Callable[[np.ndarray], np.ndarray] = lambda numbers: numbers[:, :3]
-    """Returns positions of the LiDAR by the columns after the time."""
-    header_lines: int = 0
     suffix: str = ""
     """End of the name of the recording, after that of the sequence."""
+    folders: str = "*"
+    """Pattern of the names of sequences. With another pattern than the default, a missing pose file is an error."""
+    max_gap_s: float = 0.1
+    """Maximum time between a scan and its pose, in seconds, by default the duration of one sweep."""
+    mounting: Mounting | None = None
+    """Mounting of the frame of the points."""
+
+    def pose_file(self, folder: Path) -> Path | None:
+        """Return the pose file of the sequence in a folder, or None."""
+        paths = (folder / path.format(folder.resolve().name) for path in self.poses)
+        return next((path for path in paths if path.is_file()), None)
+
+    def sequences(self, root: Path) -> tuple[Path, ...]:
+        """Return the folders of the sequences in `root`, which may be a sequence itself."""
+        folders = [folder for folder in (root, *sorted(root.glob(self.folders))) if (folder / self.scans).is_dir()]
+        return tuple(folder for folder in folders if self.folders != "*" or self.pose_file(folder) is not None)
 
 
 LAYOUTS: dict[str, tuple[Layout, ...]] = {
-    "mulran": (
+    "YYYY-MM-DD/velodyne_sync/*.bin (NCLT)": (
         Layout(
-            "Ouster",
-            "global_pose.csv",
-            13,
-            1e-9,
-            lambda path: Scan(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
-            f"MulRan, {described('kitti')}, rotated to x forward",
-            _ouster_positions,
+            scans="velodyne_sync",
+            poses=("../groundtruth_{}.csv", "groundtruth_{}.csv", "../ground_truth/groundtruth_{}.csv"),
+            tick_s=1e-6,
+            read_scan=partial(read_records, format="nclt"),
+            read_poses=read_ground_truth,
+            found="sensor: coordinates are relative to the ground below it",
+            folders="[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]",
+            max_gap_s=0.5,  # a Segway moves half a metre in this time
+            mounting=Mounting(0.0),
         ),
     ),
-    "helipr": tuple(
+    "NAME/Ouster/*.bin with NAME/global_pose.csv (MulRan)": (
         Layout(
-            f"LiDAR/{sensor}",
-            f"LiDAR_GT/{sensor}_gt.txt",
-            8,
-            1e-9,
-            partial(read_helipr, sensor=sensor),
-            f"HeLiPR's {sensor} ({record.itemsize} bytes a point)",
+            scans="Ouster",
+            poses=("global_pose.csv",),
+            tick_s=1e-9,
+            read_scan=lambda path: Scan(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
+            read_poses=read_mulran_poses,
+            found=f"format: MulRan, {describe_format('kitti')}, rotated to x forward",
+        ),
+    ),
+    "NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)": tuple(
+        Layout(
+            scans=f"LiDAR/{sensor}",
+            poses=(f"LiDAR_GT/{sensor}_gt.txt",),
+            tick_s=1e-9,
+            read_scan=partial(read_helipr, sensor=sensor),
+            read_poses=partial(read_positions, columns=8),
+            found=f"format: HeLiPR's {sensor} ({record.itemsize} bytes a point)",
             suffix=f"-{sensor}",
         )
         for sensor, record in HELIPR.items()
     ),
-    "boreas": (
+    "NAME/lidar/*.bin with NAME/applanix/lidar_poses.csv (Boreas)": (
         Layout(
-            "lidar",
-            "applanix/lidar_poses.csv",
-            13,
-            1e-6,
-            partial(read_records, format="float32x6", last_is_time=True),
-            f"Boreas, {described('float32x6')}",
-            header_lines=1,
+            scans="lidar",
+            poses=("applanix/lidar_poses.csv",),
+            tick_s=1e-6,
+            read_scan=partial(read_record_file, record=BOREAS, format="float32x6"),
+            read_poses=partial(read_positions, columns=13, header_lines=1),
+            found=f"format: Boreas, {describe_format('float32x6')}",
         ),
     ),
 }
-"""Layouts of the sequences of each dataset."""
+"""Layouts of the sequences of each dataset. A layout per sensor if a sequence has several."""
 
 
-def _recordings(root: Path, dataset: str) -> dict[str, tuple[Path, Layout]]:
-    """Folder and layout of each recording by name: those in `root`, or `root` itself if it is a sequence."""
-    found = {}
-    for layout in LAYOUTS[dataset]:
-        for folder in (root, *(sorted(root.glob("*")) if root.is_dir() else ())):
-            if (folder / layout.scans).is_dir() and (folder / layout.poses).is_file():
-                found[f"{folder.resolve().name}{layout.suffix}"] = folder, layout
-    return dict(sorted(found.items(), key=lambda one: one[1][0].name))
+def _recordings(root: Path, layouts: tuple[Layout, ...]) -> dict[str, tuple[Path, Layout]]:
+    """Folder and layout of each recording, by name."""
+    sequences = [(folder, layout) for layout in layouts for folder in layout.sequences(root)]
+    sequences.sort(key=lambda sequence: sequence[0].name)
+    return {f"{folder.resolve().name}{layout.suffix}": (folder, layout) for folder, layout in sequences}
 
 
-def recording_names(root: Path, *, dataset: str) -> tuple[str, ...]:
+def recording_names(root: Path, *, layouts: tuple[Layout, ...]) -> tuple[str, ...]:
     """Return the names of the recordings in `root`. `root` may be a sequence itself."""
-    return tuple(_recordings(root, dataset))
+    return tuple(_recordings(root, layouts))
 
 
-def open_recording(root: Path, name: str, options: ReadOptions, *, dataset: str) -> Recording:
-    """Open a recording."""
-    folder, layout = _recordings(root, dataset)[name]
-    poses = folder / layout.poses
-    stamps, numbers = read_table(poses, columns=layout.columns, header_lines=layout.header_lines)
-    return stamped_recording(
-        folder / layout.scans,
-        name,
-        stamps=stamps,
-        positions=np.ascontiguousarray(layout.positions(numbers)),
-        pose_file=poses,
-        tick_s=layout.tick_s,
-        read_points=layout.read,
-        found=(f"format: {layout.found}",),
-    )
-
-
-def stamped_recording(
-    folder: Path,
-    name: str,
-    *,
-    stamps: Int64[np.ndarray, " n"],
-    positions: Float[np.ndarray, "n 3"],
-    pose_file: Path,
-    tick_s: float,
-    read_points: Callable[[Path], Scan],
-    max_gap_s: float = MAX_GAP_S,
-    **fields: Any,
-) -> Recording:
-    """Open the `.bin` files of a folder, which are named by their time in ticks, each with the nearest pose in time.
-
-    Arguments:
-      folder: Folder of the scans.
-      name: Name of the recording.
-      stamps: Time of each pose, in ticks.
-      positions: Position of each pose, in metres.
-      pose_file: Pose file, for messages.
-      tick_s: Duration of a tick, in seconds.
-      read_points: Function that reads a scan.
-      max_gap_s: Maximum time between a scan and its pose, in seconds. Other scans are skipped.
-      fields: More fields of the recording.
-    """
-    paths = scans_in(folder, ".bin")
-    strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
-    if strange:
-        raise ValueError(f"{folder}: expected scans named by their time, as 1561000444390857630.bin, found {strange}")
+def open_recording(root: Path, name: str, options: ReadOptions, *, layouts: tuple[Layout, ...]) -> Recording:
+    """Open the scans that have a pose near in time, each with the nearest pose."""
+    folder, layout = _recordings(root, layouts)[name]
+    pose_file, tick_s, scans = layout.pose_file(folder), layout.tick_s, folder / layout.scans
+    if pose_file is None:
+        expected = " or ".join(path.format(name) for path in layout.poses)
+        raise FileNotFoundError(f"{folder}: expected {expected}, found none")
+    stamps, positions = layout.read_poses(pose_file)
+    paths = scans_in(scans, ".bin")
+    misnamed = next((path.name for path in paths if not path.stem.isdecimal()), None)
+    if misnamed:
+        raise ValueError(f"{scans}: expected scans named by their time, as 1561000444390857630.bin, found {misnamed}")
     times = np.array([int(path.stem) for path in paths], np.int64)
     order = np.argsort(stamps, kind="stable")
     check_unit(stamps[order] * tick_s, source=pose_file)
-    check_unit(times * tick_s, source=folder)
+    check_unit(times * tick_s, source=scans)
     nearest = order[nearest_rows(stamps[order], times)]
     gaps_s = np.abs(stamps[nearest] - times) * tick_s
-    rows = np.flatnonzero(gaps_s <= max_gap_s)
+    rows = np.flatnonzero(gaps_s <= layout.max_gap_s)
+    within = f"within {layout.max_gap_s:g} s"
     if not len(rows):
-        raise ValueError(
-            f"{pose_file}: expected poses within {max_gap_s:g} s of the scans in {folder}, found the nearest "
-            f"{gaps_s.min():g} s away"
-        )
-    left_out = len(paths) - len(rows)
-    said = f" ({left_out} of {len(paths)} scans left out: no pose within {max_gap_s:g} s)" if left_out else ""
+        expected, found = f"poses {within} of the scans in {scans}", f"the nearest {gaps_s.min():g} s away"
+        raise ValueError(f"{pose_file}: expected {expected}, found {found}")
+    missing = len(paths) - len(rows)
+    left_out = f" ({missing} of {len(paths)} scans left out: no pose {within})" if missing else ""
     return Recording(
         name=name,
         ids=tuple(paths[row].stem for row in rows),
         paths=tuple(paths[row] for row in rows),
-        read=lambda path, labels, lasers: read_points(path),
+        read=lambda path, labels, lasers: layout.read_scan(path),
         positions=positions[nearest[rows]],
         times=times[rows] * tick_s,
-        pose_source=f"{pose_file.name}{said}",
+        pose_source=f"{pose_file.name}{left_out}",
         rows=rows,
-        **fields,
+        mounting=layout.mounting,
+        found=(layout.found,),
     )
-
-
-def read_table(
-    path: Path, *, columns: int, header_lines: int = 0, finite: bool = True
-) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:
-    """Read the first column, times as integers of up to 19 digits, and the other columns (float64) of a table of poses.
-
-    Columns are separated by commas or white space. With `finite`, NaN is an error.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a table of poses, found none")
-    times, rows = [], []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines()):
-        words = line.replace(",", " ").split()
-        if number < header_lines or not words:
-            continue
-        try:
-            whole, _, fraction = words[0].partition(".")
-            times.append(int(whole) if not fraction.strip("0") else round(float(words[0])))
-            rows.append([float(word) for word in words[1:]])
-        except (ValueError, OverflowError):
-            words = []
-        # Python parses 1_0 as 10.
-        valid = len(words) == columns and "_" not in line and line.isascii() and abs(times[-1]) < 2**63
-        if not valid or (finite and not np.isfinite(rows[-1]).all()):
-            expected = f"{path}, line {number + 1}: expected a time and {columns - 1} finite numbers"
-            raise ValueError(f"{expected}, found {line[:60]!r}")
-    if not rows:
-        raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
-    return np.array(times, np.int64), np.array(rows, np.float64)
 
 
 READERS = tuple(
     Reader(
-        layout,
-        partial(recording_names, dataset=dataset),
-        partial(open_recording, dataset=dataset),
-        knows_mounting=False,
+        pattern,
+        partial(recording_names, layouts=layouts),
+        partial(open_recording, layouts=layouts),
+        knows_mounting=layouts[0].mounting is not None,
         rank=rank,
     )
-    for rank, (dataset, layout) in enumerate(
-        {
-            "mulran": "NAME/Ouster/*.bin with NAME/global_pose.csv (MulRan)",
-            "helipr": "NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)",
-            "boreas": "NAME/lidar/*.bin with NAME/applanix/lidar_poses.csv (Boreas)",
-        }.items(),
-        start=3,
-    )
+    for rank, (pattern, layouts) in enumerate(LAYOUTS.items(), start=2)
 )
