@@ -11,7 +11,7 @@ from recordings import of_images
 import sglpr_jax
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.gravity import mounted
-from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting, upright_from_lidar
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.grid import Grid
@@ -108,7 +108,7 @@ def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
 def test_levelling_is_rigid_and_turns_up_to_z(up, height):
     unit = np.array(up) / np.linalg.norm(up)
     mounting = Mounting(height, tuple(unit.tolist()))
-    rotation = mounting.upright_from_lidar
+    rotation = upright_from_lidar(mounting)[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
     assert np.linalg.det(rotation) == pytest.approx(1)
     np.testing.assert_allclose(rotation @ unit, [0, 0, 1], atol=1e-6)

@@ -76,7 +76,7 @@ def test_memory_is_bounded_for_a_robot_that_stands_turns_creeps_or_jumps(step):
     points = np.random.default_rng(1).uniform(-10, 10, (50, 3)).astype(np.float32)
     for _ in range(60):
         builder.add(points, where)
-        sizes.append(len(builder._clouds))
+        sizes.append(len(builder._scans))
         where = where @ step
     assert max(sizes) <= 10 + 19 and sizes[-1] == sizes[-2]
 
