@@ -45,10 +45,9 @@ def test_an_unknown_id_is_named(unknown):
         to_classes(np.array([10, unknown]))
 
 
-@pytest.mark.parametrize("categories", [0, 19])
-def test_an_unknown_setting_lists_those_there_are(categories):
-    with pytest.raises(ValueError, match=rf"expected one of 6, 15, 20, 25, 34, found {categories}"):
-        taxonomy(categories)
+def test_an_unknown_setting_lists_those_there_are():
+    with pytest.raises(ValueError, match="expected one of 6, 15, 20, 25, 34, found 19"):
+        taxonomy(19)
 
 
 def test_the_map_names_and_colours_are_those_of_semantic_kitti(shared):

@@ -181,7 +181,7 @@ def tiled_cloud(
     Raises ValueError if the cloud has no finite point, or if more than `MOST_POINTS` points remain.
     """
     origin = np.round(positions[0])
-    wanted = _tiles_around(positions[:, :2] - origin[:2], reach_m)
+    tiles_near = _tiles_around(positions[:, :2] - origin[:2], reach_m)
     lowest, highest, read = np.full(3, np.inf), np.full(3, -np.inf), 0
     stored, pending = np.zeros((0, 3), np.float32), []
     for block in blocks:
@@ -190,7 +190,7 @@ def tiled_cloud(
         lowest = np.minimum(lowest, points.min(axis=0, initial=np.inf))
         highest = np.maximum(highest, points.max(axis=0, initial=-np.inf))
         points -= origin
-        near = points[np.isin(_tile(points[:, :2]), wanted)].astype(np.float32)
+        near = points[np.isin(_tile(points[:, :2]), tiles_near)].astype(np.float32)
         pending.append(_one_per_voxel(near))
         if sum(map(len, pending)) > len(stored):
             stored, pending = _combined([stored, *pending], source), []

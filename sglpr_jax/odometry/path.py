@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.mounting import Mounting, is_tilted
+from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse

@@ -81,9 +81,6 @@ CLOUDS = {Path(f"{i}.bin"): np.ones((5, 3), np.float32) for i in range(3)}
     "fields, message",
     [
         ({"positions": np.zeros((5, 3))}, "sequence 08: expected 3 positions, one per scan, found 5"),
-        ({"times": np.zeros(2)}, "expected 3 times, one per scan, found 2"),
-        ({"label_paths": (None,)}, "expected 3 label_paths, one per scan, found 1"),
-        ({"ids": ("0", "1")}, "expected 2 paths, one per scan, found 3"),
         ({"ids": ("0", "1", "1")}, "expected a unique id for each scan, found '1' twice"),
     ],
 )
