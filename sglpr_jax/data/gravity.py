@@ -4,7 +4,6 @@ The ground of a scan gives height and up. `GroundFilter` replaces ground that co
 the ground must agree with it. With odometry, up is averaged over some metres of path.
 """
 
-import contextlib
 import dataclasses
 import os
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from sglpr_jax.data.mounting import (
 )
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.data.scan_stream import scan_stream
+from sglpr_jax.data.scan_stream import sampled_points, scan_stream
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value, require
 from sglpr_jax.se3 import inverse, travelled
@@ -127,12 +126,8 @@ def _check_layout(recording: Recording) -> None:
 
 def _of_scans(recording: Recording, scans: int) -> list[Mounting | None]:
     """Estimate the mounting from some scans, spread over the recording, or None for unreadable ones."""
-    mountings: list[Mounting | None] = []
-    for row in np.unique(np.linspace(0, len(recording) - 1, scans).astype(int)).tolist():
-        mountings.append(None)
-        with contextlib.suppress(ValueError, OSError):
-            mountings[-1] = estimate_mounting(recording.points(row))
-    return mountings
+    clouds = sampled_points(recording, scans)
+    return [None if points is None else estimate_mounting(points) for points in clouds]
 
 
 class GroundFilter:

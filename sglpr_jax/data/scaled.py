@@ -4,7 +4,6 @@ An image shows 25 m in each direction, in cells of 0.4 m. With a factor of 4, it
 weights, the descriptors and the model of the probabilities stay as they are.
 """
 
-import contextlib
 import dataclasses
 
 import numpy as np
@@ -14,6 +13,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scan_stream import sampled_points
 from sglpr_jax.fields import check_value
 
 SCALE = "scale"
@@ -52,13 +52,12 @@ def chosen_scale(recording: Recording) -> Scale:
     The range of a scan is the 90 % quantile of its horizontal distances, that of the sensor the median of some scans.
     Recordings of images and unreadable recordings have scale 1.
     """
+    if recording.has_images or not len(recording):
+        return 1
     ranges_m = []
-    rows = [] if recording.has_images or not len(recording) else np.linspace(0, len(recording) - 1, SCANS).astype(int)
-    for row in np.unique(rows).tolist():
-        with contextlib.suppress(ValueError, OSError):  # an unreadable scan
-            points = recording.points(row)
-            distances = np.hypot(*points[np.isfinite(points).all(axis=1), :2].T)
-            ranges_m += [np.quantile(distances, 0.9)] if len(distances) else []
+    for points in sampled_points(recording, SCANS):
+        if points is not None and len(points := points[np.isfinite(points).all(axis=1)]):
+            ranges_m.append(np.quantile(np.hypot(*points[:, :2].T), 0.9))
     return NEAR_SCALE if ranges_m and np.median(ranges_m) < FAR_M else 1
 
 

@@ -1,5 +1,6 @@
 """Reads the scans of a recording in order, and skips or reports bad ones."""
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -8,6 +9,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NoReturn, TypeVar
+
+import numpy as np
+from jaxtyping import Float32
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, check_cloud
@@ -90,6 +94,15 @@ def _results(
             if len(waiting) > ahead:
                 yield waiting.popleft()
         yield from waiting
+
+
+def sampled_points(recording: Recording, scans: int) -> Iterator[Float32[np.ndarray, "n 3"] | None]:
+    """Yield the points of some scans, spread over the recording, or None for unreadable ones."""
+    for row in np.unique(np.linspace(0, len(recording) - 1, scans).astype(int)).tolist():
+        points = None
+        with contextlib.suppress(ValueError, OSError):
+            points = recording.points(row)
+        yield points
 
 
 def readable(
