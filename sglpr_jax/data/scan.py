@@ -1,7 +1,7 @@
 """A scan or ready-made image, the times of its points, and the check of its points.
 
-Drivers write times of points in several units, relative to the scan or to an epoch. A field of times does not state its
-unit. A scan takes 2 ms to 1 s, so the span of the values has one possible unit.
+Drivers write times of points in several units, relative to the scan or to an epoch, without stating the unit. A scan
+takes 2 ms to 1 s, so only one unit fits the span of its times.
 """
 
 from collections.abc import Collection

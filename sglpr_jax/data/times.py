@@ -1,4 +1,4 @@
-"""Times of scans and poses: unit, order, and row numbers that are not times."""
+"""Times of scans and poses: their unit and order, and row numbers in place of times."""
 
 from pathlib import Path
 
@@ -18,9 +18,9 @@ SLOWEST_S = 10.0
 FACTORS = (1e3, 1e6, 1e9)
 """Ratios of two units."""
 SAME_FACTOR = 3.0
-"""Maximum deviation from one of `FACTORS`, as a ratio. Clocks that start at zero grow by more at a change."""
-PROOF = 5
-"""Number of steps from which the unit is judged. Fewer steps prove nothing."""
+"""Maximum ratio between the growth of times at a change of the unit and one of `FACTORS`."""
+MIN_TIMES = 5
+"""The unit is judged from more times than this."""
 EPOCH = 1e8
 """Whole numbers below this one may number frames. Whole seconds since 1970 are larger since 1973."""
 PAUSE_S = 3600.0
@@ -55,7 +55,7 @@ def time_unit_problem(times: Float[np.ndarray, " n"], *, numbers: bool = True) -
         return change[1]
     if len(times) and abs(times[-1]) > LATEST_S:
         return f"{times[-1]:g}, after the year 5000"
-    if len(times) <= PROOF:
+    if len(times) <= MIN_TIMES:
         return ""
     if counts_rows(times):
         return f"row numbers ({times[0]:g}, {times[1]:g}, {times[2]:g}, ...)"

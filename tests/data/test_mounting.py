@@ -126,7 +126,7 @@ def low_robot(tmp_path):
 def test_every_road_levels(low_robot):
     folder, _ = low_robot
     recording = open_recording(folder, sensor_height=0.5)
-    config = dataclasses.replace(model_preset("tiny"), grid=Grid(0.4, 32, 32), image="density")
+    config = dataclasses.replace(model_preset("tiny"), grid=Grid(0.4, 64, 64), image="density")
     lifted = street(0, height=0.5) + np.float32([0, 0, 0.5 - MODEL_HEIGHT_M])
     image = sglpr_jax.scan_image(street(0, height=0.5), config, mounting=Mounting(0.5))
     np.testing.assert_array_equal(image, sglpr_jax.scan_image(lifted, config))
@@ -162,7 +162,7 @@ def test_another_sensor_in_kittis_layout_is_told(height, kitti_root):
     if height == MODEL_HEIGHT_M:  # a warning is an error
         assert open_recording(kitti_root, "08").mounting is None
         return
-    words = "sequence 08: expected the sensor 1.73 m above the ground, as its layout defines, found it 0.5"
+    words = "sequence 08: expected the sensor 1.73 m above the ground, as its layout defines, found it 0.60 m"
     with pytest.warns(DataWarning, match=words):
         assert open_recording(kitti_root, "08").mounting is None
     assert open_recording(kitti_root, "08", sensor_height=height).mounting == Mounting(height)
