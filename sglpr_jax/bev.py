@@ -74,8 +74,8 @@ def rasterize_labels(
     order = jnp.broadcast_to(jnp.arange(points.shape[-2], dtype=jnp.int32), cells.shape)
     # Duplicate writes have an undefined order; a maximum is well defined.
     last = _scatter(cells, order, grid, operation="max", start=-1)
-    found = jnp.take_along_axis(labels.astype(jnp.int32), last.reshape(*last.shape[:-2], -1).clip(0), axis=-1)
-    return jnp.where(last >= 0, found.reshape(last.shape), 0)
+    label = jnp.take_along_axis(labels.astype(jnp.int32), last.reshape(*last.shape[:-2], -1).clip(0), axis=-1)
+    return jnp.where(last >= 0, label.reshape(last.shape), 0)
 
 
 @functools.partial(jax.jit, static_argnames="grid")
@@ -127,32 +127,27 @@ def even_cells(image: Num[Array | np.ndarray, "*b h w"]) -> Num[Array | np.ndarr
     """Convert a ready-made density image to the cells of equation 1, by halving its middle row and column.
 
     Ready-made images have truncated coordinates, so the middle row and the middle column are as wide as two others.
-    Each becomes two with half of the counts. Otherwise they would form a bright cross, and the sensor would not be at
-    the centre of an even crop.
-
-    Labels (integers) are not halved. Images with an even number of cells are unchanged. A numpy image stays a numpy
-    image: a JAX operation on each image of a recording would wait for the network that describes the previous batch.
+    Each becomes two with half of the counts, so that the sensor is at the centre of an even crop. Labels (integers) are
+    not halved. Images with an even number of cells are unchanged.
     """
-    of_arrays: Any = np if isinstance(image, np.ndarray) else jnp
+    # A JAX operation on a numpy image would wait for the network that describes the previous batch.
+    library: Any = np if isinstance(image, np.ndarray) else jnp
     counts = jnp.issubdtype(image.dtype, jnp.floating)
     for axis in (-2, -1):
         middle, odd = divmod(image.shape[axis], 2)
         if odd:
-            before, wide, after = of_arrays.split(image, (middle, middle + 1), axis=axis)
+            before, wide, after = library.split(image, (middle, middle + 1), axis=axis)
             half = wide / 2 if counts else wide
-            image = of_arrays.concatenate([before, half, half, after], axis=axis)
+            image = library.concatenate([before, half, half, after], axis=axis)
     return image
 
 
 def centre_crop(
     image: Shaped[Array | np.ndarray, "*b h w"], *, height: int, width: int
 ) -> Shaped[Array | np.ndarray, "*b {height} {width}"]:
-    """Return the middle `height` x `width` cells of larger images.
+    """Return the middle `height` x `width` cells of larger images. Of an odd margin, the far side loses one more cell.
 
-    If a margin is uneven, the additional cell is cut at the far side.
-
-    Raises:
-      ValueError: If the image is smaller than the crop.
+    Raises ValueError if the image is smaller than the crop.
     """
     if image.shape[-2] < height or image.shape[-1] < width:
         raise ValueError(f"a crop of {height} x {width} cells requires a larger image, found {image.shape[-2:]}")
@@ -161,13 +156,9 @@ def centre_crop(
 
 
 def uncropped(crop: Int[np.ndarray, "h w"], *, shape: tuple[int, ...]) -> Int[np.ndarray, "..."]:
-    """Return labels for a whole image from the labels of a crop of its `even_cells`. Pixels outside the crop are 0.
+    """Return labels for a whole image of a `shape` from the labels of a crop of its `even_cells`, 0 outside the crop.
 
     If the two halves of a middle cell differ, the first half counts, unless it is 0.
-
-    Arguments:
-      crop: Labels of the crop.
-      shape: Rows and columns of the whole image.
     """
     whole = np.pad(crop, [_margin(size + size % 2, part) for size, part in zip(shape, crop.shape, strict=True)])
     for axis, size in enumerate(shape):

@@ -6,46 +6,46 @@ from typing import Literal
 Categories = Literal[0, 6, 15, 20, 25, 34]
 """Number of categories of each setting of figure 9. 0: no semantics."""
 
-RAW_NAMES = {
-    0: "unlabeled",
-    1: "outlier",
-    10: "car",
-    11: "bicycle",
-    13: "bus",
-    15: "motorcycle",
-    16: "on-rails",
-    18: "truck",
-    20: "other-vehicle",
-    30: "person",
-    31: "bicyclist",
-    32: "motorcyclist",
-    40: "road",
-    44: "parking",
-    48: "sidewalk",
-    49: "other-ground",
-    50: "building",
-    51: "fence",
-    52: "other-structure",
-    60: "lane-marking",
-    70: "vegetation",
-    71: "trunk",
-    72: "terrain",
-    80: "pole",
-    81: "traffic-sign",
-    99: "other-object",
-    252: "moving-car",
-    253: "moving-bicyclist",
-    254: "moving-person",
-    255: "moving-motorcyclist",
-    256: "moving-on-rails",
-    257: "moving-bus",
-    258: "moving-truck",
-    259: "moving-other-vehicle",
+_STANDING: dict[int, tuple[str, tuple[int, ...]]] = {
+    0: ("unlabeled", (0, 0, 0)),
+    1: ("outlier", (110, 110, 110)),
+    10: ("car", (100, 150, 245)),
+    11: ("bicycle", (100, 230, 245)),
+    13: ("bus", (100, 80, 250)),
+    15: ("motorcycle", (30, 60, 150)),
+    16: ("on-rails", (0, 110, 170)),
+    18: ("truck", (80, 30, 180)),
+    20: ("other-vehicle", (0, 0, 255)),
+    30: ("person", (255, 30, 30)),
+    31: ("bicyclist", (255, 40, 200)),
+    32: ("motorcyclist", (150, 30, 90)),
+    40: ("road", (255, 0, 255)),
+    44: ("parking", (255, 150, 255)),
+    48: ("sidewalk", (75, 0, 75)),
+    49: ("other-ground", (175, 0, 75)),
+    50: ("building", (255, 200, 0)),
+    51: ("fence", (255, 120, 50)),
+    52: ("other-structure", (255, 150, 0)),
+    60: ("lane-marking", (150, 255, 170)),
+    70: ("vegetation", (0, 175, 0)),
+    71: ("trunk", (135, 60, 0)),
+    72: ("terrain", (150, 240, 80)),
+    80: ("pole", (255, 240, 150)),
+    81: ("traffic-sign", (255, 0, 0)),
+    99: ("other-object", (50, 255, 255)),
 }
-"""Names of the 34 raw ids. Ids 252 to 259 are the moving variants of other ids."""
+"""Name and colour (red, green, blue) of each raw id, as in SemanticKITTI except outlier and on-rails."""
+_MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
+"""Standing variant of each raw id of a moving object."""
+RAW_NAMES = {raw: name for raw, (name, _) in _STANDING.items()}
+RAW_NAMES |= {moving: f"moving-{RAW_NAMES[raw]}" for moving, raw in _MOVING.items()}
+"""Names of the 34 raw ids."""
+RAW_COLORS = {raw: color for raw, (_, color) in _STANDING.items()}
+RAW_COLORS |= {moving: tuple((channel + 255) // 2 for channel in RAW_COLORS[raw]) for moving, raw in _MOVING.items()}
+"""Red, green and blue of each raw id. Moving objects have the colour of their standing variant, mixed half with white,
+because SemanticKITTI draws them in the colours of other ids."""
 
 _NOTHING = (0, 1)
-_MOVING = range(252, 260)
 _MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, *_MOVING)
 _STILL = tuple(raw for raw in RAW_NAMES if raw not in (*_NOTHING, *_MOVING))
 _SCENE = tuple(raw for raw in _STILL if raw not in _MOVABLE)

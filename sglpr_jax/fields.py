@@ -71,16 +71,10 @@ def check_value(value: Any, annotation: Any, field: str) -> None:
 
 
 def read_value(value: Any, annotation: Any, field: str, *, json: bool = True) -> Any:
-    """Convert a JSON value to the type of a field: lists to tuples, strings to paths, integers to floats.
+    """Convert a JSON value to the annotated type of a field: lists to tuples, strings to paths, integers to floats.
 
-    Arguments:
-      value: JSON value, or the value of a field.
-      annotation: Type annotation of the field.
-      field: Name of the field, for error messages.
-      json: If False, the value must have the type of the field already, and numbers without bounds must be finite.
-
-    Raises:
-      ValueError: If the value does not fit the annotation.
+    With `json=False`, the value must have the type already, and numbers without bounds must be finite. Raises
+    ValueError, with the name of the `field`, if the value does not fit the annotation.
     """
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
@@ -96,7 +90,7 @@ def read_value(value: Any, annotation: Any, field: str, *, json: bool = True) ->
         require(value, isinstance(value, list | tuple if json else tuple), "a list", field)
         items = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
         require(value, len(value) == len(items), f"a list of {len(items)}", field)
-        return tuple(read_value(one, item, field, json=json) for one, item in zip(value, items, strict=True))
+        return tuple(read_value(element, item, field, json=json) for element, item in zip(value, items, strict=True))
     if annotation is float:
         require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
         finite = abs(value) <= sys.float_info.max  # works for integers of any size
@@ -127,12 +121,12 @@ def _read_union(value: Any, members: tuple[Any, ...], field: str, *, json: bool)
     if value is None and types.NoneType in members:
         return None
     expected, before, found = [], "", ""
-    for member in (one for one in members if one is not types.NoneType):
+    for member in (member for member in members if member is not types.NoneType):
         try:
             return read_value(value, member, field, json=json)
         except ValueError as error:
             before, _, after = str(error).partition("expected ")
             kind, _, found = after.rpartition(", found ")
             expected.append(kind)
-    what = " or ".join(expected).replace("or the fields of a ", "or ")
-    raise ValueError(f"{before}expected {what}, found {found}")
+    kinds = " or ".join(expected).replace("or the fields of a ", "or ")
+    raise ValueError(f"{before}expected {kinds}, found {found}")

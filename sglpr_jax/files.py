@@ -24,14 +24,12 @@ class WriteError(OSError):
 
 @contextlib.contextmanager
 def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
-    """Write `path`, a file or a folder, completely or not at all.
+    """Write `path`, a file or a folder, completely or not at all. Missing parent folders are created.
 
-    The block writes to the path that it receives, a hidden path beside `path`. At the end of the block, it replaces
-    `path`. After an error it is removed, and the earlier content of `path` stays. Missing parent folders are created.
-    With `keep`, a folder that another process has put at `path` meanwhile stays, too.
+    The block writes to the hidden path beside `path` that it receives, which replaces `path` at the end of the block.
+    After an error, it is removed. With `keep`, a folder that another process has put at `path` meanwhile stays.
 
-    Raises:
-      WriteError: If `path` cannot be written.
+    Raises WriteError if `path` cannot be written.
 
     Example:
       with replacing(path) as temporary:
@@ -50,12 +48,9 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
 def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> list[Path]:
     """Write several files of a folder, and return their paths. All are complete before the first one is replaced.
 
-    Arguments:
-      folder: Folder of the files. It is created if needed.
-      files: For each file name, a function that writes the content to the path that it receives.
+    `files` has, for each file name, a function that writes the content to the path that it receives.
 
-    Raises:
-      WriteError: If a file cannot be written. All files in the folder then stay as they were.
+    Raises WriteError if a file cannot be written. All files in the folder then stay as they were.
     """
     with contextlib.ExitStack() as opened:
         for name, write in files.items():
@@ -79,16 +74,14 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
 
     The lock is a file in the system's temporary folder. It ends with the process.
 
-    Raises:
-      BlockingIOError: If another process holds the lock.
-      NotADirectoryError: If the path leads through a file.
+    Raises BlockingIOError if another process holds the lock, NotADirectoryError if the path leads through a file.
     """
     import filelock  # slow import
 
-    there = next(one for one in (folder, *folder.parents) if one.exists())
-    if not there.is_dir():
-        raise NotADirectoryError(f"{there}: expected a folder to write into, found a file")
-    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        raise NotADirectoryError(f"{existing}: expected a folder to write into, found a file")
     with writing(folder, *folder.parents):
         folder.mkdir(parents=True, exist_ok=True)
     name = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
@@ -98,8 +91,8 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
                 yield
             finally:
                 with contextlib.suppress(OSError):  # not empty
-                    for one in made or [folder]:
-                        one.rmdir()
+                    for path in missing or [folder]:
+                        path.rmdir()
     except filelock.Timeout as error:
         raise BlockingIOError(f"{folder}: expected exclusive use, found another process at work") from error
 
@@ -157,7 +150,7 @@ def naming(source: Path | str) -> Iterator[None]:
 
 
 def in_short(error: Exception | str, *, most: int = 100) -> str:
-    """Return the message of another library's error, on one line of at most that many characters."""
+    """Return the message of another library's error, on one line of at most `most` characters."""
     return _cut(" ".join(str(error).split()) or type(error).__name__, most=most)
 
 
@@ -186,16 +179,11 @@ def writing(path: Path, *others: Path) -> Iterator[None]:
 
 
 def check_writable(path: Path) -> None:
-    """Check before long work that a file can be written at `path`. Missing parent folders are not created.
-
-    Raises:
-      IsADirectoryError: If `path` is a folder.
-      WriteError: If `path` cannot be written.
-    """
+    """Raise IsADirectoryError or WriteError before long work if no file can be written at `path`."""
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file to write, found a folder")
-    there = next(folder for folder in path.absolute().parents if folder.exists())
-    trial = _hidden(there / path.name)
+    existing = next(folder for folder in path.absolute().parents if folder.exists())
+    trial = _hidden(existing / path.name)
     try:
         with writing(path, trial, *trial.parents):
             trial.touch()
@@ -204,18 +192,16 @@ def check_writable(path: Path) -> None:
 
 
 def half_written(folder: Path) -> list[Path]:
-    """Return the unfinished files and folders of `replacing` in `folder` and below, left by killed processes.
-
-    Folders that another process removes meanwhile are passed over. `Path.rglob` would raise FileNotFoundError.
-    """
-    found = (Path(place, name) for place, folders, files in os.walk(folder) for name in (*folders, *files))
-    return [path for path in found if path.match(".*.tmp")]
+    """Return the unfinished files and folders of `replacing` in `folder` and below, left by killed processes."""
+    # `Path.rglob` would raise FileNotFoundError if another process removes a folder meanwhile.
+    paths = (Path(parent, name) for parent, folders, files in os.walk(folder) for name in (*folders, *files))
+    return [path for path in paths if path.match(".*.tmp")]
 
 
 def remove_half_written(folder: Path) -> None:
     """Remove the files and folders of `half_written`."""
-    for left in half_written(folder):
-        _remove(left)
+    for path in half_written(folder):
+        _remove(path)
 
 
 def _hidden(path: Path) -> Path:
@@ -247,7 +233,7 @@ def _remove(path: Path) -> None:
 
 
 MOST_BYTES = 120
-"""Maximum length of a file name from `file_name`, in bytes. Suffixes and temporary files need the rest of the usual
+"""Maximum length of a file name from `file_name`, in bytes. Suffixes of temporary files need the rest of the usual
 255."""
 MOST_SHOWN = 100
 """Maximum number of printed characters of a name."""
@@ -255,10 +241,10 @@ _UNSAFE = re.compile(r"[/\\\x00-\x1f\x7f]")
 
 
 def file_name(name: str) -> str:
-    """Return the name of the file or folder for a recording or a scan with this name.
+    """Return the name of the file or folder for a recording or a scan. Different names have different file names.
 
-    A name that is a safe file name stays unchanged. In any other name, such as `../x` or a very long name, unusual
-    characters are replaced and a hash is appended. Different names have different file names.
+    A safe file name stays unchanged. In any other name, such as `../x` or a very long name, unusual characters are
+    replaced and a hash is appended.
     """
     try:
         size = len(os.fsencode(name))
@@ -284,4 +270,4 @@ def path_inside(root: Path, listed: Any, *, source: Path) -> Path:
 def printable(name: str, *, most: int = MOST_SHOWN) -> str:
     """Return a name as one line of printable text. Other characters are escaped. A long name loses its middle."""
     shown = name if len(name) <= most else f"{name[: most - 19]}...{name[-16:]}"
-    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in shown)
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in shown)

@@ -1,4 +1,4 @@
-"""Append-only file of records, from which a run that was killed goes on.
+"""Append-only file of records, from which a run that was killed resumes.
 
 Each record has a number, its length and a checksum. A damaged record is skipped, and the gap in the numbers shows it.
 The end of an unfinished record is removed when the file is read.
@@ -44,17 +44,17 @@ class FrameLog:
         """Yield number and content of each whole record. Raises ValueError if the file is no log."""
         if not self._size:
             return
-        at = end = 0
+        position = end = 0
         with mmap.mmap(self._file, 0, access=mmap.ACCESS_READ) as content:
-            ours = content[: len(MARK)] == MARK
-            while (at := content.find(MARK, at)) >= 0:
-                record = _record(content, at)
+            is_log = content[: len(MARK)] == MARK
+            while (position := content.find(MARK, position)) >= 0:
+                record = _record(content, position)
                 if record is None:
-                    at += 1
+                    position += 1
                     continue
                 yield record
-                at = end = at + HEAD.size + len(record[1])
-        if not ours and not end:
+                position = end = position + HEAD.size + len(record[1])
+        if not is_log and not end:
             raise ValueError(f"{self.path}: expected a log of frames, found another file")
         self.cut = self._size - end
         self.truncate(end)
@@ -100,20 +100,15 @@ class RunLog:
 
     Example:
       with RunLog(path, settings) as log:
-          done = log.records            # steps of an earlier process
-          log.append(len(done), record)
+          steps = log.records            # of an earlier process
+          log.append(len(steps), record)
     """
 
     def __init__(self, path: Path | None, settings: Mapping[str, Any]):
-        """Open or create a log. With other settings, warn and delete its steps.
+        """Open or create a log with the JSON values that determine the steps. With other settings, warn and delete it.
 
-        Arguments:
-          path: File of the log, or None to keep nothing.
-          settings: JSON values that determine the steps.
-
-        Raises:
-          ValueError: If the file is no log of a run.
-          WriteError: If it cannot be written.
+        `path` None stores nothing. Raises ValueError if the file is no log of a run, WriteError if it cannot be
+        written.
         """
         self.records: list[bytes] = []
         """Steps of an earlier process."""
@@ -122,20 +117,20 @@ class RunLog:
             return
         with writing(path, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
-        self._log, found = FrameLog(path), list[bytes]()
+        self._log, records = FrameLog(path), list[bytes]()
         for number, record in self._log.records():
-            if number <= len(found):  # later records follow a damaged one
-                found[number:] = [record]
-        wanted = json.loads(json.dumps(settings))
-        known = parse_json(found[0], source=path) if found else {}
-        if known != wanted:
-            if found:
-                other = ", ".join(name for name in wanted if known.get(name) != wanted[name])
-                warn(f"{path}: expected a checkpoint with the same settings, found another {other}; restarting")
-            self._log.truncate(0)
-            self._log.append(0, json.dumps(wanted).encode())
-        else:
-            self.records = found[1:]
+            if number <= len(records):  # later records follow a damaged one
+                records[number:] = [record]
+        settings = json.loads(json.dumps(settings))
+        stored = parse_json(records[0], source=path) if records else {}
+        if stored == settings:
+            self.records = records[1:]
+            return
+        if records:
+            changed = ", ".join(name for name in settings if stored.get(name) != settings[name])
+            warn(f"{path}: expected a checkpoint with the same settings, found another {changed}; restarting")
+        self._log.truncate(0)
+        self._log.append(0, json.dumps(settings).encode())
 
     def __enter__(self) -> "RunLog":
         return self
@@ -153,14 +148,14 @@ class RunLog:
             self._log.append(step + 1, record)
 
 
-def _record(content: mmap.mmap, at: int) -> tuple[int, bytes] | None:
+def _record(content: mmap.mmap, position: int) -> tuple[int, bytes] | None:
     """Number and content of the record at a position, or None if it is cut or damaged."""
-    if len(content) - at < HEAD.size:
+    if len(content) - position < HEAD.size:
         return None
-    _, number, length, checksum = HEAD.unpack_from(content, at)
-    record = content[at + HEAD.size : at + HEAD.size + length]
-    whole = len(record) == length and _checksum(number, record) == checksum
-    return (number, record) if whole else None
+    _, number, length, checksum = HEAD.unpack_from(content, position)
+    record = content[position + HEAD.size : position + HEAD.size + length]
+    is_whole = len(record) == length and _checksum(number, record) == checksum
+    return (number, record) if is_whole else None
 
 
 def _checksum(number: int, record: bytes) -> int:

@@ -36,17 +36,14 @@ def lazy_triplet(
 ) -> Float[Array, "*t"]:
     """Lazy triplet loss (equation 5) of each tuple.
 
-    With a temperature of 0, the maximum pulls untrained descriptors into one point, where its gradient vanishes. The
-    smooth maximum of a positive temperature does not.
-
     Arguments:
       positive: Distances of each anchor to its k_p positives.
       negative: Distances of each anchor to its k_n negatives.
       margin: Margin between the distances of positives and negatives.
       closest_positive: Whether to use the closest positive. Otherwise the farthest is used.
       reduction: "max" for the lazy loss. "sum" for the triplet loss, in which every negative inside the margin counts.
-      temperature: T > 0 replaces max_i [x_i]_+ by the smooth T log(1 + sum_i exp(x_i / T)), which tends to it as T goes
-        to 0.
+      temperature: T > 0 replaces max_i [x_i]_+ by the smooth T log(1 + sum_i exp(x_i / T)). The maximum pulls untrained
+        descriptors into one point, where its gradient vanishes.
       where: Mask of the negatives. A tuple without negatives has loss 0.
     """
     pull = positive.min(-1) if closest_positive else positive.max(-1)
@@ -66,14 +63,14 @@ def one_threshold(
     where: Bool[Array, "t n"],
     **options: Any,
 ) -> Float[Array, "t"]:
-    """Lazy triplet loss in which every anchor has the negatives of all anchors, for a common threshold.
+    """Lazy triplet loss, with the options of `lazy_triplet`, in which every anchor has the negatives of all anchors.
 
-    Equation 5 compares the distances of one anchor. Loops, however, are accepted below one distance for all places.
-    Therefore the distance to a positive must here be below the distance of any two different places. The options are
-    those of `lazy_triplet`.
+    Equation 5 compares the distances of one anchor, but loops are accepted below one distance for all places. Here the
+    distance to a positive must be below the distance of any two different places.
     """
-    everyone = functools.partial(jnp.broadcast_to, shape=(len(positive), negative.size))
-    return lazy_triplet(positive, everyone(negative.reshape(1, -1)), where=everyone(where.reshape(1, -1)), **options)
+    to_all_anchors = functools.partial(jnp.broadcast_to, shape=(len(positive), negative.size))
+    negative, where = to_all_anchors(negative.reshape(1, -1)), to_all_anchors(where.reshape(1, -1))
+    return lazy_triplet(positive, negative, where=where, **options)
 
 
 def cross_entropy(
@@ -92,13 +89,13 @@ def cross_entropy(
       balance: Exponent a of the class balance. A pixel has the weight n^-a, where n pixels of the image have its class.
         0 is the plain average; with 1 all classes have the same weight.
     """
-    each = optax.softmax_cross_entropy_with_integer_labels(logits, labels)
-    weight = jnp.ones_like(each) if where is None else where.astype(each.dtype)
+    entropy = optax.softmax_cross_entropy_with_integer_labels(logits, labels)
+    weight = jnp.ones_like(entropy) if where is None else where.astype(entropy.dtype)
     if balance:
-        classes = jax.nn.one_hot(labels, logits.shape[-1], dtype=each.dtype)
+        classes = jax.nn.one_hot(labels, logits.shape[-1], dtype=entropy.dtype)
         pixels = jnp.einsum("...hw,...hwk->...k", weight, classes)
         weight = weight * jnp.einsum("...k,...hwk->...hw", jnp.maximum(pixels, 1) ** -balance, classes)
-    return (weight * each).sum((-2, -1)) / jnp.maximum(weight.sum((-2, -1)), 1e-6)
+    return (weight * entropy).sum((-2, -1)) / jnp.maximum(weight.sum((-2, -1)), 1e-6)
 
 
 def dice_sums(
@@ -112,22 +109,10 @@ def dice_sums(
     return jnp.stack([(x * y).sum((0, 1, 2)) for x, y in ((probability, truth), (probability,) * 2, (truth,) * 2)])
 
 
-def dice_from_sums(sums: Float[Array, "3 k"], *, weights: Float[Array, "k"] | None = None) -> Float[Array, ""]:
-    """Equation 7 from the sums of the whole batch: the weighted mean over the classes of one minus Dice."""
+def dice_from_sums(sums: Float[Array, "3 k"]) -> Float[Array, ""]:
+    """Equation 7 from the sums of the whole batch: the mean over the classes of one minus Dice."""
     product, probability, truth = sums
-    per_class = 1 - (2 * product + DICE_EPSILON) / (probability + truth + DICE_EPSILON)
-    return (per_class if weights is None else per_class * weights).mean()
-
-
-def dice(
-    logits: Float[Array, "b h w k"],
-    labels: Int[Array, "b h w"],
-    *,
-    where: Bool[Array, "b h w"] | None = None,
-    weights: Float[Array, "k"] | None = None,
-) -> Float[Array, ""]:
-    """Equation 7 over a whole batch, or over its pixels in `where`."""
-    return dice_from_sums(dice_sums(logits, labels, where), weights=weights)
+    return (1 - (2 * product + DICE_EPSILON) / (probability + truth + DICE_EPSILON)).mean()
 
 
 def joint(terms: Mapping[str, Float[Array, ""]], weights: Mapping[str, float]) -> Float[Array, ""]:

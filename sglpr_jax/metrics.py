@@ -10,12 +10,10 @@ from jaxtyping import Bool, Float
 class PrecisionRecallCurve:
     """Precision and recall at every threshold. A threshold accepts the scores that are not below it."""
 
-    thresholds: np.ndarray
-    """(k,) float64, increasing. By default the distinct scores."""
-    precision: np.ndarray
-    """(k,) float64."""
-    recall: np.ndarray
-    """(k,) float64."""
+    thresholds: Float[np.ndarray, " k"]
+    """Increasing thresholds, by default the distinct scores."""
+    precision: Float[np.ndarray, " k"]
+    recall: Float[np.ndarray, " k"]
 
     @property
     def f1(self) -> Float[np.ndarray, " k"]:
@@ -33,9 +31,9 @@ class PrecisionRecallCurve:
         return len(self.thresholds) - 1 - int(np.argmax(self.f1[::-1]))
 
     def at_precision(self, precision: float) -> int | None:
-        """Index of the highest recall with at least this precision, or None if no threshold has both.
+        """Index of the highest recall, above 0, with at least this precision, and of them the highest threshold.
 
-        If several are equal, the one with the highest threshold.
+        None if no threshold has both.
         """
         recall = np.where(self.precision >= precision, self.recall, 0.0)
         return len(recall) - 1 - int(np.argmax(recall[::-1])) if recall.any() else None
@@ -67,8 +65,7 @@ def decision_curve(
       missed_if_rejected: Whether rejecting the item is a false negative.
       thresholds: Increasing thresholds that replace the distinct scores.
 
-    Raises:
-      ValueError: If a score is NaN or +inf, or if no score is finite.
+    Raises ValueError if a score is NaN or +inf, or if no score is finite.
     """
     finite = np.isfinite(scores)
     if not finite.any() or not np.all(finite | np.isneginf(scores)):

@@ -13,9 +13,7 @@ from sglpr_jax.files import in_short
 def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
     """Read every array of an .npz file, without pickle.
 
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If it is another kind of file, or damaged. All messages name the file and what was `expected`.
+    Raises FileNotFoundError, or ValueError for another or a damaged file, with the file and what was `expected`.
     """
     expected = f"{path}: expected {expected}"
     if not path.is_file():
@@ -30,11 +28,7 @@ def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
 
 
 def read_array(stream: Any, *, size: int) -> np.ndarray:
-    """Read an array in numpy's format, without pickle. The header may declare more than the file contains.
-
-    Arguments:
-      stream: Open file, or member of an archive.
-      size: Size of the stream in bytes.
+    """Read an array in numpy's format, without pickle, from an open file or member of an archive of `size` bytes.
 
     Raises ValueError if the header declares another size, before memory is allocated. Numpy raises many types of errors
     for broken headers.

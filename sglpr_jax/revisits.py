@@ -13,7 +13,7 @@ BLOCK = 32
 """Number of queries whose positions are compared at a time, so that the distances fit in the cache."""
 
 Near = Callable[[Float[np.ndarray, "..."]], Bool[np.ndarray, "..."]]
-"""Function from distances in metres to whether they are within one place, such as `lambda apart: apart < 5`."""
+"""Function from distances in metres to whether they are within one place, such as `lambda metres: metres < 5`."""
 
 
 def close_pairs(positions: Float[np.ndarray, "n d"], *, closer_than_m: float) -> Int[np.ndarray, "pairs 2"]:
@@ -44,13 +44,13 @@ def has_near(
     queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], ends: Int[np.ndarray, " q"], near: Near
 ) -> Bool[np.ndarray, " q"]:
     """Return whether each query is a revisit: near one of the first `ends` positions of the database."""
-    found = np.zeros(len(queries), dtype=bool)
+    revisited = np.zeros(len(queries), dtype=bool)
     for start in range(0, len(queries), BLOCK):
         rows = slice(start, start + BLOCK)
-        last = ends[rows].max()
-        close = near(distances(queries[rows], database[:last]))
-        found[rows] = np.any(close & (np.arange(last) < ends[rows, None]), axis=1)
-    return found
+        end = ends[rows].max()
+        close = near(distances(queries[rows], database[:end]))
+        revisited[rows] = np.any(close & (np.arange(end) < ends[rows, None]), axis=1)
+    return revisited
 
 
 def revisits(
@@ -58,10 +58,10 @@ def revisits(
 ) -> Bool[np.ndarray, " n"]:
     """Return for each frame whether its database (see `database_end`) holds a frame within `radius_m` metres.
 
-    `positions` with three columns give the revisits in 3-D. Their first two columns give those in 2-D.
+    Distances are in 3-D for positions with three columns, in 2-D for those with two.
     """
     ends = database_end(len(positions), times=times)
     queries = np.flatnonzero(ends)
     revisited = np.zeros(len(positions), dtype=bool)
-    revisited[queries] = has_near(positions[queries], positions, ends[queries], lambda apart: apart <= radius_m)
+    revisited[queries] = has_near(positions[queries], positions, ends[queries], lambda metres: metres <= radius_m)
     return revisited

@@ -24,37 +24,25 @@ class Column(NamedTuple):
 
 
 def check_about(about: Any, fields: Mapping[str, Any], *, format: str) -> None:
-    """Check the JSON values of a file.
+    """Raise ValueError if the parsed JSON `about` is no object of a `format`, or if a field is missing or invalid.
 
-    Arguments:
-      about: Parsed JSON.
-      fields: Annotation of each required value, as in a configuration (`fields.check_value`).
-      format: Required value of `format`.
-
-    Raises:
-      ValueError: If `about` is no object of this format, or if a value is missing or has another type.
+    `fields` has the annotation of each required value, as in a configuration (`fields.check_value`).
     """
     found = about.get("format") if isinstance(about, dict) else about
     if found != format:
         raise ValueError(f"expected format {format!r}, found {found!r:.60}")
-    missing = [name for name in fields if name not in about]
-    if missing:
-        wanted = ", ".join(f"`{name}`" for name in fields)
-        raise ValueError(f"expected {wanted}, found no `{missing[0]}`")
     for name, annotation in fields.items():
+        if name not in about:
+            raise ValueError(f"expected {', '.join(f'`{field}`' for field in fields)}, found no `{name}`")
         check_value(about[name], annotation, f"`{name}`")
 
 
 def check_columns(arrays: Mapping[str, np.ndarray], columns: Mapping[str, Column], **sizes: int) -> None:
-    """Check the arrays of a file. Other arrays are ignored.
+    """Check the arrays of a file by name. Other arrays than `columns` are ignored.
 
-    Arguments:
-      arrays: Arrays by name.
-      columns: Schema of each array.
-      sizes: Known lengths of named axes. The first array defines the others.
+    `sizes` are known lengths of named axes. The first array with an axis defines the others.
 
-    Raises:
-      ValueError: If an array is missing, has another type or shape, or is not finite. The message names the array.
+    Raises ValueError, with the name of the array, if one is missing, has another type or shape, or is not finite.
     """
     missing = [name for name, column in columns.items() if not column.optional and name not in arrays]
     if missing:
@@ -70,9 +58,9 @@ def _check_column(name: str, array: np.ndarray, column: Column, sizes: dict[str,
         for axis, length in zip(column.shape, array.shape, strict=True):
             if isinstance(axis, str):
                 sizes.setdefault(axis, length)
-    wanted = tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in column.shape)
-    if array.dtype != column.dtype or array.shape != wanted:
-        shape = ", ".join(map(str, wanted))
+    expected = tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in column.shape)
+    if array.dtype != column.dtype or array.shape != expected:
+        shape = ", ".join(map(str, expected))
         raise ValueError(f"expected {name} as {column.dtype} ({shape}), found {array.dtype} {array.shape}")
     if column.finite and array.dtype.kind == "f":
         broken = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))

@@ -9,20 +9,20 @@ ROTATION_TOLERANCE = 0.01
 
 def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
     """Transform in the plane, from x and y in metres and yaw in radians counter-clockwise."""
-    found = np.eye(4)
-    found[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    found[:2, 3] = x, y
-    return found
+    a_from_b = np.eye(4)
+    a_from_b[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    a_from_b[:2, 3] = x, y
+    return a_from_b
 
 
 def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
-    """Inverse transform, b_from_a."""
-    turned = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
-    found = np.zeros_like(a_from_b)
-    found[..., :3, :3] = turned
-    found[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, a_from_b[..., :3, 3])
-    found[..., 3, 3] = 1
-    return found
+    """Inverse b_from_a of rigid transforms."""
+    rotation = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    b_from_a = np.zeros_like(a_from_b)
+    b_from_a[..., :3, :3] = rotation
+    b_from_a[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, a_from_b[..., :3, 3])
+    b_from_a[..., 3, 3] = 1
+    return b_from_a
 
 
 def yaw_of(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n"]:
@@ -38,21 +38,21 @@ def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n
 def adjoint(a_from_b: Float[np.ndarray, "*m 4 4"]) -> Float[np.ndarray, "*m 6 6"]:
     """Matrix that transforms a small motion of a body (metres, then radians) from its frame b to its frame a."""
     x, y, z = np.moveaxis(a_from_b[..., :3, 3], -1, 0)
-    turned = a_from_b[..., :3, :3]
-    crossed = np.zeros(turned.shape)
-    crossed[..., 0, 1], crossed[..., 0, 2] = -z, y
-    crossed[..., 1, 0], crossed[..., 1, 2] = z, -x
-    crossed[..., 2, 0], crossed[..., 2, 1] = -y, x
-    found = np.zeros((*turned.shape[:-2], 6, 6))
-    found[..., :3, :3] = found[..., 3:, 3:] = turned
-    found[..., :3, 3:] = crossed @ turned
-    return found
+    rotation = a_from_b[..., :3, :3]
+    cross = np.zeros(rotation.shape)
+    cross[..., 0, 1], cross[..., 0, 2] = -z, y
+    cross[..., 1, 0], cross[..., 1, 2] = z, -x
+    cross[..., 2, 0], cross[..., 2, 1] = -y, x
+    matrix = np.zeros((*rotation.shape[:-2], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation
+    matrix[..., :3, 3:] = cross @ rotation
+    return matrix
 
 
 def transform_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "*m 4 4"]) -> np.ndarray:
     """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
-    moved = adjoint(a_from_b)
-    return moved @ covariance @ np.swapaxes(moved, -1, -2)
+    matrix = adjoint(a_from_b)
+    return matrix @ covariance @ np.swapaxes(matrix, -1, -2)
 
 
 def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
@@ -81,11 +81,7 @@ def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
 
 
 def positions_from_camera(world_from_camera: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "n 3"]:
-    """Convert KITTI's camera poses (x right, y down, z forward) to positions (n, 3) in metres, z up.
-
-    The camera's (x, y, z) becomes (z, -x, -y): x forward, y left, z up. The axes are only permuted, so distances in the
-    camera's x and z are distances in x and y.
-    """
+    """Convert KITTI's camera poses (x right, y down, z forward) to positions (x forward, y left, z up), in metres."""
     x, y, z = world_from_camera[:, :, 3].astype(np.float64).T
     return np.stack([z, -x, -y], axis=1)
 
@@ -93,8 +89,8 @@ def positions_from_camera(world_from_camera: Float[np.ndarray, "n 3 4"]) -> Floa
 def are_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> Bool[np.ndarray, "*b"]:
     """Whether each matrix R is a rotation: all entries of R R^T - I are below 0.01, and R is not a reflection."""
     with np.errstate(over="ignore", invalid="ignore"):
-        apart = np.abs(matrices @ matrices.swapaxes(-1, -2) - np.eye(3)).max((-2, -1))
-        return np.asarray((apart < ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0))
+        deviations = np.abs(matrices @ matrices.swapaxes(-1, -2) - np.eye(3)).max((-2, -1))
+        return np.asarray((deviations < ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0))
 
 
 def distances(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:

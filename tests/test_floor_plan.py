@@ -6,25 +6,9 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "sglpr_jax"
+GROUND = "bev categories fields files frame_log grid growing labels losses metrics numpy_files progress revisits"
 FLOORS = (
-    (
-        "bev",
-        "categories",
-        "fields",
-        "files",
-        "grid",
-        "frame_log",
-        "growing",
-        "labels",
-        "losses",
-        "metrics",
-        "numpy_files",
-        "progress",
-        "revisits",
-        "same_place",
-        "schema",
-        "se3",
-    ),
+    (*GROUND.split(), "same_place", "schema", "se3"),
     ("data",),
     ("models", "sim"),
     ("methods",),

@@ -1,9 +1,8 @@
 """Raw SemanticKITTI ids become the classes of each setting of figure 9."""
 
-import re
-
 import numpy as np
 import pytest
+import yaml
 
 from sglpr_jax.categories import RAW_NAMES
 from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes, to_raw
@@ -45,32 +44,17 @@ def test_an_unknown_id_is_named(unknown):
         to_classes(np.array([10, unknown]))
 
 
-@pytest.mark.parametrize("categories", [0, 19])
-def test_an_unknown_setting_lists_those_there_are(categories):
-    with pytest.raises(ValueError, match=rf"expected one of 6, 15, 20, 25, 34, found {categories}"):
-        taxonomy(categories)
+def test_an_unknown_setting_lists_those_there_are():
+    with pytest.raises(ValueError, match="expected one of 6, 15, 20, 25, 34, found 19"):
+        taxonomy(19)
 
 
 def test_the_map_names_and_colours_are_those_of_semantic_kitti(shared):
-    sections = _sections((shared / "data/kitti_odometry/semantic-kitti.yaml").read_text())
-    assert {int(raw): name.strip('"') for raw, name in sections["labels"].items()} == RAW_NAMES
-    learning_map = {int(raw): int(value) for raw, value in sections["learning_map"].items()}
-    assert len(learning_map) == 34
-    raw = np.array(list(learning_map))
-    np.testing.assert_array_equal(to_classes(raw), list(learning_map.values()))
+    sections = yaml.safe_load((shared / "data/kitti_odometry/semantic-kitti.yaml").read_text())
+    assert sections["labels"] == RAW_NAMES
+    assert len(sections["learning_map"]) == 34
+    raw = np.array(list(sections["learning_map"]))
+    np.testing.assert_array_equal(to_classes(raw), list(sections["learning_map"].values()))
     for class_id, raw_id in sections["learning_map_inv"].items():
-        assert CATEGORIES[int(class_id)] == sections["labels"][raw_id].strip('"')
-        blue_green_red = [int(channel) for channel in re.findall(r"\d+", sections["color_map"][raw_id])]
-        assert taxonomy().colors[int(class_id)].tolist() == blue_green_red[::-1]
-
-
-def _sections(text: str) -> dict[str, dict[str, str]]:
-    """Parse as much YAML as the file needs: sections of `key: value` lines, with comments."""
-    sections: dict[str, dict[str, str]] = {}
-    current: dict[str, str] = {}
-    for line in text.splitlines():
-        if section := re.match(r"(\w+):", line):
-            current = sections.setdefault(section[1], {})
-        elif entry := re.match(r"\s+(\d+)\s*:\s*([^#]+)", line):
-            current[entry[1]] = entry[2].strip()
-    return sections
+        assert CATEGORIES[class_id] == sections["labels"][raw_id]
+        assert taxonomy().colors[class_id].tolist() == sections["color_map"][raw_id][::-1]  # blue, green, red

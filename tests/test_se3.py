@@ -1,10 +1,15 @@
 """Transforms against products of matrices."""
 
+import hypothesis
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.se3 import (
+    are_rotations,
+    distances,
     from_quaternions,
     inverse,
     quaternions,
@@ -13,6 +18,8 @@ from sglpr_jax.se3 import (
     travelled,
     yaw_of,
 )
+
+coordinates = st.floats(-1e4, 1e4)
 
 
 def poses(n: int = 5) -> np.ndarray:
@@ -44,3 +51,22 @@ def test_the_way_is_the_sum_of_steps():
     line[:, 0, 3] = [0, 3, 3]
     line[:, 1, 3] = [0, 4, 5]
     np.testing.assert_allclose(travelled(line), [0, 5, 6])
+
+
+@hypothesis.settings(deadline=None, max_examples=25)
+@hypothesis.given(st.floats(-4, 4), st.sampled_from([0.0, 0.02, 1e300, np.inf, np.nan]))
+def test_rotations_are_told_from_what_is_none(angle, error):
+    turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    mirror, damaged = turned * [1, 1, -1], turned + np.full((3, 3), error)
+    np.testing.assert_array_equal(are_rotations(np.stack([turned, mirror, damaged])), [True, False, error == 0])
+    assert are_rotations(turned)
+
+
+@hypothesis.settings(deadline=None, max_examples=25)
+@hypothesis.given(
+    hnp.arrays(np.float64, (5, 3), elements=coordinates), hnp.arrays(np.float64, (4, 3), elements=coordinates)
+)
+def test_distances_are_norms_of_differences(a, b):
+    expected = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    np.testing.assert_allclose(distances(a, b), expected, rtol=1e-12)
+    np.testing.assert_array_equal(distances(a, a), distances(a, a).T)

@@ -22,7 +22,7 @@ from benchmarks.drives import Case, drifted, in_memory
 from benchmarks.quality.scoring import LOOP_M, closures_of, counted, is_alias, relative_errors, town_rule, twist
 from sglpr_jax.data.choices import Gravity
 from sglpr_jax.data.gravity import mounted
-from sglpr_jax.data.levelling import upright_from_lidar
+from sglpr_jax.data.mounting import upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.closure import LoopClosure, planar_loop, to_lidar

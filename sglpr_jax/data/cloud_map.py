@@ -30,8 +30,10 @@ def on_trail(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         return np.zeros(0, bool)
     column, row = np.floor(points[:, :2].T / np.float32(CELL_M)).astype(np.int64)
     cells, cell = np.unique(row * _COLUMNS + column, return_inverse=True)
-    around = _neighbours(cells)
-    lowest = np.full(len(cells) + 1, np.inf, np.float32)  # the last one stands for missing neighbours
+    neighbours = cells[:, None] + np.array(_AROUND)
+    around = np.searchsorted(cells, neighbours).clip(max=len(cells) - 1)
+    around = np.where(cells[around] == neighbours, around, len(cells))  # the last row stands for missing neighbours
+    lowest = np.full(len(cells) + 1, np.inf, np.float32)
     np.minimum.at(lowest, cell, points[:, 2])
     ground = lowest[around].min(axis=1)
     surrounded = (lowest[around] - ground[:, None] < GROUND_M).all(axis=1)
@@ -42,19 +44,10 @@ def on_trail(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     return free[cell] & (height > LOWEST_M) & (height < HIGHEST_M)
 
 
-def _neighbours(cells: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, "c 9"]:
-    """Rows of the cells around each of the ordered `cells`. Missing ones have the row after the last."""
-    wanted = cells[:, None] + np.array(_AROUND)
-    rows = np.searchsorted(cells, wanted).clip(max=len(cells) - 1)
-    return np.where(cells[rows] == wanted, rows, len(cells))
-
-
 NEAREST_M = 1.0
 """Minimum distance of a point from the sensor, in metres. Nearer points belong to the vehicle or to a trail."""
-CELL_DEG = 0.25
-"""Edge of the smallest cells of the z-buffer, in degrees."""
-LARGEST_DEG = 32.0
-"""Edge of the largest cells, in degrees."""
+CELL_DEG, LARGEST_DEG = 0.25, 32.0
+"""Edges of the smallest and of the largest cells of the z-buffer, in degrees."""
 SPACINGS = 0.5
 """Minimum edge of a cell, as a multiple of the distance between neighbouring points. With larger cells, vegetation
 hides more than it does from a real sensor (docs/decisions.md)."""
@@ -120,8 +113,7 @@ def _nearest(
     rays: Int64[np.ndarray, " n"], points: Float32[np.ndarray, "n 3"], ranges: Float32[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " m"]:
     """Row of the nearest point of each ray, in order. Coordinates decide between equal distances."""
-    nearest = _minima(rays, ranges)
-    rows = np.flatnonzero(ranges == nearest[rays])
+    rows = np.flatnonzero(ranges == _minima(rays, ranges)[rays])
     rows = rows[np.lexsort((*points[rows].T, rays[rows]))]
     return np.sort(rows[np.unique(rays[rows], return_index=True)[1]])
 
@@ -139,10 +131,8 @@ TILE_M = 20.0
 """Edge of a tile, in metres."""
 MOST_POINTS = 1 << 26
 """Maximum number of stored points: 0.8 GB."""
-SAMPLED_TILES = 9
-"""Number of tiles in which the spacing is measured."""
-SAMPLED_POINTS = 500
-"""Maximum number of points of a tile whose spacing is measured."""
+SAMPLED_TILES, SAMPLED_POINTS = 9, 500
+"""Number of tiles in which the spacing is measured, and maximum number of points of each."""
 NEIGHBOURS = 4
 """Number of neighbours of a point in a regular grid of points on a surface."""
 _TILES, _VOXELS = 1 << 24, 1 << 21
@@ -164,9 +154,8 @@ class TiledCloud:
     spacing_m: float
     """Distance between neighbouring points on a surface, in metres, at least `VOXEL_M`."""
     lowest: Float[np.ndarray, "3"]
-    """Minimum coordinates of the whole cloud, in metres."""
     highest: Float[np.ndarray, "3"]
-    """Maximum coordinates of the whole cloud, in metres."""
+    """Minimum and maximum coordinates of the whole cloud, in metres."""
     read: int
     """Number of finite points in the whole cloud."""
 
@@ -192,38 +181,39 @@ def tiled_cloud(
     Raises ValueError if the cloud has no finite point, or if more than `MOST_POINTS` points remain.
     """
     origin = np.round(positions[0])
-    wanted = _tiles_around(positions[:, :2] - origin[:2], reach_m)
+    tiles_near = _tiles_around(positions[:, :2] - origin[:2], reach_m)
     lowest, highest, read = np.full(3, np.inf), np.full(3, -np.inf), 0
-    kept, pending = np.zeros((0, 3), np.float32), []
+    stored, pending = np.zeros((0, 3), np.float32), []
     for block in blocks:
         points = block[np.isfinite(block).all(axis=1)].astype(np.float64)
         read += len(points)
         lowest = np.minimum(lowest, points.min(axis=0, initial=np.inf))
         highest = np.maximum(highest, points.max(axis=0, initial=-np.inf))
         points -= origin
-        near = points[np.isin(_tile(points[:, :2]), wanted)].astype(np.float32)
+        near = points[np.isin(_tile(points[:, :2]), tiles_near)].astype(np.float32)
         pending.append(_one_per_voxel(near))
-        if sum(map(len, pending)) > len(kept):
-            kept, pending = _one_per_voxel(np.concatenate([kept, *pending])), []
-            _check_size(len(kept), source)
-    kept = _one_per_voxel(np.concatenate([kept, *pending]))
-    _check_size(len(kept), source)
-    kept = kept[~on_trail(kept)]
+        if sum(map(len, pending)) > len(stored):
+            stored, pending = _combined([stored, *pending], source), []
+    stored = _combined([stored, *pending], source)
+    stored = stored[~on_trail(stored)]
     if not read:
         raise ValueError(f"{source}: expected finite points, found none")
-    tile = _tile(kept[:, :2])
+    tile = _tile(stored[:, :2])
     order = np.argsort(tile, kind="stable")
     tiles, starts = np.unique(tile[order], return_index=True)
-    points, starts = kept[order], np.append(starts, len(kept))
+    points, starts = stored[order], np.append(starts, len(stored))
     return TiledCloud(origin, points, tiles, starts, _spacing(points, starts), lowest, highest, read)
 
 
-def _check_size(points: int, source: Path) -> None:
-    if points > MOST_POINTS:
+def _combined(clouds: list[Float32[np.ndarray, "_ 3"]], source: Path) -> Float32[np.ndarray, "m 3"]:
+    """One point per voxel of several clouds. Raises ValueError for more than `MOST_POINTS` points."""
+    points = _one_per_voxel(np.concatenate(clouds))
+    if len(points) > MOST_POINTS:
         raise ValueError(
             f"{source}: expected at most {MOST_POINTS} points in voxels of {VOXEL_M:g} m near the trajectory, found"
             " more; cut the cloud and its trajectory into parts, or keep one point in voxels of 0.2 m"
         )
+    return points
 
 
 def _tile(xy: Num[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
@@ -234,10 +224,10 @@ def _tile(xy: Num[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
 
 def _tiles_around(xy: Float[np.ndarray, "n 2"], reach_m: float) -> Int64[np.ndarray, " t"]:
     """Numbers of the tiles that squares around some positions touch, in order."""
-    steps = np.arange(-int(np.ceil(reach_m / TILE_M)), int(np.ceil(reach_m / TILE_M)) + 1) * TILE_M
-    around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2).clip(-reach_m, reach_m)
-    corners = np.unique(around, axis=0)
-    return np.unique(_tile((np.unique(xy, axis=0)[:, None] + corners).reshape(-1, 2)))
+    tiles = int(np.ceil(reach_m / TILE_M))
+    steps = (np.arange(-tiles, tiles + 1) * TILE_M).clip(-reach_m, reach_m)
+    squares = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    return np.unique(_tile((np.unique(xy, axis=0)[:, None] + squares).reshape(-1, 2)))
 
 
 def _one_per_voxel(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
@@ -250,11 +240,10 @@ def _spacing(points: Float32[np.ndarray, "n 3"], starts: Int64[np.ndarray, " t"]
     """Median distance to the fourth neighbour, in the tiles with the most points, at least `VOXEL_M`."""
     from scipy.spatial import KDTree  # imported here because the import is slow
 
-    fullest = np.argsort(np.diff(starts))[-SAMPLED_TILES:]
-    found = []
-    for tile in fullest:
+    distances_m = []
+    for tile in np.argsort(np.diff(starts))[-SAMPLED_TILES:]:
         inside = points[starts[tile] : starts[tile + 1]]
-        some = inside[:: len(inside) // SAMPLED_POINTS + 1]
+        sample = inside[:: len(inside) // SAMPLED_POINTS + 1]
         if len(inside) > NEIGHBOURS:
-            found.append(KDTree(inside).query(some, k=NEIGHBOURS + 1)[0][:, -1])
-    return max(VOXEL_M, float(np.median(np.concatenate(found)))) if found else VOXEL_M
+            distances_m.append(KDTree(inside).query(sample, k=NEIGHBOURS + 1)[0][:, -1])
+    return max(VOXEL_M, float(np.median(np.concatenate(distances_m)))) if distances_m else VOXEL_M

@@ -38,18 +38,16 @@ def ring_numbers(
     if len(points) == 0:
         return np.zeros(0, np.int32)
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
-    told = lasers is not None and lasers.min() < lasers.max()
-    groups = lasers if told else _by_elevation(elevation)
+    known = lasers is not None and lasers.min() < lasers.max()
+    groups = lasers if known else _by_elevation(elevation)
     if groups is None:
         azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
         groups = np.cumsum(np.diff(azimuth, prepend=0) < -np.pi)  # revolutions
         if groups[-1] == 0 or abs(np.corrcoef(groups, elevation)[0, 1]) < IN_ORDER:
-            groups = None
-    if groups is None:
-        raise ValueError(
-            "expected a scan with rings (laser numbers in its file, separate elevations, or points ring after ring "
-            f"from straight ahead), found {len(points)} points without rings"
-        )
+            raise ValueError(
+                "expected a scan with rings (laser numbers in its file, separate elevations, or points ring after ring "
+                f"from straight ahead), found {len(points)} points without rings"
+            )
     _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
     mean = np.bincount(group, weights=elevation) / count
     return np.argsort(np.argsort(mean)).astype(np.int32)[group]
@@ -58,14 +56,14 @@ def ring_numbers(
 def keep_rings(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
     """Whether each point remains if the sensor has only `beams` lasers: every 2nd of 64 for 32, every 4th for 16.
 
-    The number of found rings is rounded up to a power of two, because some lasers may have no returns.
+    The number of rings is rounded up to a power of two, because some lasers may have no returns.
     """
-    found = int(rings.max(initial=0)) + 1
-    sensor = 2 ** math.ceil(math.log2(found))
+    sensor = 2 ** math.ceil(math.log2(int(rings.max(initial=0)) + 1))
     return rings % max(sensor // beams, 1) == 0
 
 
 def _by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | None:
+    """Group of each point between gaps of elevation, in degrees, or None if a group is wider than `GAP_DEG`."""
     order = np.argsort(elevation)
     rising = elevation[order]
     starts = np.flatnonzero(np.diff(rising, prepend=-np.inf) > GAP_DEG)
@@ -78,8 +76,6 @@ def _by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] |
 
 
 Cloud = Float32[np.ndarray, "n 3"]
-
-
 Corrupt = Callable[[Cloud, float, np.random.Generator, Int[np.ndarray, " n"] | None], Cloud | Bool[np.ndarray, " n"]]
 """Function of finite points, strength, random generator and lasers if known. Returns a mask of the remaining points, or
 all points at new positions."""
@@ -93,8 +89,6 @@ class Kind(NamedTuple):
     """Usual strengths, from weak to strong. Only 0 for a kind without a strength."""
     limits: tuple[float, float] = (0.0, np.inf)
     """Minimum and maximum strength."""
-    needs_lasers: bool = False
-    """Whether `corrupt` needs the laser of each point."""
 
 
 def occlude(points: Cloud, degrees: float, rng: np.random.Generator, lasers: object) -> Bool[np.ndarray, " n"]:
@@ -104,12 +98,24 @@ def occlude(points: Cloud, degrees: float, rng: np.random.Generator, lasers: obj
     return np.abs((azimuth - heading + np.pi) % (2 * np.pi) - np.pi) >= width / 2
 
 
+def remove_beams(
+    points: Cloud, beams: float, rng: np.random.Generator, lasers: Int[np.ndarray, " n"] | None
+) -> Bool[np.ndarray, " n"]:
+    """Keep the points of a number of lasers."""
+    return keep_rings(ring_numbers(points, lasers=lasers), int(beams))
+
+
 def add_noise(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
     """Add Gaussian noise along each ray, with the given standard deviation in metres. A point at the sensor stays."""
     distance = np.linalg.norm(points.astype(np.float64), axis=1)
     steps = metres * rng.standard_normal(len(points))
-    share = np.divide(steps, distance, out=np.zeros_like(distance), where=distance > 0)
-    return (points * (1 + share[:, None])).astype(np.float32)
+    fractions = np.divide(steps, distance, out=np.zeros_like(distance), where=distance > 0)
+    return (points * (1 + fractions[:, None])).astype(np.float32)
+
+
+def drop_points(points: Cloud, probability: float, rng: np.random.Generator, lasers: object) -> Bool[np.ndarray, " n"]:
+    """Remove each point with this probability."""
+    return rng.random(len(points)) >= probability
 
 
 def offset(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
@@ -126,19 +132,12 @@ KINDS: dict[str, Kind] = {
     "clean": Kind(lambda points, *_: points, strengths=()),
     "rotation": Kind(rotate_input, strengths=(0.0,)),
     "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), limits=(0.0, 360.0)),
-    "beams": Kind(
-        lambda points, beams, rng, lasers: keep_rings(ring_numbers(points, lasers=lasers), int(beams)),
-        strengths=(32.0, 16.0),
-        limits=(1.0, np.inf),
-        needs_lasers=True,
-    ),
+    "beams": Kind(remove_beams, strengths=(32.0, 16.0), limits=(1.0, np.inf)),
     "noise": Kind(add_noise, strengths=(0.05, 0.1, 0.2)),
-    "dropout": Kind(
-        lambda points, share, rng, lasers: rng.random(len(points)) >= share, strengths=(0.5, 0.9), limits=(0.0, 1.0)
-    ),
+    "dropout": Kind(drop_points, strengths=(0.5, 0.9), limits=(0.0, 1.0)),
     "offset": Kind(offset, strengths=(0.5, 1.0, 2.0)),
 }
-"""All kinds by name: "beams" keeps a number of lasers, and "dropout" removes each point with a probability."""
+"""All kinds by name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,23 +186,16 @@ def corrupt(
     rng: np.random.Generator,
     lasers: Int[np.ndarray, " n"] | None = None,
 ) -> tuple[Float32[np.ndarray, "m 3"], Bool[np.ndarray, " n"]]:
-    """Corrupt the finite points of a scan.
+    """Corrupt the finite points of a scan, in metres in the LiDAR frame. `lasers` are their lasers, if known.
 
-    Arguments:
-      points: Finite points in the LiDAR frame, in metres.
-      corruption: Kind and strength.
-      rng: Random generator.
-      lasers: Laser of each point, if known.
-
-    Returns:
-      The remaining points, and a mask of them among the given points.
+    Returns the remaining points, and a mask of them among the given points.
 
     Raises ValueError for a rotation (see `rotation_seed` of `embed`), or if the beams cannot be separated.
     """
-    found = KINDS[corruption.kind].corrupt(points, corruption.strength, rng, lasers)
-    if found.dtype == bool:
-        return points[found], found
-    return found, np.ones(len(points), bool)
+    result = KINDS[corruption.kind].corrupt(points, corruption.strength, rng, lasers)
+    if result.dtype == bool:
+        return points[result], result
+    return result, np.ones(len(points), bool)
 
 
 def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:
@@ -219,11 +211,11 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
         )
 
     def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
-        scan = recording.read_row(row, label_path, lasers or KINDS[corruption.kind].needs_lasers)
+        scan = recording.read_row(row, label_path, lasers or corruption.kind == "beams")
         with naming(scan.name), naming(corruption.name):
             finite = scan.only(np.flatnonzero(np.isfinite(scan.cloud).all(axis=1)))
             rng = np.random.default_rng((seed, row))
-            points, kept = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
-            return dataclasses.replace(finite.only(kept), points=points)
+            points, remaining = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
+            return dataclasses.replace(finite.only(remaining), points=points)
 
     return recording.derived(read)

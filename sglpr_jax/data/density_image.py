@@ -2,11 +2,11 @@
 
 A scan is reduced to one centroid per voxel. A pixel thus measures how much of its column is occupied, regardless of
 its distance to the sensor. The rows of the image point against x (forward), and its columns against y (left).
-`density_bev` returns the image as `bev_images.read_image` does, in the orientation of eq. 1 and on the scale of counts.
+`density_bev` returns the image in the orientation of eq. 1, on the scale of counts.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32, Num, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, DENSITY_SIZE
 
@@ -24,11 +24,8 @@ MOST_SPREAD = 2**25
 30 m above the sensor increases it to 10**8."""
 SOME_POINTS, SOME_VOXELS = 18_000, 2**16
 """The quick voxel count samples at least `SOME_POINTS` points and takes voxel numbers modulo `SOME_VOXELS`."""
-EDGE_STEP_M = 0.05
-FIRST_EDGE_M = 0.10
-"""Smallest voxel edge, in metres. `EDGE_STEP_M` is its increment."""
-BEYOND_COUNTS = 2.0
-"""Tolerance for counts below 0 or above 10, which smooth resizing of an image produces."""
+FIRST_EDGE_M, EDGE_STEP_M = 0.10, 0.05
+"""Smallest voxel edge and its increment, in metres."""
 
 
 def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 151"]:
@@ -49,18 +46,6 @@ def density_label_bev(
 ) -> Int32[np.ndarray, "151 151"]:
     """Compute the map of classes aligned with `density_bev`. See `density_label_image`."""
     return np.ascontiguousarray(np.rot90(density_label_image(points, classes), -1))
-
-
-def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
-    """Raise ValueError, which begins with `name`, if a float image has grey values or point counts."""
-    least, most = image.min(initial=0), image.max(initial=0)
-    within = least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS  # False for NaN
-    if np.issubdtype(image.dtype, np.floating) and not within:
-        raise ValueError(
-            f"{name}: expected a density image, floats from 0 to {DENSITY_MAX_COUNT}, found floats from "
-            f"{least:g} to {most:g}; does the image contain grey values (255 instead of "
-            f"{DENSITY_MAX_COUNT}) or uncapped point counts?"
-        )
 
 
 def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 151"]:
@@ -96,7 +81,7 @@ def values_of_points(image: Int[np.ndarray, "151 151"], points: Float32[np.ndarr
     return values
 
 
-def _in_crop(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
+def _in_crop(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     x, y, z = points.T
     return (np.abs(x) < REACH_M) & (np.abs(y) < REACH_M) & (z > FLOOR_M) & (z < CEILING_M)
 
@@ -108,12 +93,15 @@ def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
 
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
+    """Return x and y of the mean point of each voxel, in metres, for the smallest edge with at most `MAX_VOXELS`."""
     voxels = _fewest_voxels(points)
     if not len(voxels):
         return np.zeros((2, 0))
-    found = _found(voxels)
-    numbered = None if found is None else (np.cumsum(found) - 1)[voxels - voxels.min()]
-    voxel = np.unique(voxels, return_inverse=True)[1] if numbered is None else numbered  # without gaps, in order
+    occupied = _occupied(voxels)
+    if occupied is None:
+        voxel = np.unique(voxels, return_inverse=True)[1]
+    else:
+        voxel = (np.cumsum(occupied) - 1)[voxels - voxels.min()]  # numbers without gaps, in the same order
     return np.stack([np.bincount(voxel, weights=axis) for axis in points[:2]]) / np.bincount(voxel)
 
 
@@ -122,9 +110,9 @@ def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"
 
     The quick count rules out most edges. It never exceeds the true number of voxels.
     """
-    some = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SOME_POINTS)])
+    sample = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SOME_POINTS)])
     edge_m = FIRST_EDGE_M
-    while _too_many(_voxel_of_point(some, edge_m) & (SOME_VOXELS - 1)) or _too_many(
+    while _too_many(_voxel_of_point(sample, edge_m) & (SOME_VOXELS - 1)) or _too_many(
         voxels := _voxel_of_point(points, edge_m)
     ):
         edge_m += EDGE_STEP_M
@@ -132,21 +120,21 @@ def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"
 
 
 def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
-    found = _found(voxels)
-    return int(len(np.unique(voxels)) if found is None else np.count_nonzero(found)) > MAX_VOXELS
+    occupied = _occupied(voxels)
+    return int(len(np.unique(voxels)) if occupied is None else np.count_nonzero(occupied)) > MAX_VOXELS
 
 
-def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
-    """Mark the numbers that occur, from the smallest, without sorting. None beyond a range of `MOST_SPREAD`."""
-    if not len(numbers):
+def _occupied(voxels: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
+    """Flags of the voxel numbers that occur, from the smallest. None beyond a range of `MOST_SPREAD`."""
+    if not len(voxels):
         return np.zeros(0, bool)
-    least = int(numbers.min())
-    spread = int(numbers.max()) - least + 1
+    least = int(voxels.min())
+    spread = int(voxels.max()) - least + 1
     if spread > MOST_SPREAD:
         return None
-    found = np.zeros(spread, bool)
-    found[numbers - least] = True
-    return found
+    occupied = np.zeros(spread, bool)
+    occupied[voxels - least] = True
+    return occupied
 
 
 def _voxel_of_point(points: Float32[np.ndarray, "3 n"], edge_m: float) -> Int32[np.ndarray, " n"]:

@@ -1,6 +1,6 @@
 """Removes the motion of the sensor within a scan, by the times of the points and a trajectory.
 
-A scan takes about .1 s, and each point is relative to the pose of the sensor when the point was measured. `deskew`
+A scan takes about 0.1 s, and each point is relative to the pose of the sensor when the point was measured. `deskew`
 moves the points of a scan into the frame of one pose. `deskewed` does so for a recording, with the poses of its scans.
 """
 
@@ -66,33 +66,19 @@ def deskew(
 def poses_at(
     times: Float[np.ndarray, " q"], pose_times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"]
 ) -> Float[np.ndarray, "q 4 4"]:
-    """Interpolate poses at `times`. The linear and angular velocity in the moving frame is constant between two poses.
+    """Interpolate poses at `times`, in seconds, with constant linear and angular velocity in the moving frame.
 
     Before the first and after the last pose, the velocity is that of the nearest two. `pose_times` must increase.
     """
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
+    from scipy.spatial.transform import RigidTransform  # imported here because the import is slow
 
     segments, which = np.unique((np.searchsorted(pose_times, times) - 1).clip(0, len(poses) - 2), return_inverse=True)
     start_from_end = np.linalg.solve(poses[segments], poses[segments + 1])
-    turns = Rotation.from_matrix(start_from_end[:, :3, :3]).as_rotvec()
-    shifts = np.linalg.solve(_mean_rotations(turns), start_from_end[:, :3, 3:])
-    widths = pose_times[segments + 1] - pose_times[segments]
-    shares = (times - pose_times[segments[which]]) / widths[which]
-    turned = shares[:, None] * turns[which]
-    moved = np.tile(np.eye(4), (len(times), 1, 1))
-    moved[:, :3, :3] = Rotation.from_rotvec(turned).as_matrix()
-    moved[:, :3, 3:] = _mean_rotations(turned) @ (shares[:, None, None] * shifts[which])
-    return poses[segments[which]] @ moved
-
-
-def _mean_rotations(turns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Mean of the rotations from none to each rotation vector. It maps a constant velocity to a translation."""
-    angles = np.linalg.norm(turns, axis=1).clip(min=1e-6)[:, None, None]  # smaller angles have the same mean
-    x, y, z = turns.T
-    nothing = np.zeros_like(x)
-    cross = np.array([[nothing, -z, y], [z, nothing, -x], [-y, x, nothing]]).transpose(2, 0, 1)
-    first, second = (1 - np.cos(angles)) / angles**2, (angles - np.sin(angles)) / angles**3
-    return np.eye(3) + first * cross + second * (cross @ cross)
+    start_from_end[:, 3] = [0, 0, 0, 1]  # exactly, as `RigidTransform` requires
+    motions = RigidTransform.from_matrix(start_from_end).as_exp_coords()
+    fractions = (times - pose_times[segments[which]]) / (pose_times[segments + 1] - pose_times[segments])[which]
+    moved = RigidTransform.from_exp_coords(fractions[:, None] * motions[which])
+    return poses[segments[which]] @ moved.as_matrix()
 
 
 def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
@@ -121,28 +107,27 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
     def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
         """Read a scan without the motion within it. Its points have no times any more."""
         scan = recording.read_row(row, label_path, lasers)
-        point_times = scan.point_times
+        point_times, rows = scan.point_times, _neighbours(times, row)
         if point_times is None:
             raise ValueError(f"{scan.name}: expected times of the points, found none")
-        rows = _neighbours(times, row)
-        if len(rows) < 2:
-            return dataclasses.replace(scan, time_field=None)
-        trajectory = {"pose_times": times[rows], "world_from_lidar": poses[rows]}
-        points = deskew(scan.cloud, point_times, time=float(times[row]), **trajectory)
+        points = scan.cloud
+        if len(rows) > 1:
+            trajectory = {"pose_times": times[rows], "world_from_lidar": poses[rows]}
+            points = deskew(points, point_times, time=float(times[row]), **trajectory)
         return dataclasses.replace(scan, points=points, time_field=None)
 
-    alone = sum(len(_neighbours(times, row)) < 2 for row in range(len(recording)))
-    left = f", but {alone} of {len(recording)} scans have no neighbour within {WIDEST_S:g} s" if alone else ""
-    said = f"deskewed: the motion within each scan is removed by its poses{left}"
+    isolated = sum(len(_neighbours(times, row)) < 2 for row in range(len(recording)))
+    without = f", but {isolated} of {len(recording)} scans have no neighbour within {WIDEST_S:g} s" if isolated else ""
     digest = hashlib.sha256(times.tobytes() + poses.tobytes()).hexdigest()[:16]
-    return recording.derived(read, options={DESKEWED: digest}, found=said)
+    note = f"deskewed: the motion within each scan is removed by its poses{without}"
+    return recording.derived(read, options={DESKEWED: digest}).noting(note)
 
 
 def _neighbours(times: Float[np.ndarray, " n"], row: int) -> list[int]:
     """The scan at `row` and the scans before and after it within `WIDEST_S`."""
     before, after = np.searchsorted(times, times[row], "left") - 1, np.searchsorted(times, times[row], "right")
-    rows = [int(one) for one in (before, row, after) if 0 <= one < len(times)]
-    return [one for one in rows if abs(times[one] - times[row]) <= WIDEST_S]
+    rows = [int(near) for near in (before, row, after) if 0 <= near < len(times)]
+    return [near for near in rows if abs(times[near] - times[row]) <= WIDEST_S]
 
 
 def has_point_times(recording: Recording) -> bool:
@@ -159,6 +144,6 @@ def has_point_times(recording: Recording) -> bool:
 def _first_readable(recording: Recording) -> Scan | None:
     """The first scan that can be read, among the first `TRIED`."""
     for row in range(min(len(recording), TRIED)):
-        with contextlib.suppress(ValueError, OSError):  # whoever reads the scans decides about bad ones
+        with contextlib.suppress(ValueError, OSError):  # the program that reads the scans decides about bad ones
             return recording.scan(row, labels=False)
     return None

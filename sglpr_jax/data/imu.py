@@ -1,7 +1,7 @@
 """Direction of up from an IMU: its orientation, or its accelerometer averaged over time with its gyroscope.
 
-An accelerometer measures gravity and the motion of the sensor. The gyroscope says how the sensor turned between two
-samples. Accelerations are turned into one frame with it and averaged there over some seconds, which leaves gravity.
+An accelerometer measures gravity and the motion of the sensor. The gyroscope measures how the sensor turns, so that
+accelerations can be rotated into one frame. Their average over some seconds is gravity.
 """
 
 import itertools
@@ -43,8 +43,8 @@ class Imu:
     def at(self, times: Float[np.ndarray, " n"]) -> "Imu":
         """Return the samples in order of other times, such as those of the recorder."""
         order = np.argsort(times, kind="stable")
-        turned = None if self.quaternions is None else self.quaternions[order]
-        return Imu(times[order], self.rates[order], self.accelerations[order], turned)
+        quaternions = None if self.quaternions is None else self.quaternions[order]
+        return Imu(times[order], self.rates[order], self.accelerations[order], quaternions)
 
     def ups(self, times: Float[np.ndarray, " q"]) -> tuple[Float[np.ndarray, "q 3"], str]:
         """Return the direction of up in the frame of the IMU at some times, and a description of its source.
@@ -68,39 +68,36 @@ class Imu:
     def _ups_by_orientation(self, times: Float[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
         from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
-        ups = Rotation.from_quat(self.quaternions).as_matrix()[:, 2]
-        found = np.full((len(times), 3), np.nan)
+        measured = Rotation.from_quat(self.quaternions).as_matrix()[:, 2]
+        ups = np.full((len(times), 3), np.nan)
         near = np.abs(self.times[nearest_rows(self.times, times)] - times) <= GAP_S
-        found[near] = np.stack([np.interp(times[near], self.times, axis) for axis in ups.T], axis=1)
-        return found / np.linalg.norm(found, axis=1, keepdims=True)
+        ups[near] = np.stack([np.interp(times[near], self.times, axis) for axis in measured.T], axis=1)
+        return ups / np.linalg.norm(ups, axis=1, keepdims=True)
 
     def _ups_by_gravity(self, times: Float[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
         """Up by the accelerometer, for each part between two gaps."""
-        found = np.full((len(times), 3), np.nan)
+        ups = np.full((len(times), 3), np.nan)
         valid = np.isfinite(self.accelerations).all(axis=1) & np.isfinite(self.rates).all(axis=1)
         samples = np.flatnonzero(valid & (np.diff(self.times, prepend=-np.inf) > 0))
         for part in np.split(samples, np.flatnonzero(np.diff(self.times[samples]) > GAP_S) + 1):
             if len(part) < 2:
                 continue
-            first, last = self.times[part[0]] - GAP_S, self.times[part[-1]] + GAP_S
-            within = (times >= first) & (times <= last)
-            found[within] = averaged_up(
-                self.times[part], self.rates[part], self.accelerations[part], times=times[within]
-            )
-        return found
+            stamps = self.times[part]
+            within = (times >= stamps[0] - GAP_S) & (times <= stamps[-1] + GAP_S)
+            ups[within] = _averaged_up(stamps, self.rates[part], self.accelerations[part], times=times[within])
+        return ups
 
 
-def averaged_up(
+def _averaged_up(
     stamps: Float[np.ndarray, " n"],
     rates: Float[np.ndarray, "n 3"],
     accelerations: Float[np.ndarray, "n 3"],
     *,
     times: Float[np.ndarray, " q"],
 ) -> Float[np.ndarray, "q 3"]:
-    """Return up at some times by accelerations that are averaged in a frame that does not turn.
+    """Up at some times by accelerations that are averaged in a frame that does not turn.
 
-    A line is fitted to `AVERAGED_S` of accelerations, so that a constant bias of the gyroscope cancels. `stamps` are
-    the increasing times of the samples, in seconds, `rates` their angular velocities, in radians per second.
+    A line is fitted to `AVERAGED_S` of accelerations, so that a constant bias of the gyroscope cancels.
     """
     from scipy.signal import savgol_filter  # imported here because the imports are slow
     from scipy.spatial.transform import Rotation
@@ -109,15 +106,15 @@ def averaged_up(
     start_from_imu = np.array(
         [*itertools.accumulate(Rotation.from_rotvec(turns).as_matrix(), initial=np.eye(3), func=np.matmul)]
     )
-    still = np.einsum("nij,nj->ni", start_from_imu, accelerations)
+    in_start = np.einsum("nij,nj->ni", start_from_imu, accelerations)
     bins = ((stamps - stamps[0]) / BIN_S).astype(np.int64)
-    _, which, counts = np.unique(bins, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(which, axis) / counts for axis in still.T], axis=1)
-    middles = np.bincount(which, stamps) / counts
+    _, bin_of, counts = np.unique(bins, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(bin_of, axis) / counts for axis in in_start.T], axis=1)
+    mean_times = np.bincount(bin_of, stamps) / counts
     width = min(round(AVERAGED_S / BIN_S), len(means) - 1) // 2 * 2 + 1
     smooth = np.asarray(savgol_filter(means, width, min(1, width - 1), axis=0))
-    up = np.stack([np.interp(times, middles, axis) for axis in smooth.T], axis=1)
+    gravity = np.stack([np.interp(times, mean_times, axis) for axis in smooth.T], axis=1)
     sample = nearest_rows(stamps, times)
     since = Rotation.from_rotvec(rates[sample] * (times - stamps[sample])[:, None]).as_matrix()
-    found = np.einsum("nji,nj->ni", start_from_imu[sample] @ since, up)
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    ups = np.einsum("nji,nj->ni", start_from_imu[sample] @ since, gravity)
+    return ups / np.linalg.norm(ups, axis=1, keepdims=True)

@@ -23,8 +23,7 @@ LEAST_HANGING_M = 0.2
 STEEPEST_DEG = 35.0
 """Maximum angle between the sensor's z axis and up, or down, in degrees."""
 LEVEL_DEG = 2.0
-"""Minimum tilt of a mounting, in degrees. Smaller tilts come from the slope of the road or the suspension and are
-ignored."""
+"""Minimum tilt of a mounting, in degrees. Smaller tilts come from the slope of the road or the suspension."""
 NEAR_M = (0.8, 25.0)
 """Range of distances from the sensor at which the ground is searched, in metres."""
 VOXEL_M = 0.4
@@ -33,9 +32,8 @@ THICK_M = 0.12
 """Maximum distance of a ground point from the plane, in metres."""
 MOST_BELOW = 0.1
 """Maximum fraction of points below the ground, such as reflections and descending slopes."""
-LEAST_SHARE = 0.05
-LEAST_POINTS = 40
-"""Minimum fraction (`LEAST_SHARE`) and number of points on the ground."""
+LEAST_SHARE, LEAST_POINTS = 0.05, 40
+"""Minimum fraction and number of points on the ground."""
 MOST_POINTS = 6000
 """Maximum number of points for the search. Larger clouds are subsampled."""
 TRIALS = 400
@@ -74,23 +72,15 @@ class Mounting:
         """Angle between the sensor's z axis and up, in degrees. It is 180 for an upside-down sensor."""
         return math.degrees(math.acos(min(1.0, max(-1.0, self.up[2]))))
 
-    @property
-    def upright_from_lidar(self) -> Float[np.ndarray, "3 3"]:
-        """Smallest rotation that maps up to z. For an upside-down sensor, a half rotation about x comes first."""
-        half = np.diag([1.0, -1.0, -1.0]) if self.up[2] < 0 else np.eye(3)
-        x, y, z = half @ np.array(self.up)
-        cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-        return (np.eye(3) + cross + cross @ cross / (1 + z)) @ half
-
     def level(self, points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
         """Transform points (n, 3) to the frame of a gravity-aligned sensor at `MODEL_HEIGHT_M`. NaN stays NaN."""
         if self.up == (0.0, 0.0, 1.0):
             lifted = points.copy(order="K")
             lifted[:, 2] += np.float32(self.height_m - MODEL_HEIGHT_M)
             return lifted
+        transform = upright_from_lidar(self)
         with np.errstate(invalid="ignore"):
-            turned = points.astype(np.float64) @ self.upright_from_lidar.T
-        return (turned + np.array([0, 0, self.height_m - MODEL_HEIGHT_M])).astype(np.float32)
+            return (points.astype(np.float64) @ transform[:3, :3].T + transform[:3, 3]).astype(np.float32)
 
     def scaled(self, scale: Scale) -> "Mounting":
         """The same mounting with its height and the deviation of the height multiplied by `scale`."""
@@ -104,61 +94,78 @@ class Mounting:
         return ", ".join([*parts, *([f"tilted by {tilt:.0f} degrees"] if tilt >= LEVEL_DEG else [])])
 
 
-def estimate_mounting(points: Float32[np.ndarray, "n 3"], *, near: Mounting | None = None) -> Mounting | None:
-    """Estimate the mounting of a sensor from the ground in one scan, or None if no ground is found.
+def upright_from_lidar(mounting: Mounting | None) -> Float[np.ndarray, "4 4"]:
+    """Transform from the LiDAR frame to the gravity-aligned frame at `MODEL_HEIGHT_M`, the identity for None.
 
-    RANSAC searches for the plane with the most points and almost no points below it, and least squares refine it. The
-    plane may be tilted by up to 35 degrees against the sensor's z axis, and the sensor may hang upside down. The result
-    is deterministic.
+    The rotation is the smallest one that maps up to z. For an upside-down sensor, a half rotation about x comes first.
+    """
+    transform = np.eye(4)
+    if mounting is None:
+        return transform
+    half = np.diag([1.0, -1.0, -1.0]) if mounting.up[2] < 0 else np.eye(3)
+    x, y, z = half @ np.array(mounting.up)
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    transform[:3, :3] = (np.eye(3) + cross + cross @ cross / (1 + z)) @ half
+    transform[2, 3] = mounting.height_m - MODEL_HEIGHT_M
+    return transform
+
+
+def is_tilted(upright_from_lidar: Float[np.ndarray, "*n 4 4"]) -> bool:
+    """Return whether the z axis of a sensor does not point up, in any of the transforms."""
+    return bool((upright_from_lidar[..., 2, :3] != [0.0, 0.0, 1.0]).any())
+
+
+def estimate_mounting(points: Float32[np.ndarray, "n 3"], *, near: Mounting | None = None) -> Mounting | None:
+    """Estimate the mounting of a sensor from the ground in one scan. Returns None without ground.
+
+    RANSAC, with a fixed seed, searches for the plane with the most points and almost no points below it, and least
+    squares refine it. The plane is tilted by at most 35 degrees, and the sensor may hang upside down.
 
     Arguments:
       points: Points in the LiDAR frame, in metres.
-      near: Mounting of other scans of the sensor. The ground is searched on the same side of the sensor, with fewer
-        trials.
+      near: Mounting at other scans. The ground is searched on the same side of the sensor, with fewer trials.
 
     Example:
       mounting = estimate_mounting(recording.points(0))
     """
     cloud = _thinned(points)
     cloud = cloud[:: len(cloud) // MOST_POINTS + 1]
-    few = cloud if near is None else cloud[:: len(cloud) // NEAR_POINTS + 1]
-    if len(few) < LEAST_POINTS:
+    sample = cloud if near is None else cloud[:: len(cloud) // NEAR_POINTS + 1]
+    if len(sample) < LEAST_POINTS:
         return None
-    normals, heights = _planes(few, trials=TRIALS if near is None else NEAR_TRIALS)
+    normals, heights = _planes(sample, trials=TRIALS if near is None else NEAR_TRIALS)
     if near is not None:
         same_side = normals @ np.array(near.up) > 0
         normals, heights = normals[same_side], heights[same_side]
-    if not len(heights):
-        return None
-    distances = few @ normals.T + heights
+    distances = sample @ normals.T + heights
     ground = np.abs(distances) < THICK_M
     score = np.where((distances < -2 * THICK_M).mean(axis=0) <= MOST_BELOW, ground.sum(axis=0), 0)
     score = np.where(normals[:, 2] > 0, UPSIDE_DOWN * score, score)
-    best = int(np.argmax(score))
-    if score[best] == 0:
+    if not score.any():
         return None
+    best = int(np.argmax(score))
     on_plane = ground[:, best] if near is None else np.abs(cloud @ normals[best] + heights[best]) < THICK_M
     return _fitted(cloud, on_plane, normals[best])
 
 
-def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
-    """Median of the mountings that were estimated from the scans of a recording. A tilt below 2 degrees is set to zero.
+def common_mounting(mountings: Iterable[Mounting | None]) -> Mounting | None:
+    """Median of the mountings estimated from scans of a recording. A tilt below 2 degrees is set to zero.
 
     Only the side of the ground that most scans show counts. Returns None if fewer than half of the scans have a
     mounting, or without a majority.
     """
-    scans = list(found)
-    hanging = [one for one in scans if one is not None and one.up[2] < 0]
-    upright = [one for one in scans if one is not None and one.up[2] >= 0]
-    agreed = max(hanging, upright, key=len)
+    scans = list(mountings)
+    hanging = [mounting for mounting in scans if mounting is not None and mounting.up[2] < 0]
+    upright = [mounting for mounting in scans if mounting is not None and mounting.up[2] >= 0]
+    majority = max(hanging, upright, key=len)
     if 2 * len(hanging + upright) < len(scans) or len(hanging) == len(upright):
         return None
-    height = float(np.median([mounting.height_m for mounting in agreed]))
-    up = np.median([mounting.up for mounting in agreed], axis=0)
-    mounting = Mounting(height, _unit(up))
-    if min(mounting.tilt_deg, 180 - mounting.tilt_deg) < LEVEL_DEG:
+    height = float(np.median([mounting.height_m for mounting in majority]))
+    up = np.median([mounting.up for mounting in majority], axis=0)
+    common = Mounting(height, _unit(up))
+    if min(common.tilt_deg, 180 - common.tilt_deg) < LEVEL_DEG:
         return Mounting(height, (0.0, 0.0, float(np.sign(up[2]))))
-    return mounting
+    return common
 
 
 def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -167,8 +174,6 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
         x, y, z = points.T.astype(np.float64)
         distance = np.sqrt(x * x + y * y + z * z)  # NaN and infinity fail the next test.
         near = points[(distance > NEAR_M[0]) & (distance < NEAR_M[1])].astype(np.float64)
-    if not len(near):
-        return near
     x, y, z = np.floor(near.T / VOXEL_M).astype(np.int64) + 128
     _, first = np.unique((z * 256 + y) * 256 + x, return_index=True)
     return near[np.sort(first)]
@@ -184,12 +189,12 @@ def _planes(
     a, b, c = (points[index % len(points)] for index in (first, *near))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
-    kept = np.abs(normals[:, 2]) > np.maximum(np.cos(np.radians(STEEPEST_DEG)) * lengths, 0.5)
-    normals = (normals / np.copysign(np.maximum(lengths, 1e-9), normals[:, 2])[:, None])[kept]
-    heights = -np.einsum("ti,ti->t", normals, a[kept])
+    flat = np.abs(normals[:, 2]) > np.maximum(np.cos(np.radians(STEEPEST_DEG)) * lengths, 0.5)
+    normals = (normals / np.copysign(np.maximum(lengths, 1e-9), normals[:, 2])[:, None])[flat]
+    heights = -np.einsum("ti,ti->t", normals, a[flat])
     normals, heights = np.concatenate([normals, -normals]), np.concatenate([heights, -heights])  # either side may be up
-    kept = (heights >= np.where(normals[:, 2] > 0, HEIGHTS_M[0], LEAST_HANGING_M)) & (heights <= HEIGHTS_M[1])
-    return normals[kept], heights[kept]
+    possible = (heights >= np.where(normals[:, 2] > 0, HEIGHTS_M[0], LEAST_HANGING_M)) & (heights <= HEIGHTS_M[1])
+    return normals[possible], heights[possible]
 
 
 def _fitted(

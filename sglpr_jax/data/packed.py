@@ -1,7 +1,6 @@
 """Packs of recordings: the arrays of all scans one after another in files that are mapped into memory."""
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 import math
@@ -19,71 +18,61 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import file_name, in_short, read_json, replacing, writing
 
+FORMAT = "sglpr-jax packed recording 1"
+ABOUT_FILE = "pack.json"
+LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)}
+"""Type and shape of the rows of each array. Images of different packs have different widths."""
 
-@dataclasses.dataclass(frozen=True, eq=False)
+
 class Stacked:
     """Arrays in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`.
 
     Indexing returns a read-only view. It raises ValueError if the checksum of the array is wrong.
     """
 
-    path: Path
-    file: mmap.mmap
-    rows: np.ndarray
-    offsets: tuple[int, ...]
-    checksums: tuple[int, ...] | None
-    """Checksum of each array. None for older files, which have no checksums."""
+    def __init__(
+        self,
+        path: Path,
+        *,
+        dtype: str,
+        row: Sequence[int],
+        offsets: Sequence[int],
+        checksums: Sequence[int] | None = None,
+    ):
+        """Map a file of `_write_arrays` with the layout that it returned. Packs of older versions have no checksums.
+
+        Raises ValueError if the layout contradicts the file. Access beyond its end would kill the process.
+        """
+        if any(type(n) is not int for n in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
+            raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
+        if checksums is not None and [type(checksum) for checksum in checksums] != [int] * (len(offsets) - 1):
+            raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {checksums!s:.60}")
+        shape = (offsets[-1], *row)
+        expected, found = np.dtype(dtype).itemsize * math.prod(shape), path.stat().st_size
+        if expected != found:
+            raise ValueError(f"{path.name}: expected {expected} bytes, found {found}")
+        self._path, self._offsets, self._checksums = path, offsets, checksums
+        with path.open("rb") as stream:
+            self._file = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self._rows = np.frombuffer(self._file, dtype).reshape(shape)
 
     def __getitem__(self, i: int) -> np.ndarray:
-        array = self.rows[slice(*self.offsets[i : i + 2])]
+        array = self._rows[slice(*self._offsets[i : i + 2])]
         if len(array):  # request the bytes at once: by default, the system reads 128 KiB at each first access
-            start = self.offsets[i] * self.rows.strides[0]
+            start = self._offsets[i] * self._rows.strides[0]
             page = start - start % mmap.PAGESIZE
-            self.file.madvise(mmap.MADV_WILLNEED, page, start + array.nbytes - page)
-        if self.checksums is not None and self.checksums[i] != (found := _checksum(array)):
+            self._file.madvise(mmap.MADV_WILLNEED, page, start + array.nbytes - page)
+        if self._checksums is not None and self._checksums[i] != (found := _checksum(array)):
             raise ValueError(
-                f"{self.path}: expected array {i} with the checksum {self.checksums[i]} of pack.json, found {found};"
+                f"{self._path}: expected array {i} with the checksum {self._checksums[i]} of pack.json, found {found};"
                 " delete its folder to pack the recording again"
             )
         return array
 
 
-def map_stacked(
-    path: Path, *, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int] | None = None
-) -> Stacked:
-    """Map a file of `_write_arrays` into memory. The keyword arguments are those that it returned.
-
-    Raises ValueError if they contradict the file. Access beyond the end of the file would kill the process.
-    """
-    if any(type(number) is not int for number in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
-        raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
-    if checksums is not None and [type(number) for number in checksums] != [int] * (len(offsets) - 1):
-        raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {checksums!s:.60}")
-    shape = (offsets[-1], *row)
-    expected, found = np.dtype(dtype).itemsize * math.prod(shape), path.stat().st_size
-    if expected != found:
-        raise ValueError(f"{path.name}: expected {expected} bytes, found {found}")
-    with path.open("rb") as stream:
-        file = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    rows = np.frombuffer(file, dtype).reshape(shape)
-    return Stacked(path, file, rows, tuple(offsets), None if checksums is None else tuple(checksums))
-
-
 def _checksum(array: np.ndarray) -> int:
     """CRC-32 of type, shape and content of an array: 0.2 ms for a scan of 120,000 points."""
     return zlib.crc32(array.data, zlib.crc32(f"{array.dtype.str} {array.shape}".encode()))
-
-
-def sync(stream: IO) -> None:
-    """Flush a file to disk. If the file were renamed before, a power failure could leave it incomplete."""
-    stream.flush()
-    os.fsync(stream.fileno())
-
-
-FORMAT = "sglpr-jax packed recording 1"
-ABOUT_FILE = "pack.json"
-LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)}
-"""Type and shape of the rows of each array. Images of different packs have different widths."""
 
 
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
@@ -111,7 +100,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
             about = _write_arrays(temporary, recording, on_progress)
             with (temporary / ABOUT_FILE).open("w") as stream:
                 json.dump({**source, "arrays": about}, stream)
-                sync(stream)
+                _sync(stream)
     arrays = open_pack(target, scans=len(recording))
 
     def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
@@ -136,34 +125,32 @@ def _source(recording: Recording) -> dict[str, Any]:
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
-    """Write the arrays of all scans or images one after another, and return their layout, as for `map_stacked`."""
+    """Write the arrays of all scans or images one after another, and return their layout, as for `Stacked`."""
     streams: dict[str, IO] = {}
-    about: dict[str, Any] = {}
+    layouts: dict[str, Any] = {}
     with contextlib.ExitStack() as opened:
         for i in range(len(recording)):
             for name, array in _arrays(recording, i).items():
                 path, rows = folder / f"{name}.bin", {"dtype": array.dtype.str, "row": array.shape[1:]}
-                if name not in about:
-                    with writing(path):
-                        streams[name] = path.open("xb")
-                    opened.callback(_close, streams[name])
-                    about[name] = {**rows, "offsets": [0], "checksums": []}
-                lies = about[name]
-                if any(lies[part] != value for part, value in rows.items()):
+                layout = layouts.setdefault(name, {**rows, "offsets": [0], "checksums": []})
+                if any(layout[part] != value for part, value in rows.items()):
                     raise ValueError(
-                        f"scan {recording.ids[i]} of sequence {recording.name}: expected {lies['dtype']} with rows of "
-                        f"shape {lies['row']}, like the first array of the pack, found {array.dtype} {rows['row']}"
+                        f"scan {recording.ids[i]} of sequence {recording.name}: expected {layout['dtype']} with rows "
+                        f"of shape {layout['row']}, like the first array of the pack, found {array.dtype} {rows['row']}"
                     )
                 array = np.ascontiguousarray(array)
                 with writing(path):
+                    if name not in streams:
+                        streams[name] = path.open("xb")
+                        opened.callback(_close, streams[name])
                     streams[name].write(array.data)
-                lies["checksums"].append(_checksum(array))
-                lies["offsets"].append(lies["offsets"][-1] + len(array))
+                layout["checksums"].append(_checksum(array))
+                layout["offsets"].append(layout["offsets"][-1] + len(array))
             on_progress(i + 1)
         for name, stream in streams.items():
             with writing(folder / f"{name}.bin"):
-                sync(stream)
-    return about
+                _sync(stream)
+    return layouts
 
 
 def _close(stream: IO) -> None:
@@ -171,7 +158,14 @@ def _close(stream: IO) -> None:
         stream.close()
 
 
+def _sync(stream: IO) -> None:
+    """Flush a file to disk. If the file were renamed before, a power failure could leave it incomplete."""
+    stream.flush()
+    os.fsync(stream.fileno())
+
+
 def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
+    """Arrays of one scan or image by their name in the pack."""
     if recording.has_images:
         return {"images": recording.image(i)}
     scan = recording.scan(i)
@@ -184,16 +178,16 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
 def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
     """Return the arrays of a pack by name. Raises ValueError, with the folder, if the pack is damaged."""
     try:
-        lie = read_json(folder / ABOUT_FILE)["arrays"]
-        for name, about in lie.items():
+        layouts = read_json(folder / ABOUT_FILE)["arrays"]
+        for name, layout in layouts.items():
             dtype, row = LAYOUT.get(name, (None, None))
-            if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
-                raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")
-            if scans is not None and len(about["offsets"]) != scans + 1:
-                raise ValueError(f"expected {scans} scans, found {len(about['offsets']) - 1}")
-        if "images" not in lie and "points" not in lie:
-            raise ValueError(f"expected arrays of points or images, found {', '.join(lie) or 'none'}")
-        return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
+            if layout["dtype"] != dtype or (row is not None and layout["row"] != row) or len(layout["row"]) > 1:
+                raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {layout['dtype']!r:.20}")
+            if scans is not None and len(layout["offsets"]) != scans + 1:
+                raise ValueError(f"expected {scans} scans, found {len(layout['offsets']) - 1}")
+        if "images" not in layouts and "points" not in layouts:
+            raise ValueError(f"expected arrays of points or images, found {', '.join(layouts) or 'none'}")
+        return {name: Stacked(folder / f"{name}.bin", **layout) for name, layout in layouts.items()}
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError) as error:
         raise ValueError(
             f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); delete the "

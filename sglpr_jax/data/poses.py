@@ -1,4 +1,4 @@
-"""Poses of scans: checks, interpolation at the times of the scans, and poses that go row by row."""
+"""Poses of scans: checks, and interpolation of poses at the times of the scans."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from sglpr_jax.data.times import usual_step
 from sglpr_jax.se3 import are_rotations
 
 WIDEST_S = (1.0, 2.0)
-"""Maximum time between two poses for interpolation, in seconds: the least and the greatest value (`widest_gap_s`)."""
+"""Least and greatest value of the maximum time between two poses for interpolation (`widest_gap_s`), in seconds."""
 JITTER = 1.5
 """Maximum time between two poses for interpolation, as a multiple of the median time between them."""
 BEYOND_S = 0.1
@@ -77,7 +77,7 @@ def have_poses(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) 
 def interpolate_poses(
     stamps: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " q"]
 ) -> Float[np.ndarray, "q 4 4"]:
-    """Interpolate poses linearly and with constant angular velocity. They are valid where `have_poses` is true.
+    """Interpolate positions linearly and rotations with constant angular velocity. Valid where `have_poses` is true.
 
     `stamps` and `times` are in seconds and in any order.
     """
@@ -86,9 +86,9 @@ def interpolate_poses(
     stamps, rows = np.unique(stamps, return_index=True)
     if len(stamps) < 2:
         return poses_of(np.zeros((len(times), 3)))
-    turns = Slerp(stamps, Rotation.from_matrix(poses[rows, :3, :3]))(times.clip(stamps[0], stamps[-1]))
+    rotations = Slerp(stamps, Rotation.from_matrix(poses[rows, :3, :3]))(times.clip(stamps[0], stamps[-1]))
     positions = np.stack([np.interp(times, stamps, axis) for axis in poses[rows, :3, 3].T], axis=1)
-    return poses_of(positions, turns.as_matrix().reshape(-1, 3, 3))
+    return poses_of(positions, rotations.as_matrix().reshape(-1, 3, 3))
 
 
 def pose_at(
@@ -119,10 +119,10 @@ def poses_at_scans(
     scans: int,
     of: str,
 ) -> ScanPoses:
-    """Assign a pose to each scan: row by row, or interpolated at the scans that have poses near in time (`have_poses`).
+    """Assign poses to scans: pose i to scan i, or interpolated at the scans with poses near in time (`have_poses`).
 
-    Poses go row by row if there are as many as scans and their times are equal, unknown, or have the same intervals
-    from another origin.
+    Pose i belongs to scan i if there are as many poses as scans and their times are equal, unknown, or have the same
+    intervals from another origin.
 
     Arguments:
       source: Name of the pose file, for messages.
@@ -134,40 +134,40 @@ def poses_at_scans(
 
     Raises ValueError if fewer than half of the scans have a pose, or if interpolation is needed and times are missing.
     """
-    if len(poses) == scans and (said := _row_by_row(stamps, times)) is not None:
-        return ScanPoses(np.ones(scans, bool), poses, said)
+    if len(poses) == scans and (note := _row_by_row(stamps, times)) is not None:
+        return ScanPoses(np.ones(scans, bool), poses, note)
     expected, found = f"expected {scans} poses, one for each {of}", f"found {len(poses)}"
     if stamps is None or times is None:
         why = "the file has no times" if stamps is None else "the scans have no times"
         raise ValueError(
             f"{source}: {expected}, {found}, and {why} to interpolate at (row numbers 0, 1, 2, ... are not times)"
         )
-    kept = have_poses(stamps, times)
-    if kept.mean() < LEAST_SHARE:
+    with_pose = have_poses(stamps, times)
+    if with_pose.mean() < LEAST_SHARE:
         by_row = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
         raise ValueError(
             f"{source}: {expected}, at its time, or poses at most {widest_gap_s(stamps):.2g} s apart that cover the "
             f"scans, {times[0]:.1f} to {times[-1]:.1f} s, {found} from {stamps[0]:.1f} to {stamps[-1]:.1f} s"
             f"{by_row if len(stamps) == len(times) else ''}"
         )
-    said = f"interpolated at the times of the scans{left_out(kept)}"
-    return ScanPoses(kept, interpolate_poses(stamps, poses, times)[kept], said)
+    note = f"interpolated at the times of the scans{left_out(with_pose)}"
+    return ScanPoses(with_pose, interpolate_poses(stamps, poses, times)[with_pose], note)
 
 
-def left_out(kept: Bool[np.ndarray, " n"]) -> str:
+def left_out(with_pose: Bool[np.ndarray, " n"]) -> str:
     """Describe how many scans have no pose. The description is empty if all have one."""
-    missing = len(kept) - int(kept.sum())
-    return f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
+    missing = len(with_pose) - int(with_pose.sum())
+    return f"; {missing} of {len(with_pose)} scans left out, which have no pose" if missing else ""
 
 
 def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
     """Description of a match row by row, or None if the times contradict it."""
     if stamps is None or times is None:
         return ""
-    behind = times - stamps
-    if np.abs(behind).max() <= SAME_S:
+    offsets = times - stamps
+    if np.abs(offsets).max() <= SAME_S:
         return ""
-    elsewhere = stamps[-1] < times[0] or times[-1] < stamps[0]
-    if elsewhere and np.ptp(behind) <= SAME_S:
-        return f"row by row: the scans have the same intervals and start {behind.mean():.1f} s later"
+    other_clock = stamps[-1] < times[0] or times[-1] < stamps[0]
+    if other_clock and np.ptp(offsets) <= SAME_S:
+        return f"row by row: the scans have the same intervals and start {offsets.mean():.1f} s later"
     return None

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.data.scan import Scan
 
 ReadRecord = Callable[[Path, Path | None, bool], Scan]
-"""Reads a record from the file of a scan or image, its label file (None: no labels), and whether to read lasers."""
+"""Reads a scan from the file of its points or image, its label file (None: no labels), and whether to read lasers."""
 ReadUps = Callable[[], tuple[Float[np.ndarray, "n 3"], str] | None]
 """Reads up in the LiDAR frame at each scan, NaN where unknown, and its source in words; None if there is no gravity."""
 
@@ -27,7 +27,7 @@ class Recording:
 
     Example:
       recording = open_recording(root, "08")
-      record = recording.record(0)  # points (n, 3), labels (n,) or None
+      scan = recording.scan(0)  # points (n, 3), labels (n,) or None
     """
 
     name: str
@@ -36,7 +36,7 @@ class Recording:
     paths: tuple[Path, ...]
     """Files of the scans or images. The scans of a bag have names instead, and the bag is in `containers`."""
     read: ReadRecord
-    """Function that reads a record from its files."""
+    """Function that reads a scan from its files."""
     positions: Float[np.ndarray, "n 3"] | None = None
     """Positions in metres, z up, or None if unknown."""
     times: Float[np.ndarray, " n"] | None = None
@@ -58,17 +58,16 @@ class Recording:
     read_ups: ReadUps | None = None
     """Function that reads up at each scan from an IMU. None without an IMU, and when the gravity is known."""
     found: tuple[str, ...] = ()
-    """What the reader found, in words: the format of the scans and the ignored files."""
+    """Notes of the reader: the format of the scans, the mounting of the sensor, ignored files."""
     rows: Int[np.ndarray, " n"] | None = None
     """Row of each scan in the whole recording, if scans are left out. None means that no scan is left out."""
     containers: tuple[Path, ...] = ()
     """Files that contain all scans, such as those of a bag. Empty if each scan is a file."""
 
     def __post_init__(self):
-        """Check that ids are unique and that fields have one entry per scan."""
         if len(set(self.ids)) < len(self.ids):
-            twice = next(name for name in self.ids if self.ids.count(name) > 1)
-            raise ValueError(f"sequence {self.name}: expected a unique id for each scan, found {twice!r} twice")
+            repeated = next(name for name in self.ids if self.ids.count(name) > 1)
+            raise ValueError(f"sequence {self.name}: expected a unique id for each scan, found {repeated!r} twice")
         for name in ("paths", "positions", "times", "label_paths", "world_from_lidar", "rows", "mountings"):
             values = getattr(self, name)
             if values is not None and len(values) != len(self) and not (name == "label_paths" and not values):
@@ -131,20 +130,22 @@ class Recording:
             mounting=self.mounting_of(i),
         )
 
+    def noting(self, note: str, **fields: Any) -> "Recording":
+        """Return the recording with a further note in `found` and other `fields`."""
+        return dataclasses.replace(self, found=(*self.found, note), **fields)
+
     def derived(
         self,
         read: Callable[[int, Path | None, bool], Scan],
         *,
         options: Mapping[str, str] | None = None,
-        found: str | None = None,
         **fields: Any,
     ) -> "Recording":
-        """Return a recording of the same scans with other records, such as corrupted or scaled ones.
+        """Return a recording whose scans are computed from those of this recording, such as corrupted or scaled ones.
 
         Arguments:
           read: Function of the row, the label file and whether to read lasers, as `read_row`.
           options: Read options that identify the change, in addition to those of this recording.
-          found: Line to add to `found`.
           fields: Other fields that change.
         """
         row_of = {path: row for row, path in enumerate(self.paths)}
@@ -152,17 +153,18 @@ class Recording:
         def read_path(path: Path, label_path: Path | None, lasers: bool, **options: str) -> Scan:
             return read(row_of[path], label_path, lasers)
 
-        return dataclasses.replace(
-            self,
-            read=partial(read_path, **{**self.read_options, **(options or {})}),
-            on_disk=False,
-            found=(*self.found, *([] if found is None else [found])),
-            **fields,
-        )
+        read_options = {**self.read_options, **(options or {})}
+        return dataclasses.replace(self, read=partial(read_path, **read_options), on_disk=False, **fields)
 
     def mounting_of(self, i: int) -> Mounting | None:
         """Mounting of the sensor at scan `i`."""
         return self.mounting if self.mountings is None else self.mountings[i]
+
+    @property
+    def uprights(self) -> Float[np.ndarray, "n 4 4"]:
+        """Transform from the LiDAR frame to the gravity-aligned frame at each scan."""
+        mountings = [self.mounting] if self.mountings is None else self.mountings
+        return np.broadcast_to([upright_from_lidar(mounting) for mounting in mountings], (len(self), 4, 4))
 
     def points(self, i: int) -> Float32[np.ndarray, "n 3"]:
         """Read the points of scan `i`. Raises ValueError if the recording contains images."""

@@ -4,7 +4,6 @@ An image shows 25 m in each direction, in cells of 0.4 m. With a factor of 4, it
 weights, the descriptors and the model of the probabilities stay as they are.
 """
 
-import contextlib
 import dataclasses
 
 import numpy as np
@@ -14,16 +13,16 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scan_stream import sampled_points
 from sglpr_jax.fields import check_value
 
 SCALE = "scale"
 """Name of the read option that states the scale of a recording."""
-
 SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0
-"""Minimum range of scans that are not scaled, in metres. Simulated corridors and rooms
-have 5 to 6 m, warehouses 9 to 13 m, and garages and streets 12 m or more (`benchmarks/quality/sensors.py`)."""
+"""Minimum range of scans that are not scaled, in metres. Simulated corridors and rooms have 5 to 6 m, warehouses 9 to
+13 m, and garages and streets 12 m or more (`benchmarks/quality/sensors.py`)."""
 NEAR_SCALE: Scale = 4
 """Scale of recordings with shorter ranges."""
 
@@ -38,29 +37,28 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
         return recording
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans to scale by {scale}, found ready-made images")
-    each = recording.mountings
+    mountings = recording.mountings
     return recording.derived(
         lambda row, label_path, lasers: scaled_scan(recording.read_row(row, label_path, lasers), scale),
         options={SCALE: str(scale)},
         mounting=_scaled_mounting(recording.mounting, scale),
-        mountings=None if each is None else tuple(_scaled_mounting(mounting, scale) for mounting in each),
+        mountings=None if mountings is None else tuple(_scaled_mounting(mounting, scale) for mounting in mountings),
     )
 
 
 def chosen_scale(recording: Recording) -> Scale:
     """Choose the scale of a recording: `NEAR_SCALE` if the sensor sees less than `FAR_M`, otherwise 1.
 
-    A scan sees as far as the 90 % quantile of its horizontal distances, and the sensor as far as the median of some
-    scans. Recordings of images and unreadable recordings have scale 1.
+    The range of a scan is the 90 % quantile of its horizontal distances, that of the sensor the median of some scans.
+    Recordings of images and unreadable recordings have scale 1.
     """
-    ranges = []
-    rows = [] if recording.has_images or not len(recording) else np.linspace(0, len(recording) - 1, SCANS).astype(int)
-    for row in np.unique(rows).tolist():
-        with contextlib.suppress(ValueError, OSError):  # an unreadable scan
-            points = recording.points(row)
-            distances = np.hypot(*points[np.isfinite(points).all(axis=1), :2].T)
-            ranges += [np.quantile(distances, 0.9)] if len(distances) else []
-    return NEAR_SCALE if ranges and np.median(ranges) < FAR_M else 1
+    if recording.has_images or not len(recording):
+        return 1
+    ranges_m = []
+    for points in sampled_points(recording, SCANS):
+        if points is not None and len(points := points[np.isfinite(points).all(axis=1)]):
+            ranges_m.append(np.quantile(np.hypot(*points[:, :2].T), 0.9))
+    return NEAR_SCALE if ranges_m and np.median(ranges_m) < FAR_M else 1
 
 
 def scale_of(recording: Recording) -> int:
@@ -80,11 +78,10 @@ def scaled_scan(scan: Scan, scale: Scale) -> Scan:
 
 def scaled_poses(poses: Float[np.ndarray, "*n 4 4"], factor: float) -> Float[np.ndarray, "*n 4 4"]:
     """Return poses with their translations multiplied by `factor`."""
-    found = np.array(poses, np.float64)
-    found[..., :3, 3] *= factor
-    return found
+    poses = np.array(poses, np.float64)
+    poses[..., :3, 3] *= factor
+    return poses
 
 
 def _scaled_mounting(mounting: Mounting | None, scale: Scale) -> Mounting:
-    """The mounting of scaled scans. None stands for `MODEL_HEIGHT_M`."""
     return (mounting or Mounting(MODEL_HEIGHT_M)).scaled(scale)

@@ -1,7 +1,7 @@
 """A scan or ready-made image, the times of its points, and the check of its points.
 
-Drivers write times of points in several units, relative to the scan or to an epoch. A field of times does not state its
-unit. A scan takes 2 ms to 1 s, so the span of the values has one possible unit.
+Drivers write times of points in several units, relative to the scan or to an epoch, without stating the unit. A scan
+takes 2 ms to 1 s, so only one unit fits the span of its times.
 """
 
 from collections.abc import Collection
@@ -35,9 +35,9 @@ def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
 
     It must be (n, 3), with a finite point that is not at the sensor, and at least half within `FARTHEST_M`.
     """
-    where = f"{name}: " if name else ""
+    source = f"{name}: " if name else ""
     if points.shape[1] != 3:
-        raise ValueError(f"{where}expected points (n, 3) with x, y and z only, found shape {points.shape}")
+        raise ValueError(f"{source}expected points (n, 3) with x, y and z only, found shape {points.shape}")
     x, y, z = np.abs(points.T)  # Column by column: a reduction over the last axis takes ten times as long.
     largest = np.maximum(np.maximum(x, y), z)  # Not finite if any coordinate is not finite.
     near = largest <= FARTHEST_M
@@ -45,20 +45,19 @@ def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
         return  # Nearly all scans end here.
     largest = largest[np.isfinite(largest)]
     if not len(largest):
-        raise ValueError(f"{where}expected finite points, found none among {len(points)}")
+        raise ValueError(f"{source}expected finite points, found none among {len(points)}")
     if not largest.any():
-        raise ValueError(f"{where}expected points around the sensor, found all {len(largest)} points at (0, 0, 0)")
-    half_are_beyond = 2 * np.count_nonzero(largest > FARTHEST_M) >= len(largest)
-    if half_are_beyond and np.median(largest) > FARTHEST_M:
+        raise ValueError(f"{source}expected points around the sensor, found all {len(largest)} points at (0, 0, 0)")
+    if 2 * np.count_nonzero(largest > FARTHEST_M) >= len(largest) and np.median(largest) > FARTHEST_M:
         raise ValueError(
-            f"{where}expected metres, with most points within {FARTHEST_M:g}, found half of the points beyond"
+            f"{source}expected metres, with most points within {FARTHEST_M:g}, found half of the points beyond"
             f" {np.median(largest):.4g} and the farthest at {largest.max():.4g}; are the coordinates in millimetres,"
             " or is the format of the scan wrong (--format, for .bin files)?"
         )
 
 
 def time_field_of(names: Collection[str]) -> str | None:
-    """Return the name of the field of times among the fields of a point, or None."""
+    """Return the name of the field of times among the names of the fields of a point, or None."""
     return next((name for name in TIME_FIELDS if name in names), None)
 
 

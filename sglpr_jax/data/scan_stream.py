@@ -1,6 +1,6 @@
-"""Reads the scans of a recording in order and decides what happens to bad ones, for every program that describes
-scans."""
+"""Reads the scans of a recording in order, and skips or reports bad ones."""
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -10,6 +10,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NoReturn, TypeVar
 
+import numpy as np
+from jaxtyping import Float32
+
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, check_cloud
 
@@ -17,7 +20,7 @@ OnBadScan = Callable[[str, Exception], None]
 """Receives the id and the error of a bad scan."""
 T = TypeVar("T")
 Look = Callable[[int, Scan], T]
-"""Computes a result from the row and the record of a scan."""
+"""Computes a result from the row of a scan and the scan."""
 
 
 def scan_stream(
@@ -37,7 +40,7 @@ def scan_stream(
 
     Arguments:
       recording: Scans or images to read.
-      look: Function of the row and the record. With `ahead` it must be pure, because it runs in other threads.
+      look: Function of the row and the scan. With `ahead` it must be pure, because it runs in other threads.
       rows: Rows to read, by default all. Without `ahead`, a row is taken after the previous scan was processed.
       labels: Whether to read the labels, too.
       ahead: Number of scans that are read ahead.
@@ -45,17 +48,16 @@ def scan_stream(
       should_stop: Asked before a scan is read. If it returns True, no further scan is read.
       on_progress: Called with the number of rows up to a scan, after the caller has processed the scan.
     """
-    wanted = range(len(recording)) if rows is None else rows
-    read = itertools.takewhile(lambda row: not should_stop(), wanted)
-    for row, result in _results(recording, look, read, labels=labels, ahead=ahead):
-        seen = None
+    rows = itertools.takewhile(lambda row: not should_stop(), range(len(recording)) if rows is None else rows)
+    for row, compute in _results(recording, look, rows, labels=labels, ahead=ahead):
+        result = None
         try:
-            seen = result()
+            result = compute()
         except (ValueError, OSError) as error:
             if on_bad_scan is None:
                 raise
             on_bad_scan(recording.ids[row], error)
-        yield row, seen
+        yield row, result
         on_progress(row + 1)
 
 
@@ -94,20 +96,26 @@ def _results(
         yield from waiting
 
 
+def sampled_points(recording: Recording, scans: int) -> Iterator[Float32[np.ndarray, "n 3"] | None]:
+    """Yield the points of some scans, spread over the recording, or None for unreadable ones."""
+    for row in np.unique(np.linspace(0, len(recording) - 1, scans).astype(int)).tolist():
+        points = None
+        with contextlib.suppress(ValueError, OSError):
+            points = recording.points(row)
+        yield points
+
+
 def readable(
-    recording: Recording,
-    *,
-    on_bad_scan: OnBadScan,
-    on_progress: Callable[[int], None] = lambda done: None,
+    recording: Recording, *, on_bad_scan: OnBadScan, on_progress: Callable[[int], None] = lambda done: None
 ) -> Recording:
     """Read every scan or image with its labels, and return the recording without invalid scans (`scan_stream`).
 
     Raises ValueError if all scans are invalid.
     """
     options = {"labels": True, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    good = [row for row, read in scan_stream(recording, lambda row, scan: True, **options) if read]
-    check_readable(recording, len(good))
-    return recording if len(good) == len(recording) else only(recording, good)
+    rows = [row for row, is_valid in scan_stream(recording, lambda row, scan: True, **options) if is_valid]
+    check_readable(recording, len(rows))
+    return recording if len(rows) == len(recording) else only(recording, rows)
 
 
 def only(recording: Recording, rows: Sequence[int]) -> Recording:

@@ -1,8 +1,7 @@
-"""Submaps: the scans of the last metres of a drive, laid together in the frame of the newest scan.
+"""Submaps: the scans of the last metres of a drive, merged in the frame of the newest scan.
 
-A narrow sensor sees more of a place in several scans than in one. `SubmapBuilder` takes a stream of scans, and
-`submaps` returns a recording whose scans are submaps. A submap holds the nearest point of each direction, as a scan
-does, because the weights are trained on scans (docs/decisions.md).
+A narrow sensor sees more of a place in several scans than in one. A submap holds the nearest point of each direction,
+as a scan does, because the weights are trained on scans (docs/decisions.md).
 """
 
 import dataclasses
@@ -55,8 +54,7 @@ class SubmapBuilder:
     def __init__(self, *, length_m: float = LENGTH_M, keyframe_m: float = KEYFRAME_M):
         """Create a builder of submaps of `length_m` metres of path, of scans at least `keyframe_m` metres apart."""
         self._window = _Window(length_m, keyframe_m)
-        self._clouds: dict[int, Scan] = {}
-        self._poses: dict[int, Float[np.ndarray, "4 4"]] = {}
+        self._scans: dict[int, tuple[Scan, Float[np.ndarray, "4 4"]]] = {}
 
     def add(
         self, points: Float32[np.ndarray, "n 3"], world_from_lidar: Float[np.ndarray, "4 4"]
@@ -71,10 +69,9 @@ class SubmapBuilder:
         """
         check_cloud(points)
         pose = turned_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
-        rows = self._window.add(pose)
-        self._clouds = {row: self._clouds[row] for row in rows[1:]} | {rows[0]: _thinned(Scan(points=points))}
-        self._poses = {row: self._poses[row] for row in rows[1:]} | {rows[0]: pose}
-        return _together([self._clouds[row] for row in rows], [self._poses[row] for row in rows]).cloud
+        newest, *older = self._window.add(pose)
+        self._scans = {newest: (_thinned(Scan(points=points)), pose), **{row: self._scans[row] for row in older}}
+        return _merged(*zip(*self._scans.values(), strict=True)).cloud
 
 
 def submaps(
@@ -106,7 +103,7 @@ def submaps(
     members = [window.add(pose) for pose in poses]
 
     @lru_cache(maxsize=max(map(len, members), default=1))
-    def cloud(row: int, labelled: bool) -> Scan:
+    def thinned(row: int, labelled: bool) -> Scan:
         scan = recording.scan(row, labels=labelled)
         check_cloud(scan.cloud, name=scan.name)
         if labelled and scan.labels is None:
@@ -116,18 +113,18 @@ def submaps(
     def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
         """Read a submap. Submaps have no laser numbers."""
         newest, *older = members[row]
-        clouds = {newest: cloud(newest, label_path is not None)}
-        for one in older:
+        scans = {newest: thinned(newest, label_path is not None)}
+        for keyframe in older:
             try:
-                clouds[one] = cloud(one, label_path is not None)
+                scans[keyframe] = thinned(keyframe, label_path is not None)
             except (ValueError, OSError) as error:
-                warn(f"{recording.ids[one]}: left out of the submaps of later scans: {error}")
-        found = _together(list(clouds.values()), [poses[one] for one in clouds])
-        return dataclasses.replace(found, labels_file=label_path)
+                warn(f"{recording.ids[keyframe]}: left out of the submaps of later scans: {error}")
+        submap = _merged(list(scans.values()), [poses[keyframe] for keyframe in scans])
+        return dataclasses.replace(submap, labels_file=label_path)
 
     digest = hashlib.sha256(poses.tobytes()).hexdigest()[:16]
-    said = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
-    return recording.derived(read, options={SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}, found=said)
+    note = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
+    return recording.derived(read, options={SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}).noting(note)
 
 
 class _Window:
@@ -138,20 +135,20 @@ class _Window:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"submaps: expected {name} in metres, more than 0, found {value}")
         self._length_m, self._keyframe_m = length_m, keyframe_m
-        self._frames, self._way = 0, 0.0
+        self._frames, self._path_m = 0, 0.0
         most = math.ceil(length_m / keyframe_m) + TURN
         self._keyframes: deque[tuple[int, float]] = deque(maxlen=most)
         self._last: Float[np.ndarray, "4 4"] | None = None
 
     def add(self, pose: Float[np.ndarray, "4 4"]) -> tuple[int, ...]:
-        """Numbers of the scans in the submap of the next scan, the newest first."""
+        """Add the next frame. Returns its number and those of the keyframes before it, the newest first."""
         frame, self._frames = self._frames, self._frames + 1
         step_m, turn_deg = (math.inf, 0.0) if self._last is None else _motion(self._last, pose)
-        way = self._way + step_m if self._keyframes else 0.0
-        rows = (frame, *(row for row, at in reversed(self._keyframes) if way - at <= self._length_m))
+        path_m = self._path_m + step_m if self._keyframes else 0.0
+        rows = (frame, *(row for row, at_m in reversed(self._keyframes) if path_m - at_m <= self._length_m))
         if step_m >= self._keyframe_m or turn_deg >= KEYFRAME_DEG:
-            self._keyframes.append((frame, way))
-            self._way, self._last = way, pose
+            self._keyframes.append((frame, path_m))
+            self._path_m, self._last = path_m, pose
         return rows
 
 
@@ -161,28 +158,24 @@ def _motion(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -
     return float(np.linalg.norm(after[:3, 3] - before[:3, 3])), math.degrees(math.acos(np.clip(cosine, -1, 1)))
 
 
-def _together(scans: Sequence[Scan], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Scan:
-    """One cloud in the frame of the first one, as its sensor would see it."""
-    turned, position = poses[0][:3, :3], poses[0][:3, 3]
+def _merged(scans: Sequence[Scan], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Scan:
+    """One scan in the frame of the first one, with the nearest point of each direction."""
+    rotation, position = poses[0][:3, :3], poses[0][:3, 3]
     moved = [
-        (scan.cloud @ (turned.T @ pose[:3, :3]).T + turned.T @ (pose[:3, 3] - position)).astype(np.float32)
+        (scan.cloud @ (rotation.T @ pose[:3, :3]).T + rotation.T @ (pose[:3, 3] - position)).astype(np.float32)
         for scan, pose in zip(scans[1:], poses[1:], strict=True)
     ]
     labels = [scan.labels for scan in scans if scan.labels is not None]
     points = np.concatenate([scans[0].cloud, *moved])
-    return _visible(Scan(points=points, labels=np.concatenate(labels) if labels else None))
-
-
-def _visible(scan: Scan) -> Scan:
-    """The nearest point of each direction. A scan also shows nothing behind it, and weights are trained on scans."""
-    x, y, z = scan.cloud.T
+    x, y, z = points.T
     distance = np.sqrt(x * x + y * y + z * z)
     scale = np.float32(AZIMUTHS / (2 * np.pi))
     azimuth = np.floor(np.arctan2(y, x) * scale).astype(np.int64) + AZIMUTHS
     elevation = np.floor(np.arctan2(z, np.hypot(x, y)) * scale).astype(np.int64) + AZIMUTHS
     direction = (elevation * 2 * AZIMUTHS + azimuth).astype(np.uint64)
     keys = direction << np.uint64(20) | (distance * 500).clip(max=2**20 - 1).astype(np.uint64)
-    return scan.only(_first_of(keys, shift=20))
+    merged = Scan(points=points, labels=np.concatenate(labels) if labels else None)
+    return merged.only(_first_of(keys, shift=20))
 
 
 def _thinned(scan: Scan) -> Scan:

@@ -1,4 +1,4 @@
-"""Times of scans and poses: unit, order, and row numbers that are not times."""
+"""Times of scans and poses: their unit and order, and row numbers in place of times."""
 
 from pathlib import Path
 
@@ -18,9 +18,9 @@ SLOWEST_S = 10.0
 FACTORS = (1e3, 1e6, 1e9)
 """Ratios of two units."""
 SAME_FACTOR = 3.0
-"""Maximum deviation from one of `FACTORS`, as a ratio. Clocks that start at zero grow by more at a change."""
-PROOF = 5
-"""Number of steps from which the unit is judged. Fewer steps prove nothing."""
+"""Maximum ratio between the growth of times at a change of the unit and one of `FACTORS`."""
+MIN_TIMES = 5
+"""The unit is judged from more times than this."""
 EPOCH = 1e8
 """Whole numbers below this one may number frames. Whole seconds since 1970 are larger since 1973."""
 PAUSE_S = 3600.0
@@ -41,29 +41,29 @@ def times_of(
         return seconds
     if counts_rows(seconds):
         return None
-    if found := time_unit_problem(seconds):
-        raise ValueError(f"{source}: expected times in seconds, found {found}; {ADVICE}")
+    if problem := time_unit_problem(seconds):
+        raise ValueError(f"{source}: expected times in seconds, found {problem}; {ADVICE}")
     return seconds
 
 
 def time_unit_problem(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
-    """Describe why times cannot be seconds of scans or poses: an empty text if they can, or are too few to judge.
+    """Describe why times cannot be seconds of scans or poses. Empty if they can, or are too few to judge.
 
     With `numbers`, whole numbers count as numbers of frames.
     """
-    if changed := unit_change(times):
-        return changed[1]
+    if change := unit_change(times):
+        return change[1]
     if len(times) and abs(times[-1]) > LATEST_S:
         return f"{times[-1]:g}, after the year 5000"
-    if len(times) <= PROOF:
+    if len(times) <= MIN_TIMES:
         return ""
     if counts_rows(times):
         return f"row numbers ({times[0]:g}, {times[1]:g}, {times[2]:g}, ...)"
-    usual = usual_step(times)
-    if usual > SLOWEST_S:
-        unit = next((unit for unit in NAMES if usual <= SLOWEST_S * PER_SECOND[unit]), "ns")
-        return f"steps of {usual:g}, which fit {NAMES[unit]}"
-    if numbers and usual >= 1 and times[0] < EPOCH and (times == np.round(times)).all():
+    step = usual_step(times)
+    if step > SLOWEST_S:
+        unit = next((unit for unit in NAMES if step <= SLOWEST_S * PER_SECOND[unit]), "ns")
+        return f"steps of {step:g}, which fit {NAMES[unit]}"
+    if numbers and step >= 1 and times[0] < EPOCH and (times == np.round(times)).all():
         return f"whole numbers from {times[0]:g} to {times[-1]:g}, as of frames"
     return ""
 
@@ -85,9 +85,9 @@ def unit_change(times: Float[np.ndarray, " n"]) -> tuple[int, str] | None:
     row = int(np.argmax(times[1:] / before)) + 1
     if any(np.count_nonzero(np.diff(part) > 0) < 2 for part in (times[:row], times[row:])):
         return None
-    grown = np.array([times[row] / before[row - 1], usual_step(times[row:]) / usual_step(times[:row])])
+    ratios = np.array([times[row] / before[row - 1], usual_step(times[row:]) / usual_step(times[:row])])
     for factor in FACTORS:
-        if (grown > factor / SAME_FACTOR).all() and (grown < factor * SAME_FACTOR).all():
+        if (ratios > factor / SAME_FACTOR).all() and (ratios < factor * SAME_FACTOR).all():
             return row, f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large"
     return None
 
@@ -114,20 +114,19 @@ def check_order(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
 
 def check_unit(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
     """Raise ValueError if the unit of times changes between two rows (`unit_change`)."""
-    if changed := unit_change(times):
-        row, found = changed
-        raise ValueError(f"{source}, row {row + 1}: expected times in one unit, found {found}")
+    if change := unit_change(times):
+        raise ValueError(f"{source}, row {change[0] + 1}: expected times in one unit, found {change[1]}")
 
 
 def check_jumps(times: Float[np.ndarray, " n"], *, source: str) -> None:
     """Warn if two consecutive times of a recording are more than an hour apart, as after a change of the clock."""
     steps = np.diff(times)
-    far = np.flatnonzero(steps > PAUSE_S)
-    if far.size:
-        row = int(far[0])
+    jumps = np.flatnonzero(steps > PAUSE_S)
+    if jumps.size:
+        row = int(jumps[0])
         warn(
             f"{source}: expected one drive, found {steps[row] / 3600:.3g} h between scans {row} and {row + 1} "
-            f"({far.size} jumps); scans before and after a jump count as separate visits of a place"
+            f"({jumps.size} jumps); scans before and after a jump count as separate visits of a place"
         )
 
 

@@ -29,19 +29,20 @@ def leave_one_out(
         raise ValueError(
             f"{root}: expected training recordings other than {test!r}, found {', '.join(names) or 'none'}"
         )
-    recordings = [_with_positions(root, open_recording(root, name, **options)) for name in names]
-    return recordings, _with_positions(root, tested)
+    *recordings, tested = _with_positions(root, [*(open_recording(root, name, **options) for name in names), tested])
+    return recordings, tested
 
 
 def all_recordings(root: Path, **options: Any) -> list[Recording]:
     """Open every recording of a dataset with the options of `open_recording`. All recordings must have positions."""
-    return [_with_positions(root, open_recording(root, name, **options)) for name in recording_names(root)]
+    return _with_positions(root, [open_recording(root, name, **options) for name in recording_names(root)])
 
 
-def _with_positions(root: Path, recording: Recording) -> Recording:
-    if recording.positions is None:
-        raise ValueError(f"{root}: sequence {recording.name} has no poses; training and testing need them")
-    return recording
+def _with_positions(root: Path, recordings: list[Recording]) -> list[Recording]:
+    for recording in recordings:
+        if recording.positions is None:
+            raise ValueError(f"{root}: sequence {recording.name} has no poses; training and testing need them")
+    return recordings
 
 
 def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:
@@ -52,10 +53,10 @@ def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Re
     """
     labelled = [_labelled(recording, folder / file_name(recording.name)) for recording in recordings]
     if not any(new is not old for new, old in zip(labelled, recordings, strict=True)):
-        wanted = [each.name for each in recordings if each.has_images and not each.has_labels]
+        unlabelled = [recording.name for recording in recordings if recording.has_images and not recording.has_labels]
         raise FileNotFoundError(
             f"{folder}: expected label images NN/<id>.png for the image recordings without labels "
-            f"({', '.join(wanted) or 'the data has no image recording without labels'}), found none"
+            f"({', '.join(unlabelled) or 'the data has no image recording without labels'}), found none"
         )
     return labelled
 
@@ -63,6 +64,6 @@ def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Re
 def _labelled(recording: Recording, folder: Path) -> Recording:
     if not recording.has_images or recording.has_labels:
         return recording
-    there = {path.stem: path for path in folder.glob("*.png")}
-    label_paths = tuple(there.get(file_name(image)) for image in recording.ids)
+    files = {path.stem: path for path in folder.glob("*.png")}
+    label_paths = tuple(files.get(file_name(image)) for image in recording.ids)
     return dataclasses.replace(recording, label_paths=label_paths) if any(label_paths) else recording

@@ -1,6 +1,6 @@
-"""Converts a record to the input of a model: its image and, if requested, its map of classes.
+"""Converts a scan to the input of a model: its image and, if requested, its map of classes.
 
-`view` converts one record. Training divides the work: the host computes `picture` or the points of each record, and the
+`view` converts one scan. Training divides the work: the host computes `picture` or the points of each scan, and the
 compiled step applies `image_view` or `cloud_view` to a whole batch.
 """
 
@@ -19,10 +19,12 @@ from sglpr_jax.bev import (
     rotate_labels,
     rotate_points,
 )
-from sglpr_jax.data.density_image import check_density_counts, density_bev, density_label_bev
+from sglpr_jax.data.density_image import density_bev, density_label_bev
 from sglpr_jax.data.scan import Scan, check_cloud
-from sglpr_jax.grid import Grid, ImageKind, check_density_grid
+from sglpr_jax.grid import DENSITY_MAX_COUNT, Grid, ImageKind, check_density_grid
 
+BEYOND_COUNTS = 2.0
+"""Tolerance for counts below 0 or above 10, which smooth resizing of an image produces."""
 _POINTS_STEP = 16384
 """Clouds are padded to a multiple of this number of points, so that few sizes are compiled."""
 
@@ -43,10 +45,10 @@ def view(
     categories: int = 0,
     angle: Float[Array | np.ndarray, ""] | None = None,
 ) -> View:
-    """Compute the image (h, w) of a record on a grid and, if requested, its map of classes (h, w).
+    """Compute the image (h, w) of a scan on a grid and, if requested, its map of classes (h, w).
 
     Arguments:
-      record: Scan or ready-made image.
+      scan: Scan or ready-made image.
       grid: Grid of the image. Ready-made images are cropped to it, or kept whole with None.
       image: Kind of image to compute from the points of a scan.
       categories: Number of classes of the map; 0 for no map.
@@ -72,13 +74,20 @@ def view(
 
 
 def check_ready_made(scan: Scan, image: ImageKind) -> None:
-    """Raise ValueError if a record has a ready-made image that is not of the given kind."""
-    if image == "density" and scan.image is not None:
-        check_density_counts(scan.image, name=scan.name)
+    """Raise ValueError if the ready-made image of a scan should be a density image, but has grey values or counts."""
+    if image != "density" or scan.image is None or not np.issubdtype(scan.image.dtype, np.floating):
+        return
+    least, most = scan.image.min(initial=0), scan.image.max(initial=0)
+    if not (least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS):  # True for NaN
+        raise ValueError(
+            f"{scan.name}: expected a density image, floats from 0 to {DENSITY_MAX_COUNT}, found floats from "
+            f"{least:g} to {most:g}; does the image contain grey values (255 instead of "
+            f"{DENSITY_MAX_COUNT}) or uncapped point counts?"
+        )
 
 
 def classes_of(scan: Scan, categories: int) -> Int32[np.ndarray, "..."]:
-    """Return the class of every point or pixel. Raises ValueError if the record has no labels."""
+    """Return the class of every point or pixel. Raises ValueError if the scan has no labels."""
     classes = scan.classes(categories)
     if classes is None:
         raise ValueError(f"{scan.name}: expected labels, found none")
@@ -108,12 +117,12 @@ def image_view(
     images stay whole.
     """
 
-    def see(whole: Any, rotate: Any) -> Array | np.ndarray:
+    def transformed(whole: Any, rotate: Any) -> Array | np.ndarray:
         whole = whole if grid is None else even_cells(whole)
         whole = whole if angle is None else rotate(jnp.asarray(whole), angle)
         return whole if grid is None else centre_crop(whole, height=grid.height, width=grid.width)
 
-    return View(see(image, rotate_image), None if classes is None else see(classes, rotate_labels))
+    return View(transformed(image, rotate_image), None if classes is None else transformed(classes, rotate_labels))
 
 
 def cloud_view(
@@ -133,7 +142,7 @@ def cloud_view(
 
 
 def rotated(points: Float32[np.ndarray, "n 3"], angle: float) -> Float32[np.ndarray, "n 3"]:
-    """Return the result of `bev.rotate_points` without compiling for each number of points."""
+    """Rotate points about the z axis by `angle` radians, as `bev.rotate_points` but without compiling."""
     x, y, z = points.astype(np.float64).T
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1).astype(np.float32)

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.levelling import uprights
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, missing, render
@@ -84,7 +83,7 @@ def _trajectory(result: LoopSearchResult) -> list[Picture | Text]:
         share = f"{len(wrong)} of {len(result.loops)} loops are wrong{' (red)' if wrong else ''}"
         quality = f"{share}: more than {NEGATIVE_M:g} m apart by {source}."
     if session.odometry is not None:
-        positions, source = level_odometry(session.odometry, uprights(session.recording))[:, :3, 3], "the odometry"
+        positions, source = level_odometry(session.odometry, session.recording.uprights)[:, :3, 3], "the odometry"
     pictures = []
     if positions is not None:
         caption = f"The trajectory from {source}. A line connects the two frames of each loop. {quality}"
@@ -126,7 +125,7 @@ def _corrected(result: LoopSearchResult, optimized: OptimizedTrajectory) -> Pict
         caption += f" Position error (RMSE after alignment with {session.recording.pose_source}): {errors}."
     if not figures.can_draw():
         return missing(caption)
-    upright = uprights(session.recording)[: session.frames]
+    upright = session.recording.uprights[: session.frames]
     level = {name: level_odometry(poses, upright)[:, :3, 3] for name, poses in trajectories.items()}
     return figure_picture(figures.trajectories(level), "The trajectory before and after", caption=caption)
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.levelling import upright_from_lidar
+from sglpr_jax.data.mounting import upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, LoopClosure, Reason, RejectedClosure, frames_of, scaled_drift

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.bev import even_cells, rotate_image
-from sglpr_jax.data.levelling import uprights
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import scan_stream
@@ -138,7 +137,7 @@ class _Drive:
 
     def __init__(self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"]):
         self.finder, self.recording = CandidateSearch(params), recording
-        self.motion = BevOdometry.of(level_odometry(odometry, uprights(recording)))
+        self.motion = BevOdometry.of(level_odometry(odometry, recording.uprights))
         self.motion.add(0.0, continues=False)
         self.stored = StoredScans(self.finder.index)
         for row, keyframe in scan_stream(recording, lambda row, scan: self.finder.keyframe(scan)):

@@ -4,8 +4,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from sglpr_jax.data.levelling import is_tilted, upright_from_lidar
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.arguments import check_is

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.levelling import upright_from_lidar
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
-from sglpr_jax.data.levelling import check_level, uprights
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
@@ -185,7 +184,6 @@ def _checked(recording: Recording, odometry: ArrayLike | None, config: DetectorC
     if registered:
         check_installed()
     if poses is not None:
-        check_level(poses, recording)
         recording = with_odometry(recording, poses)
     return Input(recording, poses, config)
 
@@ -367,7 +365,7 @@ def _aligned(
         rows = np.flatnonzero(finder.motion.segments == finder.motion.segments[frame])
         parts.append(TrajectorySegment(session, int(rows[0]), int(rows[-1]), odometry is not None))
         if odometry is None:
-            keyframe = finder.motion.poses @ uprights(one.given.recording)[: len(finder)]
+            keyframe = finder.motion.poses @ one.given.recording.uprights[: len(finder)]
             poses.append(inverse(keyframe[rows[0]]) @ keyframe)
         else:
             poses.append(odometry[: len(finder)])

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
-from sglpr_jax.data.levelling import check_level
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
@@ -69,7 +68,6 @@ def map_recording(
     poses = given_poses(poses, of="poses")
     if len(poses) != len(recording) or not len(recording):
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
-    check_level(poses, recording)
     recording = with_odometry(recording, poses)
     finder, keyframes = CandidateSearch(params), list[Keyframe | None]()
     frame_rows, places, done = list[int](), list[tuple[int, int]](), 0

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
-from sglpr_jax.data.levelling import upright_from_lidar
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled_poses, scaled_scan
 from sglpr_jax.data.scan import Scan

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.levelling import is_tilted
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse
@@ -83,7 +82,8 @@ class DrivenPath:
         """
         if not self.tilted or not len(self):
             return np.eye(3)
-        return Mounting(0.0, tuple((self._up / np.linalg.norm(self._up)).tolist())).upright_from_lidar
+        up = tuple((self._up / np.linalg.norm(self._up)).tolist())
+        return upright_from_lidar(Mounting(0.0, up))[:3, :3]
 
     def extend(self, poses: Float[np.ndarray, "n 4 4"], guessed_m: Float[np.ndarray, " n"] | None = None) -> None:
         """Add the poses of the next frames, and the guessed motion up to each of them (`BevOdometry.guessed_m`).

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.levelling import is_tilted, uprights
+from sglpr_jax.data.mounting import is_tilted
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.closure import LoopClosure, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
@@ -105,7 +105,7 @@ def _solve_group(
     Returns the solution for the gravity-aligned frames, and the corrected poses of the LiDAR for each session.
     """
     sessions, (first, *_) = result.sessions, members
-    upright_from_lidar = {k: uprights(sessions[k].recording)[: sessions[k].frames] for k in members}
+    upright_from_lidar = {k: sessions[k].recording.uprights[: sessions[k].frames] for k in members}
     upright = {}
     for k, first_from_session in members.items():
         odometry = np.asarray(sessions[k].odometry)[: sessions[k].frames]

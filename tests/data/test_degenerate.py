@@ -14,14 +14,8 @@ from sglpr_jax.grid import Grid
 from sglpr_jax.models.config import model_preset
 
 GOOD = np.random.default_rng(0).uniform(-15, 15, (400, 3)).astype(np.float32)
-OUTSIDE = {"far": GOOD + np.float32([200, 0, 0]), "one point": GOOD[:1]}
+FAR = GOOD + np.float32([200, 0, 0])
 CONFIG = model_preset("tiny")
-
-
-@pytest.mark.parametrize("kind", OUTSIDE)
-def test_nothing_in_the_window_is_refused(kind):
-    with pytest.raises(ValueError, match=r"the scan: expected points in at least 2 cells of the window"):
-        sglpr_jax.scan_image(OUTSIDE[kind], CONFIG)
 
 
 def recording(*clouds):
@@ -29,7 +23,7 @@ def recording(*clouds):
 
 
 def test_embedding_refuses_an_empty_window_and_an_empty_image(random_params):
-    scans = recording(GOOD, OUTSIDE["far"])
+    scans = recording(GOOD, FAR)
     params = random_params(CONFIG)
     with pytest.raises(ValueError, match="scan 1 of sequence 08: expected points in at least 2 cells"):
         sglpr_jax.embed(params, scans)

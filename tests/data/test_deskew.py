@@ -13,7 +13,6 @@ from scipy.linalg import expm, logm
 import sglpr_jax
 from sglpr_jax.data.deskew import deskew, deskewed, poses_at
 from sglpr_jax.data.scan import Scan, TimeField
-from sglpr_jax.data.submap import submaps
 
 RATE_S = 0.1
 WORLD = np.random.default_rng(0).uniform([-40, -40, -2], [40, 40, 6], (24, 3))
@@ -88,29 +87,14 @@ def test_a_recording_is_deskewed_and_a_scan_without_a_neighbour_stays():
         deskewed(found, poses)
 
 
-def test_submaps_of_deskewed_scans():
-    times, poses, clouds = drive(twist([0, 0, 1.5], [9, 0, 0]))
-    found = submaps(deskewed(recording_of(times, clouds), poses), poses, keyframe_m=0.1)
-    in_world = found.points(3) @ poses[3][:3, :3].T + poses[3][:3, 3]
-    apart = np.linalg.norm(in_world[:, None] - WORLD[None], axis=2).min(axis=1)
-    assert apart.max() < 0.01 and set(found.read_options) == {"deskewed", "submaps"}
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"times": None}, "sequence 08: expected times of the scans to remove their motion, found none"),
-        ({"read": lambda *_: Scan(points=np.ones((5, 3), np.float32))}, "expected times of the points to remove"),
-    ],
-)
-def test_missing_times_are_one_clear_error(changed, message):
-    times, poses, clouds = drive(twist([0, 0, 1], [5, 0, 0]), scans=2)
-    with pytest.raises(ValueError, match=message):
-        deskewed(dataclasses.replace(recording_of(times, clouds), **changed), poses)
-
-
 def test_invalid_arguments_are_one_clear_error():
     times, poses, clouds = drive(twist([0, 0, 1], [5, 0, 0]), scans=2)
+    for changed, message in (
+        ({"times": None}, "sequence 08: expected times of the scans to remove their motion, found none"),
+        ({"read": lambda *_: Scan(points=np.ones((5, 3), np.float32))}, "expected times of the points to remove"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            deskewed(dataclasses.replace(recording_of(times, clouds), **changed), poses)
     zeros = recording_of(times, clouds, within=np.zeros(24, np.float32))
     with pytest.raises(ValueError, match=r"scan 000 of sequence 08: expected times of points over .* found 0 to 0"):
         deskewed(zeros, poses)

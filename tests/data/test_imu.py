@@ -143,7 +143,3 @@ def test_topics_transforms_and_gravity_that_are_missing(tmp_path):
         assert "imu" not in open_recording(free, gravity="scan").found[-1]
     with pytest.raises(ValueError, match=r"b.bag, /livox/imu: expected accelerations with gravity, of 9.8 m/s\^2 or"):
         open_recording(free, gravity="scan", imu_topic="/livox/imu")
-    np.ones((50, 4), "<f4").tofile(tmp_path / "0.bin")
-    (tmp_path / "a.bag").unlink(), (tmp_path / "b.bag").unlink()
-    with pytest.raises(ValueError, match="expected a bag with the IMU topic /imu, found"):
-        open_recording(tmp_path, imu_topic="/imu", format="kitti")

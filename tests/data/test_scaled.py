@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from recordings import of_images, of_scans
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.scaled import chosen_scale, scale_of, scaled, scaled_poses, scaled_scan
+from sglpr_jax.data.scaled import chosen_scale, scale_of, scaled, scaled_scan
 from sglpr_jax.data.scan import Scan
 
 POINTS = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)
@@ -35,13 +35,6 @@ def test_a_scaled_recording_keeps_positions_and_times():
     np.testing.assert_array_equal(found.points(2), 4 * one.points(2))
     assert found.mounting_of(1) == Mounting(3.6, (0.6, 0.0, 0.8), 0.08, 0.3)
     assert found.positions is positions and found.times is times and scale_of(found) == 4
-
-
-def test_poses_keep_their_rotations():
-    pose = np.eye(4)
-    pose[:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
-    found = scaled_poses(pose, 2.0)
-    assert found[:3, 3].tolist() == [2, 4, 6] and found[:3, :3].tolist() == pose[:3, :3].tolist()
 
 
 @pytest.mark.parametrize(("metres", "expected"), [(5.0, 4), (20.0, 1)])

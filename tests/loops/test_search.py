@@ -12,7 +12,7 @@ from drives import PASS, SCANS, part_of_drive
 from recordings import of_images, of_scans
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
-from sglpr_jax.data.levelling import check_level
+from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import only
@@ -94,14 +94,14 @@ def test_odometry_in_other_axes_is_told(found):
 def test_odometry_in_the_cameras_axes_is_told_by_its_way_too():
     poses = there_and_back()
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
-    check_level(poses, recording)
+    with_odometry(recording, poses)
     camera = CAMERA_FROM_LIDAR @ poses @ CAMERA_FROM_LIDAR.T
-    check_level(camera[:5], only(recording, range(5)))
+    with_odometry(only(recording, range(5)), camera[:5])
     words = r"08: expected poses of a LiDAR that moves along the ground .*, found \d+ of \d+ m of path up or down"
     forward = dataclasses.replace(recording, mounting=Mounting(1.0, (1.0, 0.0, 0.0)))
     for given, one in ((camera, recording), (poses, forward)):
         with pytest.warns(DataWarning, match=words):
-            check_level(given, one)
+            with_odometry(one, given)
 
 
 @pytest.mark.slow

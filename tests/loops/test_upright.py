@@ -7,8 +7,7 @@ import pytest
 from recordings import reading_scans
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.levelling import upright_from_lidar
-from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, upright_from_lidar
 from sglpr_jax.loops.closure import LoopClosure, planar_loop, to_lidar, to_upright
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.maps.build import map_recording

@@ -88,7 +88,7 @@ def run(weights: dict, image: jax.Array, labels: jax.Array, config: ModelConfig)
     tokens, seen = backbone.apply({"params": weights["backbone"]}, image)
     pixels = PatchExpand(swin.patch, swin.embed_dim).apply({"params": weights["expand"]}, tokens)
     logits = nn.Dense(config.classes, use_bias=False).apply({"params": weights["segmentation_head"]}, pixels)
-    ce, dice = losses.cross_entropy(logits, labels).mean(), losses.dice(logits, labels)
+    ce, dice = losses.cross_entropy(logits, labels).mean(), losses.dice_from_sums(losses.dice_sums(logits, labels))
     return 0.4 * ce + 0.6 * dice, {**seen, "up_x4": pixels, "logits": logits, "ce": ce, "dice": dice}
 
 

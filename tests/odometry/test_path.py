@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sglpr_jax.data.levelling import upright_from_lidar
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import inverse, travelled
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scenes import difference, place, relative, seen_from
 from scipy import ndimage, signal
 
-from sglpr_jax.data.levelling import uprights
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.registration.config import VerificationConfig
@@ -77,7 +76,7 @@ def test_between_two_plain_walls_the_place_along_them_is_unknown(yaw):
 
 @pytest.mark.slow
 def test_errors_in_a_town_are_as_large_as_the_covariance_says(drive):
-    poses = drive.poses.world_from_lidar @ inverse(uprights(drive))
+    poses = drive.poses.world_from_lidar @ inverse(drive.uprights)
     apart = np.linalg.norm(drive.positions[:, None] - drive.positions[None], axis=2)
     apart[np.subtract.outer(drive.times, drive.times) < 30] = np.inf
     queries = np.flatnonzero(apart.min(1) < 8)[::2]

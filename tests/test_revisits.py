@@ -1,4 +1,4 @@
-"""Positions, distances and the rule of LoGG3D-Net for queries, databases and revisits."""
+"""The rule of LoGG3D-Net for queries, databases and revisits."""
 
 import json
 
@@ -9,31 +9,8 @@ import numpy as np
 import pytest
 from recordings import kitti_trajectory
 
-from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.revisits import database_end, revisits
-from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S, POSITIVE_M
-from sglpr_jax.se3 import are_rotations, distances
-
-coordinates = st.floats(-1e4, 1e4)
-
-
-@hypothesis.settings(deadline=None, max_examples=25)
-@hypothesis.given(st.floats(-4, 4), st.sampled_from([0.0, 0.02, 1e300, np.inf, np.nan]))
-def test_rotations_are_told_from_what_is_none(angle, error):
-    turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    mirror, damaged = turned * [1, 1, -1], turned + np.full((3, 3), error)
-    np.testing.assert_array_equal(are_rotations(np.stack([turned, mirror, damaged])), [True, False, error == 0])
-    assert are_rotations(turned)
-
-
-@hypothesis.settings(deadline=None, max_examples=25)
-@hypothesis.given(
-    hnp.arrays(np.float64, (5, 3), elements=coordinates), hnp.arrays(np.float64, (4, 3), elements=coordinates)
-)
-def test_distances_are_norms_of_differences(a, b):
-    expected = np.linalg.norm(a[:, None] - b[None], axis=-1)
-    np.testing.assert_allclose(distances(a, b), expected, rtol=1e-12)
-    np.testing.assert_array_equal(distances(a, a), distances(a, a).T)
+from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
 
 @hypothesis.settings(deadline=None, max_examples=25)
@@ -89,13 +66,3 @@ def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
     assert found.sum() == count
     np.testing.assert_array_equal(found, np.array(published) == 1)
     assert revisits(positions).sum() == count  # 290 frames stand for 30 s
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sequence, count", [("02", 217)])
-def test_revisits_of_the_bev_images(shared, sequence, count):
-    positions = read_poses(shared / f"data/kitti_bev/{sequence}/pose.txt")[:, :, 3]
-    assert revisits(positions).sum() == count
-    frames = np.arange(len(positions))
-    fifty_apart = frames[:, None] - frames[None, :] > 50
-    assert ((distances(positions, positions) < POSITIVE_M) & fifty_apart).any(axis=1).sum() == count
