@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.drives import lidar
 from benchmarks.speed.inputs import random_scans
 from benchmarks.timing import median_seconds
 from sglpr_jax.bev import rasterize
@@ -23,11 +22,11 @@ GRID = Grid(height=224, width=224)
 Row = dict[str, Any]
 
 
-class Along:
+class TownDrive:
     """A drive through its town, and the sensor that makes it."""
 
-    def __init__(self, seq: str, scans: int, sensor: Sensor):
-        path = plan_path(np.random.default_rng(0), seq, scans=scans)
+    def __init__(self, route: str, scans: int, sensor: Sensor):
+        path = plan_path(np.random.default_rng(0), route, scans=scans)
         xy, yaw, self.times = (values[scan_rows(path, scans)] for values in path)
         self.world = build_world(0, xy, self.times)
         self.poses = poses_on(self.world.ground.relief, xy, yaw, height_m=sensor.height_m)
@@ -48,23 +47,22 @@ class Along:
 
 
 def measurements(
-    sensor: str, azimuth_steps: int | None, *, route: str, scans: int, batch: int, points: int, repeats: int
+    name: str, sensor: Sensor, *, route: str, scans: int, batch: int, points: int, repeats: int
 ) -> Iterator[tuple[Row, Callable[[], Row]]]:
     """The key of each row, and a function that measures its rest."""
-    one = lidar(sensor, azimuth_steps)
-    drive = functools.cache(lambda: Along(route, scans, one))
-    rays = {"sensor": sensor, "rays": [len(one.elevations_deg), one.azimuth_steps]}
+    drive = functools.cache(lambda: TownDrive(route, scans, sensor))
+    rays = {"sensor": name, "rays": [len(sensor.elevations_deg), sensor.azimuth_steps]}
     yield {"what": "scan", **rays}, lambda: _whole_scans(drive(), repeats)
-    for number in (1, batch):
-        key = {"what": "cast", "batch": number, **rays}
-        yield key, functools.partial(_casts, drive, number, repeats)
-    for number in (1, batch):
-        key = {"what": "rasterize", "batch": number, "points": points}
-        yield key, functools.partial(_rasterized, number, points, repeats)
+    for size in (1, batch):
+        key = {"what": "cast", "batch": size, **rays}
+        yield key, lambda size=size: _casts(drive(), size, repeats)
+    for size in (1, batch):
+        key = {"what": "rasterize", "batch": size, "points": points}
+        yield key, functools.partial(_rasterized, size, points, repeats)
     yield {"what": "density_bev on the host", "points": points}, functools.partial(_densities, points, repeats)
 
 
-def _whole_scans(drive: Along, repeats: int) -> Row:
+def _whole_scans(drive: TownDrive, repeats: int) -> Row:
     """Scans from the town to the host's memory: stages, and the rate in one and two threads.
 
     The cast is done twice to tell it from the returns, which follow it.
@@ -84,12 +82,12 @@ def _whole_scans(drive: Along, repeats: int) -> Row:
     return {**row, "scans_per_second": count / one, "scans_per_second_in_2_threads": count / two}
 
 
-def _casts(drive: Callable[[], Along], batch: int, repeats: int) -> Row:
-    """The device's part alone: the rays of so many scans in one call, all they may meet on the device already."""
-    along, keys = drive(), jax.random.split(jax.random.key(0), batch)
-    views = [along.view(i % len(along.poses)) for i in range(batch)]
+def _casts(drive: TownDrive, batch: int, repeats: int) -> Row:
+    """The device's part alone: the rays of this number of scans in one call, all surfaces on the device already."""
+    keys = jax.random.split(jax.random.key(0), batch)
+    views = [drive.view(i % len(drive.poses)) for i in range(batch)]
     stacked = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *views))
-    cast = jax.jit(jax.vmap(functools.partial(cast_turn, sensor=along.sensor)))
+    cast = jax.jit(jax.vmap(functools.partial(cast_turn, sensor=drive.sensor)))
     seconds = median_seconds(lambda: jax.block_until_ready(cast(keys, stacked)), repeats=repeats)
     return {"seconds": seconds, "scans_per_second": batch / seconds}
 

@@ -7,10 +7,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
 import sglpr_jax
+from benchmarks.table import Table
 from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
@@ -79,8 +78,7 @@ def compare(
         raise SystemExit("nothing to measure: name datasets with --real, --real-range or --simulated")
     table = Table("total variation from the real drives, %", *sources)
     for measure, (title, _) in HISTOGRAMS.items():
-        table.add_row(title, *(_distance_from_real(name, measure, sources) for name in sources))
-    Console(width=200).print(table)
+        table.add(title, *(_distance_from_real(name, measure, sources) for name in sources))
     save(_draw(sources), out / "histograms.png")
     print(out / "histograms.png")
 
@@ -238,12 +236,11 @@ def semantics(
     totals["all"] = np.sum(list(totals.values()), axis=0)
     for source, matrices in totals.items():
         ours, guess = map(score_confusion, matrices)
-        table = Table("class", "share of the cells", "IoU", "IoU of each cell's commonest class", title=source)
+        table = Table(source, "share of the cells", "IoU", "IoU of each cell's commonest class")
         for i in np.flatnonzero(ours.shares).tolist():
-            table.add_row(CATEGORIES[i], f"{ours.shares[i]:.2%}", f"{ours.iou[i]:.3f}", f"{guess.iou[i]:.3f}")
-        table.add_row(f"mean of {ours.present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
-        table.add_row(f"{CATEGORIES[ours.majority]} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
-        Console(width=120).print(table)
+            table.add(CATEGORIES[i], f"{ours.shares[i]:.2%}", f"{ours.iou[i]:.3f}", f"{guess.iou[i]:.3f}")
+        table.add(f"mean of {ours.present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
+        table.add(f"{CATEGORIES[ours.majority]} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
 
 
 def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Iterator[tuple[str, Scan]]:
