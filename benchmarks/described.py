@@ -42,10 +42,6 @@ class DescribedDrive(NamedTuple):
     """World, route, seed, sensor and carrier, or others."""
     scale: int
 
-    def __len__(self) -> int:
-        """Number of scans."""
-        return len(self.keyframes)
-
     def odometry(self, kind: Odometry, seed: int) -> Float[np.ndarray, "n 4 4"] | None:
         """The true poses, the same with drift, or None."""
         odometry = odometry_of(kind, scaled_poses(self.world_from_lidar, 1 / self.scale), seed=seed)
@@ -107,5 +103,5 @@ def replay(
     middle."""
     for i, keyframe in enumerate(drive.keyframes):
         pose = None if odometry is None else odometry[i]
-        continues = not (breaks and i == len(drive) // 2)
+        continues = not (breaks and i == len(drive.keyframes) // 2)
         yield search.add_keyframe(keyframe, time=float(drive.times[i]), odometry=pose, continues=continues)

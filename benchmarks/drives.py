@@ -14,8 +14,7 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
 from sglpr_jax.se3 import inverse, transform
 from sglpr_jax.sim.drive import CARRIERS
-from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
-from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, simulate_repeating
 from sglpr_jax.sim.routes import REVISITS
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor

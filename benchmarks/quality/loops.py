@@ -209,7 +209,7 @@ def loops(
             answer = METHODS[name](Task(stored, simulate, given, params, weights, environment))
             seconds = time.perf_counter() - start[0], _processor_s() - start[1]
             counts = counted(answer.closures, poses[:, :3, 3], rule)
-            numbers = np.array([len(stored), *counts, *_pose_counts(stored, answer.loops)])
+            numbers = np.array([len(stored.keyframes), *counts, *_pose_counts(stored, answer.loops)])
             error = "-" if answer.trajectory is None else f"{trajectory_error(answer.trajectory, poses[:, :3, 3]):.2f}"
             errors = told(answer.loops, stored.world_from_lidar)
             table.add(drive.name, name, *(f"{value:.0f}" for value in seconds), *_cells(numbers), error, errors)

@@ -19,8 +19,8 @@ from sglpr_jax.loops.keyframes import Keyframe, described
 from sglpr_jax.odometry.kiss_icp import scan_odometry
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import distances, inverse, yaw_of
+from sglpr_jax.sim.recording import plan_sessions
 from sglpr_jax.sim.sensor import SENSORS
-from sglpr_jax.sim.sessions import plan_sessions
 
 WELL_M, WELL_DEG, SURE = 0.5, 2.0, 0.99
 """Largest errors of a right pose, and the probability of an answer that should not be wrong."""

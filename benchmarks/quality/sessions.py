@@ -19,10 +19,9 @@ from benchmarks.drives import drifted, lidar
 from benchmarks.quality.scoring import OTHER_M
 from sglpr_jax.se3 import inverse, yaw_of
 from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
-from sglpr_jax.sim.recording import drive_through
+from sglpr_jax.sim.recording import PAUSE_S, drive_through
 from sglpr_jax.sim.routes import travelled
 from sglpr_jax.sim.sensor import Sensor
-from sglpr_jax.sim.sessions import PAUSE_S
 from sglpr_jax.sim.world import build_world
 
 ROUTES = ("00", "02", "05", "06", "07", "08", "10")

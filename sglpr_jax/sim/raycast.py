@@ -74,13 +74,13 @@ def find_candidates(
     step = (last - first) / azimuth_steps
     middle = first + (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
     half_width = (COLUMNS - 1) / 2 * step + _MARGIN
-    found = []
+    candidates = []
     for shapes, count in zip(scene, slots, strict=True):
-        near = at_time(shapes, time, world_from_lidar[:3, 3], reach_m=reach_m)
-        bearing, half_extent = _bearings(near, world_from_lidar)
-        apart = np.abs(_wrapped(bearing[:, None] - middle))
-        found.append(_listed(near, world_from_lidar[:3, 3], apart <= half_extent[:, None] + half_width, count))
-    return tuple(found)
+        present = at_time(shapes, time, world_from_lidar[:3, 3], reach_m=reach_m)
+        bearing, half_extent = _bearings(present, world_from_lidar)
+        angle = np.abs(_wrapped(bearing[:, None] - middle))
+        candidates.append(_listed(present, world_from_lidar[:3, 3], angle <= half_extent[:, None] + half_width, count))
+    return tuple(candidates)
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
@@ -274,8 +274,8 @@ def echo_returns(
     1 - exp(-(e / faintest_echo)^2), reduced by `dropout` and by windows. A flat road vanishes between 35 and 55 m.
     """
     echo = reflectivity(surface.label) * surface.facing / jnp.maximum(surface.distance, 1) ** 2
-    seen = (1 - dropout) * -jnp.expm1(-((echo / faintest_echo) ** 2))
-    return chance < jnp.where(surface.window, 1 - WINDOW_LOSS, 1) * seen
+    detected = (1 - dropout) * -jnp.expm1(-((echo / faintest_echo) ** 2))
+    return chance < jnp.where(surface.window, 1 - WINDOW_LOSS, 1) * detected
 
 
 def mix_edges(

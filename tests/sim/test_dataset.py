@@ -15,8 +15,7 @@ from sglpr_jax.se3 import positions_from_camera
 from sglpr_jax.sim import recording
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.drive import CARRIERS
-from sglpr_jax.sim.recording import simulate_recording
-from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.recording import simulate_recording, simulate_repeating
 from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)

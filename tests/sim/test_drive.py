@@ -16,8 +16,7 @@ from sglpr_jax.sim.drive import (
     speeds,
 )
 from sglpr_jax.sim.ground import draw_relief, relief_height
-from sglpr_jax.sim.recording import SimulatedRecording
-from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.recording import SimulatedRecording, simulate_repeating
 from sglpr_jax.sim.routes import ROLES, plan_walk
 from sglpr_jax.sim.sensor import Sensor
 

@@ -7,7 +7,7 @@ from sglpr_jax.sim.drive import drive_seed
 from sglpr_jax.sim.ground import relief_height
 from sglpr_jax.sim.labels import BUILDING, FENCE, POLE
 from sglpr_jax.sim.placement import HEAD_ROOM_M, distances, footprint_distance
-from sglpr_jax.sim.repeating import driven_line, plan_drive, simulate_repeating
+from sglpr_jax.sim.recording import driven_line, plan_drive, simulate_repeating
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sceneries.site import STEP_M, build, painted_ground
 from sglpr_jax.sim.sceneries.site import Strip as GroundStrip

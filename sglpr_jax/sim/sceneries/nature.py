@@ -21,8 +21,11 @@ BEND_M = 25.0  # distance between two bends of the path through the forest, in m
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Track through fields, with posts or poles along it, some bushes, and single trees and sheds far away."""
     whole, driven = road(rng, length_m, closed)
-    (every, thick, high), beside = ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)], rng.choice((-1, 1)) * 5.0
-    posts = along(shifted(whole, beside), ((post(POLE, thick, high),), every))
+    (every, thickness, height), beside = (
+        ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)],
+        rng.choice((-1, 1)) * 5.0,
+    )
+    posts = along(shifted(whole, beside), ((post(POLE, thickness, height),), every))
     bushes = _beside(rng, whole, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
 
     def tree_or_shed() -> ObjectModel:
@@ -47,9 +50,9 @@ def _beside(
 def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Trees of one stand on slopes, 250 to 900 a hectare, with a bush for every 3 to 30 trunks."""
     line = _path(rng, length_m, closed)
-    density, thick = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
+    density, thickness = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
     branches, shrubs = rng.uniform(3.0, 7.0), 1 / rng.uniform(3, 30)
-    spots = [Spot(_tree(rng, thick, branches), x, y) for x, y in _scattered(rng, line, density)]
+    spots = [Spot(_tree(rng, thickness, branches), x, y) for x, y in _scattered(rng, line, density)]
     for x, y in _scattered(rng, line, shrubs * density):
         spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
     relief = draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))
@@ -78,10 +81,10 @@ def _scattered(rng: np.random.Generator, line: Line, density: float) -> list[tup
     return [(float(x), float(y)) for x, y in points[near]]
 
 
-def _tree(rng: np.random.Generator, thick: float, branches: float) -> ObjectModel:
+def _tree(rng: np.random.Generator, thickness: float, branches: float) -> ObjectModel:
     """Trunk, and a crown that begins at about `branches` metres. The thickness has a log-normal distribution."""
-    thick = float(thick * np.exp(rng.normal(scale=0.35)))
-    wide, bottom = 10 * thick * rng.uniform(0.7, 1.3), branches * rng.uniform(0.7, 1.3)
-    high = wide * rng.uniform(1.2, 2.0)
-    leaves = ball(VEGETATION, wide, high, bottom=bottom, roughness=0.8, porosity=0.6)
-    return post(TRUNK, thick, bottom + 0.4 * high), leaves
+    thickness = float(thickness * np.exp(rng.normal(scale=0.35)))
+    width, bottom = 10 * thickness * rng.uniform(0.7, 1.3), branches * rng.uniform(0.7, 1.3)
+    height = width * rng.uniform(1.2, 2.0)
+    leaves = ball(VEGETATION, width, height, bottom=bottom, roughness=0.8, porosity=0.6)
+    return post(TRUNK, thickness, bottom + 0.4 * height), leaves

@@ -45,9 +45,9 @@ def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _tube(half: float, height: float, niche: float) -> ObjectModel:
-    long, away = OVERLAP * TUNNEL_M, half + THICK_M / 2
-    wall = block(BUILDING, long, THICK_M, height + 0.5, y=away, roughness=0.02)
-    ceiling = block(BUILDING, long, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
+    length, away = OVERLAP * TUNNEL_M, half + THICK_M / 2
+    wall = block(BUILDING, length, THICK_M, height + 0.5, y=away, roughness=0.02)
+    ceiling = block(BUILDING, length, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
     return wall, wall._replace(y=-away - niche), ceiling
 
 

@@ -85,12 +85,12 @@ def mirrored(*parts: Primitive) -> ObjectModel:
 
 def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep: float = 1.0) -> list[Spot]:
     """Keeps the fraction `keep` of the spots, shifts them by about `metres`, and turns them by up to 3 degrees."""
-    kept = [spot for spot in spots if rng.random() < keep]
-    moves = rng.normal(scale=metres, size=(len(kept), 2)).tolist()
-    turns = np.radians(rng.uniform(-3, 3, len(kept))).tolist()
+    spots = [spot for spot in spots if rng.random() < keep]
+    moves = rng.normal(scale=metres, size=(len(spots), 2)).tolist()
+    turns = np.radians(rng.uniform(-3, 3, len(spots))).tolist()
     return [
         spot._replace(x=spot.x + dx, y=spot.y + dy, heading=spot.heading + turn)
-        for spot, (dx, dy), turn in zip(kept, moves, turns, strict=True)
+        for spot, (dx, dy), turn in zip(spots, moves, turns, strict=True)
     ]
 
 
@@ -123,8 +123,8 @@ def track(line: Line, half_m: float, relief: Relief) -> Ground:
 
 def wall(start: tuple[float, float], stop: tuple[float, float], height_m: float) -> Primitive:
     """Wall of a building along x or y."""
-    long, wide = (abs(b - a) + WALL_M for a, b in zip(start, stop, strict=True))
-    return block(BUILDING, long, wide, height_m, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)
+    length, width = (abs(b - a) + WALL_M for a, b in zip(start, stop, strict=True))
+    return block(BUILDING, length, width, height_m, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)
 
 
 def closed_box(left: float, right: float, low: float, high: float, height_m: float) -> ObjectModel:
@@ -139,9 +139,9 @@ def build(site: Site, driven: Line, *, clearance_m: float) -> World:
     """Builds the world of a site without standing things closer than `clearance_m` to the driven line."""
     placed = place(site.spots, site.ground)
     driven = driven if site.levels is None else site.levels.along(driven)[0]
-    low = np.array([part.bottom < HEAD_ROOM_M for part in placed.parts]) & ~placed.shapes.velocity.any(axis=1)
-    bad = low & (distances(placed.shapes, driven, reach_m=clearance_m) < clearance_m)
-    scene = to_scene(placed, ~np.isin(placed.owner, placed.owner[bad]))
+    is_low = np.array([part.bottom < HEAD_ROOM_M for part in placed.parts]) & ~placed.shapes.velocity.any(axis=1)
+    is_close = is_low & (distances(placed.shapes, driven, reach_m=clearance_m) < clearance_m)
+    scene = to_scene(placed, ~np.isin(placed.owner, placed.owner[is_close]))
     return World(scene, site.ground, site.levels)
 
 
