@@ -21,8 +21,8 @@ TINY = f"{ROOT}/tests/tiny.py"
 SMALL = "--scans 12 --azimuth-steps 90"
 RUN = (
     "methods baselines --data town --methods solid --frames 100",
-    f"loops --world walls town --route same --sensor vlp16 --method sglpr scan-context --weights circular {SMALL} --out drives",
-    "loops evidence drives --sensor vlp16 --weights circular",
+    f"loops --world walls town --route same --sensor vlp16 --method sglpr scan-context {SMALL} --weights circular --out d",
+    "loops evidence d --sensor vlp16 --weights circular",
     "sensors rotation --data images --weights circular --scans 2 --step-deg 120 --among 20",
     "realism compare --real town --simulated images --scans 2 --out compared",
     f"speed training --preset {TINY} --size 64 --repeats 1 --steps 1",
