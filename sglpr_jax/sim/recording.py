@@ -34,9 +34,9 @@ from sglpr_jax.sim.drive import (
     timed,
 )
 from sglpr_jax.sim.layouts import to_utime
-from sglpr_jax.sim.routes import REVISITS, Line, Revisit
+from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING, Repeating
-from sglpr_jax.sim.sceneries.site import LAPS, Site, build, way
+from sglpr_jax.sim.sceneries.site import LAPS, build, driven_line
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor, scan
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import World, build_world
@@ -145,9 +145,11 @@ def simulate_repeating(
     check_drawing(rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
     world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
-    rows = scan_rows(path, scans)
-    options = {"name": f"{name}-{revisit}", "sensor": _mounted(sensor, scenery, carrier), "carrier": carrier}
-    return drive_through(world, path, rows, **options, **random_of(seeds))
+    height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
+    if height_m is not None:
+        sensor = dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))
+    options = {"name": f"{name}-{revisit}", "sensor": sensor, "carrier": carrier}
+    return drive_through(world, path, scan_rows(path, scans), **options, **random_of(seeds))
 
 
 def plan_drive(
@@ -166,23 +168,9 @@ def plan_drive(
     if revisit == "same":  # a lap has room for the scenery even if the carrier is slow
         length = max(length, SHORTEST_S * scenery.speed_mps[0] / LAPS)
     site = scenery.site(rng, length, scenery.is_closed(revisit))
-    line = driven_line(rng, site, scenery, revisit)
+    line = driven_line(rng, site, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
     path = carrier.halted(rng, timed(rng, line, free_mps=speed, poses=scans), poses=scans)
     return build(site, line, clearance_m=scenery.clearance_m), path
-
-
-def driven_line(rng: np.random.Generator, site: Site, scenery: Repeating, revisit: Revisit) -> Line:
-    """Path along the line of a site."""
-    laps = "none" if site.returns and revisit == "same" else revisit
-    return way(rng, site.line, laps, right_m=scenery.right_m, sway_m=scenery.sway_m)
-
-
-def _mounted(sensor: Sensor, scenery: Repeating, carrier: Carrier) -> Sensor:
-    """`sensor` with the height and minimum range for the carrier, or for the scenery's vehicle."""
-    height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
-    if height_m is None:
-        return sensor
-    return dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))
 
 
 def plan_sessions(
@@ -272,19 +260,10 @@ def drive_through(
     rng: np.random.Generator,
     carrier: Carrier = VEHICLE,
 ) -> SimulatedRecording:
-    """Returns the recording of a drive through a town.
+    """Returns the recording of a drive along `path` through a town, with scans at some of its rows.
 
-    Arguments:
-      world: Town.
-      path: Path of the vehicle, with the times of the town.
-      rows: Rows of `path` at which scans are taken.
-      name: Name of the recording.
-      ids: Names of the scans. None numbers them.
-      times: Times of the scans in the recording, in seconds. None: the times of the town.
-      sensor: LiDAR.
-      key: Random key of the measurements.
-      rng: Random generator of the sway of the carrier.
-      carrier: Carrier of the sensor. Its height and sway are used.
+    `ids` and `times` (seconds) of the scans are numbers and those of the town if they are None. `key` draws the
+    measurements, and `rng` the sway of the carrier, of which the height and the sway are used.
     """
     clock = path.times[rows]
     ids, times = ids or numbered(len(rows)), clock if times is None else times

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
+from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
 MIDDLE_M = 1.2  # distance from the first pass to the middle of the street on its left, in metres
@@ -66,7 +67,7 @@ class Island(NamedTuple):
     radius: float  # metres
 
 
-def resample(trajectory: Float[np.ndarray, "n 2"], times: Float[np.ndarray, " n"]) -> Path:
+def resample(trajectory: Line, times: Float[np.ndarray, " n"]) -> Path:
     """Resamples `trajectory` to one point per metre. A standstill becomes one point.
 
     Raises:
@@ -156,9 +157,7 @@ def _draw_stretches(
         start = stop
 
 
-def _branch_starts(
-    rng: np.random.Generator, street: Street, scenery: Scenery
-) -> list[tuple[Float[np.ndarray, "2"], float]]:
+def _branch_starts(rng: np.random.Generator, street: Street, scenery: Scenery) -> list[tuple[np.ndarray, float]]:
     """Start points and headings of possible side streets: ahead at sharp bends, and sideways at random points."""
     starts = []
     for turn in _sharp_turns(street.heading):
@@ -188,9 +187,7 @@ def _sharp_turns(heading: Float[np.ndarray, " n"]) -> Iterator[int]:
             yield peak + 10
 
 
-def _free_line(
-    start: Float[np.ndarray, "2"], heading: float, length: float, bend: float, others: KDTree
-) -> Float[np.ndarray, "m 2"]:
+def _free_line(start: Float[np.ndarray, "2"], heading: float, length: float, bend: float, others: KDTree) -> Line:
     """Gentle curve from `start` to the next street that it meets. Where it runs along a street, it is cut or empty."""
     along = np.arange(int(length))
     bearing = heading + bend * along
@@ -245,9 +242,7 @@ class Network:
         return np.copysign(np.hypot(left, np.maximum(ahead - 1, 0)), left)
 
 
-def paint_ground(
-    network: Network, islands: tuple[Island, ...], relief: Relief, path: Float[np.ndarray, "n 2"]
-) -> Ground:
+def paint_ground(network: Network, islands: tuple[Island, ...], relief: Relief, path: Line) -> Ground:
     """Paints the ground around the streets. Ground within 1.5 m of `path` is road."""
     block_m = BLOCK_CELLS * CELL_M
     low = np.floor(network.middle.min(axis=0) - REACH_M - 20)
@@ -278,10 +273,7 @@ def _near_streets(points: Float[np.ndarray, "n 2"], size: tuple[int, int], reach
 
 
 def _labels(
-    network: Network,
-    profiles: tuple[np.ndarray, np.ndarray],
-    xy: Float[np.ndarray, "m 2"],
-    nearest: Int[np.ndarray, " m"],
+    network: Network, profiles: tuple[np.ndarray, np.ndarray], xy: Line, nearest: Int[np.ndarray, " m"]
 ) -> UInt8[np.ndarray, " m"]:
     """Label at each position, from the nearest point of a street."""
     bounds, names = profiles

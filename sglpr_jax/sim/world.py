@@ -61,19 +61,11 @@ class World(NamedTuple):
 
 
 def build_world(
-    seed: int | tuple[int, ...],
-    trajectory: Float[np.ndarray, "n 2"],
-    times: Float[np.ndarray, " n"],
-    *,
-    scenery: Scenery = TOWN,
+    seed: int | tuple[int, ...], trajectory: Line, times: Float[np.ndarray, " n"], *, scenery: Scenery = TOWN
 ) -> World:
-    """Builds a town along a drive. Nothing is closer to the trajectory than 1.6 m.
+    """Builds a town along a drive: x and y of the LiDAR in metres, 0.2 to 3 m apart, with times in seconds.
 
-    Arguments:
-      seed: Seed of the town.
-      trajectory: x and y of the LiDAR, in metres. Points may be 0.2 to 3 m apart, and the vehicle may stand still.
-      times: Times of these positions, in seconds.
-      scenery: Scenery of the town.
+    The vehicle may stand still. Nothing is closer to the trajectory than 1.6 m.
 
     Raises:
       ValueError: The trajectory is shorter than 2 m or not finite, or `times` do not increase.
@@ -96,12 +88,7 @@ def build_world(
 
 
 def _furnish(
-    rng: np.random.Generator,
-    network: Network,
-    islands: tuple[Island, ...],
-    ground: Ground,
-    path: Float[np.ndarray, "n 2"],
-    clock: Clock,
+    rng: np.random.Generator, network: Network, islands: tuple[Island, ...], ground: Ground, path: Line, clock: Clock
 ) -> list[Spot]:
     """Things along the streets of `network`, clear of the streets and of `path`."""
     spots, next_bystander, free, first = [], bystanders(rng), _free(network), 0

@@ -18,10 +18,10 @@ ROOT = Path(__file__).resolve().parents[2]
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
 TINY = f"{ROOT}/tests/tiny.py"
 """A preset of next to no arithmetic."""
-SMALL = "--scans 12 --azimuth-steps 90"
+SMALL, LIGHT = "--scans 12 --azimuth-steps 90", "--weights circular"
 RUN = (
     "methods baselines --data town --methods solid --frames 100",
-    f"loops --world walls town --route same --sensor vlp16 --method sglpr scan-context {SMALL} --weights circular --out d",
+    f"loops --world walls town --route same --sensor vlp16 --method sglpr scan-context {SMALL} {LIGHT} --out d",
     "loops evidence d --sensor vlp16 --weights circular",
     "sensors rotation --data images --weights circular --scans 2 --step-deg 120 --among 20",
     "realism compare --real town --simulated images --scans 2 --out compared",

@@ -75,14 +75,14 @@ def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     streets = pitch * np.arange(-1, plan.count + 1)
     slab, middles = _slab(length, depth, high), np.arange(gap / 2 + length / 2, plan.run_m, length + gap)
     buildings = grid(middles, streets + pitch / 2, lambda: slab)
-    xs, aside = np.arange(10.0, plan.run_m - 10.0, 6.0), ROAD_M - 0.9
-    bays = grid(xs, np.concatenate([streets - aside, streets + aside]), lambda: parked(rng))
+    xs, parking_offset = np.arange(10.0, plan.run_m - 10.0, 6.0), ROAD_M - 0.9
+    bays = grid(xs, np.concatenate([streets - parking_offset, streets + parking_offset]), lambda: parked(rng))
     lamps = grid(xs[::5], streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 7.0),))
     spots = [*buildings, *jittered(rng, bays, 0.2, keep=rng.uniform(0.3, 0.6)), *lamps]
     low, high = (0, SLABS_WALK_M + 1.0), (plan.run_m, (pitch - depth) / 2 - 2.0)  # between sidewalks and slabs
     for street, side, _ in itertools.product(streets.tolist(), (-1, 1), range(round(plan.run_m / 14.0))):
-        x, away = rng.uniform(low, high).tolist()
-        spots.append(Spot(_plant(rng, 5.0), x, street + side * away, rng.uniform(0, 2 * np.pi)))
+        x, offset = rng.uniform(low, high).tolist()
+        spots.append(Spot(_plant(rng, 5.0), x, street + side * offset, rng.uniform(0, 2 * np.pi)))
     return Site(plan.line, spots, _street(plan.line, SLABS_WALK_M, rolling(rng)))
 
 
@@ -115,13 +115,13 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     lines = np.arange(-2, count + 1)
     twin, spots = _building(rng, pitch), []
     for column, row in itertools.product(columns.tolist(), lines.tolist()):
-        building = twin if row == 0 and column in (0, 1) else _building(rng, pitch)  # beside the first path
+        building = twin if row == 0 and column in (0, 1) else _building(rng, pitch)  # shift the first path
         x, y = (column + 0.5) * pitch, (row + 0.5) * pitch
         spots.append(Spot(building, x, y))
         for _ in range(int(rng.integers(4, 11))):
-            beside = rng.uniform(-0.5, 0.5) * pitch
-            away = rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
-            dx, dy = ((beside, away), (away, beside))[rng.integers(2)]
+            shift = rng.uniform(-0.5, 0.5) * pitch
+            offset = rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
+            dx, dy = ((shift, offset), (offset, shift))[rng.integers(2)]
             spots.append(Spot(_plant(rng, 6.0), x + dx, y + dy, rng.uniform(0, 2 * np.pi)))
     spots += along(shifted(line, 2.5), ((post(POLE, 0.15, 4.5),), rng.uniform(18, 26)))
     spots += along(shifted(line, -2.6), ((block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40)))

@@ -54,15 +54,15 @@ def _corridor_walls(
     for side in (1, -1):
         first = (half if side > 0 else -half) if closed else 0.0
         pieces = max(1, round((length - 2 * first) / pitch))
-        each = (length - 2 * first) / pieces
-        away, part = half + thickness / 2, (each - door) / 2
+        piece_length = (length - 2 * first) / pieces
+        offset, part = half + thickness / 2, (piece_length - door) / 2
         thing = (
-            block(BUILDING, part, thickness, height, part / 2, side * away),
-            block(BUILDING, door, thickness, height, each / 2, side * (away + recess)),  # door in the middle
-            block(BUILDING, part, thickness, height, each - part / 2, side * away),
+            block(BUILDING, part, thickness, height, part / 2, side * offset),
+            block(BUILDING, door, thickness, height, piece_length / 2, side * (offset + recess)),  # door in the middle
+            block(BUILDING, part, thickness, height, piece_length - part / 2, side * offset),
         )
         for k in range(pieces):
-            x, y = (start + (first + k * each) * ahead).tolist()
+            x, y = (start + (first + k * piece_length) * ahead).tolist()
             spots.append(Spot(thing, x, y, heading))
     return spots
 
@@ -76,8 +76,8 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
     """Rooms of one size along a corridor, with `equal` or with different furniture."""
     pitch, size, depth, height = rng.uniform(7.5, 8.5), *rng.uniform(4.7, 5.3, 2), rng.uniform(2.4, 3.0)
     into = ROOMS_HALF_M + 0.6 * depth
-    each = pitch + 2 * into + (pitch if closed else 0.0)  # a closed path returns through the corridor
-    count = max(2, round(length_m / each) if closed else int(np.ceil(length_m / each)))
+    visit_length = pitch + 2 * into + (pitch if closed else 0.0)  # a closed path returns through the corridor
+    count = max(2, round(length_m / visit_length) if closed else int(np.ceil(length_m / visit_length)))
     corners = [(-pitch / 2, 0.0)]
     for k in range(count):
         corners += _visit(k * pitch, ROOMS_SIDE_M, into)
@@ -85,14 +85,16 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
         corners += [(corners[-1][0] + 1.0, 0.0), (corners[-1][0] + 1.0, -0.4), (-pitch / 2, -0.4)]
     line = rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
     middles = pitch * np.arange(-2, count + 2)
-    same = _room_furniture(rng, size, depth)
-    inside = grid(middles, (ROOMS_HALF_M + WALL_M,), lambda: same if equal else _room_furniture(rng, size, depth))
+    standard = _room_furniture(rng, size, depth)
+    equipment = grid(
+        middles, (ROOMS_HALF_M + WALL_M,), lambda: standard if equal else _room_furniture(rng, size, depth)
+    )
     shell = grid(middles, (0.0,), lambda: _room_walls(pitch, size, depth, height))
     middle, length = float(middles.mean()), pitch * len(middles)
     ends = tuple(block(BUILDING, 0.3, 2 * ROOMS_HALF_M, height, x) for x in (-length / 2, length / 2))
     wall = block(BUILDING, length, 0.3, height, y=-ROOMS_HALF_M - 0.15)
     ceiling = block(BUILDING, length, 2 * ROOMS_HALF_M + 2 * depth + 2, 0.3, bottom=height)
-    spots = [*inside, *shell, Spot((*ends, wall, ceiling), middle, 0.0)]
+    spots = [*equipment, *shell, Spot((*ends, wall, ceiling), middle, 0.0)]
     return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
@@ -209,8 +211,8 @@ def _tour(floor: Floor, visited: list[Room], length_m: float, closed: bool) -> L
     for k, room in enumerate(visited):
         ahead = (1, -1)[k % 2]
         ends = [(0.0, 0.0), (floor.run_m, 0.0)][::ahead]
-        way = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + 2.5, ahead)
-        corners += [(x, y + k * floor.pitch_m) for x, y in (ends[0], *way, ends[1])]
+        visit = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + 2.5, ahead)
+        corners += [(x, y + k * floor.pitch_m) for x, y in (ends[0], *visit, ends[1])]
     return rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
 
 
@@ -233,10 +235,10 @@ def _shell(floor: Floor, count: int) -> list[Spot]:
     """Outer walls and ceiling of the floor. The wall at x = 0 is partly glass."""
     low, high = -1.5 * floor.pitch_m, (count + 0.5) * floor.pitch_m
     x, y, width, half = floor.run_m / 2, (low + high) / 2, high - low, floor.half_m
-    length, away = floor.run_m + 2 * half, floor.run_m / 2 + half + WALL_M / 2
+    length, offset = floor.run_m + 2 * half, floor.run_m / 2 + half + WALL_M / 2
     walls = [
-        block(BUILDING, WALL_M, width, floor.height_m, -away, glass=0.6),
-        block(BUILDING, WALL_M, width, floor.height_m, away),
+        block(BUILDING, WALL_M, width, floor.height_m, -offset, glass=0.6),
+        block(BUILDING, WALL_M, width, floor.height_m, offset),
         *(block(BUILDING, length, WALL_M, floor.height_m, y=side * width / 2) for side in (-1, 1)),
     ]
     ceiling = block(BUILDING, length, width, 0.3, bottom=floor.height_m)

@@ -19,21 +19,21 @@ BEND_M = 25.0  # distance between two bends of the path through the forest, in m
 
 
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Track through fields, with posts or poles along it, some bushes, and single trees and sheds far away."""
-    whole, driven = road(rng, length_m, closed)
-    (every, thickness, height), beside = (
+    """Track through fields, with posts or poles along it, some bushes, and single trees and sheds distant away."""
+    road_line, path = road(rng, length_m, closed)
+    (every, thickness, height), offset = (
         ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)],
         rng.choice((-1, 1)) * 5.0,
     )
-    posts = along(shifted(whole, beside), ((post(POLE, thickness, height),), every))
-    bushes = _beside(rng, whole, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
+    posts = along(shifted(road_line, offset), ((post(POLE, thickness, height),), every))
+    bushes = _beside(rng, road_line, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
 
     def tree_or_shed() -> ObjectModel:
         return garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
 
-    far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), tree_or_shed)
-    ground = track(whole, 1.5, rolling(rng))
-    return Site(driven, [*posts, *bushes, *far], ground)
+    distant = _beside(rng, road_line, rng.uniform(30, 80), (30.0, 75.0), tree_or_shed)
+    ground = track(road_line, 1.5, rolling(rng))
+    return Site(path, [*posts, *bushes, *distant], ground)
 
 
 def _beside(
@@ -41,9 +41,9 @@ def _beside(
 ) -> Iterator[Spot]:
     """Yields things at random positions beside a line, on average one per `every_m` metres."""
     for _ in range(round(len(line) * STEP_M / every_m)):
-        away = np.array([rng.uniform(*away_m) * rng.choice((-1, 1))])
+        offset = np.array([rng.uniform(*away_m) * rng.choice((-1, 1))])
         row = int(rng.integers(1, len(line) - 1))
-        x, y = shifted(line[row - 1 : row + 2], away)[1].tolist()
+        x, y = shifted(line[row - 1 : row + 2], offset)[1].tolist()
         yield Spot(make(), x, y, rng.uniform(0, 2 * np.pi))
 
 
@@ -77,8 +77,8 @@ def _scattered(rng: np.random.Generator, line: Line, density: float) -> list[tup
     low, high = line.min(axis=0) - WIDE_M, line.max(axis=0) + WIDE_M
     points = rng.uniform(low, high, (round(density * np.prod(high - low)), 2))
     coarse = line[:: round(1 / STEP_M)]
-    near = [np.linalg.norm(coarse - point, axis=1).min() < WIDE_M for point in points]
-    return [(float(x), float(y)) for x, y in points[near]]
+    is_near = [np.linalg.norm(coarse - point, axis=1).min() < WIDE_M for point in points]
+    return [(float(x), float(y)) for x, y in points[is_near]]
 
 
 def _tree(rng: np.random.Generator, thickness: float, branches: float) -> ObjectModel:

@@ -67,11 +67,16 @@ def solar(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Aisles 5 to 6 m apart, between shelves with three levels that are 85 to 95 % full."""
-    pitch, aisle, bay, full = rng.uniform(5, 6), rng.uniform(2.6, 3.0), rng.uniform(2.4, 3.0), rng.uniform(0.85, 0.95)
+    pitch, aisle, bay, occupancy = (
+        rng.uniform(5, 6),
+        rng.uniform(2.6, 3.0),
+        rng.uniform(2.4, 3.0),
+        rng.uniform(0.85, 0.95),
+    )
     plan = rows(length_m, run_m=rng.uniform(25, 40), pitch_m=pitch, closed=closed, back_m=2.5, corner_m=0.6)
     lanes = pitch * np.arange(-1, plan.count + 2)
     bays = np.arange(2.5, plan.run_m - 2.5 - bay, bay) + bay / 2
-    spots = grid(bays, lanes - pitch / 2, lambda: _shelf(rng, bay, pitch - aisle, full))
+    spots = grid(bays, lanes - pitch / 2, lambda: _shelf(rng, bay, pitch - aisle, occupancy))
     low, high, height = lanes[0] - pitch / 2, lanes[-1] - pitch / 2, rng.uniform(6, 9)
     x, y, length, width = plan.run_m / 2, (low + high) / 2, plan.run_m + 14.0, high - low + 6.0
     walls = [block(BUILDING, length, 0.4, height, y=side * width / 2) for side in (-1, 1)]
@@ -80,7 +85,7 @@ def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     return Site(plan.line, [*spots, Spot((*walls, ceiling), x, y)], painted_ground(OTHER_GROUND))
 
 
-def _shelf(rng: np.random.Generator, bay: float, depth: float, full: float) -> ObjectModel:
+def _shelf(rng: np.random.Generator, bay: float, depth: float, occupancy: float) -> ObjectModel:
     """One bay of a double shelf: a frame, two boards, and pallets on three levels on both sides."""
     parts = [block(POLE, 0.12, 0.12, 3.4 * LEVEL_M, -bay / 2, side * (depth / 2 - 0.06)) for side in (-1, 1)]
     parts += [block(OTHER_OBJECT, bay, depth, 0.14, bottom=level * LEVEL_M) for level in (1, 2)]
@@ -89,7 +94,7 @@ def _shelf(rng: np.random.Generator, bay: float, depth: float, full: float) -> O
             width, thickness, height = rng.uniform(
                 (0.75 * bay, 0.38 * depth, 0.8), (0.92 * bay, 0.46 * depth, 1.45)
             ).tolist()
-            if rng.random() < full:
+            if rng.random() < occupancy:
                 y = side * (depth / 2 - thickness / 2 - rng.uniform(0, 0.1))
                 parts.append(block(OTHER_OBJECT, width, thickness, height, y=y, bottom=level * LEVEL_M + 0.14))
     return tuple(parts)
@@ -102,8 +107,8 @@ def terminal(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     pitch, bay = width * (across + gap) + LANE_M, length + gap
     plan = rows(length_m, run_m=run, pitch_m=pitch, closed=closed, back_m=LANE_M / 2, corner_m=2.5)
     lanes = pitch * np.arange(-2, plan.count + 1)
-    first, each = np.linspace(0, plan.run_m, 1 + max(1, round(plan.run_m / 55.0)), retstep=True)
-    middles = (np.arange((each - LANE_M) // bay) + 0.5) * bay
+    first, block_pitch = np.linspace(0, plan.run_m, 1 + max(1, round(plan.run_m / 55.0)), retstep=True)
+    middles = (np.arange((block_pitch - LANE_M) // bay) + 0.5) * bay
     xs = (first[:-1, None] + LANE_M / 2 + middles).ravel()
     ys = (lanes[:, None] + LANE_M / 2 + (np.arange(width) + 0.5) * (across + gap)).ravel()
     stacks = grid(xs, ys, lambda: (block(OTHER_OBJECT, length, across, height * int(rng.integers(1, 6))),))

@@ -188,22 +188,23 @@ def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m:
     else:
         count = int(np.ceil(length_m / (run_m + pitch_m))) + 1
     ends = [(x, k * pitch_m) for k in range(count) for x in ((0.0, run_m), (run_m, 0.0))[k % 2]]
-    back = [(-back_m, ends[-1][1]), (-back_m, 0.0)] * closed
-    return Rows(rounded([*ends, *back], corner_m=corner_m, closed=closed, length_m=length_m), count, run_m)
+    return_path = [(-back_m, ends[-1][1]), (-back_m, 0.0)] * closed
+    return Rows(rounded([*ends, *return_path], corner_m=corner_m, closed=closed, length_m=length_m), count, run_m)
 
 
-def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
-    """Path of a vehicle `right_m` metres to the right of `line`, with a sway of up to `sway_m` metres.
+def driven_line(rng: np.random.Generator, site: Site, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
+    """Path of a vehicle `right_m` metres to the right of a site's line, with a sway of up to `sway_m` metres.
 
     Revisits are on the way back ("opposite"), or in LAPS laps of a closed line ("same").
     """
-    if revisit == "same":
+    line = site.line
+    if revisit == "same" and not site.returns:
         line = np.concatenate([line, line[: round((LAPS - 1) * len(line))]])
-    out = shifted(line, -right_m)
+    path = shifted(line, -right_m)
     if revisit == "opposite":  # a half circle to the left around the end of the line, and back
         ahead = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
         angle = np.linspace(-np.pi / 2, np.pi / 2, 2 + round(np.pi * right_m / STEP_M))[1:-1, None]
         turn = line[-1] + right_m * (np.cos(angle) * ahead + np.sin(angle) * np.array([-ahead[1], ahead[0]]))
-        out = np.concatenate([out, turn, shifted(line[::-1], -right_m)])
-    out = resampled(out, STEP_M)
-    return resampled(shifted(out, sway_m * waves(rng, travelled(out), (15.0, 60.0))), STEP_M)
+        path = np.concatenate([path, turn, shifted(line[::-1], -right_m)])
+    path = resampled(path, STEP_M)
+    return resampled(shifted(path, sway_m * waves(rng, travelled(path), (15.0, 60.0))), STEP_M)

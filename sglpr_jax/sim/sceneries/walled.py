@@ -32,8 +32,8 @@ def _places(
     walls = [wall((0.0, side * half), (ends, side * half), height_m) for side in (-1, 1)]
     walls += [wall((x, -half), (x, half), height_m) for x in (0.0, ends)]
     for k, y in enumerate(gates, 1):
-        beside = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
-        walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in beside]
+        wall_parts = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
+        walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in wall_parts]
     return line, tuple(walls), len(gates) + 1
 
 
