@@ -43,11 +43,12 @@ MOTIONS = {"car": (10.0, 25.0), "robot": (1.0, 90.0), "hand": (1.4, 180.0)}
 """Speed in m/s and maximum yaw rate in degrees per second."""
 AZIMUTHS = 900
 OTHER_PLACE_M = 20.0
+CARRIED = dataclasses.replace(WALKS, sensor=("vlp16",))
 BATCH = 64
 
 
 def imu(
-    drives: tyro.conf.OmitArgPrefixes[Drives] = dataclasses.replace(WALKS, sensor=("vlp16",)),  # noqa: B008
+    drives: tyro.conf.OmitArgPrefixes[Drives] = CARRIED,
     *,
     blind: float = 0.0,
 ) -> None:

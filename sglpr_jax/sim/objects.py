@@ -35,17 +35,17 @@ ObjectModel = tuple[Primitive, ...]
 
 
 def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
-    """Box with its centre at x and y. `more` holds fields of Part."""
+    """Box with its centre at x and y. `more` holds fields of `Primitive`."""
     return Primitive("box", label, (length, width, height), x, y, **more)
 
 
 def post(label: int, thickness: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
-    """Cylinder with its axis at x and y. `more` holds fields of Part."""
+    """Cylinder with its axis at x and y. `more` holds fields of `Primitive`."""
     return Primitive("cylinder", label, (thickness, thickness, height), x, y, **more)
 
 
 def ball(label: int, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
-    """Round ellipsoid with its axis at x and y, such as a crown of leaves. `more` holds fields of Part."""
+    """Round ellipsoid with its axis at x and y, such as a crown of leaves. `more` holds fields of `Primitive`."""
     return Primitive("ellipsoid", label, (width, width, height), x, y, **more)
 
 
