@@ -56,9 +56,6 @@ def _add_simulate(command: argparse.ArgumentParser) -> None:
     add("--sensor", default="hdl64e", help="as of bin/simulate")
     add("--azimuth-steps", type=_count, help="firings per turn (the real sensor's)")
     add("--seed", type=int, default=0)
-    add("--batch", type=_count, default=16, help="scans and clouds in one call, beside one (16)")
-    add("--points", type=_count, default=120_000, help="of a cloud that is rasterised (120000)")
-    add("--repeats", type=_count, default=10, help="how often everything is timed (10)")
 
 
 def _add_train(command: argparse.ArgumentParser) -> None:

@@ -84,8 +84,7 @@ class OutOfTime(Exception):
 def simulate(flags: Flags, stopped: Stopped) -> tuple[str, bool]:
     """Measure the rates of the simulator and of images, then write what is missing of a dataset."""
     rows, sensor = StoredRows(flags.results / "simulate.json"), lidar(flags.sensor, flags.azimuth_steps)
-    sizes = {"batch": flags.batch, "points": flags.points, "repeats": flags.repeats}
-    for key, measure in measurements(flags.sensor, sensor, route=flags.seq[0], scans=max(flags.batch, 2), **sizes):
+    for key, measure in measurements(flags.sensor, sensor, route=flags.seq[0]):
         if not rows.has(key) and not stopped():
             rows.add(key, measure)
     dataset = Simulated(flags.out, tuple(flags.seq), flags.scans, flags.layout, sensor)

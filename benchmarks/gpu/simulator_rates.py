@@ -19,6 +19,8 @@ from sglpr_jax.sim.world import build_world
 
 GRID = Grid(height=224, width=224)
 """The paper's, onto which clouds are rasterised."""
+BATCH, POINTS, REPEATS = 16, 120_000, 10
+"""Scans and clouds in one call, points of a cloud, and how often everything is timed."""
 Row = dict[str, Any]
 
 
@@ -46,23 +48,21 @@ class TownDrive:
             list(pool.map(self.scan, range(len(self.poses))))
 
 
-def measurements(
-    name: str, sensor: Sensor, *, route: str, scans: int, batch: int, points: int, repeats: int
-) -> Iterator[tuple[Row, Callable[[], Row]]]:
+def measurements(name: str, sensor: Sensor, *, route: str) -> Iterator[tuple[Row, Callable[[], Row]]]:
     """The key of each row, and a function that measures its rest."""
-    drive = functools.cache(lambda: TownDrive(route, scans, sensor))
+    drive = functools.cache(lambda: TownDrive(route, BATCH, sensor))
     rays = {"sensor": name, "rays": [len(sensor.elevations_deg), sensor.azimuth_steps]}
-    yield {"what": "scan", **rays}, lambda: _whole_scans(drive(), repeats)
-    for size in (1, batch):
+    yield {"what": "scan", **rays}, lambda: _whole_scans(drive())
+    for size in (1, BATCH):
         key = {"what": "cast", "batch": size, **rays}
-        yield key, lambda size=size: _casts(drive(), size, repeats)
-    for size in (1, batch):
-        key = {"what": "rasterize", "batch": size, "points": points}
-        yield key, functools.partial(_rasterized, size, points, repeats)
-    yield {"what": "density_bev on the host", "points": points}, functools.partial(_densities, points, repeats)
+        yield key, lambda size=size: _casts(drive(), size)
+    for size in (1, BATCH):
+        key = {"what": "rasterize", "batch": size, "points": POINTS}
+        yield key, functools.partial(_rasterized, size)
+    yield {"what": "density_bev on the host", "points": POINTS}, _densities
 
 
-def _whole_scans(drive: TownDrive, repeats: int) -> Row:
+def _whole_scans(drive: TownDrive) -> Row:
     """Scans from the town to the host's memory: stages, and the rate in one and two threads.
 
     The cast is done twice to tell it from the returns, which follow it.
@@ -75,31 +75,31 @@ def _whole_scans(drive: TownDrive, repeats: int) -> Row:
         "cast and returns": lambda: jax.block_until_ready(cast_turn(drive.key, view, sensor=drive.sensor)),
         "copy": lambda: returned_points(turn),
     }
-    row = {f"{name}_s": median_seconds(job, repeats=repeats) for name, job in stages.items()}
+    row = {f"{name}_s": median_seconds(job, repeats=REPEATS) for name, job in stages.items()}
     row["returns_s"] = row.pop("cast and returns_s") - row["cast_s"]
-    one, two = (median_seconds(lambda n=n: drive.scans_in(n), repeats=repeats) for n in (1, 2))
+    one, two = (median_seconds(lambda n=n: drive.scans_in(n), repeats=REPEATS) for n in (1, 2))
     count = len(drive.poses)
     return {**row, "scans_per_second": count / one, "scans_per_second_in_2_threads": count / two}
 
 
-def _casts(drive: TownDrive, batch: int, repeats: int) -> Row:
+def _casts(drive: TownDrive, batch: int) -> Row:
     """The device's part alone: the rays of this number of scans in one call, all surfaces on the device already."""
     keys = jax.random.split(jax.random.key(0), batch)
     views = [drive.view(i % len(drive.poses)) for i in range(batch)]
     stacked = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *views))
     cast = jax.jit(jax.vmap(functools.partial(cast_turn, sensor=drive.sensor)))
-    seconds = median_seconds(lambda: jax.block_until_ready(cast(keys, stacked)), repeats=repeats)
+    seconds = median_seconds(lambda: jax.block_until_ready(cast(keys, stacked)), repeats=REPEATS)
     return {"seconds": seconds, "scans_per_second": batch / seconds}
 
 
-def _rasterized(batch: int, points: int, repeats: int) -> Row:
-    clouds = jax.device_put(random_scans(batch, points, grid=GRID)[0])
-    seconds = median_seconds(lambda: jax.block_until_ready(rasterize(clouds, grid=GRID)), repeats=repeats)
-    return {"seconds": seconds, "points_per_second": batch * points / seconds}
+def _rasterized(batch: int) -> Row:
+    clouds = jax.device_put(random_scans(batch, POINTS, grid=GRID)[0])
+    seconds = median_seconds(lambda: jax.block_until_ready(rasterize(clouds, grid=GRID)), repeats=REPEATS)
+    return {"seconds": seconds, "points_per_second": batch * POINTS / seconds}
 
 
-def _densities(points: int, repeats: int) -> Row:
+def _densities() -> Row:
     """The density image, which numpy makes: no device takes part."""
-    cloud = random_scans(points, grid=GRID)[0]
-    seconds = median_seconds(lambda: density_bev(cloud), repeats=repeats)
-    return {"seconds": seconds, "points_per_second": points / seconds}
+    cloud = random_scans(POINTS, grid=GRID)[0]
+    seconds = median_seconds(lambda: density_bev(cloud), repeats=REPEATS)
+    return {"seconds": seconds, "points_per_second": POINTS / seconds}
