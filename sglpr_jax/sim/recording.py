@@ -262,8 +262,8 @@ def drive_through(
 ) -> SimulatedRecording:
     """Returns the recording of a drive along `path` through a town, with scans at some of its rows.
 
-    `ids` and `times` (seconds) of the scans are numbers and those of the town if they are None. `key` draws the
-    measurements, and `rng` the sway of the carrier, of which the height and the sway are used.
+    By default, `ids` numbers the scans, and `times` (seconds) are those of the town. `key` draws the measurements, and
+    `rng` the sway. The carrier determines height and sway, not the speed.
     """
     clock = path.times[rows]
     ids, times = ids or numbered(len(rows)), clock if times is None else times
