@@ -66,8 +66,13 @@ def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
     left, right = sizes[stretch, (forward < 0).astype(int)], sizes[stretch, (forward > 0).astype(int)]
     median, everywhere = left[:, 2], np.ones(len(stretch), bool)
     beyond = np.where(median > 0, half_width + median + 3.5, half_width - 1.55)
-    offsets = {"own": (np.zeros(len(stretch)), everywhere), "oncoming": (to_middle + beyond, everywhere)}
-    for name, sign, (sidewalk, verge, _) in (("left walk", 1, left.T), ("right walk", -1, right.T)):
+    offsets: dict[LaneName, Lane] = {
+        "own": (np.zeros(len(stretch)), everywhere),
+        "oncoming": (to_middle + beyond, everywhere),
+    }
+    walks: tuple[tuple[LaneName, int, np.ndarray], ...] = ("left walk", 1, left), ("right walk", -1, right)
+    for name, sign, side in walks:
+        sidewalk, verge, _ = side.T
         offset = half_width + verge - np.where(sidewalk > 0, sidewalk / 2, -0.8)
         offsets[name] = to_middle + sign * offset, sidewalk > 0.9
     return {
