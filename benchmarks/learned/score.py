@@ -23,8 +23,8 @@ from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation.protocols.pairs import PAIRS_F1MAX
+from sglpr_jax.evaluation.protocols.protocol import Source, TopK, nearest_frames
 from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL, BEVPLACE_RECALL_AT_1
-from sglpr_jax.evaluation.protocols.source import Source, TopK, nearest_frames
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
@@ -39,7 +39,7 @@ from sglpr_jax.models.weights_file import LAST
 from sglpr_jax.registration.bev_alignment import refined
 from sglpr_jax.registration.bev_search import search
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
-from sglpr_jax.reproduce.runs import content_of
+from sglpr_jax.reproduce.reproduction import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.revisits import database_end, has_near

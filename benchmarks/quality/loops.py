@@ -35,7 +35,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.scaled import scaled_poses
-from sglpr_jax.evaluation.protocols.source import TopK
+from sglpr_jax.evaluation.protocols.protocol import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.loops.acceptance import accepted
 from sglpr_jax.loops.calibration import reliability_of

@@ -89,8 +89,8 @@ def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures
     """Score the methods and print the table. Returns the results, and pictures if there is a dataset."""
     from sglpr_jax.data.formats.pose_files import read_trajectory
     from sglpr_jax.evaluation import figures
-    from sglpr_jax.evaluation.evaluation_page import poses_of, recording_rows, take_pictures
-    from sglpr_jax.evaluation.inputs import read_methods
+    from sglpr_jax.evaluation.evaluation_page import take_pictures
+    from sglpr_jax.evaluation.inputs import read_methods, recording_rows, recording_trajectory
     from sglpr_jax.evaluation.scoring import evaluate_methods
     from sglpr_jax.models.weights_file import load
 
@@ -103,7 +103,7 @@ def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures
     methods = read_methods(
         (command.file, *command.compare),
         poses=poses,
-        dataset=None if recording is None else poses_of(recording),
+        dataset=None if recording is None else recording_trajectory(recording),
         sequence=command.source.seq or (None if recording is None else recording.name),
         distance=command.distance,
     )

@@ -61,8 +61,8 @@ def live(command: LiveCommand) -> int:
     _check(command)
     report = Reports()
 
-    def source(found: "LiveMap") -> "Source":
-        return open_source(command.source, command, report, taken=found.names.__contains__)
+    def source(live_map: "LiveMap") -> "Source":
+        return open_source(command.source, command, report, taken=live_map.names.__contains__)
 
     def sinks() -> Iterator["Sink"]:
         return (open_sink(text, command, report) for text in command.sinks)
@@ -89,27 +89,26 @@ def run_node(
     cannot be written.
     """
     from sglpr_jax.live.node import Node
-    from sglpr_jax.live.results import corrected_trajectory, write_results
+    from sglpr_jax.live.results import write_results
 
     with exclusive_lock(command.out), contextlib.ExitStack() as opened:
-        found = _map(command, report)
-        opened.callback(found.close)
-        missed = found.recall()
-        corrected = corrected_trajectory(found, odometry=command.expects_odometry, report=report)
+        live_map = _open_map(command, report)
+        opened.callback(live_map.close)
+        missed = live_map.recall()
         sinks = []
         for sink in open_sinks():
             opened.callback(_close, sink, report)
             sinks.append(sink)
-        source = open_source(found)
+        source = open_source(live_map)
         opened.callback(source.close)
-        node = Node(found, sinks, report=report, say=say, corrected=corrected)
+        node = Node(live_map, sinks, report=report, say=say)
         node.publish(missed)
         say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
         try:
             node.run(source, should_stop=should_stop)
         finally:
             say(str(node))
-            paths = [*write_results(found, command.out, corrected=corrected), record_command(command, command.out)]
+            paths = [*write_results(live_map, command.out), record_command(command, command.out)]
             say(f"{command.out}: {', '.join(path.name for path in paths)}")
 
 
@@ -129,7 +128,7 @@ def _check(command: LiveCommand) -> None:
         )
 
 
-def _map(command: LiveCommand, report: "Report") -> "LiveMap":
+def _open_map(command: LiveCommand, report: "Report") -> "LiveMap":
     """Open the map, with all programs compiled."""
     from sglpr_jax.live.live_map import LiveMap
     from sglpr_jax.live.node import warm_up
@@ -137,10 +136,10 @@ def _map(command: LiveCommand, report: "Report") -> "LiveMap":
     from sglpr_jax.models.weights_file import load
 
     params, config, odometry = load(command.weights), command.detector, command.expects_odometry
-    height, detector = command.sensor_height, LoopDetector(params, config=config)
-    found = LiveMap(detector, command.out, report=report, sensor_height=height, expects_odometry=odometry)
+    options = {"sensor_height": command.sensor_height, "expects_odometry": odometry}
+    live_map = LiveMap(LoopDetector(params, config=config), command.out, report=report, **options)
     warm_up(params, config, odometry=odometry)
-    return found
+    return live_map
 
 
 def _close(sink: "Sink", report: "Report") -> None:

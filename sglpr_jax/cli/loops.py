@@ -110,8 +110,8 @@ def loops_of_recording(command: LoopsCommand) -> int:
 
 def _check(command: LoopsCommand) -> None:
     """Raises ValueError or ImportError before the search, if it would end in an error or overwrite an input."""
+    from sglpr_jax.pose_graph.factor_graph import gtsam_library
     from sglpr_jax.pose_graph.folder import TRAJECTORIES
-    from sglpr_jax.pose_graph.optimize import check_installed
 
     recordings, files = command.recordings, command.odometry_files
     if not recordings:
@@ -129,7 +129,7 @@ def _check(command: LoopsCommand) -> None:
     if command.odometry is None and command.optimize:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
     if command.optimize:
-        check_installed()
+        gtsam_library()
     for path in filter(None, (*files, command.source.poses, command.source.times)):
         is_ours = path.name in TRAJECTORIES or path.name.startswith("trajectory-")
         if is_ours and path.resolve().parent == command.out.resolve():

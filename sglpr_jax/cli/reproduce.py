@@ -16,7 +16,7 @@ from sglpr_jax.training.config import TrainConfig
 
 if TYPE_CHECKING:
     from sglpr_jax.reproduce.plan import Plan
-    from sglpr_jax.reproduce.runs import Runs
+    from sglpr_jax.reproduce.reproduction import Reproduction
 
     What = str
 else:
@@ -72,46 +72,53 @@ def reproduce(command: ReproduceCommand) -> None:
     from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
     from sglpr_jax.data.readers import recording_names
     from sglpr_jax.reproduce.plan import check, make_plan, time_a_step
-    from sglpr_jax.reproduce.runs import Runs
+    from sglpr_jax.reproduce.reproduction import Reproduction
 
     names = list(EXPERIMENTS if "all" in command.what else dict.fromkeys(command.what))
     root = dataset_root(command.data, write=not command.plan)
-    runs = Runs(command.out, root, command.preset, command.config, command.pose_source, progress_bar)
-    seqs = command.seq or tuple(seq for seq in PAPER_SEQUENCES if seq in recording_names(runs.data))
-    check(runs, names, seqs, command.method, command.nclt, weights=command.weights, trained=command.train)
-    if not command.train and not command.plan:
-        _write(command, names, runs, seqs)
-        return
-    plan = make_plan(runs, names if command.train else [], seqs)
-    print(plan.text(time_a_step(runs, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
-    if not command.plan:
-        _train(runs, plan)
-        _write(command, names, runs, seqs)
+    reproduction = Reproduction(
+        folder=command.out,
+        data=root,
+        preset=command.preset,
+        config=command.config,
+        seqs=command.seq or tuple(seq for seq in PAPER_SEQUENCES if seq in recording_names(root)),
+        methods=command.method,
+        weights=command.weights,
+        sessions=lambda: dataset_root(command.nclt, sessions=True),
+        trained=command.train,
+        pose_source=command.pose_source,
+        progress=progress_bar,
+    )
+    check(reproduction, names, command.nclt)
+    if command.train or command.plan:
+        plan = make_plan(reproduction, names if command.train else [])
+        print(plan.text(time_a_step(reproduction, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
+        if command.plan:
+            return
+        _train(reproduction, plan)
+    record_command(command, command.out)
+    _write(reproduction, names)
 
 
-def _train(runs: "Runs", plan: "Plan") -> None:
+def _train(reproduction: "Reproduction", plan: "Plan") -> None:
     """Train the missing runs. If a run is asked to stop, save it and exit."""
     for done, (variant, seq) in enumerate(plan.missing):
         print(f"run {done + 1} of {len(plan.missing)}: {variant}, {seq}", file=sys.stderr)
         with stop_on_signal() as stopped:
-            result = runs.train(variant, seq, stopped=stopped)
+            result = reproduction.train(variant, seq, stopped=stopped)
         print(result, file=sys.stderr)
         exit_unless_finished(result, stopped, go_on="run the same command again to continue")
 
 
-def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tuple[str, ...]) -> None:
+def _write(reproduction: "Reproduction", names: list[str]) -> None:
     """Compute, write and print the tables and figures of finished runs."""
-    from sglpr_jax.cli.datasets import dataset_root
     from sglpr_jax.reproduce.figures import write_figures
-    from sglpr_jax.reproduce.tables import Reproduction, write_tables
+    from sglpr_jax.reproduce.tables import write_tables
 
-    record_command(command, command.out)
-    compared = (*command.weights, *command.method)
-    found = Reproduction(runs, seqs, compared, lambda: dataset_root(command.nclt, sessions=True), trained=command.train)
     for name in names:
         if EXPERIMENTS[name].kind == "figure":
-            for path in write_figures(name, found, command.out):
+            for path in write_figures(reproduction, name):
                 print(f"written: {path}")
         else:
-            for table in write_tables(name, found, command.out):
+            for table in write_tables(reproduction, name):
                 console().print(table)

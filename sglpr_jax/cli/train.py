@@ -124,7 +124,7 @@ def _train(
     go_on: str,
 ) -> "TrainResult":
     """Train. If the training is asked to stop, save its state and exit."""
-    from sglpr_jax.evaluation.final_test import LearningCurves
+    from sglpr_jax.evaluation.learning_curves import LearningCurves
     from sglpr_jax.training.callbacks import EVENTS, Callbacks, EventFiles, ProgressBar
     from sglpr_jax.training.devices import is_first_host
     from sglpr_jax.training.recipe import train

@@ -4,13 +4,13 @@ import importlib.util
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int, Num
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import affine_transform
 
-from sglpr_jax.evaluation.protocols.protocol import Decision
+from sglpr_jax.evaluation.protocols.result import Decision
 from sglpr_jax.files import MOST_SHOWN, printable, replacing
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.labels import taxonomy
@@ -26,6 +26,8 @@ MOST_INSIDE = 4
 """Maximum number of lines with a legend inside the axes. A longer legend would cover the lines."""
 LEGEND_CHARACTERS = 40
 """Maximum length of a name in a legend. Longer ones leave no room for the plot."""
+INSIDE: Mapping[str, Any] = {"loc": "best", "framealpha": 0.95}
+"""Options of a legend inside the axes."""
 BLUE, RED = "#2b5fc4", "#d62728"
 
 DECISIONS = {
@@ -113,7 +115,7 @@ def learning_curves(
         axes.set_ylabel(title)
         axes.grid(color="0.92")
         if len(curves) > 1:
-            axes.legend(loc="best", framealpha=0.95)
+            axes.legend(**INSIDE)
     rows[-1].set_xlabel(xlabel)
     return figure
 
@@ -134,15 +136,15 @@ def segmentation_panel(
     from matplotlib.patches import Patch
 
     labels = taxonomy(categories)
-    pictures = {"point counts": np.repeat(brightness(bev)[..., None], 3, axis=-1)}
+    images = {"point counts": np.repeat(brightness(bev)[..., None], 3, axis=-1)}
     if truth is not None:
-        pictures["true classes"] = labels.colors[truth]
-    pictures["predicted classes"] = labels.colors[prediction]
-    figure = new_figure(3.7 * len(pictures), 5.2)
+        images["true classes"] = labels.colors[truth]
+    images["predicted classes"] = labels.colors[prediction]
+    figure = new_figure(3.7 * len(images), 5.2)
     figure.suptitle(title)
     height, width = np.array(bev.shape) * resolution_m / 2
-    for axes, (name, picture) in zip(figure.subplots(1, len(pictures), sharey=True), pictures.items(), strict=True):
-        axes.imshow(picture, extent=(-width, width, -height, height), interpolation="nearest")
+    for axes, (name, image) in zip(figure.subplots(1, len(images), sharey=True), images.items(), strict=True):
+        axes.imshow(image, extent=(-width, width, -height, height), interpolation="nearest")
         axes.set(title=name, xlabel="x [m]")
     figure.axes[0].set_ylabel("y [m]")
     classes = np.unique(prediction) if truth is None else np.union1d(truth, prediction)
@@ -158,14 +160,28 @@ def heat_maps(
     figure = new_figure(2.1 * (1 + len(maps)), 2.6)
     figure.suptitle(title)
     panels = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
-    panels[0].imshow(brightness(bev), cmap="gray")
-    panels[0].set_title("point counts", fontsize=9)
+    _show(panels[0], "point counts", brightness(bev), cmap="gray")
     for axes, (name, values) in zip(panels[1:], maps.items(), strict=True):
-        axes.imshow(values, cmap="inferno")
-        axes.set_title(name, fontsize=9)
+        _show(axes, name, values, cmap="inferno")
+    return figure
+
+
+def overlays(images: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.figure.Figure":
+    """Draw coloured images with their titles, three in a row."""
+    rows = -(-len(images) // 3)
+    figure = new_figure(9.0, 3.2 * rows)
+    panels = figure.subplots(rows, 3, squeeze=False).ravel()
+    for axes, (title, image) in zip(panels, images.items(), strict=False):
+        _show(axes, title, image, interpolation="nearest")
     for axes in panels:
         axes.set_axis_off()
     return figure
+
+
+def _show(axes: "matplotlib.axes.Axes", title: str, image: Float[np.ndarray, "h w ..."], **options: str) -> None:
+    axes.imshow(image, **options)  # pyright: ignore[reportArgumentType]
+    axes.set_title(title, fontsize=9)
+    axes.set_axis_off()
 
 
 def loops(
@@ -174,14 +190,13 @@ def loops(
     """Draw a trajectory from above, with a line between query and match of each loop. `wrong` loops are red."""
     figure, axes = axes_from_above(positions)
     axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
-    for name, some, colour, layer in (("loops", pairs, BLUE, 3), ("wrong", wrong, RED, 4)):
-        if name == "wrong" and not some:
-            continue
-        for query, match in some:
+    lines = [("loops", pairs, BLUE, 3), *([("wrong", wrong, RED, 4)] if wrong else [])]
+    for name, frames, colour, layer in lines:
+        for query, match in frames:
             axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
-        seen = positions[[query for query, _ in some], :2]
-        axes.scatter(*seen.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(some)})", zorder=layer)
-    axes.legend(loc="best", framealpha=0.95)
+        queries = positions[[query for query, _ in frames], :2]
+        axes.scatter(*queries.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(frames)})", zorder=layer)
+    axes.legend(**INSIDE)
     return figure
 
 
@@ -191,7 +206,7 @@ def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.f
     for (name, positions), colour in zip(named.items(), ("0.6", BLUE, RED), strict=False):
         axes.plot(*positions[:, :2].T, color=colour, linewidth=1.2, label=name)
         axes.plot(*positions[-1, :2], "o", color=colour, markersize=4)
-    axes.legend(loc="best", framealpha=0.95)
+    axes.legend(**INSIDE)
     return figure
 
 
@@ -204,7 +219,7 @@ def loops_between(
         axes.plot(*positions[:, :2].T, linewidth=1.2, label=name)
     for ends in pairs:
         axes.plot(*np.array(ends)[:, :2].T, color="0.4", linewidth=0.8, zorder=3)
-    axes.legend(loc="best", framealpha=0.95)
+    axes.legend(**INSIDE)
     return figure
 
 
@@ -213,8 +228,8 @@ def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.
     figure = new_figure(5.0, 4.6)
     axes = figure.add_subplot(xlabel="predicted probability", ylabel="share of loops", xlim=(-0.03, 1.09))
     axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)
-    said, share, _ = np.array(bins).T
-    axes.plot(said, share, "o-", color=BLUE, markersize=5, linewidth=1.4)
+    probability, share, _ = np.array(bins).T
+    axes.plot(probability, share, "o-", color=BLUE, markersize=5, linewidth=1.4)
     for x, y, pairs in bins:
         axes.annotate(f"{pairs}", (x, y), xytext=(5, -10), textcoords="offset points", fontsize=8, color="0.35")
     axes.set_ylim(-0.08, 1.05)
@@ -223,11 +238,11 @@ def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.
 
 
 def loops_in_time(
-    found: Sequence[tuple[int, int, float]],
+    loops: Sequence[tuple[int, int, float]],
     frames: int,
     *,
-    wrong: Sequence[tuple[int, int]] = (),
-    rejected: Sequence[tuple[int, int]] = (),
+    wrong: Sequence[tuple[int, int]],
+    rejected: Sequence[tuple[int, int]],
 ) -> "matplotlib.figure.Figure":
     """Plot the frame of each match over that of its query, coloured by the probability.
 
@@ -238,8 +253,8 @@ def loops_in_time(
     axes.plot([0, frames], [0, frames], color="0.8", linewidth=1)
     if rejected:
         axes.scatter(*np.array(rejected).T, s=5, color="0.7", linewidths=0, label=f"rejected ({len(rejected)})")
-    if found:
-        query, match, probability = np.array(found).T
+    if loops:
+        query, match, probability = np.array(loops).T
         dots = axes.scatter(query, match, s=8, c=probability, cmap="viridis", vmin=0.9, vmax=1, linewidths=0)
         figure.colorbar(dots, label="probability")
     if wrong:
@@ -247,19 +262,6 @@ def loops_in_time(
     if wrong or rejected:
         axes.legend(loc="upper left", framealpha=0.95)
     axes.grid(color="0.92")
-    return figure
-
-
-def overlays(pictures: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.figure.Figure":
-    """Draw coloured images with their titles, three in a row."""
-    rows = -(-len(pictures) // 3)
-    figure = new_figure(9.0, 3.2 * rows)
-    panels = figure.subplots(rows, 3, squeeze=False).ravel()
-    for axes in panels:
-        axes.set_axis_off()
-    for axes, (title, picture) in zip(panels, pictures.items(), strict=False):
-        axes.imshow(picture, interpolation="nearest")
-        axes.set_title(title, fontsize=9)
     return figure
 
 
@@ -274,19 +276,12 @@ def overlaid(
 
     The match is red. The query, transformed to the frame of the match, is cyan. Cells occupied in both are white.
     """
-    size = len(match)
-    down, right = np.mgrid[:size, :size] - (size - 1) / 2
-    query_from_match = inverse(match_from_query)
-    x, y = right * resolution_m, -down * resolution_m
-    at_x = query_from_match[0, 0] * x + query_from_match[0, 1] * y + query_from_match[0, 3]
-    at_y = query_from_match[1, 0] * x + query_from_match[1, 1] * y + query_from_match[1, 3]
-    cells = [-at_y / resolution_m + (size - 1) / 2, at_x / resolution_m + (size - 1) / 2]
-    moved = map_coordinates(np.asarray(query, np.float64), cells, order=1, mode="grid-constant")
-    return np.stack([_bright(match), _bright(moved), _bright(moved)], axis=-1)
-
-
-def _bright(image: Num[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    return np.sqrt(np.asarray(image, np.float64) / max(float(image.max()), 1e-9))
+    centre, per_metre, plane = (len(match) - 1) / 2, 1 / resolution_m, np.ix_([0, 1, 3], [0, 1, 3])
+    pixel_from_metres = np.array([[0, -per_metre, centre], [per_metre, 0, centre], [0, 0, 1]])  # rows point to -y
+    query_from_match = pixel_from_metres @ inverse(match_from_query)[plane] @ np.linalg.inv(pixel_from_metres)
+    moved = affine_transform(np.asarray(query, np.float64), query_from_match, order=1, mode="grid-constant")
+    red, cyan = (np.sqrt(np.asarray(image, np.float64) / max(float(image.max()), 1e-9)) for image in (match, moved))
+    return np.stack([red, cyan, cyan], axis=-1)
 
 
 def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -1,4 +1,4 @@
-"""Results of a training run: its learning curves, and the test on a held-out recording beside other methods."""
+"""Test of a trained network on a held-out recording, beside other methods."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,8 +9,8 @@ from rich.console import Console, ConsoleOptions, RenderableType
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures, report
-from sglpr_jax.evaluation.protocols.protocol import Result
-from sglpr_jax.evaluation.scoring import score
+from sglpr_jax.evaluation.protocols import score
+from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.segmentation import SegmentationScore, segment_recording
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.names import BESIDE, NETWORK
@@ -18,19 +18,8 @@ from sglpr_jax.methods.registry import method_beside, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.embed import embed
-from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.loss import TERM_NAMES
-from sglpr_jax.training.metrics_log import read_metrics
-from sglpr_jax.training.trainer import METRICS_FILE
 
 ROTATION_SEED = 0
-LEARNING_CURVES = "learning-curves.png"
-_PANELS = {
-    "loss": ("loss", *TERM_NAMES),
-    "score: recall@1 of held-out or training places": ("score",),
-    "gradient norm": ("gradient_norm",),
-}
-"""Title of each panel, and the names of its curves in the metrics file."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -46,7 +35,7 @@ class FinalTest(report.PrintsItself):
     def to_json(self) -> dict[str, Any]:
         """Return plain values for `json.dump`."""
         scores = {
-            title: {name: report.to_json(found) for name, found in methods.items()}
+            title: {name: report.to_json(results) for name, results in methods.items()}
             for title, methods in self.results.items()
         }
         segmentation = {} if self.semantics is None else {"segmentation": self.semantics.to_json()}
@@ -99,39 +88,17 @@ def final_test(
     semantics = None
     if params.config.segments and recording.has_labels:
         semantics = segment_recording(params, recording, folder, progress=progress)
-    found = FinalTest(recording.name, results, semantics)
-    write_json(folder / "results.json", found.to_json())
-    return found
+    test = FinalTest(recording.name, results, semantics)
+    write_json(folder / "results.json", test.to_json())
+    return test
 
 
 def _draw(results: Mapping[str, Sequence[Result]], recording: Recording, folder: Path, title: str) -> None:
-    top1 = {name: scored[0] for name, scored in results.items()}
-    curves = {name: result.curve for name, result in top1.items() if result.curve is not None}
+    """Draw the curves of all methods by the first protocol, top-1 F1max, and the decisions for the network."""
+    curves = {name: first.curve for name, (first, *_) in results.items() if first.curve is not None}
     if curves:  # empty if the recording has no revisit
         picture = figures.precision_recall(curves, title=f"{recording.name}, {title}: top-1")
         figures.save(picture, folder / f"precision-recall-{title}.png")
-    decisions = top1[NETWORK].decisions
+    decisions = results[NETWORK][0].decisions
     if decisions is not None and recording.positions is not None:
         figures.save(figures.trajectory(recording.positions, decisions), folder / f"trajectory-{title}.png")
-
-
-class LearningCurves(Callback):
-    """Draws the learning curves of the run in `folder` when training ends, if matplotlib (extra `viz`) is installed."""
-
-    def __init__(self, folder: Path):
-        self._folder = folder
-
-    def on_end(self, step: int) -> None:
-        """Draw loss terms, score and gradient norm of the whole run, including those of earlier processes."""
-        lines = read_metrics(self._folder / METRICS_FILE)
-        if not lines or not figures.can_draw():
-            return
-        panels = {
-            title: {
-                name: [(line["step"], line[name]) for line in lines if line.get(name) is not None]
-                for name in names
-                if any(line.get(name) is not None for line in lines)
-            }
-            for title, names in _PANELS.items()
-        }
-        figures.save(figures.learning_curves(panels), self._folder / LEARNING_CURVES)

@@ -11,26 +11,25 @@ start with # are ignored.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, Num
+from jaxtyping import Num
 
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.data.poses import poses_at_scans, poses_of
-from sglpr_jax.evaluation.protocols.source import ScoredPairs, Source, TopK
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.evaluation.protocols.protocol import Input, ScoredPairs, TopK
 from sglpr_jax.files import in_short, naming
 from sglpr_jax.numpy_files import read_array
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 
-Input = Source | ScoredPairs
-LABELS = {"0": False, "1": True}
-NEAR_M = 0.01
+SAME_M = 0.01
 """Largest difference of equal positions, in metres. Programs round the numbers in their files."""
-NEAR_S = 0.001
+SAME_S = 0.001
 """Largest difference of equal times, in seconds."""
 
 
@@ -80,22 +79,44 @@ def read_methods(
       distance: Name of the distance between descriptors, for the first file and for every .npy file.
     """
     methods: dict[str, Input] = {}
-    of_first = None
+    poses_of_first = None
     for path in paths:
-        trajectory = poses if path.suffix == ".npz" else of_first or poses or dataset
-        compared_by = distance if path == paths[0] or path.suffix == ".npy" else None
+        trajectory = poses if path.suffix == ".npz" else poses_of_first or poses or dataset
+        options = {"distance": distance} if path == paths[0] or path.suffix == ".npy" else {}
         name = path.stem if sum(other.stem == path.stem for other in paths) == 1 else str(path)
-        method = read_input(path, trajectory, sequence=sequence or path.stem, distance=compared_by)
+        method = read_input(path, trajectory, sequence=sequence or path.stem, **options)
         if not methods and isinstance(method, DescriptorFile) and method.positions is not None:
             source = method.pose_source or method.sequence
-            of_first = Trajectory(method.positions, method.times, source, by_row=True)
+            poses_of_first = Trajectory(method.positions, method.times, source, by_row=True)
         methods[name] = method
     if poses is not None:
-        untimed = {name: one for name, one in methods.items() if not isinstance(one, ScoredPairs) and one.times is None}
-        all_times = (one.times for one in methods.values() if not isinstance(one, ScoredPairs))
-        times = next((one for one in all_times if one is not None), None)
-        methods |= {name: replace(one, times=times) for name, one in untimed.items()}
+        retrievals = {name: method for name, method in methods.items() if not isinstance(method, ScoredPairs)}
+        times = next((method.times for method in retrievals.values() if method.times is not None), None)
+        methods |= {name: replace(method, times=times) for name, method in retrievals.items() if method.times is None}
     return methods
+
+
+def recording_trajectory(recording: Recording) -> Trajectory | None:
+    """Return the positions and times of a recording, or None if it has no positions."""
+    if recording.positions is None:
+        return None
+    return Trajectory(recording.positions, recording.times, recording.pose_source or recording.name)
+
+
+def recording_rows(recording: Recording, source: Input) -> Mapping[int, int]:
+    """Return the row in the recording of each frame of `source`.
+
+    Frames are matched by id or, if ids do not match, by number. Raises ValueError if the numbers of frames differ, too.
+    """
+    n = len(recording) if source.positions is None else len(source.positions)
+    row_of = {name: row for row, name in enumerate(recording.ids)}
+    if isinstance(source, DescriptorFile) and set(source.ids) <= set(row_of):
+        return {frame: row_of[name] for frame, name in enumerate(source.ids)}
+    if n != len(recording):
+        raise ValueError(
+            f"--data: expected {n} frames in sequence {recording.name}, as in the input, found {len(recording)}"
+        )
+    return {frame: frame for frame in range(n)}
 
 
 def as_descriptors(
@@ -134,22 +155,26 @@ def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> De
         if file.positions is None:
             raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
         return file
-    poses, times = trajectory.positions, trajectory.times
+    positions, times = trajectory.positions, trajectory.times
     recorded = file.recorded
-    if len(poses) == len(recorded) != len(file):
-        poses, times = poses[recorded], None if times is None else times[recorded]
-    stamps, about = None if trajectory.by_row else times, {"scans": len(file), "of": f"frame of {path.name}"}
+    if len(positions) == len(recorded) != len(file):
+        positions, times = positions[recorded], None if times is None else times[recorded]
     with naming(path):
-        found = poses_at_scans(trajectory.source, poses_of(poses), stamps, file.times, **about)
-    keeps_times = times is None or (file.times is not None and not trajectory.by_row)
-    source = f"{trajectory.source}, {found.said}" if found.said else trajectory.source
-    placed = file if found.kept.all() else file.only(found.kept)
-    with naming(path):
+        scan_poses = poses_at_scans(
+            trajectory.source,
+            poses_of(positions),
+            None if trajectory.by_row else times,
+            file.times,
+            scans=len(file),
+            of=f"frame of {path.name}",
+        )
+        with_pose = file if scan_poses.kept.all() else file.only(scan_poses.kept)
+        keeps_times = times is None or (file.times is not None and not trajectory.by_row)
         return replace(
-            placed,
-            positions=found.poses[:, :3, 3],
-            times=placed.times if keeps_times else times,
-            pose_source=source,
+            with_pose,
+            positions=scan_poses.poses[:, :3, 3],
+            times=with_pose.times if keeps_times else times,
+            pose_source=", ".join(filter(None, (trajectory.source, scan_poses.said))),
         )
 
 
@@ -165,7 +190,7 @@ def _read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, di
         raise ValueError(f"{expected}, found no valid .npy file ({in_short(error)})") from error
     if rows.ndim != 2 or rows.dtype.kind not in "fiub" or rows.size == 0:
         raise ValueError(f"{expected}, found {rows.dtype} {rows.shape}")
-    trajectory = _needed(path, trajectory)
+    trajectory = _required(path, trajectory)
     if len(rows) != (poses := len(trajectory.positions)):
         raise ValueError(
             f"{path}: expected {poses} descriptors, one for each pose of {trajectory.source}, found {len(rows)}"
@@ -176,18 +201,22 @@ def _read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, di
 
 def _read_top_k_list(path: Path, trajectory: Trajectory | None, *, sequence: str) -> TopK:
     """Read the frames retrieved for each query. Either all frames have a score or none has."""
-    trajectory = _needed(path, trajectory)
-    where, lines = zip(*_lines(path), strict=True)
-    queries, answers = zip(*map(_answers, where, lines), strict=True)
-    nearest = _padded([[frame for frame, _ in row] for row in answers], fill=-1).astype(np.int64)
-    frames = np.column_stack([queries, nearest])
-    _check_rows(where, frames, trajectory)
-    scores = [[score for _, score in row] for row in answers]
+    trajectory = _required(path, trajectory)
+    rows, scores = [], []
+    for where, line in _lines(path):
+        query, colon, answers = line.partition(":")
+        if not colon:
+            raise ValueError(f"{where}: expected `query: frame frame ...`, found {line.strip()[:80]!r}")
+        words = [word.partition("=") for word in answers.split()]
+        rows.append([_frame(word, where, trajectory) for word in (query.strip(), *(frame for frame, _, _ in words))])
+        scores.append([_score(score, where) if equals else None for _, equals, score in words])
     retrieved, missing = sum(map(len, scores)), sum(score is None for row in scores for score in row)
     if 0 < missing < retrieved:
         raise ValueError(
             f"{path}: expected a score for every retrieved frame or for none, found {missing} without a score"
         )
+    columns = max(2, *map(len, rows))
+    frames = np.array([row + [-1] * (columns - len(row)) for row in rows])
     with naming(path):
         return TopK(
             sequence=sequence,
@@ -195,19 +224,9 @@ def _read_top_k_list(path: Path, trajectory: Trajectory | None, *, sequence: str
             times=trajectory.times,
             pose_source=trajectory.source,
             queries=frames[:, 0],
-            nearest=nearest,
-            scores=None if missing == retrieved else _padded([[score or 0.0 for score in row] for row in scores], 0.0),
+            nearest=frames[:, 1:],
+            scores=None if missing == retrieved else np.array([row + [0] * (columns - 1 - len(row)) for row in scores]),
         )
-
-
-def _answers(where: str, line: str) -> tuple[int, list[tuple[int, float | None]]]:
-    """Return the query of a line, and its answers as (frame, score or None)."""
-    query, colon, retrieved = line.partition(":")
-    if not colon:
-        raise ValueError(f"{where}: expected `query: frame frame ...`, found {line.strip()[:80]!r}")
-    words = [word.partition("=") for word in retrieved.split()]
-    answers = [(_frame(frame, where), _score(score, where) if equals else None) for frame, equals, score in words]
-    return _frame(query.strip(), where), answers
 
 
 def _read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
@@ -222,16 +241,14 @@ def _read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
             raise ValueError(
                 f"{where}: expected {expected} numbers `i j score [label]`, found {' '.join(words)[:80]!r}"
             )
-    pairs = np.array([[_frame(word, where) for word in words[:2]] for where, words in rows])
-    scores = np.array([_score(words[2], where) for where, words in rows])
-    for where, words in rows if columns == 4 else ():
-        if words[3] not in LABELS:
+        if columns == 4 and words[3] not in ("0", "1"):
             raise ValueError(f"{where}: expected a label 0 or 1, found {words[3]!r}")
-    labels = np.array([LABELS[words[3]] for _, words in rows]) if columns == 4 else None
-    if trajectory is None and labels is not None:
+    labels = np.array([words[3] == "1" for _, words in rows]) if columns == 4 else None
+    trajectory = trajectory if labels is not None else _required(path, trajectory)
+    pairs = np.array([[_frame(word, where, trajectory) for word in words[:2]] for where, words in rows])
+    scores = np.array([_score(words[2], where) for where, words in rows])
+    if trajectory is None:
         return ScoredPairs(pairs, scores, labels)
-    trajectory = _needed(path, trajectory)
-    _check_rows([where for where, _ in rows], pairs, trajectory)
     return ScoredPairs(pairs, scores, labels, trajectory.positions, trajectory.source)
 
 
@@ -242,9 +259,12 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
             yield f"{path}, line {number}", line
 
 
-def _frame(word: str, where: str) -> int:
+def _frame(word: str, where: str, trajectory: Trajectory | None) -> int:
+    """Return the number of a frame. Raises ValueError if it is no number, or if the trajectory has no such frame."""
     if not (word.isascii() and word.isdigit() and len(word) < 10):
         raise ValueError(f"{where}: expected a frame number, found {word!r}")
+    if trajectory is not None and int(word) >= (n := len(trajectory.positions)):
+        raise ValueError(f"{where}: expected frames from 0 to {n - 1} ({trajectory.source}), found {int(word)}")
     return int(word)
 
 
@@ -258,21 +278,7 @@ def _score(word: str, where: str) -> float:
     return score
 
 
-def _check_rows(where: Sequence[str], frames: Int[np.ndarray, "rows _"], trajectory: Trajectory) -> None:
-    """Raise ValueError if a frame has no pose. The message names the first such line."""
-    n = len(trajectory.positions)
-    for row, column in np.argwhere(frames >= n)[:1]:
-        expected = f"expected frames from 0 to {n - 1} ({trajectory.source})"
-        raise ValueError(f"{where[row]}: {expected}, found {frames[row, column]}")
-
-
-def _padded(rows: Sequence[Sequence[int | float]], fill: int | float) -> Float[np.ndarray, "rows columns"]:
-    """Return rows of different lengths as one array with at least one column, padded with `fill`."""
-    columns = max([1, *map(len, rows)])
-    return np.array([[*row, *[fill] * (columns - len(row))] for row in rows], dtype=np.float64)
-
-
-def _needed(path: Path, trajectory: Trajectory | None) -> Trajectory:
+def _required(path: Path, trajectory: Trajectory | None) -> Trajectory:
     if trajectory is None:
         raise ValueError(f"{path}: expected positions to score against (--poses, or --data with poses), found none")
     return trajectory
@@ -286,26 +292,24 @@ def check_agreement(first: Input, other: Input) -> None:
     if isinstance(first, DescriptorFile) and isinstance(other, DescriptorFile) and first.ids != other.ids:
         pairs = itertools.zip_longest(first.ids, other.ids)
         here, there = next((a, b) for a, b in pairs if a != b)
-        said = [f"{len(file)} with {name or 'none more'!r}" for file, name in ((first, here), (other, there))]
-        raise ValueError(f"expected the frames of the first file, {said[0]}, found {said[1]}")
-    _check_equal("positions", first.positions, other.positions, NEAR_M)
-    if not isinstance(first, ScoredPairs) and not isinstance(other, ScoredPairs):
-        if (first.times is None) != (other.times is None):
-            has, has_not = ("times", "none") if first.times is not None else ("none", "times")
-            raise ValueError(
-                f"expected times in both files or in neither, found {has} in the first and {has_not} in this one"
-            )
-        _check_equal("times", first.times, other.times, NEAR_S)
-
-
-def _check_equal(what: str, first: np.ndarray | None, other: np.ndarray | None, near: float) -> None:
-    if first is None or other is None:
-        return
-    if len(first) != len(other):
-        raise ValueError(f"expected {len(first)} {what}, as in the first file, found {len(other)}")
-    apart = np.abs(first - other).reshape(len(first), -1).max(axis=1)
-    row = int(apart.argmax())
-    if apart[row] > near:
         raise ValueError(
-            f"expected the {what} of the first file, {first[row].tolist()} in row {row}, found {other[row].tolist()}"
+            f"expected the frames of the first file, {len(first)} with {here or 'none more'!r}, "
+            f"found {len(other)} with {there or 'none more'!r}"
         )
+    has_times = [source.times is not None for source in (first, other) if not isinstance(source, ScoredPairs)]
+    if has_times in ([True, False], [False, True]):
+        words = ["times" if has else "none" for has in has_times]
+        raise ValueError(
+            f"expected times in both files or in neither, found {words[0]} in the first and {words[1]} in this one"
+        )
+    for name, tolerance in (("positions", SAME_M), ("times", SAME_S)):
+        expected, found = getattr(first, name, None), getattr(other, name, None)
+        if expected is None or found is None:
+            continue
+        if len(expected) != len(found):
+            raise ValueError(f"expected {len(expected)} {name}, as in the first file, found {len(found)}")
+        difference = np.abs(expected - found).reshape(len(expected), -1).max(axis=1)
+        row = int(difference.argmax())
+        if difference[row] > tolerance:
+            rows = expected[row].tolist(), found[row].tolist()
+            raise ValueError(f"expected the {name} of the first file, {rows[0]} in row {row}, found {rows[1]}")

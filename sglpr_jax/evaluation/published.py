@@ -16,13 +16,13 @@ Our numbers are comparable with these only under the same protocol, on the same 
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
+from statistics import fmean
 from typing import Any, Literal
 
-Kind = Literal["handcrafted", "learned"]
-LEARNED = "learned"
-RINET, OWN_RUN = "RINet's paper", "run by SG-LPR's authors"
+RINET = "RINet's paper"
 
 NCLT_DATABASE = "2012-01-15"
 """Database session of table 3."""
@@ -36,7 +36,7 @@ class Row:
     scores: tuple[float, ...]
     mean: float
     """Mean as printed. It may differ from the mean of the rounded scores."""
-    kind: Kind
+    kind: Literal["handcrafted", "learned"]
     source: str
     """Source of the numbers according to the paper. It determines the protocol."""
 
@@ -65,3 +65,40 @@ def _read(table: dict[str, Any]) -> Table:
 
 TABLES = tuple(map(_read, json.loads((resources.files("sglpr_jax.evaluation") / "published.json").read_text())))
 TABLE_1, TABLE_2, TABLE_3, *_ = TABLES
+TABLE_1_NOTE = (
+    f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
+    "protocol: rows from RINet's paper use pairs-f1max, the others top1-f1max as far as is known."
+)
+TABLE_3_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset}, by bevplace-nclt-recall's rule."
+
+
+def table_1_rows(sequence: str) -> list[tuple[str, ...]]:
+    """Return method, score and source of the learned methods in table 1, for one KITTI sequence.
+
+    Raises ValueError if table 1 does not have the sequence.
+    """
+    if sequence not in TABLE_1.columns:
+        raise ValueError(f"expected a sequence with published numbers, {', '.join(TABLE_1.columns)}, found {sequence}")
+    i = TABLE_1.columns.index(sequence)
+    return [(row.method, f"{row.scores[i]:.3f}", row.source) for row in TABLE_1.rows if row.kind == "learned"]
+
+
+def table_3_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return method, scores and mean of table 3 for these query sessions, marked as published.
+
+    Cells of sessions that are not in the table are empty and do not count in the mean. Raises ValueError if the
+    database is not that of the table, or if the table has none of the sessions.
+    """
+    columns = [session for session in sessions if session in TABLE_3.columns]
+    if database != NCLT_DATABASE or not columns:
+        raise ValueError(
+            f"expected database {NCLT_DATABASE} and queries among {', '.join(TABLE_3.columns)}, for which numbers "
+            f"are published; found database {database} and queries {', '.join(sessions)}"
+        )
+    rows = []
+    for row in TABLE_3.rows:
+        scores = dict(zip(TABLE_3.columns, row.scores, strict=True))
+        mean = row.mean if len(columns) == len(scores) else fmean(scores[session] for session in columns)
+        cells = (f"{scores[session]:.3f}" if session in scores else "" for session in sessions)
+        rows.append((f"published: {row.method}", *cells, f"{mean:.3f}"))
+    return rows

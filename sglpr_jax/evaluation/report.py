@@ -10,8 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sglpr_jax.evaluation.protocols.protocol import Result
-from sglpr_jax.evaluation.published import LEARNED, TABLE_1, TABLE_3
+from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.files import printable
 from sglpr_jax.metrics import PrecisionRecallCurve
 
@@ -24,11 +23,8 @@ MOST_COLUMNS = 6
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
 PRECISIONS = (0.99, 1.0)
 """Precisions for which results state a threshold."""
-PUBLISHED_NOTE = (
-    f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
-    "protocol: rows from RINet's paper use pairs-f1max, the others top1-f1max as far as is known."
-)
-SESSIONS_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset}, by bevplace-nclt-recall's rule."
+COORDINATES = ("distance", "precision", "recall")
+"""Numbers of a point of a curve, in the order of tables."""
 
 
 class PrintsItself:
@@ -99,14 +95,15 @@ def threshold_table(results: Sequence[Result]) -> TextTable:
 
     Each result with a curve has a row for the highest F1 and for each of `PRECISIONS`.
     """
-    names = ("distance", "precision", "recall")
-    rows = [
-        (result.name, goal, *("" if point is None else f"{point[name]:.3f}" for name in names))
-        for result in results
-        if result.curve is not None
-        for goal, point in {"highest F1": _at_f1max(result), **_at_precisions(result, "precision {:g}")}.items()
-    ]
     header = ("protocol", "threshold for", "descriptor distance", "precision", "recall")
+    rows = []
+    for result in results:
+        if (curve := result.curve) is None:
+            continue
+        points = {"highest F1": _point(curve, curve.best), **_at_precisions(curve, "precision {:g}")}
+        for goal, point in points.items():
+            cells = ["", "", ""] if point is None else [f"{point[name]:.3f}" for name in COORDINATES]
+            rows.append((result.name, goal, *cells))
     return TextTable(header, rows, header[2:])
 
 
@@ -116,36 +113,18 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> T
     If there are more than `MOST_COLUMNS` protocols, rows and columns are exchanged. All methods are scored on the same
     sequence.
     """
-    names = [result.name for result in next(iter(methods.values()))]
-    scores = [[format_score(result.score) for result in results] for results in methods.values()]
-    if len(names) <= MOST_COLUMNS:
-        rows = [(name, *line) for name, line in zip(methods, scores, strict=True)]
-        return TextTable(("method", *names), rows, names, title)
-    rows = [(name, *line) for name, line in zip(names, zip(*scores, strict=True), strict=True)]
-    return TextTable(("protocol", *methods), rows, list(methods), title)
+    header = ("method", *(result.name for result in next(iter(methods.values()))))
+    rows = [(name, *(format_score(result.score) for result in results)) for name, results in methods.items()]
+    if len(header) - 1 > MOST_COLUMNS:
+        _, *rows = zip(header, *rows, strict=True)
+        header = ("protocol", *methods)
+    return TextTable(header, rows, header[1:], title)
 
 
 def mean_score(results: Sequence[Result]) -> float:
     """Return the mean score over the sessions with a revisit, or NaN if no session has one."""
     scores = [result.score for result in results if not math.isnan(result.score)]
     return float(np.mean(scores)) if scores else math.nan
-
-
-def published_rows(sequence: str) -> list[tuple[str, ...]]:
-    """Return method, score and source of the learned methods in table 1 of the paper, for one KITTI sequence.
-
-    Raises ValueError if table 1 does not have the sequence.
-    """
-    if sequence not in TABLE_1.columns:
-        raise ValueError(f"expected a sequence with published numbers, {', '.join(TABLE_1.columns)}, found {sequence}")
-    i = TABLE_1.columns.index(sequence)
-    return [(row.method, f"{row.scores[i]:.3f}", row.source) for row in TABLE_1.rows if row.kind == LEARNED]
-
-
-def published_table(rows: Sequence[tuple[str, ...]]) -> TextTable:
-    """Return `published_rows` as a table. `PUBLISHED_NOTE` belongs below it."""
-    header = ("method", "published F1max", "numbers from")
-    return TextTable(header, rows, header[1:2])
 
 
 def format_score(score: float) -> str:
@@ -160,15 +139,15 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
             "protocol": result.name,
             "rule": result.rule,
             "score": score_or_none(result.score),
-            "interval": None if result.interval is None else list(result.interval),
+            "interval": result.interval,
             "counts": result.counts,
             "dimensions": result.dimensions,
             "poses": result.pose_source,
             "published_on": result.published_on,
-            "average_precision": None if result.curve is None else result.curve.average_precision,
-            "at_f1max": _at_f1max(result),
-            "at_precision": _at_precisions(result, "{:g}"),
-            "recall_at": {str(n): recall for n, recall in result.recalls.items()},
+            "average_precision": result.curve and result.curve.average_precision,
+            "at_f1max": result.curve and _point(result.curve, result.curve.best),
+            "at_precision": {} if result.curve is None else _at_precisions(result.curve, "{:g}"),
+            "recall_at": result.recalls,
         }
         for result in results
     ]
@@ -179,18 +158,13 @@ def score_or_none(score: float) -> float | None:
     return None if math.isnan(score) else score
 
 
-def _at_f1max(result: Result) -> dict[str, float] | None:
-    """Return precision, recall and largest accepted descriptor distance at the highest F1."""
-    return None if result.curve is None else _point(result.curve, result.curve.best)
-
-
-def _at_precisions(result: Result, name: str) -> dict[str, dict[str, float] | None]:
-    """Return the same for each of `PRECISIONS`, or None if no threshold reaches this precision."""
-    curve = result.curve
-    return {} if curve is None else {name.format(goal): _point(curve, curve.at_precision(goal)) for goal in PRECISIONS}
+def _at_precisions(curve: PrecisionRecallCurve, name: str) -> dict[str, dict[str, float] | None]:
+    """Return the point of each of `PRECISIONS`, or None if no threshold reaches this precision."""
+    return {name.format(goal): _point(curve, curve.at_precision(goal)) for goal in PRECISIONS}
 
 
 def _point(curve: PrecisionRecallCurve, index: int | None) -> dict[str, float] | None:
+    """Return precision, recall and largest accepted descriptor distance at a threshold of the curve."""
     if index is None:
         return None
     precision, recall, threshold = curve.precision[index], curve.recall[index], curve.thresholds[index]

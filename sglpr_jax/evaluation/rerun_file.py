@@ -10,9 +10,8 @@ from jaxtyping import Float, Float32
 
 from sglpr_jax.evaluation.loops_page import overlay_of, wrong_loops
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.result import LoopSearchResult
+from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transformed, travelled
 
@@ -33,7 +32,7 @@ def check_installed() -> None:
         raise ImportError("--rerun needs rerun-sdk: pip install 'sglpr-jax[view]'")
 
 
-def write_rerun(found: LoopSearchResult, path: Path | str, *, optimized: OptimizedTrajectory | None = None) -> None:
+def write_rerun(result: LoopSearchResult, path: Path | str, *, optimized: OptimizedTrajectory | None = None) -> None:
     """Write the loops of a recording as an .rrd file for the rerun viewer.
 
     The time line counts frames. With poses (odometry or, without it, known poses) the file has the trajectory, the
@@ -43,20 +42,20 @@ def write_rerun(found: LoopSearchResult, path: Path | str, *, optimized: Optimiz
     """
     check_installed()
     rerun: Any = importlib.import_module("rerun")
-    poses = _poses(found, optimized)
+    poses = _poses(result, optimized)
     with replacing(Path(path)) as temporary:
-        stream = rerun.RecordingStream("sglpr-jax", recording_id=f"loops {found.sessions[0].recording.name}")
-        stream.save(temporary, default_blueprint=_layout(rerun, with_map=poses is not None))
+        stream = rerun.RecordingStream("sglpr-jax", recording_id=f"loops {result.sessions[0].recording.name}")
+        stream.save(temporary, default_blueprint=_layout(with_map=poses is not None))
         if poses is not None:
-            _log_map(rerun, stream, found, poses, optimized)
-        _log_loops(rerun, stream, found, poses)
-        _log_evidence(rerun, stream, found)
+            _log_map(rerun, stream, result.sessions[0], poses, is_corrected=optimized is not None)
+        _log_loops(rerun, stream, result, poses)
+        _log_evidence(rerun, stream, result)
         stream.disconnect()
 
 
-def _poses(found: LoopSearchResult, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
+def _poses(result: LoopSearchResult, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
     """Pose of each searched frame in the map: corrected, by odometry, or a known position without a rotation."""
-    session = found.sessions[0]
+    session = result.sessions[0]
     if optimized is not None:
         return optimized.poses
     if session.odometry is not None:
@@ -69,7 +68,7 @@ def _poses(found: LoopSearchResult, optimized: OptimizedTrajectory | None) -> Fl
     return poses
 
 
-def _layout(rerun: Any, *, with_map: bool) -> Any:
+def _layout(*, with_map: bool) -> Any:
     views = importlib.import_module("rerun.blueprint")
     images = views.Spatial2DView(origin="pair", name="Query (cyan) on match (red)")
     lines = views.TimeSeriesView(origin="evidence", name="Evidence")
@@ -79,35 +78,26 @@ def _layout(rerun: Any, *, with_map: bool) -> Any:
 
 
 def _log_map(
-    rerun: Any,
-    stream: Any,
-    found: LoopSearchResult,
-    poses: Float[np.ndarray, "n 4 4"],
-    optimized: OptimizedTrajectory | None,
+    rerun: Any, stream: Any, session: Session, poses: Float[np.ndarray, "n 4 4"], *, is_corrected: bool
 ) -> None:
-    """Both trajectories, the sensor, and the scans of keyframes."""
-    session = found.sessions[0]
+    """Log the trajectories, the sensor, and the scans of keyframes."""
     stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     lines = {"given": (poses, BEFORE)}
-    if optimized is not None and session.odometry is not None:
+    if is_corrected and session.odometry is not None:
         lines = {"given": (session.odometry[: session.frames], BEFORE), "corrected": (poses, AFTER)}
     for name, (path, colour) in lines.items():
         stream.log(f"map/trajectory/{name}", rerun.LineStrips3D([path[:, :3, 3]], colors=[colour]), static=True)
-    turned = session.odometry is not None  # known positions have no rotation
-    keyframes = set(_keyframes(poses).tolist()) if turned and not session.recording.has_images else set()
+    # The first frame of every `KEYFRAME_M` of the path. Known positions have no rotation, so scans need odometry.
+    keyframes = np.unique(np.floor(travelled(poses) / KEYFRAME_M), return_index=True)[1].tolist()
+    with_scans = session.odometry is not None and not session.recording.has_images
     for frame, pose in enumerate(poses):
         stream.set_time(TIMELINE, sequence=frame)
         stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[AFTER]))
-        if frame in keyframes and session.recording.ids[frame] not in session.skipped:
+        if with_scans and frame in keyframes and session.recording.ids[frame] not in session.skipped:
             points = session.recording.scan(frame, labels=False).points
             if points is not None and len(points):
-                placed = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)
-                stream.log(f"map/scans/{frame}", rerun.Points3D(placed, colors=[SCAN], radii=[0.05]))
-
-
-def _keyframes(poses: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
-    """The first frame of every `KEYFRAME_M` of the path."""
-    return np.unique(np.floor(travelled(poses) / KEYFRAME_M), return_index=True)[1]
+                in_map = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)
+                stream.log(f"map/scans/{frame}", rerun.Points3D(in_map, colors=[SCAN], radii=[0.05]))
 
 
 def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
@@ -117,36 +107,31 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
     return finite[first]
 
 
-def _log_loops(rerun: Any, stream: Any, found: LoopSearchResult, poses: Float[np.ndarray, "n 4 4"] | None) -> None:
-    """A line in the map, the pair of images and a text for each loop, at the frame of the query."""
-    session = found.sessions[0]
-    wrong = {(loop.query, loop.match) for loop in wrong_loops(found)}
-    for loop in found.loops:
+def _log_loops(rerun: Any, stream: Any, result: LoopSearchResult, poses: Float[np.ndarray, "n 4 4"] | None) -> None:
+    """Log a line in the map, the pair of images and a text for each loop, at the frame of the query."""
+    recording = result.sessions[0].recording
+    wrong = {(loop.query, loop.match) for loop in wrong_loops(result)}
+    for loop in result.loops:
         colour = WRONG if (loop.query, loop.match) in wrong else RIGHT
+        overlap = "" if loop.overlap is None else f", overlap {loop.overlap:.2f}"
+        label = f"probability {loop.probability:.4f}{overlap}"
         stream.set_time(TIMELINE, sequence=loop.query)
         if poses is not None:
             ends = poses[[loop.match, loop.query], :3, 3]
-            stream.log(
-                f"map/loops/{loop.query}",
-                rerun.LineStrips3D([ends], colors=[colour], labels=[_said(loop)], show_labels=False),
-            )
-        image = (255 * np.clip(overlay_of(session.recording, session.recording, loop), 0, 1)).astype(np.uint8)
+            line = rerun.LineStrips3D([ends], colors=[colour], labels=[label], show_labels=False)
+            stream.log(f"map/loops/{loop.query}", line)
+        image = (255 * np.clip(overlay_of(recording, recording, loop), 0, 1)).astype(np.uint8)
         stream.log("pair", rerun.Image(image).compress(jpeg_quality=90))
-        stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {_said(loop)}"))
+        stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {label}"))
 
 
-def _said(loop: LoopClosure) -> str:
-    overlap = "" if loop.overlap is None else f", overlap {loop.overlap:.2f}"
-    return f"probability {loop.probability:.4f}{overlap}"
-
-
-def _log_evidence(rerun: Any, stream: Any, found: LoopSearchResult) -> None:
-    """Correlation of the candidate of each frame, and its probability without the evidence of neighbours."""
-    session = found.sessions[0]
-    if found.model is None or not session.candidates:
+def _log_evidence(rerun: Any, stream: Any, result: LoopSearchResult) -> None:
+    """Log correlation of the candidate of each frame, and its probability without the evidence of neighbours."""
+    candidates = result.sessions[0].candidates
+    if result.model is None or not candidates:
         return
-    probabilities = found.model.probability(Evidence.stack([one.evidence for one in session.candidates]))
-    for one, probability in zip(session.candidates, probabilities.tolist(), strict=True):
-        stream.set_time(TIMELINE, sequence=one.query)
+    probabilities = result.model.probability(Evidence.stack([candidate.evidence for candidate in candidates]))
+    for candidate, probability in zip(candidates, probabilities.tolist(), strict=True):
+        stream.set_time(TIMELINE, sequence=candidate.query)
         stream.log("evidence/probability", rerun.Scalars(probability))
-        stream.log("evidence/correlation", rerun.Scalars(float(one.alignment.correlation)))
+        stream.log("evidence/correlation", rerun.Scalars(float(candidate.alignment.correlation)))

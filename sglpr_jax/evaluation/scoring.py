@@ -13,18 +13,19 @@ from numpy.typing import ArrayLike
 from rich.console import Console, ConsoleOptions
 
 from sglpr_jax.data.formats.pose_files import Trajectory
+from sglpr_jax.evaluation import published as paper
 from sglpr_jax.evaluation import report
-from sglpr_jax.evaluation.inputs import Input, as_descriptors, check_agreement, read_input
-from sglpr_jax.evaluation.protocols import PROTOCOLS, chosen_protocols
-from sglpr_jax.evaluation.protocols.protocol import Decision, Result
-from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
+from sglpr_jax.evaluation.inputs import as_descriptors, check_agreement, read_input
+from sglpr_jax.evaluation.protocols import PROTOCOLS, chosen_protocols, score
+from sglpr_jax.evaluation.protocols.protocol import Input, ScoredPairs, TopK, kind_of
+from sglpr_jax.evaluation.protocols.result import Decision, Result
 from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 
-APART = 10
+MISTAKE_GAP = 10
 """Minimum gap between the queries of two shown mistakes, in frames. Neighbouring frames make the same mistake."""
-MOST_SHOWN = 6
+MOST_MISTAKES = 6
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Evaluation(report.PrintsItself):
         """Results of the evaluated method, one for each protocol and, across sessions, for each query session."""
         if self.database is None:
             return next(iter(self.methods.values()))
-        return [result for of_one in zip(*self.methods.values(), strict=True) for result in of_one]
+        return [result for results in self._by_protocol().values() for result in results]
 
     @cached_property
     def judged(self) -> Result | None:
@@ -72,53 +73,62 @@ class Evaluation(report.PrintsItself):
 
     @cached_property
     def worst(self) -> Sequence[FalsePositive]:
-        """Up to `MOST_SHOWN` false positives of `judged`, in order of descriptor distance."""
+        """Up to `MOST_MISTAKES` false positives of `judged`, in order of descriptor distance."""
         result, positions, worst = self.judged, self.positions, list[FalsePositive]()
         if result is None or positions is None:
             return worst
         assert result.answers is not None and result.answer_distances is not None and result.decisions is not None
         wrong = np.flatnonzero(result.decisions == Decision.FALSE_POSITIVE)
         for query in wrong[np.argsort(result.answer_distances[wrong], kind="stable")].tolist():
-            if len(worst) < MOST_SHOWN and all(abs(query - other.query) >= APART for other in worst):
+            if len(worst) < MOST_MISTAKES and all(abs(query - other.query) >= MISTAKE_GAP for other in worst):
                 answer = int(result.answers[query])
-                apart = (positions[query] - positions[answer])[: result.dimensions]
-                metres = float(np.linalg.norm(apart))
-                worst.append(FalsePositive(query, answer, metres, float(result.answer_distances[query])))
+                apart_m = np.linalg.norm((positions[query] - positions[answer])[: result.dimensions])
+                worst.append(FalsePositive(query, answer, float(apart_m), float(result.answer_distances[query])))
         return worst
 
-    def _by_protocol(self) -> dict[str, list[Result]]:
+    def _by_protocol(self) -> dict[str, tuple[Result, ...]]:
         """Return the results of all methods or query sessions by the protocol's name on the command line."""
         names = {protocol.title: name for name, protocol in PROTOCOLS.items()}
-        return {names[of_one[0].name]: list(of_one) for of_one in zip(*self.methods.values(), strict=True)}
+        return {names[results[0].name]: results for results in zip(*self.methods.values(), strict=True)}
 
     def table(self) -> report.TextTable:
         """Return the table of all scores: methods side by side, or the query sessions, their mean and the paper's."""
         if self.database is None:
             return report.comparison(self.methods)
         header = ("", *map(printable, self.methods), "mean")
-        each = {name: [*(one.score for one in of), report.mean_score(of)] for name, of in self._by_protocol().items()}
-        rows = [(name, *map(report.format_score, scores)) for name, scores in each.items()]
+        rows = []
+        for name, results in self._by_protocol().items():
+            scores = [*(result.score for result in results), report.mean_score(results)]
+            rows.append((name, *map(report.format_score, scores)))
         return report.TextTable(header, [*rows, *self.published], header[1:], self.title)
+
+    def published_tables(self) -> list[report.TextTable | str]:
+        """Return the paper's numbers that `table` does not have, and the note on them. Empty if not requested."""
+        if not self.published:
+            return []
+        if self.database is not None:
+            return [paper.TABLE_3_NOTE]
+        header = ("method", "published F1max", "numbers from")
+        return [report.TextTable(header, self.published, header[1:2]), paper.TABLE_1_NOTE]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for `json.dump`."""
         if self.database is not None:
             results = {
                 name: {
-                    "mean": report.score_or_none(report.mean_score(of_one)),
-                    "sessions": dict(zip(self.methods, report.to_json(of_one), strict=True)),
+                    "mean": report.score_or_none(report.mean_score(results)),
+                    "sessions": dict(zip(self.methods, report.to_json(results), strict=True)),
                 }
-                for name, of_one in self._by_protocol().items()
+                for name, results in self._by_protocol().items()
             }
-            beside = {"about": report.SESSIONS_NOTE, "columns": self.table().header, "rows": self.published}
+            beside = {"about": paper.TABLE_3_NOTE, "columns": self.table().header, "rows": self.published}
             published = {"published": beside} if self.published else {}
             return {**self.made_with, "database_session": self.database, "results": results, **published}
-        others = list(self.methods.items())[1:]
         return {
             **self.made_with,
             "results": report.to_json(self.results),
             "false_positives": [dataclasses.asdict(mistake) for mistake in self.worst],
-            "compared": {name: report.to_json(results) for name, results in others},
+            "compared": {name: report.to_json(results) for name, results in list(self.methods.items())[1:]},
             "published": self.published,
         }
 
@@ -129,10 +139,7 @@ class Evaluation(report.PrintsItself):
             yield report.threshold_table(self.results)
         if not alone or len(self.methods) > 1:
             yield self.table()
-        if self.published:
-            yield from (
-                [report.published_table(self.published), report.PUBLISHED_NOTE] if alone else [report.SESSIONS_NOTE]
-            )
+        yield from self.published_tables()
 
 
 def evaluate(
@@ -163,41 +170,40 @@ def evaluate(
       print(sglpr_jax.evaluate("08.npz"))
     """
     clock = None if times is None else np.asarray(times, np.float64)
-    poses, given = {}, None
+    options, trajectory = {"times": clock}, None
     if positions is not None:
-        given = Trajectory(np.asarray(positions, np.float64), clock, "positions given as an array", by_row=True)
-        poses = {"positions": given.positions, "pose_source": given.source}
+        trajectory = Trajectory(np.asarray(positions, np.float64), clock, "positions given as an array", by_row=True)
     if isinstance(source, str | Path):
         path = Path(source)
-        read = read_input(path, given, sequence=path.stem, distance=distance)
-        read = _with_options(read, where=f"{path}: ", times=clock)
+        read = read_input(path, trajectory, sequence=path.stem, distance=distance)
+        with naming(path):
+            read = _with_options(read, **options)
         return evaluate_methods({path.stem: read}, protocols, published=published, file=path)
     if distance is not None:
         distance_function(distance)
     if isinstance(source, Input):
-        source = _with_options(source, **poses, times=clock, distance=distance)
+        if trajectory is not None:
+            options |= {"positions": trajectory.positions, "pose_source": trajectory.source}
+        source = _with_options(source, **options, distance=distance)
     else:
         rows = np.asarray(source)
         if rows.ndim != 2:
             raise ValueError(
                 f"expected a file, an opened input, or descriptors (n, d), found an array of shape {rows.shape}"
             )
-        if given is None:
+        if trajectory is None:
             raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
-        source = as_descriptors(rows, given, sequence="", method="", distance=distance or "l2")
+        source = as_descriptors(rows, trajectory, sequence="", method="", distance=distance or "l2")
     return evaluate_methods({"descriptors": source}, protocols, published=published)
 
 
-def _with_options(source: Input, *, where: str = "", **options: Any) -> Input:
-    """Return the source with the given options in place of its own. Raises ValueError if an option does not fit."""
-    given = {name: value for name, value in options.items() if value is not None}
-    for name in given:
+def _with_options(source: Input, **options: Any) -> Input:
+    """Replace fields of the source by options that are not None. Raises ValueError if an option does not fit."""
+    options = {name: value for name, value in options.items() if value is not None}
+    for name in options:
         if not hasattr(source, name):
-            raise ValueError(f"{where}expected no {name} beside {_about(source)}, found {name}")
-    try:
-        return dataclasses.replace(source, **given)
-    except ValueError as error:
-        raise ValueError(f"{where}{error}") from error
+            raise ValueError(f"expected no {name} beside {_about(source)}, found {name}")
+    return dataclasses.replace(source, **options)
 
 
 def evaluate_methods(
@@ -215,12 +221,12 @@ def evaluate_methods(
       ValueError: If a method cannot be scored, or has other frames than the first. The message names the method.
     """
     source = next(iter(methods.values()))
-    chosen = chosen_protocols(source, protocols)
+    names = chosen_protocols(kind_of(source), protocols)
     results = {}
-    for name, of_one in methods.items():
-        with naming(name):
-            check_agreement(source, of_one)
-            results[name] = score(of_one, chosen)
+    for method, other in methods.items():
+        with naming(method):
+            check_agreement(source, other)
+            results[method] = score(other, names)
     if isinstance(source, ScoredPairs):
         sequence, title = "scored pairs", f"{'pairs' if file is None else file.name}, {len(source.pairs)} pairs"
     else:
@@ -233,14 +239,9 @@ def evaluate_methods(
         about=_about(source) if file is None else f"{file}: {_about(source)}",
         methods=results,
         positions=source.positions,
-        published=report.published_rows(sequence) if published else (),
+        published=paper.table_1_rows(sequence) if published else (),
         made_with=made_with,
     )
-
-
-def score(source: Input, protocols: Sequence[str] = ()) -> list[Result]:
-    """Return the result of each named protocol (`chosen_protocols`). Raises ValueError if positions are missing."""
-    return [PROTOCOLS[name](source) for name in chosen_protocols(source, protocols)]
 
 
 def _about(source: Input) -> str:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,9 +13,13 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
+from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.image_maps import SemanticMap, semantic_map
+
+if TYPE_CHECKING:
+    import matplotlib.figure
 
 PICTURE = "segmentation.png"
 
@@ -44,9 +48,9 @@ class SegmentationScore(PrintsItself):
         return int((self.shares > 0).sum())
 
     @property
-    def majority(self) -> int:
-        """Id of the most frequent class."""
-        return int(self.shares.argmax())
+    def majority(self) -> str:
+        """Name of the most frequent class."""
+        return taxonomy(self.categories).names[int(self.shares.argmax())]
 
     @property
     def majority_mean_iou(self) -> float:
@@ -56,28 +60,22 @@ class SegmentationScore(PrintsItself):
     def to_json(self) -> dict[str, Any]:
         """Return values for `json.dump`. The score of a class that does not occur is null."""
         names = taxonomy(self.categories).names
-
-        def by_name(values: np.ndarray) -> dict[str, float | None]:
-            return {name: None if np.isnan(x) else float(x) for name, x in zip(names, values, strict=True)}
-
+        iou = [None if np.isnan(score) else score for score in self.iou.tolist()]
         return {
             "mean_iou": self.mean_iou,
-            "majority": names[self.majority],
+            "majority": self.majority,
             "majority_mean_iou": self.majority_mean_iou,
             "cells": self.cells,
-            "iou": by_name(self.iou),
-            "shares": by_name(self.shares),
+            "iou": dict(zip(names, iou, strict=True)),
+            "shares": dict(zip(names, self.shares.tolist(), strict=True)),
         }
 
     def __rich__(self) -> TextTable:
-        names, header = taxonomy(self.categories).names, ("class", "share of the cells", "IoU")
-        rows = [
-            (name, f"{share:.2%}", f"{iou:.3f}")
-            for name, share, iou in zip(names, self.shares, self.iou, strict=True)
-            if share
-        ]
+        header = ("class", "share of the cells", "IoU")
+        classes = zip(taxonomy(self.categories).names, self.shares, self.iou, strict=True)
+        rows = [(name, f"{share:.2%}", f"{iou:.3f}") for name, share, iou in classes if share]
         rows.append((f"mean of {self.present} classes", "", f"{self.mean_iou:.3f}"))
-        rows.append((f"{names[self.majority]} everywhere", "", f"{self.majority_mean_iou:.3f}"))
+        rows.append((f"{self.majority} everywhere", "", f"{self.majority_mean_iou:.3f}"))
         return TextTable(header, rows, header[1:], self.title, f"{self.cells} cells with points and a label")
 
 
@@ -92,7 +90,7 @@ def segment_recording(
 ) -> SegmentationScore | None:
     """Predict semantic maps of a recording, score them, and draw the middle labelled scan into `folder` (figure 7).
 
-    `on_map` is called with row, record and map of every scan; without it, only labelled scans are predicted.
+    `on_map` is called with row, scan and map of every scan; without it, only labelled scans are predicted.
 
     Returns:
       Score of all labelled scans. None without labels.
@@ -102,26 +100,39 @@ def segment_recording(
     """
     config, labelled = params.config, np.flatnonzero(recording.labelled).tolist()
     rows = labelled if on_map is None else range(len(recording))
-    shown, confusion = None, np.zeros((config.classes, config.classes), np.int64)
+    middle, confusion = None, np.zeros((config.classes, config.classes), np.int64)
     with progress(f"segment {recording.name}", len(rows)) as show:
         for done, row in enumerate(rows, start=1):
             scan = recording.scan(row)
-            found = semantic_map(params, scan, min_confidence=min_confidence)
+            semantic = semantic_map(params, scan, min_confidence=min_confidence)
             if on_map is not None:
-                on_map(row, scan, found)
+                on_map(row, scan, semantic)
             if labelled and row == labelled[len(labelled) // 2]:
-                shown = found
-            confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=config.classes)
+                middle = semantic
+            classes = config.classes
+            confusion += confusion_matrix(semantic.truth, semantic.predicted, counted=semantic.seen, classes=classes)
             show(done)
-    if shown is None:
+    if middle is None:
         return None
     title = f"segmentation of {len(labelled)} scans of {recording.name}"
     score = score_confusion(confusion, categories=config.categories, title=title)
     if figures.can_draw():
-        about = {"resolution_m": config.grid.resolution_m, "categories": config.categories}
-        panel = figures.segmentation_panel(shown.counts, shown.truth, shown.predicted, **about)
-        figures.save(panel, folder / PICTURE)
+        figures.save(draw_map(middle, config), folder / PICTURE)
     return score
+
+
+def draw_map(
+    semantic: SemanticMap, config: ModelConfig, *, labelled: bool = True, title: str = ""
+) -> "matplotlib.figure.Figure":
+    """Draw point counts and predicted classes of a scan, and the true classes if the scan is labelled (figure 7)."""
+    return figures.segmentation_panel(
+        semantic.counts,
+        semantic.truth if labelled else None,
+        semantic.predicted,
+        resolution_m=config.grid.resolution_m,
+        categories=config.categories,
+        title=title,
+    )
 
 
 def confusion_matrix(

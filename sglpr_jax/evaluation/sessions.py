@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.evaluation.inputs import read_descriptor_file
-from sglpr_jax.evaluation.protocols import ALL, protocol_named, protocols_taking
-from sglpr_jax.evaluation.protocols.source import positions_of
-from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
-from sglpr_jax.evaluation.report import format_score
+from sglpr_jax.evaluation.protocols import PROTOCOLS, chosen_protocols
+from sglpr_jax.evaluation.protocols.protocol import positions_of
+from sglpr_jax.evaluation.published import table_3_rows
 from sglpr_jax.evaluation.scoring import Evaluation
 from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
@@ -36,55 +35,32 @@ def evaluate_sessions(
     for path in (database, *queries):
         if path.suffix != ".npz":
             raise ValueError(f"{path}: expected descriptor files of bin/embed (.npz) for an evaluation across sessions")
-    there, *files = map(read_descriptor_file, (database, *queries))
+    first, *files = map(read_descriptor_file, (database, *queries))
     for path, file in zip(queries, files, strict=True):
         with naming(path):
-            check_same_method(there, file)
-    known = protocols_taking("sessions")
-    chosen = list(dict.fromkeys(names)) if names and ALL not in names else list(known)
-    protocols = [protocol_named(name, known) for name in chosen]
+            check_same_method(first, file)
+    protocols = [PROTOCOLS[name] for name in chosen_protocols("sessions", names)]
     sessions = [file.sequence for file in files]
-    if len({there.sequence, *sessions}) <= len(sessions):
-        found = f"database {there.sequence}, queries {', '.join(sessions)}"
-        raise ValueError(f"expected different sessions, found {found}")
+    if len({first.sequence, *sessions}) <= len(sessions):
+        raise ValueError(f"expected different sessions, found database {first.sequence}, queries {', '.join(sessions)}")
     for file in files:
-        _check_one_world(there, file)
-    width = there.descriptors.shape[1]
+        _check_one_world(first, file)
+    width = first.descriptors.shape[1]
     return Evaluation(
-        title=f"database {printable(there.sequence)}; queries of {len(sessions)} sessions",
-        about=f"{database}: descriptors of {width} numbers, compared by {there.distance}",
-        methods={file.sequence: [protocol(there, file) for protocol in protocols] for file in files},
-        published=published_rows(there.sequence, sessions) if published else (),
+        title=f"database {printable(first.sequence)}; queries of {len(sessions)} sessions",
+        about=f"{database}: descriptors of {width} numbers, compared by {first.distance}",
+        methods={file.sequence: [protocol(first, file) for protocol in protocols] for file in files},
+        published=table_3_rows(first.sequence, sessions) if published else (),
         made_with={"files": [str(path) for path in queries], "database": str(database)},
-        database=there.sequence,
+        database=first.sequence,
     )
-
-
-def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the rows of table 3 for these sessions, marked as published.
-
-    Cells of sessions that are not in the table are empty and do not count in the mean. Raises ValueError if the
-    database is not that of the table, or if the table has none of the sessions.
-    """
-    shown = [session for session in sessions if session in TABLE_3.columns]
-    if database != NCLT_DATABASE or not shown:
-        raise ValueError(
-            f"expected database {NCLT_DATABASE} and queries among {', '.join(TABLE_3.columns)}, for which numbers "
-            f"are published; found database {database} and queries {', '.join(sessions)}"
-        )
-    rows = []
-    for row in TABLE_3.rows:
-        scores = dict(zip(TABLE_3.columns, row.scores, strict=True))
-        mean = row.mean if len(shown) == len(scores) else float(np.mean([scores[session] for session in shown]))
-        cells = (format_score(scores[session]) if session in scores else "" for session in sessions)
-        rows.append((f"published: {row.method}", *cells, format_score(mean)))
-    return rows
 
 
 def _check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
     """Raise ValueError if the areas of the two sessions do not overlap. Their positions then have different frames."""
-    planes = [positions_of(file, 2) for file in (database, queries)]
-    (low, high), (low_q, high_q) = ((places.min(axis=0), places.max(axis=0)) for places in planes)
+    (low, high), (low_q, high_q) = (
+        (plane.min(axis=0), plane.max(axis=0)) for plane in (positions_of(database, 2), positions_of(queries, 2))
+    )
     if np.any(low_q > high + APART_M) or np.any(high_q < low - APART_M):
         there, here = (
             f"x {a[0]:.0f} to {b[0]:.0f}, y {a[1]:.0f} to {b[1]:.0f} m" for a, b in ((low, high), (low_q, high_q))

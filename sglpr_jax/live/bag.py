@@ -8,8 +8,8 @@ from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.live.endpoints import WAIT_S, Taken
-from sglpr_jax.live.messages import LatestScan, LiveFrame, Report
+from sglpr_jax.live.endpoints import Taken
+from sglpr_jax.live.messages import WAIT_S, LatestScan, LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
 
 
@@ -18,9 +18,9 @@ class BagSource:
 
     def __init__(self, root: Path, recording: Recording, options: LiveOptions, report: Report, taken: Taken):
         self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
-        self._posed = options.odometry_topic is not None
-        done = [row for row in range(len(recording)) if taken(self._name(row))]
-        self._rows = range(done[-1] + 1 if done else 0, len(recording))
+        self._poses = None if options.odometry_topic is None else recording.world_from_lidar
+        last_taken = max((row for row in range(len(recording)) if taken(self._name(row))), default=-1)
+        self._rows = range(last_taken + 1, len(recording))
         self._latest: LatestScan[LiveFrame] = LatestScan()
         self._stopped, self._ended = threading.Event(), threading.Event()
 
@@ -62,12 +62,10 @@ class BagSource:
         try:
             scan = self._recording.scan(row, labels=False)
         except (ValueError, OSError) as error:
-            self._report("scan", f"a scan is left out: {error}")
-            return None
-        poses, times = self._recording.world_from_lidar, self._recording.times
-        pose = poses[row] if self._posed and poses is not None else None
-        scan = dataclasses.replace(scan, name=self._name(row))
-        return LiveFrame(scan, 0.0 if times is None else float(times[row]), pose, time.monotonic())
+            return self._report("scan", f"a scan is left out: {error}")
+        pose = None if self._poses is None else self._poses[row]
+        stamp = 0.0 if self._recording.times is None else float(self._recording.times[row])
+        return LiveFrame(dataclasses.replace(scan, name=self._name(row)), stamp, pose, time.monotonic())
 
     def _name(self, row: int) -> str:
         return f"{self._root}, scan {self._recording.ids[row]}"
@@ -83,8 +81,8 @@ def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) 
     """
     root = Path(where)
     names = recording_names(root)
-    wanted = None if options.topic is None else options.topic.strip("/").replace("/", "_")
-    name = wanted if wanted in names else None if len(names) == 1 else wanted
+    name = None if options.topic is None else options.topic.strip("/").replace("/", "_")
+    name = None if len(names) == 1 and name not in names else name
     recording = open_recording(
         root, name, pose_topic=options.odometry_topic, sensor_height=options.sensor_height, gravity="recording"
     )

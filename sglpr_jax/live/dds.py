@@ -22,10 +22,8 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import Report
-from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
+from sglpr_jax.live.ros import Receive, domain_of, ros_type, wire_type
 from sglpr_jax.live.ros_messages import Received, typestore
 
 PREFIX = "rt"
@@ -68,9 +66,9 @@ class DdsTransport:
         try:
             self._participant = DomainParticipant(domain)
         except DDSException as error:
-            found = os.environ.get("CYCLONEDDS_URI", "no CYCLONEDDS_URI")
+            setting = os.environ.get("CYCLONEDDS_URI", "no CYCLONEDDS_URI")
             raise ValueError(
-                f"dds:{domain}: expected a network and a valid CYCLONEDDS_URI, found {found} ({in_short(error)})"
+                f"dds:{domain}: expected a network and a valid CYCLONEDDS_URI, found {setting} ({in_short(error)})"
             ) from error
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._waiting = WaitSet(self._participant)
@@ -111,18 +109,19 @@ class DdsTransport:
         return publish
 
     def published(self) -> dict[str, set[str]]:
-        found: dict[str, set[str]] = {}
-        for one in self._publications.read(N=10_000):
-            name, alive = one.topic_name, one.sample_info.instance_state == InstanceState.Alive
-            if alive and name is not None and one.type_name is not None and name.startswith(f"{PREFIX}/"):
-                found.setdefault(name.removeprefix(PREFIX), set()).add(ros_type(one.type_name))
-        return found
+        topics: dict[str, set[str]] = {}
+        for publication in self._publications.read(N=10_000):
+            name, kind = publication.topic_name, publication.type_name
+            alive = publication.sample_info.instance_state == InstanceState.Alive
+            if alive and name is not None and kind is not None and name.startswith(f"{PREFIX}/"):
+                topics.setdefault(name.removeprefix(PREFIX), set()).add(ros_type(kind))
+        return topics
 
     def close(self) -> None:
         self._closed.set()
         self._thread.join()
-        for held in (self._watched, self._readers, self._writers, self._topics):
-            held.clear()
+        for entities in (self._watched, self._readers, self._writers, self._topics):
+            entities.clear()
         del self._waiting, self._publications, self._participant
 
     def _topic(self, topic: str, kind: str) -> Topic:
@@ -137,27 +136,29 @@ class DdsTransport:
                 self._waiting.wait(duration(milliseconds=100))
             else:  # the wait of cyclonedds returns at once if nothing is attached, and this loop would use a core
                 self._closed.wait(0.1)
-            for one in tuple(self._readers):
-                self._take(one)
+            for reader in tuple(self._readers):
+                self._take(reader)
             if time.monotonic() - looked > LOOK_S:
                 looked = time.monotonic()
                 self._look()
 
-    def _take(self, one: _Reader) -> None:
+    def _take(self, source: _Reader) -> None:
+        """Hand on the new messages of a reader."""
+        kind = source.kind
         try:
-            for sample in one.reader.take(N=one.depth, condition=one.condition):
+            for sample in source.reader.take(N=source.depth, condition=source.condition):
                 if sample.sample_info.valid_data:
                     publisher = sample.sample_info.publication_handle
-                    one.receive(Received(one.kind, sample.cdr, publisher, time.monotonic()))
+                    source.receive(Received(kind, sample.cdr, publisher, time.monotonic()))
         except Exception as error:  # the thread serves the other topics, too
-            self._report(f"message {one.kind}", f"{one.kind}: expected a valid message, found {in_short(error)}")
+            self._report(f"message {kind}", f"{kind}: expected a valid message, found {in_short(error)}")
 
     def _look(self) -> None:
         """Report publishers and subscribers whose QoS does not fit, each once. The readers of all types count them."""
         for text, status in tuple(self._watched):
-            found = status()
-            if found.total_count_change > 0 and found.last_policy_id != TYPE:
-                policy = POLICIES.get(found.last_policy_id, f"policy {found.last_policy_id}")
+            mismatch = status()
+            if mismatch.total_count_change > 0 and mismatch.last_policy_id != TYPE:
+                policy = POLICIES.get(mismatch.last_policy_id, f"policy {mismatch.last_policy_id}")
                 self._report(f"qos {text}", f"{text} ({policy}); they do not exchange messages")
 
 
@@ -194,35 +195,29 @@ def _raw_type(kind: str) -> Any:
     def read(cls: Any, cdr: bytes) -> Any:
         return cls(cdr)
 
-    found = _type.__wrapped__(kind)
-    found.__init__, found.serialize = begin, lambda self, **_: self.cdr
-    found.deserialize = found.deserialize_key = classmethod(read)  # a key: a publisher has ended
-    return found
+    raw = _struct.__wrapped__(kind)
+    raw.__init__, raw.serialize = begin, lambda self, **_: self.cdr
+    raw.deserialize = raw.deserialize_key = classmethod(read)  # a key: a publisher has ended
+    return raw
 
 
 @functools.cache
-def _type(kind: str) -> Any:
-    """Type with the fields of ROS 2."""
+def _struct(kind: str) -> Any:
+    """Type with the fields of ROS 2, from their definitions by rosbags."""
+
+    def field_type(node: Any, definition: Any) -> Any:
+        if node.name == "BASE":
+            return _NUMBERS[definition[0]]
+        if node.name == "NAME":
+            return _struct(definition)
+        inner, count = definition
+        return types.array[field_type(*inner), count] if node.name == "ARRAY" else types.sequence[field_type(*inner)]
+
     name = wire_type(kind).replace("::", ".")
-    fields = {field: _field(*of) for field, of in typestore().fielddefs[kind][1]}
+    fields = {field: field_type(*definition) for field, definition in typestore().fielddefs[kind][1]}
     return make_idl_struct(name.rpartition(".")[2], name, fields, dataclassify=False)
 
 
-def _field(node: Any, of: Any) -> Any:
-    """Type of a field, from its definition by rosbags."""
-    if node.name == "BASE":
-        return _NUMBERS[of[0]]
-    if node.name == "NAME":
-        return _type(of)
-    (inner, count) = of
-    return types.array[_field(*inner), count] if node.name == "ARRAY" else types.sequence[_field(*inner)]
-
-
-def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> RosSource:
-    """Open the source `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
-    return RosSource(DdsTransport(domain_of(where, source="dds"), report), options, report)
-
-
-def open_sink(where: str, options: LiveOptions, report: Report) -> RosSink:
-    """Open the sink `dds` or `dds:DOMAIN`. Raises ValueError if `where` is not a domain."""
-    return RosSink(DdsTransport(domain_of(where, source="dds"), report), options)
+def open_transport(where: str, report: Report) -> DdsTransport:
+    """Connect to the domain `where`, by default that of ROS. Raises ValueError if it is not a domain."""
+    return DdsTransport(domain_of(where, source="dds"), report)

@@ -1,7 +1,7 @@
-"""Sources of scans and sinks of loops, by name. The module of a name is imported when it is asked for.
+"""Sources of scans and sinks of loops, by name. The module `live/NAME.py` is imported when its name is asked for.
 
-The module `live/NAME.py` has `open_source(where, options, report, taken)`, `open_sink(where, options, report)` or both.
-To support another source or sink, add a module and its name.
+A module has `open_source(where, options, report, taken)`, `open_sink(where, options, report)` or, for a connection to
+ROS, `open_transport(where, report)`. To support another source or sink, add a module and its name.
 """
 
 import importlib
@@ -15,8 +15,10 @@ from sglpr_jax.live.options import LiveOptions
 SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
 SINKS = {"json": None, "dds": "live", "zenoh": "live", "rerun": "view"}
 """Names of sources and sinks, with the extra that each needs."""
-WAIT_S = 0.2
-"""Maximum time that `Source.frames` blocks before it yields None, in seconds."""
+TRANSPORTS = ("dds", "zenoh")
+"""Connections to ROS, each a source and a sink."""
+Taken = Callable[[str], bool]
+"""Whether a scan with this `Scan.name` is in the map already."""
 
 
 @runtime_checkable
@@ -24,8 +26,8 @@ class Source(Protocol):
     """Source of scans."""
 
     def frames(self) -> Iterator[LiveFrame | None]:
-        """Yield scans as they arrive. Yields None after at most `WAIT_S` seconds without a scan, so that the node can
-        react to signals. Ends if no more scans can come."""
+        """Yield scans as they arrive, and None after `WAIT_S` seconds without a scan, so that the node can react to
+        signals. Ends if no more scans can come."""
         ...
 
     @property
@@ -47,10 +49,6 @@ class Sink(Protocol):
     def close(self) -> None: ...
 
 
-Taken = Callable[[str], bool]
-"""Whether a scan with this `Scan.name` is in the map already."""
-
-
 def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken = lambda name: False) -> Source:
     """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
 
@@ -58,13 +56,23 @@ def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken
     ValueError if no source has this name, and ImportError if its extra is not installed.
     """
     name, where = check_name(text, SOURCES, kind="sources")
-    return _module(name, SOURCES[name]).open_source(where, options, report, taken)
+    module = _module(name, SOURCES[name])
+    if name not in TRANSPORTS:
+        return module.open_source(where, options, report, taken)
+    from sglpr_jax.live.ros import RosSource  # needs the same extra
+
+    return RosSource(module.open_transport(where, report), options, report)
 
 
 def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
     """Open the sink that a text names, such as `json:loops.jsonl`, as `open_source` does."""
     name, where = check_name(text, SINKS, kind="sinks")
-    return _module(name, SINKS[name]).open_sink(where, options, report)
+    module = _module(name, SINKS[name])
+    if name not in TRANSPORTS:
+        return module.open_sink(where, options, report)
+    from sglpr_jax.live.ros import RosSink  # needs the same extra
+
+    return RosSink(module.open_transport(where, report), options)
 
 
 def check_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str]:

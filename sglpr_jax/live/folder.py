@@ -38,27 +38,28 @@ class FolderSource:
     """Scans are never dropped: their files stay until they are read."""
 
     def __init__(self, root: Path, options: LiveOptions, report: Report, taken: Taken):
+        """Begin after the last scan in the folder that is `taken`. Raises ValueError if --poses cannot grow."""
         self._root, self._options, self._report = root, options, report
         self._records: RecordFormat | None = None
         """Format of .bin files whose name does not define it, by the content of the first one."""
         self._sizes: dict[Path, int] = {}
         """Size of each waiting file at the last look."""
-        self._done: set[Path] = set()
         self._waiting: list[Path] = []
-        self._changed = 0
-        self._stopped = False
-        found = files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
-        last = max((i for i, path in enumerate(found) if taken(_name(path))), default=-1)
-        self._done.update(found[: last + 1])
+        self._listed_ns = 0
+        """Time of the last change of the folder that was listed, in nanoseconds."""
+        self._closed = False
+        paths = self._list()
+        last_taken = max((row for row, path in enumerate(paths) if taken(_name(path))), default=-1)
+        self._done = set(paths[: last_taken + 1])
         self._poses = None
         if options.poses is not None:
             self._poses = GrowingPoses(options.poses, options.pose_format, options.time_unit)
 
     def frames(self) -> Iterator[LiveFrame | None]:
         """Yield scans as they are completed. Never ends."""
-        while not self._stopped:
+        while not self._closed:
             self._look()
-            path = self._complete()
+            path = self._next_complete()
             if path is None:
                 time.sleep(LOOK_S)
                 yield None
@@ -68,37 +69,37 @@ class FolderSource:
             yield from self._frame(path, received)
 
     def close(self) -> None:
-        self._stopped = True
+        self._closed = True
+
+    def _list(self) -> list[Path]:
+        """Files of scans in the folder, in order."""
+        return list(files_in(self._root, *ENDINGS) or files_in(self._root, *ARRAY_ENDINGS))
 
     def _look(self) -> None:
         """List the folder again if a file was added."""
         try:
-            changed = self._root.stat().st_mtime_ns
-            if changed == self._changed and time.time_ns() - changed > QUIET_S * 1e9:
-                return
-            found = files_in(self._root, *ENDINGS) or files_in(self._root, *ARRAY_ENDINGS)
+            changed_ns = self._root.stat().st_mtime_ns
+            if changed_ns != self._listed_ns or time.time_ns() - changed_ns <= QUIET_S * 1e9:
+                self._waiting = [path for path in self._list() if path not in self._done]
+                self._listed_ns = changed_ns
         except OSError as error:
-            return self._report("folder", f"{self._root}: expected a folder of scans, found none ({error.strerror})")
-        self._changed = changed
-        self._waiting = [path for path in found if path not in self._done]
+            self._report("folder", f"{self._root}: expected a folder of scans, found none ({error.strerror})")
 
-    def _complete(self) -> Path | None:
-        """The first waiting scan, if it is complete."""
+    def _next_complete(self) -> Path | None:
+        """Remove and return the first waiting scan, if it is complete."""
         if not self._waiting:
             return None
         path = self._waiting[0]
         try:
-            about = path.stat()
+            file = path.stat()
         except OSError:  # it was removed or renamed
             self._waiting.pop(0)
             return None
-        old = time.time() - about.st_mtime > QUIET_S
-        if about.st_size == 0 and not old:
-            return None
-        if old or self._sizes.get(path) == about.st_size:
+        is_old = time.time() - file.st_mtime > QUIET_S
+        if is_old or file.st_size == self._sizes.get(path, 0) > 0:
             self._sizes.pop(path, None)
             return self._waiting.pop(0)
-        self._sizes[path] = about.st_size
+        self._sizes[path] = file.st_size
         return None
 
     def _frame(self, path: Path, received: float) -> Iterator[LiveFrame | None]:
@@ -107,24 +108,23 @@ class FolderSource:
             if self._records is None and self._options.format == "auto" and named_format(path) is None:
                 self._records = record_of_scan(path)
             scan = scan_of_file(path, format=self._options.format, records=self._records or "kitti")
-            seconds = _time_in_name(path)
-            written = path.stat().st_mtime
+            stamp, written = _time_in_name(path), path.stat().st_mtime
         except (ValueError, OSError, ImportError) as error:
             return self._report("scan", f"a scan is left out: {error}")
-        pose = None
+        pose, row = None, len(self._done) - 1
         if self._poses is not None:
-            row = len(self._done) - 1
-            while (pose := self._pose(row, seconds)) is None and time.time() - written < POSE_S:
+            while (pose := self._pose(self._poses, row, stamp)) is None and time.time() - written < POSE_S:
                 time.sleep(LOOK_S)
                 yield None
-        stamp = written if seconds is None else seconds
-        yield LiveFrame(dataclasses.replace(scan, name=_name(path)), stamp, pose, received)
+        yield LiveFrame(
+            dataclasses.replace(scan, name=_name(path)), written if stamp is None else stamp, pose, received
+        )
 
-    def _pose(self, row: int, seconds: float | None):
-        assert self._poses is not None
+    def _pose(self, poses: "GrowingPoses", row: int, stamp: float | None) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of a scan, or None if the file does not have it yet. An invalid line is reported."""
         try:
-            self._poses.look()
-            return self._poses.of(row, seconds)
+            poses.look()
+            return poses.of(row, stamp)
         except ValueError as error:
             return self._report("poses", f"a pose is left out: {error}")
 
@@ -151,6 +151,7 @@ class GrowingPoses:
             raise ValueError(f"{path}: expected poses as tum, kitti or lidar, found csv")
         self._path, self._format, self._unit = path, format, PER_SECOND[time_unit]
         self._read = self._line = 0
+        """Number of bytes and of lines read so far."""
         self._times: list[float] = []
         """Time of each line, in seconds, in order. 0 in files without times."""
         self._poses: list[np.ndarray | None] = []
@@ -166,18 +167,18 @@ class GrowingPoses:
         with self._path.open("rb") as file:
             file.seek(self._read)
             new = file.read()
-        whole = new[: new.rfind(b"\n") + 1]
-        self._read += len(whole)
-        wrong = None
-        for line in whole.decode(errors="replace").splitlines():
+        whole_lines = new[: new.rfind(b"\n") + 1]
+        self._read += len(whole_lines)
+        first_error = None
+        for line in whole_lines.decode(errors="replace").splitlines():
             self._line += 1
             try:
                 if line.strip() and not line.startswith("#"):
                     self._add(line.split(), f"{self._path}, line {self._line}")
             except ValueError as error:
-                wrong = wrong or error
-        if wrong is not None:
-            raise wrong
+                first_error = first_error or error
+        if first_error is not None:
+            raise first_error
 
     def of(self, row: int, time: float | None) -> Float[np.ndarray, "4 4"] | None:
         """Pose of a scan, or None if the file does not have it yet.
@@ -188,10 +189,10 @@ class GrowingPoses:
             return self._poses[row] if row < len(self._poses) else None
         middle = bisect.bisect_left(self._times, time)
         near = range(max(middle - AROUND, 0), min(middle + AROUND, len(self._poses)))
-        known = [(self._times[i], pose) for i in near if (pose := self._poses[i]) is not None]
-        if len(known) < 2 or known[-1][0] < time - BEYOND_S:
+        posed = [(self._times[i], pose) for i in near if (pose := self._poses[i]) is not None]
+        if len(posed) < 2 or posed[-1][0] < time - BEYOND_S:
             return None
-        stamps, poses = zip(*known, strict=True)
+        stamps, poses = zip(*posed, strict=True)
         return pose_at(np.array(stamps), np.stack(poses), time)
 
     def _add(self, words: list[str], where: str) -> None:

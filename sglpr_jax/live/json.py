@@ -1,7 +1,4 @@
-"""Results as JSON, one object a line: on standard output, or appended to a file.
-
-Each object has a `type`: `frame` (`FrameStatus`) or `loop` (`LoopEdge`).
-"""
+"""Results as JSON, one object a line, whose `type` is `frame` (`FrameStatus`) or `loop` (`LoopEdge`)."""
 
 import json
 import sys
@@ -22,23 +19,24 @@ class JsonLines:
         self._file = file
 
     def frame(self, status: FrameStatus) -> None:
-        self._line("frame", status)
+        self._write("frame", status)
 
     def loop(self, edge: LoopEdge) -> None:
-        self._line("loop", edge)
+        self._write("loop", edge)
 
     def close(self) -> None:
         """Close the file, unless it is standard output."""
         if self._file is not sys.stdout:
             self._file.close()
 
-    def _line(self, kind: str, value: FrameStatus | LoopEdge) -> None:
-        found = {name: _plain(one) for name, one in value._asdict().items()}
-        self._file.write(json.dumps({"type": kind, **found}) + "\n")
+    def _write(self, kind: str, message: FrameStatus | LoopEdge) -> None:
+        values = {name: _json_value(value) for name, value in message._asdict().items()}
+        self._file.write(json.dumps({"type": kind, **values}) + "\n")
         self._file.flush()
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
+    """Arrays as lists, and numbers with six decimals, but times since 1970 with all digits."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     return round(value, 6) if isinstance(value, float) and abs(value) < 1e6 else value

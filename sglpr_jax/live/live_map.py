@@ -24,6 +24,7 @@ from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
+from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
 SETTINGS, FRAMES, LOOPS = "settings.json", "frames.log", "loops.jsonl"
 OLD = "journal.bin"
@@ -42,6 +43,7 @@ class LiveScan(NamedTuple):
     keyframe: Keyframe | None
     """None for a scan that is damaged in the log."""
     compared: Fits | None
+    """Comparisons with earlier scans, if they are known."""
     pose: Float[np.ndarray, "4 4"] | None
     """Pose of the LiDAR by odometry."""
     part: int
@@ -80,16 +82,22 @@ class LiveMap:
           folder: Folder of the map.
           report: Function for events that need no action.
           sensor_height: Height in metres, or "auto" to estimate it in the first scans.
-          expects_odometry: Whether the first scans wait for odometry.
+          expects_odometry: Whether the first scans wait for odometry, and loops correct it.
 
         Raises:
           ValueError: If the folder has a map of another version, other settings or weights.
           WriteError: If the folder cannot be written.
         """
         self.detector, self._report = detector, report
-        self._height: SensorHeight = sensor_height
         self.names: set[str] = set()
         """Names of the scans that have one."""
+        self.trajectory: IncrementalTrajectory | None = None
+        """Odometry that the loops correct. None without odometry or gtsam."""
+        if expects_odometry:
+            try:
+                self.trajectory = IncrementalTrajectory(drift=detector.config.drift)
+            except ImportError as error:
+                report("gtsam", f"the map has no transform from map to odometry: {error}")
         self._stamps = GrowingArray(np.empty(0))
         self._poses = GrowingArray(np.empty((0, 4, 4)))
         self._part = 0
@@ -115,6 +123,12 @@ class LiveMap:
         """Pose of the LiDAR at each scan by odometry. Empty without odometry."""
         return self._poses.rows
 
+    @property
+    def map_from_world(self) -> Float[np.ndarray, "4 4"] | None:
+        """Correction of the odometry at the last scan. None without odometry, and while no loop connects the odometry
+        with that before a restart."""
+        return None if self.trajectory is None or not len(self.trajectory) else self.trajectory.map_from_world
+
     def recall(self) -> list[LoopEdge]:
         """Add the scans of the log. Returns the loops of an earlier process that it did not write any more.
 
@@ -122,22 +136,39 @@ class LiveMap:
         comparisons assume its image. Raises ValueError if the log is of another program.
         """
         assert self._log is not None
-        scan, lost, known = None, 0, True
+        scan, damaged, motion_is_known = None, 0, True
         for frame, content in self._log.records():
             keyframe, compared, pose, about = read_frame(content, frame, ABOUT, source=self._log.path)
             scan = LiveScan(keyframe, compared, pose, **about)
-            known = scan.part == self._part
+            motion_is_known = scan.part == self._part
             for _ in range(len(self), frame):
-                self._extend(scan._replace(keyframe=None, compared=None, name=""))
-                lost += 1
-            self._extend(scan._replace(compared=None) if lost else scan)
-        if lost:
-            self._report("lost", f"{self._log.path}: {lost} damaged scans are left out")
+                self._add(scan._replace(keyframe=None, compared=None, name=""))
+                damaged += 1
+            self._add(scan._replace(compared=None) if damaged else scan)
+        if damaged:
+            self._report("lost", f"{self._log.path}: {damaged} damaged scans are left out")
         if self._log.cut:
             self._report("cut", f"{self._log.path}: {self._log.cut} bytes of an unfinished scan were removed")
         if scan is not None:
-            self._resume(scan, known=known)
+            assert scan.keyframe is not None
+            passed = min(max(time.time() - scan.wall, 0.0), MOST_WALL_S)
+            self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - passed)
+            self._continuity.resume(scan.pose, scan.time, known=motion_is_known)
+            self._mounting.resume(scan.keyframe.mounting)
+            self._report("recall", f"the map continues after {len(self)} scans and {len(self.detector.loops)} loops")
         return [self._edge(loop, time.monotonic()) for loop in self._restore_loops()]
+
+    def _restore_loops(self) -> list[LoopClosure]:
+        """Write all loops so far, and return those that the file of an earlier process lacks."""
+        path, loops = self._loops_path, self.detector.loops
+        written = _written_pairs(path)
+        missed = [loop for loop in loops if (loop.query, loop.match) not in written]
+        if missed and written:
+            self._report("log", f"{path}: {len(missed)} loops were added that the last process missed")
+        write_loops_jsonl(path, loops)
+        with writing(path):
+            self._loops_file = os.open(path, os.O_WRONLY | os.O_APPEND)
+        return missed
 
     def add(self, frame: LiveFrame) -> list[LoopEdge] | None:
         """Add a scan and return its loops, or None if the scan is left out, which is reported.
@@ -148,72 +179,45 @@ class LiveMap:
         if scan.points is None or not np.isfinite(scan.points).all(axis=1).any():
             raise ValueError(f"{scan.name or 'scan'}: expected points, found none")
         if scan.mounting is None:
-            scan = dataclasses.replace(scan, mounting=self._mounting.see(scan.points))
+            scan = dataclasses.replace(scan, mounting=self._mounting.add(scan.points))
         keyframe = self.detector.finder.keyframe(scan)  # first, because an invalid scan must not count below
         clock = self._clock.time(frame.time, frame.received)
-        placed = self._continuity.placed(pose, clock)
-        if placed is None:
+        state = self._continuity.add(pose, clock)
+        if state is None:
             return None
-        loops = self.detector.add_keyframe(keyframe, time=clock, odometry=placed.pose, continues=placed.continues)
-        compared, stamp, wall = self.detector.finder.compared, float(frame.time), time.time()
-        stamp, part = stamp if np.isfinite(stamp) else 0.0, self._part + (not placed.continues)
-        described = LiveScan(keyframe, compared, placed.pose, part, scan.name, stamp, clock, wall)
-        self._note(described)
+        stamp, part = float(frame.time), self._part + (not state.continues)
+        stamp = stamp if np.isfinite(stamp) else 0.0
+        described = LiveScan(keyframe, None, state.pose, part, scan.name, stamp, clock, time.time())
+        loops = self._add(described)
         if self.detector.finder.empty[-1]:
             self._report("empty", f"{scan.name or f'scan {len(self) - 1}'}: expected a place, found almost no points")
-        self._write(described, loops)
+        self._write(described, self.detector.finder.compared, loops)
         return [self._edge(loop, frame.received) for loop in loops]
 
-    def close(self) -> None:
-        """Force everything to the disk and close the files."""
-        if self._loops_file >= 0:
-            os.close(self._loops_file)
-        if self._log is not None:
-            self._log.close()
-
-    def _extend(self, scan: LiveScan) -> None:
-        """Add a scan of the log."""
-        known = {"compared": scan.compared, "continues": scan.part == self._part}
-        self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **known)
-        self._note(scan)
-
-    def _note(self, scan: LiveScan) -> None:
+    def _add(self, scan: LiveScan) -> list[LoopClosure]:
+        """Add a scan to the detector and the trajectory, and return the loops that it closes."""
+        options = {"compared": scan.compared, "continues": scan.part == self._part}
+        loops = self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **options)
+        self.detector.candidates.clear()  # they are in the log
         self._part = scan.part
         self._stamps.append(scan.stamp)
-        if scan.pose is not None:
-            self._poses.append(scan.pose)
         if scan.name:
             self.names.add(scan.name)
-        self.detector.candidates.clear()  # they are in the log
+        if scan.pose is not None:
+            self._poses.append(scan.pose)
+            if self.trajectory is not None:
+                segments = self.detector.finder.motion.segments[-2:]
+                ordered = sorted(loops, key=lambda loop: loop.query)
+                self.trajectory.add(scan.pose, ordered, continues=bool(segments[0] == segments[-1]))
+        return loops
 
-    def _resume(self, scan: LiveScan, *, known: bool) -> None:
-        """Continue after the last scan of an earlier process. `known`: whether the motion up to it is known."""
-        passed = min(max(time.time() - scan.wall, 0.0), MOST_WALL_S)
-        self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - passed)
-        self._continuity.resume(scan.pose, scan.time, known=known)
-        assert scan.keyframe is not None
-        self._mounting = FirstScans(self._height, known=scan.keyframe.mounting)
-        self._report("recall", f"the map continues after {len(self)} scans and {len(self.detector.loops)} loops")
-
-    def _restore_loops(self) -> list[LoopClosure]:
-        """Write all loops so far, and return those that the file of an earlier process lacks."""
-        written, loops = _pairs(self._loops_path), self.detector.loops
-        missed = [loop for loop in loops if (loop.query, loop.match) not in written]
-        if missed and written:
-            self._report("log", f"{self._loops_path}: {len(missed)} loops were added that the last process missed")
-        write_loops_jsonl(self._loops_path, loops)
-        with writing(self._loops_path):
-            self._loops_file = os.open(self._loops_path, os.O_WRONLY | os.O_APPEND)
-        return missed
-
-    def _write(self, scan: LiveScan, loops: list[LoopClosure]) -> None:
+    def _write(self, scan: LiveScan, compared: Fits, loops: list[LoopClosure]) -> None:
         """Write a scan and its loops. After an error the map lives on in memory."""
         if self._log is None:
             return
         try:
-            assert scan.compared is not None
             about = {name: getattr(scan, name) for name in ABOUT}
-            self._log.append(len(self) - 1, frame_bytes(scan.keyframe, scan.compared, pose=scan.pose, **about))
+            self._log.append(len(self) - 1, frame_bytes(scan.keyframe, compared, pose=scan.pose, **about))
             with writing(self._loops_path):
                 os.write(self._loops_file, loop_lines(loops).encode())
             if time.monotonic() - self._synced > SYNC_S:
@@ -226,14 +230,21 @@ class LiveMap:
                 self._log.close()
             self._log = None
 
+    def close(self) -> None:
+        """Force everything to the disk and close the files."""
+        if self._loops_file >= 0:
+            os.close(self._loops_file)
+        if self._log is not None:
+            self._log.close()
+
     def _edge(self, loop: LoopClosure, received: float) -> LoopEdge:
         """The loop, with the times of its scans, and their poses if these are in the present frame of the odometry."""
         ends = np.array([loop.query, loop.match])
-        known = self.detector.finder.motion.same(-1, ends) & (len(self.odometry) > 0)
-        query, match = (self.odometry[one].copy() if ok else None for one, ok in zip(ends, known, strict=True))
-        times = float(self._stamps.rows[loop.query]), float(self._stamps.rows[loop.match])
-        found = loop.match_from_query, loop.covariance, loop.probability
-        return LoopEdge(loop.query, loop.match, *times, *found, query, match, time.monotonic() - received)
+        in_frame = self.detector.finder.motion.same(-1, ends) & (len(self.odometry) > 0)
+        query, match = (self.odometry[end].copy() if ok else None for end, ok in zip(ends, in_frame, strict=True))
+        times = float(self.stamps[loop.query]), float(self.stamps[loop.match])
+        closure = loop.match_from_query, loop.covariance, loop.probability
+        return LoopEdge(loop.query, loop.match, *times, *closure, query, match, time.monotonic() - received)
 
 
 def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
@@ -243,12 +254,12 @@ def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
         raise ValueError(f"{folder}: expected a map of this version, found {OLD} of an earlier one; use another --out")
     if not (folder / FRAMES).exists():
         return write_json(path, wanted)
-    found = read_json(path)
-    if not isinstance(found, dict) or found.get("format") != FRAME_FORMAT:
+    stored = read_json(path)
+    if not isinstance(stored, dict) or stored.get("format") != FRAME_FORMAT:
         raise ValueError(
             f"{path}: expected the settings of a live map ({FRAME_FORMAT}), found others; use another --out"
         )
-    other = [name for name, value in wanted.items() if not _holds(found.get(name), value)]
+    other = [name for name, value in wanted.items() if not _includes(stored.get(name), value)]
     if other:
         raise ValueError(
             f"{path}: expected a map with the same settings, found another {', '.join(other)}; "
@@ -256,18 +267,18 @@ def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
         )
 
 
-def _holds(found: Any, wanted: Any) -> bool:
+def _includes(stored: Any, wanted: Any) -> bool:
     """Whether a stored setting is the wanted one. Maps of earlier versions have fields that are constants today."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        return all(_holds(found.get(name), value) for name, value in wanted.items())
-    return found == wanted
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        return all(_includes(stored.get(name), value) for name, value in wanted.items())
+    return stored == wanted
 
 
-def _pairs(path: Path) -> set[tuple[int, int]]:
+def _written_pairs(path: Path) -> set[tuple[int, int]]:
     """Query and match of each whole line of a file. A line that is cut or damaged is left out."""
-    found = set()
+    pairs = set()
     for line in path.read_bytes().splitlines() if path.is_file() else ():
         with contextlib.suppress(ValueError, KeyError, TypeError):
-            value = parse_json(line, source=path)
-            found.add((value["query"], value["match"]))
-    return found
+            loop = parse_json(line, source=path)
+            pairs.add((loop["query"], loop["match"]))
+    return pairs

@@ -12,6 +12,8 @@ from jaxtyping import Float
 
 from sglpr_jax.data.scan import Scan
 
+WAIT_S = 0.2
+"""Maximum time that `Source.frames` blocks before it yields None, in seconds."""
 AGAIN_S = 30.0
 """Minimum time between two lines of the same kind, in seconds."""
 Report = Callable[[str, str], None]
@@ -23,8 +25,7 @@ class LiveFrame(NamedTuple):
     """A scan as it arrives."""
 
     scan: Scan
-    """Points in the LiDAR frame, with the mounting if it is known. The name of a scan from a file is unique; a scan
-    whose name is in the map already is not taken again. Scans without a name are always taken."""
+    """Points in the LiDAR frame, with the mounting if it is known. A scan from a file has a unique name."""
     time: float
     """Time of the message's header, in seconds. 0 or not finite if the header has none."""
     odometry: Float[np.ndarray, "4 4"] | None
@@ -79,13 +80,7 @@ class LoopEdge(NamedTuple):
 
 
 class LatestScan(Generic[T]):
-    """The newest item. `put` replaces an item that waits and counts it as dropped.
-
-    Example:
-      latest = Latest()
-      latest.put(frame)              # in the receiving thread
-      frame = latest.take(0.2)       # in the node: None after 0.2 s without an item
-    """
+    """The newest item that a thread received. `put` replaces an item that waits, and counts it as dropped."""
 
     def __init__(self):
         self.dropped = 0
@@ -117,14 +112,14 @@ class Reports:
     def __init__(self, write: Callable[[str], object] | None = None, *, clock: Callable[[], float] = time.monotonic):
         self._write = write or (lambda text: print(text, file=sys.stderr, flush=True))
         self._clock = clock
-        self._said: dict[str, tuple[float, int]] = {}
+        self._printed: dict[str, tuple[float, int]] = {}
         """Time of the last line of each kind, and number of events since."""
 
     def __call__(self, kind: str, text: str) -> None:
         """Print an event, or count it if its kind was printed in the last `AGAIN_S` seconds."""
-        now, (at, more) = self._clock(), self._said.get(kind, (-math.inf, 0))
-        if now - at < AGAIN_S:
-            self._said[kind] = at, more + 1
+        now, (printed_at, count) = self._clock(), self._printed.get(kind, (-math.inf, 0))
+        if now - printed_at < AGAIN_S:
+            self._printed[kind] = printed_at, count + 1
             return
-        self._said[kind] = now, 0
-        self._write(f"{text} ({more} more since the last line)" if more else text)
+        self._printed[kind] = now, 0
+        self._write(f"{text} ({count} more since the last line)" if count else text)

@@ -4,7 +4,7 @@ import dataclasses
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
@@ -12,10 +12,10 @@ from sglpr_jax.files import in_short
 from sglpr_jax.live.endpoints import Sink, Source
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.messages import FrameStatus, LiveFrame, LoopEdge, Report
-from sglpr_jax.live.results import CorrectedTrajectory
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.models.params import Params
+from sglpr_jax.se3 import transform
 
 EVERY_S = 10.0
 """Time between two lines about the progress, in seconds."""
@@ -28,32 +28,23 @@ WARM_UP = 12
 class Node:
     """Takes scans from a source until it ends or `should_stop` is true, and hands the results to the sinks."""
 
-    def __init__(
-        self,
-        live: LiveMap,
-        sinks: Sequence[Sink],
-        *,
-        report: Report,
-        say: Callable[[str], object],
-        corrected: CorrectedTrajectory | None = None,
-    ):
-        """Connect a map, after `recall`, to sinks. `corrected` is updated after each scan."""
-        self._corrected = corrected
+    def __init__(self, live: LiveMap, sinks: Sequence[Sink], *, report: Report, say: Callable[[str], object]):
+        """Connect a map, after `recall`, to sinks. `say` prints lines about the progress."""
         self._live, self._sinks, self._report, self._say = live, list(sinks), report, say
         self._seconds: deque[float] = deque(maxlen=LATEST)
-        self._latest = 0.0
+        """Times for processing the latest scans, in seconds."""
         self.scans = self.left_out = self.dropped = self.loops = 0
         """Numbers of scans that were added, left out and dropped, and of loops, since the start."""
 
     def run(self, source: Source, *, should_stop: Callable[[], bool] = lambda: False) -> None:
         """Process scans. The source and the sinks are not closed."""
-        said = time.monotonic()
+        said_at = time.monotonic()
         for frame in source.frames():
             if frame is not None:
                 self.dropped = source.dropped
                 self._process(frame)
-            if time.monotonic() - said >= EVERY_S:
-                said = time.monotonic()
+            if time.monotonic() - said_at >= EVERY_S:
+                said_at = time.monotonic()
                 self._say(str(self))
             if should_stop():
                 break
@@ -84,29 +75,26 @@ class Node:
             self.left_out += 1
             return
         self.publish(edges)
-        if self._corrected is not None:
-            self._corrected.update()
         end = time.monotonic()
         self.scans += 1
         self._seconds.append(end - begin)
-        finder = self._live.detector.finder
         status = FrameStatus(
             frame=len(self._live) - 1,
             time=frame.time,
             seconds=end - begin,
             latency_s=end - frame.received,
             dropped=self.dropped,
-            places=len(finder.stored),
+            places=len(self._live.detector.finder.stored),
             nbytes=self._live.detector.nbytes,
-            map_from_world=None if self._corrected is None else self._corrected.map_from_world,
+            map_from_world=self._live.map_from_world,
         )
         self._to_sinks("frame", status)
 
-    def _to_sinks(self, what: str, value: Any) -> None:
-        """Call a method of every sink. A sink that fails is reported and left out."""
+    def _to_sinks(self, method: Literal["frame", "loop"], message: FrameStatus | LoopEdge) -> None:
+        """Hand a message to every sink. A sink that fails is reported and left out."""
         for sink in list(self._sinks):
             try:
-                getattr(sink, what)(value)
+                getattr(sink, method)(message)
             except Exception as error:  # a sink may use any library
                 self._sinks.remove(sink)
                 self._report(f"sink {id(sink)}", f"{type(sink).__name__} is left out: {in_short(error, most=300)}")
@@ -114,12 +102,10 @@ class Node:
 
 def warm_up(params: Params, config: DetectorConfig, *, odometry: bool) -> None:
     """Compile all programs of the search by random scans, so that no scan is dropped meanwhile."""
-    anything = {"recent_m": 1e-9, "good_correlation": 2.0, "min_coarse_correlation": -1.0, "min_correlation": -1.0}
-    rules = dataclasses.replace(config.candidates, **anything)
-    detector = LoopDetector(params, config=dataclasses.replace(config, candidates=rules, max_places=None))
-    draw = np.random.default_rng(0)
+    accept_all = {"recent_m": 1e-9, "good_correlation": 2.0, "min_coarse_correlation": -1.0, "min_correlation": -1.0}
+    candidates = dataclasses.replace(config.candidates, **accept_all)
+    detector = LoopDetector(params, config=dataclasses.replace(config, candidates=candidates, max_places=None))
+    rng = np.random.default_rng(0)
     for i in range(WARM_UP):
-        points = draw.uniform((-20, -20, -1), (20, 20, 3), (4000, 3)).astype(np.float32)
-        pose = np.eye(4)
-        pose[0, 3] = 0.01 * i
-        detector.add(points, time=0.7 * i, odometry=pose if odometry else None)
+        points = rng.uniform((-20, -20, -1), (20, 20, 3), (4000, 3)).astype(np.float32)
+        detector.add(points, time=0.7 * i, odometry=transform(0.01 * i, 0.0, 0.0) if odometry else None)

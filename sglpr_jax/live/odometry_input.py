@@ -43,72 +43,75 @@ class Continuity:
     def __init__(self, report: Report, *, expected: bool):
         """Begin a map. `expected` says that odometry was asked for, so that the first scans wait for it."""
         self._report, self._expected = report, expected
-        self._used: bool | None = None
-        self._last: Float[np.ndarray, "4 4"] | None = None
-        self._time = 0.0
-        """Time of `_last`, in seconds."""
+        self._has_odometry: bool | None = None
+        """None until the first scan decides."""
         self._began: float | None = None
-        self._known = True
-        """Whether the scan before was placed by odometry."""
+        """Time of the first scan, in seconds."""
+        self._last: Float[np.ndarray, "4 4"] | None = None
+        """Last pose by odometry."""
+        self._last_time = 0.0
+        """Time of `_last`, in seconds."""
+        self._last_is_current = True
+        """Whether `_last` is the pose of the previous scan."""
         self._resumed = False
+        """Whether the next scan is the first one after a restart."""
 
     def resume(self, pose: Float[np.ndarray, "4 4"] | None, time: float, *, known: bool = True) -> None:
         """Continue a map of an earlier process, whose last scan had this pose at this time.
 
         With `known=False`, the motion up to that scan was unknown, so its pose may be an old one.
         """
-        self._used, self._last, self._time, self._known, self._resumed = pose is not None, pose, time, known, True
+        self._has_odometry, self._last, self._last_time = pose is not None, pose, time
+        self._last_is_current, self._resumed = known, True
 
-    def placed(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> OdometryState | None:
-        """Place the next scan by its odometry, or return None if it is to be left out. Times do not decrease."""
-        if self._used is None and not self._decided(pose, time):
+    def add(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> OdometryState | None:
+        """Return the state of the next scan, or None if the scan is to be left out. Times do not decrease."""
+        if self._has_odometry is None and self._waits(pose, time):
             return None
         resumed, self._resumed = self._resumed, False
-        if not self._used:
+        if not self._has_odometry:
             if pose is not None:
                 self._report("odometry", "expected no odometry, because the map began without it; it is not used")
             if resumed:
                 self._report("restart", "the way since the restart's last scan is unknown")
             return OdometryState(None, not resumed)
         if pose is None:
-            return self._without(time, resumed)
-        continues = self._last is None or (self._known and self._continues(pose, time, resumed))
+            return self._without_pose(time, resumed)
+        continues = self._last is None or (self._last_is_current and self._can_follow(pose, time, resumed))
         if not continues or resumed:
-            said = "continues" if continues else "is taken as unknown, and begins in a frame of its own"
-            self._report("restart" if resumed else "jump", f"the odometry {said}{' after the restart' * resumed}")
-        self._last, self._time, self._known = pose, time, True
+            what = "continues" if continues else "is taken as unknown, and begins in a frame of its own"
+            self._report("restart" if resumed else "jump", f"the odometry {what}{' after the restart' * resumed}")
+        self._last, self._last_time, self._last_is_current = pose, time, True
         return OdometryState(pose, continues)
 
-    def _decided(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> bool:
-        """Decide whether the map has odometry. Returns False while the first scans wait for it."""
+    def _waits(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> bool:
+        """Whether the first scans still wait for odometry. Otherwise decides whether the map has odometry."""
         self._began = time if self._began is None else self._began
         if pose is None and self._expected and time - self._began < WAIT_S:
             self._report("wait", "expected odometry, found none yet; scans are left out until it comes")
-            return False
-        self._used = pose is not None
-        if self._expected and not self._used:
+            return True
+        self._has_odometry = pose is not None
+        if self._expected and not self._has_odometry:
             self._report("wait over", f"expected odometry, found none for {WAIT_S:.0f} s; the map is made without it")
-        return True
+        return False
 
-    def _without(self, time: float, resumed: bool) -> OdometryState | None:
-        """Place a scan without odometry in a map that has odometry."""
-        if not resumed and self._known and time - self._time < HOLD_S:
-            self._report("hold", "expected odometry at a scan, found none; the scan is left out")
-            return None
-        self._report(
-            "stopped", f"expected odometry, found none for {time - self._time:.0f} s; loops are found by scans"
-        )
-        self._known = False
+    def _without_pose(self, time: float, resumed: bool) -> OdometryState | None:
+        """State of a scan without odometry in a map that has odometry."""
+        passed = time - self._last_time
+        if not resumed and self._last_is_current and passed < HOLD_S:
+            return self._report("hold", "expected odometry at a scan, found none; the scan is left out")
+        self._report("stopped", f"expected odometry, found none for {passed:.0f} s; loops are found by scans")
+        self._last_is_current = False
         return OdometryState(np.eye(4) if self._last is None else self._last, False)
 
-    def _continues(self, pose: Float[np.ndarray, "4 4"], time: float, resumed: bool) -> bool:
+    def _can_follow(self, pose: Float[np.ndarray, "4 4"], time: float, resumed: bool) -> bool:
         """Whether a pose can follow the last one: near enough, not reset to the origin, and not after a long stop."""
         assert self._last is not None
-        passed = time - self._time
+        passed = time - self._last_time
         moved = float(np.linalg.norm((inverse(self._last) @ pose)[:3, 3]))
-        reset = float(np.linalg.norm(pose[:3, 3])) < RESET_M and moved > 5 * RESET_M
-        near = moved <= SLACK_M + FASTEST_M_PER_S * passed
-        return near and not reset and (not resumed or passed <= RESTART_S)
+        is_reset = float(np.linalg.norm(pose[:3, 3])) < RESET_M and moved > 5 * RESET_M
+        is_near = moved <= SLACK_M + FASTEST_M_PER_S * passed
+        return is_near and not is_reset and (not resumed or passed <= RESTART_S)
 
 
 class Clock:
@@ -132,20 +135,19 @@ class Clock:
         """Return the time of the next scan, in seconds, which is not before that of the previous one."""
         passed = max(received - self._received, 0.0)
         expected = received if self._last is None else self._last + passed
-        found = stamp + self._offset
+        time = stamp + self._offset
         if not _is_time(stamp):
             self._report("time", f"expected the time of a scan in its header, found {stamp:g}; its arrival is used")
-            found = expected
-        elif self._last is not None and not self._last <= found <= expected + JUMP_S:
+            time = expected
+        elif self._last is not None and not self._last <= time <= expected + JUMP_S:
             self._report(
                 "clock",
-                f"expected a scan about {passed:.1f} s after the last one, found {found - self._last:+.1f} s in its "
+                f"expected a scan about {passed:.1f} s after the last one, found {time - self._last:+.1f} s in its "
                 "header; from now on times are counted from its arrival",
             )
-            self._offset = expected - stamp
-            found = expected
-        self._last, self._received = found, received
-        return found
+            self._offset, time = expected - stamp, expected
+        self._last, self._received = time, received
+        return time
 
 
 def _is_time(stamp: float) -> bool:
@@ -155,18 +157,19 @@ def _is_time(stamp: float) -> bool:
 class FirstScans:
     """Estimates the mounting from the ground in the first scans. Then it is fixed."""
 
-    def __init__(self, height: SensorHeight = "auto", *, known: Mounting | None = None):
-        """Begin with the height that the user gave, in metres, or with the mounting of an earlier process."""
-        given = None if isinstance(height, str) else Mounting(float(height))
-        self.mounting = known or given
-        """Mounting found by now, or None if the scans do not show the ground."""
-        self._fixed = self.mounting is not None
-        self._found: list[Mounting | None] = []
+    def __init__(self, height: SensorHeight = "auto"):
+        """Begin with the height that the user gave, in metres, or without a mounting."""
+        self._mounting = None if isinstance(height, str) else Mounting(float(height))
+        self._estimates: list[Mounting | None] = []
 
-    def see(self, points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
-        """Return the mounting at the next scan."""
-        if not self._fixed:
-            self._found.append(estimate_mounting(points))
-            self.mounting = common_mounting(self._found)
-            self._fixed = len(self._found) >= SCANS
-        return self.mounting
+    def resume(self, mounting: Mounting | None) -> None:
+        """Continue with the mounting of an earlier process, if it had one."""
+        self._mounting = mounting or self._mounting
+
+    def add(self, points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
+        """Return the mounting at the next scan, or None if the scans so far do not show the ground."""
+        is_known = self._mounting is not None and not self._estimates
+        if not is_known and len(self._estimates) < SCANS:
+            self._estimates.append(estimate_mounting(points))
+            self._mounting = common_mounting(self._estimates)
+        return self._mounting

@@ -40,19 +40,24 @@ class RerunSink:
 
     def frame(self, status: FrameStatus) -> None:
         """Plot the status after a scan. Raises RuntimeError if the connection to the viewer is lost."""
-        self._at(status.frame, status.time)
-        self._scalar("milliseconds/scan", 1e3 * status.seconds)
-        self._scalar("milliseconds/latency", 1e3 * status.latency_s)
-        self._scalar("scans/dropped", status.dropped)
-        self._scalar("scans/places", status.places)
+        self._set_time(status.frame, status.time)
+        self._plot("milliseconds/scan", 1e3 * status.seconds)
+        self._plot("milliseconds/latency", 1e3 * status.latency_s)
+        self._plot("scans/dropped", status.dropped)
+        self._plot("scans/places", status.places)
         if time.monotonic() - self._checked > CHECK_S:
-            self._check()
+            self._checked = time.monotonic()
+            try:
+                self._stream.flush(timeout_sec=CHECK_WAIT_S)
+            except RuntimeError as error:
+                if "timed out" not in str(error):  # a slow viewer is not a lost one
+                    raise
 
     def loop(self, edge: LoopEdge) -> None:
-        self._at(edge.query, edge.query_time)
+        self._set_time(edge.query, edge.query_time)
         text = f"query {edge.query}, match {edge.match}: probability {edge.probability:.4f}"
         self._stream.log("loops", rerun.TextLog(text))
-        self._scalar("probability/loop", edge.probability)
+        self._plot("probability/loop", edge.probability)
         if edge.world_from_query is not None and edge.world_from_match is not None:
             ends = np.stack([edge.world_from_match[:3, 3], edge.world_from_query[:3, 3]])
             self._stream.log(f"map/loops/{edge.query}", rerun.LineStrips3D([ends], colors=[LINE], labels=[text]))
@@ -61,21 +66,13 @@ class RerunSink:
         """Disconnect from the viewer, or finish the file."""
         self._stream.disconnect()
 
-    def _check(self) -> None:
-        self._checked = time.monotonic()
-        try:
-            self._stream.flush(timeout_sec=CHECK_WAIT_S)
-        except RuntimeError as error:
-            if "timed out" not in str(error):  # a slow viewer is not a lost one
-                raise
-
-    def _at(self, frame: int, seconds: float) -> None:
+    def _set_time(self, frame: int, seconds: float) -> None:
         self._stream.reset_time()
         self._stream.set_time("frame", sequence=frame)
         if np.isfinite(seconds) and seconds > 0:
             self._stream.set_time("time", timestamp=seconds)
 
-    def _scalar(self, name: str, value: float | int) -> None:
+    def _plot(self, name: str, value: float | int) -> None:
         self._stream.log(name, rerun.Scalars(value))
 
 
@@ -96,29 +93,23 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> RerunSink:
         stream = rerun.RecordingStream("sglpr-jax")
         stream.save(where, default_blueprint=_layout())
         return RerunSink(stream)
-    host, port = _address(where or VIEWER)
+    host, _, port = (where or VIEWER).rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError(f"rerun:{where}: expected rerun, rerun:HOST:PORT or rerun:FILE.rrd, found {where}")
     try:
-        socket.create_connection((host, port), timeout=WAIT_S).close()
+        socket.create_connection((host, int(port)), timeout=WAIT_S).close()
     except OSError as error:
-        report(
-            "rerun", f"rerun: expected a viewer at {host}:{port}, found none ({error}); start `rerun` before bin/live"
-        )
+        expected = f"rerun: expected a viewer at {host}:{port}"
+        report("rerun", f"{expected}, found none ({error}); start `rerun` before bin/live")
         return RerunSink(rerun.RecordingStream("sglpr-jax", default_enabled=False))
     stream = rerun.RecordingStream("sglpr-jax")
     stream.connect_grpc(f"rerun+http://{host}:{port}/proxy", default_blueprint=_layout())
     return RerunSink(stream)
 
 
-def _address(where: str) -> tuple[str, int]:
-    host, _, port = where.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ValueError(f"rerun:{where}: expected rerun, rerun:HOST:PORT or rerun:FILE.rrd, found {where}")
-    return host, int(port)
-
-
 def _layout() -> Any:
     """The map, the loops as text, and three plots."""
-    plots = [views.TimeSeriesView(origin=name, name=name.capitalize()) for name in ("milliseconds", "scans")]
-    plots.append(views.TimeSeriesView(origin="probability", name="Probability"))
+    names = "milliseconds", "scans", "probability"
+    plots = [views.TimeSeriesView(origin=name, name=name.capitalize()) for name in names]
     beside = views.Vertical(*plots, views.TextLogView(origin="loops", name="Loops"))
     return views.Blueprint(views.Horizontal(views.Spatial3DView(origin="map", name="Map"), beside))

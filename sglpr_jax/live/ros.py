@@ -10,8 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sglpr_jax.live.endpoints import WAIT_S
-from sglpr_jax.live.messages import FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.messages import WAIT_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_messages import (
     CLOUDS,
@@ -70,29 +69,29 @@ class Transport(Protocol):
 class RosSource:
     """Source of the scans of a topic."""
 
-    def __init__(self, transport: Transport, options: LiveOptions, report: Report, *, missing_s: float = MISSING_S):
-        """Subscribe to the topics. After `missing_s` seconds without scans, the existing topics are reported."""
+    def __init__(self, transport: Transport, options: LiveOptions, report: Report):
+        """Subscribe to the topics. After `MISSING_S` seconds without scans, the existing topics are reported."""
         self.topic = full_name(options.topic or CLOUD_TOPIC)
-        self._transport, self._report, self._missing_s = transport, report, missing_s
+        self._transport, self._report = transport, report
         self._latest: LatestScan[Received] = LatestScan()
         self._publisher = None
-        self._heard = self._reported = time.monotonic()
+        self._received = self._reported = time.monotonic()
         self._closed = threading.Event()
         transport.subscribe(self.topic, CLOUDS, self._receive, depth=1, reliable=options.reliable, latched=False)
         self._odometry = None
         if options.odometry_topic is not None:
-            found = self._odometry = LiveOdometry(full_name(options.odometry_topic), report)
-            for topic, kinds, receive, fixed in (
-                (found.topic, KINDS, found.receive, False),
-                (STATIC_TOPIC, (TRANSFORMS,), found.receive_static, True),
-            ):
-                transport.subscribe(topic, kinds, receive, depth=POSES_KEPT, reliable=fixed, latched=fixed)
+            odometry = self._odometry = LiveOdometry(full_name(options.odometry_topic), report)
+            transport.subscribe(
+                odometry.topic, KINDS, odometry.receive, depth=POSES_KEPT, reliable=False, latched=False
+            )
+            static = odometry.receive_static
+            transport.subscribe(STATIC_TOPIC, (TRANSFORMS,), static, depth=POSES_KEPT, reliable=True, latched=True)
 
     def frames(self) -> Iterator[LiveFrame | None]:
         while not self._closed.is_set():
             message = self._latest.take(WAIT_S)
             if message is None:
-                self._look()
+                self._report_silence()
             yield None if message is None else self._frame(message)
 
     def close(self) -> None:
@@ -106,11 +105,11 @@ class RosSource:
     def _receive(self, message: Received) -> None:
         """Keep the scan, if it is of the publisher in use."""
         if message.publisher != self._publisher:
-            if self._publisher is not None and message.at - self._heard < TAKEN_OVER_S:
+            if self._publisher is not None and message.at - self._received < TAKEN_OVER_S:
                 expected = f"{self.topic}: expected one publisher"
                 return self._report("publishers", f"{expected}, found several; the scans of the first are used")
             self._publisher = message.publisher
-        self._heard = message.at
+        self._received = message.at
         self._latest.put(message)
 
     def _frame(self, message: Received) -> LiveFrame | None:
@@ -118,64 +117,61 @@ class RosSource:
         try:
             header, scan = decode_cloud(message.raw, message.kind)
         except ValueError as error:
-            self._report("cloud", f"{self.topic}: {error}")
-            return None
+            return self._report("cloud", f"{self.topic}: {error}")
         pose = None
         if self._odometry is not None:
             pose = self._odometry.pose(header.time, header.frame.strip("/"), wait_s=WAIT_S)
         return LiveFrame(dataclasses.replace(scan, time=header.time), header.time, pose, message.at)
 
-    def _look(self) -> None:
+    def _report_silence(self) -> None:
         """Report which topics exist if no scans arrive."""
         now = time.monotonic()
-        if now - max(self._heard, self._reported) < self._missing_s:
+        if now - max(self._received, self._reported) < MISSING_S:
             return
         self._reported = now
-        found = self._transport.published()
-        kinds = found.get(self.topic, set())
-        wanted = f"{self.topic}: expected {' or '.join(CLOUDS)}"
-        if kinds & set(CLOUDS):
-            self._report("silent", f"{wanted}, found a publisher but no message for {now - self._heard:.0f} s; waiting")
+        topics = {topic: sorted(kinds) for topic, kinds in sorted(self._transport.published().items())}
+        kinds = topics.get(self.topic, [])
+        expected = f"{self.topic}: expected {' or '.join(CLOUDS)}"
+        if not set(CLOUDS).isdisjoint(kinds):
+            silence = f"found a publisher but no message for {now - self._received:.0f} s"
+            self._report("silent", f"{expected}, {silence}; waiting")
         elif kinds:
-            self._report("type", f"{wanted}, found {', '.join(sorted(kinds))}; waiting")
+            self._report("type", f"{expected}, found {', '.join(kinds)}; waiting")
         else:
-            others = ", ".join(f"{topic} ({' '.join(sorted(kinds))})" for topic, kinds in sorted(found.items()))
-            self._report("missing", f"{wanted}, found no such topic; existing topics: {others or 'none'}; waiting")
+            others = ", ".join(f"{topic} ({' '.join(kinds)})" for topic, kinds in topics.items())
+            self._report("missing", f"{expected}, found no such topic; existing topics: {others or 'none'}; waiting")
 
 
 class RosSink:
-    """Publishes loops.
-
-    The topics are `PREFIX/loops` (`ros_messages.edge_message`), `PREFIX/loop_markers` and `/tf`. The transform from map
-    to odometry is that of the corrected trajectory (`FrameStatus.map_from_world`).
-    """
+    """Publishes loops on `PREFIX/loops` (`edge_message`), draws them on `PREFIX/loop_markers`, and publishes the
+    transform from map to odometry of the corrected trajectory (`FrameStatus.map_from_world`) on `/tf`."""
 
     def __init__(self, transport: Transport, options: LiveOptions):
         """Advertise the topics. `close` closes the connection."""
         self._transport, self._options = transport, options
         prefix = full_name(options.topic_prefix)
-        self._edges = transport.advertise(f"{prefix}/loops", EDGE, depth=EDGES_KEPT, latched=True)
-        self._markers = transport.advertise(f"{prefix}/loop_markers", MARKERS, depth=1, latched=True)
-        self._transforms = transport.advertise("/tf", TRANSFORMS, depth=100, latched=False)
+        self._publish_edge = transport.advertise(f"{prefix}/loops", EDGE, depth=EDGES_KEPT, latched=True)
+        self._publish_markers = transport.advertise(f"{prefix}/loop_markers", MARKERS, depth=1, latched=True)
+        self._publish_transform = transport.advertise("/tf", TRANSFORMS, depth=100, latched=False)
         self._lines: deque[np.ndarray] = deque(maxlen=LINES)
+        """Positions (2, 3) of match and query of the last loops, in metres in the frame of the odometry."""
 
     def frame(self, status: FrameStatus) -> None:
         """Publish the transform from map to odometry at the time of the scan, or now if the scan has no time."""
         if status.map_from_world is None:
             return
-        at = status.time if np.isfinite(status.time) and status.time > 0 else time.time()
+        stamp = status.time if np.isfinite(status.time) and status.time > 0 else time.time()
         frames = {"frame": self._options.map_frame, "child": self._options.odometry_frame}
-        self._transforms(transform_message(status.map_from_world, time=at, **frames))
+        self._publish_transform(transform_message(status.map_from_world, time=stamp, **frames))
 
     def loop(self, edge: LoopEdge) -> None:
         """Publish an edge. With odometry of both scans, draw it."""
-        self._edges(edge_message(edge))
+        self._publish_edge(edge_message(edge))
         query, match = edge.world_from_query, edge.world_from_match
-        if query is None or match is None:
-            return
-        self._lines.append(np.stack([match[:3, 3], query[:3, 3]]))
-        drawn = marker_message(list(self._lines), time=edge.query_time, frame=self._options.odometry_frame)
-        self._markers(drawn)
+        if query is not None and match is not None:
+            self._lines.append(np.stack([match[:3, 3], query[:3, 3]]))
+            frame = self._options.odometry_frame
+            self._publish_markers(marker_message(list(self._lines), time=edge.query_time, frame=frame))
 
     def close(self) -> None:
         self._transport.close()

@@ -65,21 +65,21 @@ def encode(kind: str, fields: Mapping[str, Any]) -> bytes:
 
 
 def _message(kind: str, fields: Mapping[str, Any]) -> Any:
+    """Message of rosbags with these fields."""
+
+    def value(node: Any, definition: Any, content: Any) -> Any:
+        if node.name == "NAME":
+            return _message(definition, content or {})
+        if node.name == "BASE":
+            return content if content is not None else {"string": "", "bool": False}.get(definition[0], 0)
+        (inner, inner_type), count = definition
+        if inner.name == "NAME":
+            return [_message(inner_type, element) for element in content or ()]
+        return content if content is not None else np.zeros(count, inner_type[0])
+
     defined = typestore().fielddefs[kind][1]
-    return typestore().types[kind](**{name: _value(of, fields.get(name)) for name, of in defined})
-
-
-def _value(field: tuple[Any, Any], given: Any) -> Any:
-    """Value of a field, from its definition by rosbags."""
-    node, of = field
-    if node.name == "NAME":
-        return _message(of, given or {})
-    if node.name == "BASE":
-        return given if given is not None else {"string": "", "bool": False}.get(of[0], 0)
-    (inner, content), count = of
-    if inner.name == "NAME":
-        return [_message(content, one) for one in given or ()]
-    return given if given is not None else np.zeros(count, content[0])
+    values = {name: value(node, of, fields.get(name)) for name, (node, of) in defined}
+    return typestore().types[kind](**values)
 
 
 def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Scan]:
@@ -103,11 +103,11 @@ def edge_message(edge: LoopEdge) -> bytes:
     pose is that of the query's LiDAR in the frame of the match's LiDAR. As ROS defines it, the covariance is along and
     about the axes of the match's frame: x, y, z in metres, then rotations about x, y, z in radians.
     """
-    turned = np.kron(np.eye(2), edge.match_from_query[:3, :3])
-    covariance = np.ascontiguousarray(turned @ edge.covariance @ turned.T, np.float64).reshape(-1)
+    rotation = np.kron(np.eye(2), edge.match_from_query[:3, :3])
+    covariance = np.ascontiguousarray(rotation @ edge.covariance @ rotation.T, np.float64).reshape(-1)
     seconds, nanoseconds = _split(edge.match_time)
-    at, turn = _pose(edge.match_from_query)
-    pose = {"pose": {"position": at, "orientation": turn}, "covariance": covariance}
+    position, orientation = _pose(edge.match_from_query)
+    pose = {"pose": {"position": position, "orientation": orientation}, "covariance": covariance}
     return encode(EDGE, {"header": header(edge.query_time, f"match/{seconds}.{nanoseconds:09d}"), "pose": pose})
 
 
@@ -127,10 +127,10 @@ def marker_message(ends: Sequence[Float[np.ndarray, "2 3"]], *, time: float, fra
 
 def transform_message(frame_from_child: Float[np.ndarray, "4 4"], *, time: float, frame: str, child: str) -> bytes:
     """Pose of a child frame in a frame, as tf2_msgs/TFMessage."""
-    at, turn = _pose(frame_from_child)
-    transform = {"translation": at, "rotation": turn}
-    one = {"header": header(time, frame), "child_frame_id": child, "transform": transform}
-    return encode(TRANSFORMS, {"transforms": [one]})
+    translation, rotation = _pose(frame_from_child)
+    transform = {"translation": translation, "rotation": rotation}
+    stamped = {"header": header(time, frame), "child_frame_id": child, "transform": transform}
+    return encode(TRANSFORMS, {"transforms": [stamped]})
 
 
 def header(time: float, frame: str) -> dict[str, Any]:
@@ -141,13 +141,12 @@ def header(time: float, frame: str) -> dict[str, Any]:
 
 def _pose(frame_from_body: Float[np.ndarray, "4 4"]) -> tuple[dict[str, float], dict[str, float]]:
     """Position and quaternion of a pose."""
-    turn = quaternions(frame_from_body[None])[0].tolist()
-    return dict(zip("xyz", frame_from_body[:3, 3].tolist(), strict=True)), dict(zip("xyzw", turn, strict=True))
+    quaternion = quaternions(frame_from_body[None])[0].tolist()
+    return dict(zip("xyz", frame_from_body[:3, 3].tolist(), strict=True)), dict(zip("xyzw", quaternion, strict=True))
 
 
 def _split(time: float) -> tuple[int, int]:
     """Seconds and nanoseconds of a time. Times that no stamp can hold become 0."""
     if not math.isfinite(time) or not 0 <= time < 2**31:
         return 0, 0
-    seconds, nanoseconds = divmod(round(time * 1e9), 10**9)
-    return seconds, nanoseconds
+    return divmod(round(time * 1e9), 10**9)

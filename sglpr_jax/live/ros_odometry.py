@@ -32,30 +32,36 @@ BACK_S = 1.0
 """Step back in the times of poses with which another odometry begins, in seconds."""
 
 
+Frames = tuple[str, str]
+"""Reference frame and child frame of a pose."""
+
+
 class LiveOdometry:
     """Latest poses by odometry. A thread adds messages, and the node asks for the pose at the time of a scan."""
 
     def __init__(self, topic: str, report: Report):
         self.topic = topic
         self._report = report
-        self._poses: dict[tuple[str, str], deque[StampedPose]] = defaultdict(lambda: deque(maxlen=KEPT))
-        self._static: dict[tuple[str, str], StampedPose] = {}
+        self._poses: dict[Frames, deque[StampedPose]] = defaultdict(lambda: deque(maxlen=KEPT))
+        self._static: dict[Frames, StampedPose] = {}
         self._began = self._received = -np.inf
+        """Times of arrival of the first and the last pose, by `time.monotonic()`, in seconds."""
         self._changed = threading.Condition()
-        self._used: tuple[tuple[str, str], np.ndarray] | None = None
+        self._used: tuple[Frames, np.ndarray] | None = None
+        """Frames of the poses in use, and pose of the LiDAR in their child frame. Both stay as they are."""
 
     def receive(self, message: Received) -> None:
         """Add the poses of a message of odometry or tf."""
-        found = RosMessage(message.raw, cdr=True)
-        poses = read_transforms(found) if message.kind == TRANSFORMS else [POSES[message.kind](found)]
+        content = RosMessage(message.raw, cdr=True)
+        poses = read_transforms(content) if message.kind == TRANSFORMS else [POSES[message.kind](content)]
         with self._changed:
-            for pose in map(_plain, poses):
-                if self._used is not None and (pose.frame, pose.child) != self._used[0]:
+            for frames, pose in map(_named, poses):
+                if self._used is not None and frames != self._used[0]:
                     continue
-                kept = self._poses[pose.frame, pose.child]
-                if kept and pose.time < kept[-1].time - BACK_S:
-                    kept.clear()
-                kept.append(pose)
+                track = self._poses[frames]
+                if track and pose.time < track[-1].time - BACK_S:
+                    track.clear()
+                track.append(pose)
                 self._began = message.at if np.isinf(self._began) else self._began
                 self._received = message.at
             self._changed.notify_all()
@@ -63,8 +69,7 @@ class LiveOdometry:
     def receive_static(self, message: Received) -> None:
         """Add the transforms of a message of /tf_static."""
         with self._changed:
-            for pose in map(_plain, read_transforms(RosMessage(message.raw, cdr=True))):
-                self._static[pose.frame, pose.child] = pose
+            self._static |= map(_named, read_transforms(RosMessage(message.raw, cdr=True)))
 
     def pose(self, time: float, lidar: str, *, wait_s: float) -> Float[np.ndarray, "4 4"] | None:
         """Return the pose of the LiDAR at the time of a scan, or None with a report if it is unknown.
@@ -75,65 +80,65 @@ class LiveOdometry:
           wait_s: Maximum time to wait for a pose after the scan, in seconds. If the odometry has stopped, the function
             does not wait.
         """
+
+        def is_decided() -> bool:
+            """Whether the poses reach the time of the scan, or no longer come."""
+            self._choose(lidar)
+            track = self._poses[self._used[0]] if self._used else ()
+            return clock.monotonic() - self._received > SILENT_S or bool(track and track[-1].time >= time)
+
         with self._changed:
-            self._changed.wait_for(lambda: self._is_silent() or self._reaches(time, lidar), wait_s)
-            found = self._used or self._use(lidar)
-            key, mounting = found or (None, np.eye(4))
-            near = [one for one in self._poses.get(key, ()) if abs(one.time - time) <= SILENT_S] if key else []
-            why = self._why(lidar)
-        pose = _at(near, time)
-        if pose is None:
-            self._report("odometry", f"{self.topic}: expected a pose at {time:.3f}, found {why}")
-        return None if pose is None else pose @ mounting
+            self._changed.wait_for(is_decided, wait_s)
+            frames, child_from_lidar = self._used or (None, np.eye(4))
+            track = self._poses[frames] if frames else ()
+            near = [pose for pose in track if abs(pose.time - time) <= SILENT_S]
+            reason = self._why_missing(lidar)
+        world_from_child = _interpolate(near, time)
+        if world_from_child is None:
+            return self._report("odometry", f"{self.topic}: expected a pose at {time:.3f}, found {reason}")
+        return world_from_child @ child_from_lidar
 
-    def _is_silent(self) -> bool:
-        return clock.monotonic() - self._received > SILENT_S
-
-    def _reaches(self, time: float, lidar: str) -> bool:
-        """Whether the poses reach the time of a scan."""
-        found = self._used or self._use(lidar)
-        poses = () if found is None else self._poses[found[0]]
-        return bool(poses) and poses[-1].time >= time
-
-    def _use(self, lidar: str) -> tuple[tuple[str, str], np.ndarray] | None:
-        """Choose the poses to use, and the mounting of the LiDAR in their child frame. Both stay as they are."""
+    def _choose(self, lidar: str) -> None:
+        """Choose the poses to use, if tf states how the LiDAR is mounted in their child frame."""
+        if self._used is not None:
+            return
         static = tracks_of((0, pose) for pose in self._static.values())
-        for key in self._poses:
-            child = key[1]
-            mounting = np.eye(4) if child in ("", lidar) else fixed_transform(static, child, lidar)
-            if mounting is not None:
-                self._used = key, mounting
-                return self._used
-        waited = clock.monotonic() - self._began > STATIC_S
-        if waited and len(self._poses) == 1:
-            (key,) = self._poses
-            found = f"found no path; the poses are used as those of {lidar}"
-            self._report("mounting", f"/tf_static: expected {key[1]} and {lidar}, {found}")
-            self._used = key, np.eye(4)
-        return self._used
+        for frames in self._poses:
+            child = frames[1]
+            child_from_lidar = np.eye(4) if child in ("", lidar) else fixed_transform(static, child, lidar)
+            if child_from_lidar is not None:
+                self._used = frames, child_from_lidar
+                return
+        if clock.monotonic() - self._began > STATIC_S and len(self._poses) == 1:
+            (frames,) = self._poses
+            self._used = frames, np.eye(4)
+            consequence = f"the poses are used as those of {lidar}"
+            self._report("mounting", f"/tf_static: expected {frames[1]} and {lidar}, found no path; {consequence}")
 
-    def _why(self, lidar: str) -> str:
+    def _why_missing(self, lidar: str) -> str:
         """Reason for a missing pose."""
-        if np.isinf(self._received):
+        silent_s = clock.monotonic() - self._received
+        if np.isinf(silent_s):
             return "no message"
-        if self._is_silent():
-            return f"none for {clock.monotonic() - self._received:.0f} s"
+        if silent_s > SILENT_S:
+            return f"none for {silent_s:.0f} s"
         if self._used is None:
             children = ", ".join(sorted({child for _, child in self._poses}))
             return f"poses of {children}, which tf does not connect to {lidar} rigidly"
-        stamps = [one.time for one in self._poses[self._used[0]]]
+        stamps = [pose.time for pose in self._poses[self._used[0]]]
         return f"poses from {min(stamps):.3f} to {max(stamps):.3f}"
 
 
-def _plain(pose: StampedPose) -> StampedPose:
-    """The pose with names of frames without slashes at their ends."""
-    return pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
+def _named(pose: StampedPose) -> tuple[Frames, StampedPose]:
+    """The names of the frames without slashes at their ends, and the pose with these names."""
+    pose = pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
+    return (pose.frame, pose.child), pose
 
 
-def _at(poses: list[StampedPose], time: float) -> Float[np.ndarray, "4 4"] | None:
+def _interpolate(poses: list[StampedPose], time: float) -> Float[np.ndarray, "4 4"] | None:
     """Interpolate between the poses before and after a time. The latest pose is used up to 0.1 s later."""
-    nearest = sorted(poses, key=lambda one: abs(one.time - time))
-    before = [one for one in nearest if one.time <= time][:1]
-    after = [one for one in nearest if one.time > time][:1]
-    track = Track.of((0, one) for one in (before + after if before and after else nearest[:2]))
+    nearest = sorted(poses, key=lambda pose: abs(pose.time - time))
+    before = [pose for pose in nearest if pose.time <= time][:1]
+    after = [pose for pose in nearest if pose.time > time][:1]
+    track = Track.of((0, pose) for pose in (before + after if before and after else nearest[:2]))
     return pose_at(track.stamps.own, track.poses, time)

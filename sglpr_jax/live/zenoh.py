@@ -29,10 +29,8 @@ from zenoh.ext import (
 )
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.endpoints import Taken
 from sglpr_jax.live.messages import Report
-from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros import Receive, RosSink, RosSource, domain_of, ros_type, wire_type
+from sglpr_jax.live.ros import Receive, domain_of, ros_type, wire_type
 from sglpr_jax.live.ros_messages import Received, typestore
 
 ROUTER = "tcp/localhost:7447"
@@ -110,16 +108,16 @@ class ZenohTransport:
 
     def published(self) -> dict[str, set[str]]:
         """Topics with a publisher, and their types, by the tokens of rmw_zenoh."""
-        found: dict[str, set[str]] = {}
+        topics: dict[str, set[str]] = {}
         for reply in self._session.liveliness().get(f"@ros2_lv/{self._domain}/*/*/*/MP/**", timeout=ANSWER_S):
             if reply.ok is not None:
                 *_, topic, kind, _, _ = str(reply.ok.key_expr).split("/")
-                found.setdefault(topic.replace("%", "/"), set()).add(ros_type(kind))
-        return found
+                topics.setdefault(topic.replace("%", "/"), set()).add(ros_type(kind))
+        return topics
 
     def close(self) -> None:
-        for one in self._declared:
-            one.undeclare()
+        for entity in self._declared:
+            entity.undeclare()
         self._session.close()
 
     def _token(self, entity: str, number: int, topic: str = "") -> Any:
@@ -130,26 +128,22 @@ class ZenohTransport:
 
 def _config(endpoint: str) -> zenoh.Config:
     """Configuration of a peer that finds others by a router, as rmw_zenoh's."""
-    given = "" if endpoint else os.environ.get("ZENOH_SESSION_CONFIG_URI")
-    config = zenoh.Config.from_file(given) if given else zenoh.Config()
-    settings = {
-        "mode": "peer",
-        "connect/endpoints": [endpoint or ROUTER],
-        "listen/endpoints": ["tcp/localhost:0"],
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
-    }
-    settings = {} if given else settings
-    for key, value in {**settings, "timestamping/enabled": True}.items():  # publishers with a cache need timestamps
+    file = "" if endpoint else os.environ.get("ZENOH_SESSION_CONFIG_URI")
+    config = zenoh.Config.from_file(file) if file else zenoh.Config()
+    settings: dict[str, Any] = {"timestamping/enabled": True}  # publishers with a cache need timestamps
+    if not file:
+        settings |= {
+            "mode": "peer",
+            "connect/endpoints": [endpoint or ROUTER],
+            "listen/endpoints": ["tcp/localhost:0"],
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": True,
+        }
+    for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
-def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> RosSource:
-    """Open the source `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
-    return RosSource(ZenohTransport(where, domain_of("", source="zenoh"), report), options, report)
-
-
-def open_sink(where: str, options: LiveOptions, report: Report) -> RosSink:
-    """Open the sink `zenoh` or `zenoh:ENDPOINT`. Raises ValueError if `where` is not an endpoint."""
-    return RosSink(ZenohTransport(where, domain_of("", source="zenoh"), report), options)
+def open_transport(where: str, report: Report) -> ZenohTransport:
+    """Connect by the endpoint `where`. Raises ValueError if it is not an endpoint."""
+    return ZenohTransport(where, domain_of("", source="zenoh"), report)

@@ -56,17 +56,17 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
             loops.append(dataclasses.replace(answers[0].loop, query=row))
     if not loops:
         return None
-    offset, upright = len(before), []
+    upright_loops = []  # as if the new map followed the existing one
     for loop in loops:
-        level = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
-        upright.append(dataclasses.replace(level, query=offset + loop.query))
-    motion = BevOdometry.joined([BevOdometry.of(one.upright_poses()) for one in (before, new)])
-    sets, _ = accepted_between(upright, motion, drift=DriftModel())
-    if not sets:
+        upright = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
+        upright_loops.append(dataclasses.replace(upright, query=len(before) + loop.query))
+    motion = BevOdometry.joined([BevOdometry.of(places.upright_poses()) for places in (before, new)])
+    groups, _ = accepted_between(upright_loops, motion, drift=DriftModel())
+    if not groups:
         return None
-    accepted = {loop.query - offset for loop in sets[0]}
+    accepted = {loop.query - len(before) for loop in groups[0]}
     common = [loop for loop in loops if loop.query in accepted]
-    found = aligned_frames(
+    old_from_new, covariance = aligned_frames(
         common,
         before.world_from_place,
         new.world_from_place,
@@ -74,24 +74,24 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
         query_way=travelled(new.world_from_place),
         drift=DriftModel(),
     )
-    there = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])
-    here = new.world_from_place[[loop.query for loop in common]]
-    apart = np.linalg.norm(there[:, :3, 3] - here[:, :3, 3], axis=1)
-    return MapAlignment(*found, len(common), float(np.median(apart)))
+    located = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])
+    stated = new.world_from_place[[loop.query for loop in common]]
+    apart_m = np.linalg.norm(located[:, :3, 3] - stated[:, :3, 3], axis=1)
+    return MapAlignment(old_from_new, covariance, len(common), float(np.median(apart_m)))
 
 
 def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
     """Raise ValueError if common places of two maps have other positions, so that their world frames differ."""
-    found = align_maps(before, new)
-    if found is not None and found.apart_m > MAX_APART_M:
+    alignment = align_maps(before, new)
+    if alignment is not None and alignment.apart_m > MAX_APART_M:
         raise ValueError(
-            f"expected poses in the world frame of the existing map, found {found.places} places that are "
-            f"{found.apart_m:.1f} m away from where the existing map has them (median); with --frame align the poses "
-            "are moved to the existing map"
+            f"expected poses in the world frame of the existing map, found {alignment.places} places that are "
+            f"{alignment.apart_m:.1f} m away from where the existing map has them (median); with --frame align the "
+            "poses are moved to the existing map"
         )
 
 
 def without_known_places(before: PlaceMap, new: PlaceMap) -> PlaceMap:
     """The new map without the places whose descriptors the existing map has, so that no scan is added twice."""
     known = {descriptor.tobytes() for descriptor in before.index.descriptors}
-    return new.some([row for row, found in enumerate(new.index.descriptors) if found.tobytes() not in known])
+    return new.some([row for row in range(len(new)) if new.index.descriptors[row].tobytes() not in known])

@@ -71,9 +71,9 @@ def map_recording(
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
     check_level(poses, recording)
     recording = with_odometry(recording, poses)
-    finder, descriptions = CandidateSearch(params), list[Keyframe | None]()
-    looked_at, places, done = list[int](), list[tuple[int, int]](), 0
-    """Rows that are frames of the finder, frame and row of each place, and number of processed rows."""
+    finder, keyframes = CandidateSearch(params), list[Keyframe | None]()
+    frame_rows, places, done = list[int](), list[tuple[int, int]](), 0
+    """Row of each frame of the finder, frame and row of each place, and number of processed rows."""
 
     def rows_to_read() -> Iterator[int]:
         """Rows far enough from the last place. Each is added to the finder before the next one is taken."""
@@ -81,16 +81,16 @@ def map_recording(
         for done in range(len(poses)):
             if places and np.linalg.norm(poses[done, :3, 3] - poses[places[-1][1], :3, 3]) < spacing_m:
                 continue
-            frame = len(looked_at)
-            if frame == len(finder):  # not seen by an earlier run
+            frame = len(frame_rows)
+            if frame == len(finder):  # not in the checkpoint of an earlier run
                 yield done
             if not finder.empty[frame]:
                 places.append((frame, done))
-            looked_at.append(done)
+            frame_rows.append(done)
         done = len(poses)
 
     def add(keyframe: Keyframe | None, compared: Fits | None) -> None:
-        descriptions.append(keyframe)
+        keyframes.append(keyframe)
         finder.add_keyframe(keyframe, compared=NO_FITS)
 
     add_scans(
@@ -110,10 +110,10 @@ def map_recording(
         raise ValueError(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )
-    skipped = tuple(recording.ids[looked_at[frame]] for frame in finder.missing)
+    skipped = tuple(recording.ids[frame_rows[frame]] for frame in finder.missing)
     index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
-    keyframe = [one for one in (descriptions[frame] for frame, _ in places) if one is not None]
-    return MapBuildResult(_places(index, recording, poses, [row for _, row in places], keyframe), done, skipped)
+    described = [keyframe for frame, _ in places if (keyframe := keyframes[frame]) is not None]
+    return MapBuildResult(_places(index, recording, poses, [row for _, row in places], described), done, skipped)
 
 
 def _places(
@@ -121,18 +121,18 @@ def _places(
     recording: Recording,
     poses: Float[np.ndarray, "n 4 4"],
     rows: Sequence[int],
-    keyframe: Sequence[Keyframe],
+    keyframes: Sequence[Keyframe],
 ) -> PlaceMap:
     """Map of some scans of a recording, added to an index without places."""
     names = place_names(recording)
-    descriptors = np.array([one.descriptor for one in keyframe], np.float32).reshape(-1, index.width)
+    descriptors = np.array([keyframe.descriptor for keyframe in keyframes], np.float32).reshape(-1, index.width)
     index.add(descriptors, ids=[names[row] for row in rows], positions=poses[rows, :3, 3])
-    sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
-    deviations = [[sensor.height_deviation_m, sensor.tilt_deviation_deg] for sensor in sensors]
+    mountings = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
+    deviations = [[mounting.height_deviation_m, mounting.tilt_deviation_deg] for mounting in mountings]
     return PlaceMap(
         index,
-        np.stack([one.image for one in keyframe]) if keyframe else np.zeros((0, 0, 0), np.uint8),
+        np.stack([keyframe.image for keyframe in keyframes]) if keyframes else np.zeros((0, 0, 0), np.uint8),
         poses[rows],
-        np.array([[sensor.height_m, *sensor.up] for sensor in sensors], np.float64).reshape(-1, 4),
+        np.array([[mounting.height_m, *mounting.up] for mounting in mountings], np.float64).reshape(-1, 4),
         np.array(deviations, np.float64).reshape(-1, 2),  # None becomes NaN
     )

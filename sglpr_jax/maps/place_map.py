@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,15 +55,15 @@ class Relocalization(NamedTuple):
 
 def with_shared_probability(answers: Sequence[Relocalization], *, apart_m: float = NEGATIVE_M) -> list[Relocalization]:
     """Sort answers by probability, scaled so that those of answers more than `apart_m` apart add up to at most 1."""
-    answers = sorted(answers, key=lambda one: -one.probability)
+    answers = sorted(answers, key=lambda answer: -answer.probability)
     best: list[Relocalization] = []
-    for one in answers:
-        position = one.world_from_query[:3, 3]
+    for answer in answers:
+        position = answer.world_from_query[:3, 3]
         if all(np.linalg.norm(other.world_from_query[:3, 3] - position) > apart_m for other in best):
-            best.append(one)
-    total = max(1.0, sum(one.probability for one in best))
-    shared = [one._replace(loop=dataclasses.replace(one.loop, probability=one.probability / total)) for one in answers]
-    return sorted(shared, key=lambda one: -one.probability)
+            best.append(answer)
+    total = max(1.0, sum(answer.probability for answer in best))
+    loops = [dataclasses.replace(answer.loop, probability=answer.probability / total) for answer in answers]
+    return [answer._replace(loop=loop) for answer, loop in zip(answers, loops, strict=True)]
 
 
 NO_DRIFT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=1e-3)
@@ -84,7 +84,7 @@ class PlaceMap(Keyframes):
     Example:
       places = map_recording(recording, params, poses).places
       places.save("town.safetensors")
-      best = PlaceMap.load("town.safetensors").relocate(params, record)[0]
+      best = PlaceMap.load("town.safetensors").relocate(params, scan)[0]
     """
 
     index: Index
@@ -132,22 +132,23 @@ class PlaceMap(Keyframes):
         `other` is not complete, `drive` has the poses of all scans of its recording (`poses_by_id`), so that the ids
         are those of the complete map.
 
-        Raises:
-          ValueError: If the maps were made with other weights or another scale, or have images of another size.
+        Raises ValueError if the maps were made with other weights or another scale, or have images of another size.
         """
-        self.index.check(scale=other.scale)
+        self.index.check(scale=other.scale, weights=other.index.weights_hash)
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
-        known = set(self._contents())
-        new = [row for row, content in enumerate(other._contents()) if content not in known]
-        coming: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in (drive or {}).items()}
-        coming |= zip(other.index.ids, other._contents(), strict=True)
-        taken = dict(zip(self.index.ids, self._contents(), strict=True))
-        new_ids = _free_names([other.index.ids[row] for row in new], coming, taken=taken)
-        index = self.index.without_places()
-        for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
-            places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
-            index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
+        contents, other_contents = self._contents(), other._contents()
+        known = set(contents)
+        new = [row for row, content in enumerate(other_contents) if content not in known]
+        drive_contents: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in (drive or {}).items()}
+        drive_contents |= zip(other.index.ids, other_contents, strict=True)
+        taken = dict(zip(self.index.ids, contents, strict=True))
+        index = self.some(range(len(self))).index
+        index.add(
+            other.index.descriptors[new],
+            ids=_free_names([other.index.ids[row] for row in new], drive_contents, taken=taken),
+            positions=other.world_from_place[new, :3, 3],
+        )
         return PlaceMap(index, *(np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in ARRAYS))
 
     def relocate(
@@ -162,8 +163,8 @@ class PlaceMap(Keyframes):
 
         Arguments:
           params: Weights that made the map.
-          record: A record, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that
-            of the map (`query_mounting`). For another mounting pass a record.
+          scan: A scan, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that of
+            the map (`query_mounting`). For another mounting pass a `Scan`.
           model: Model of the probabilities, by default the one shipped for the weights.
           candidates: Maximum number of poses, and number of nearest places that the query is compared with. If it fits
             none of them well, as many others of the nearest 25 are compared, chosen by a coarse comparison.
@@ -174,16 +175,17 @@ class PlaceMap(Keyframes):
         Raises:
           ValueError: If other weights made the map, if an array has another shape, or if `candidates` is not from 1 to
             1000.
-          TypeError: If an argument is not parameters, a record or an array.
+          TypeError: If an argument is not parameters, a scan or an array.
         """
         check_value(candidates, PlaceCount, "candidates")
-        finder = CandidateSearch(params)
-        given = given_scan(scan)
-        if len(self) and not isinstance(scan, Scan) and given.points is not None:
-            given = dataclasses.replace(given, mounting=self.query_mounting(given.points))
-        keyframe = finder.keyframe(scaled_scan(given, self.scale))
+        finder, query = CandidateSearch(params), given_scan(scan)
+        if len(self) and not isinstance(scan, Scan) and query.points is not None:
+            query = dataclasses.replace(query, mounting=self.query_mounting(query.points))
         return self.relocate_keyframe(
-            keyframe, weights_hash=finder.index.weights_hash, model=model, candidates=candidates
+            finder.keyframe(scaled_scan(query, self.scale)),
+            weights_hash=finder.index.weights_hash,
+            model=model,
+            candidates=candidates,
         )
 
     def relocate_keyframe(
@@ -204,18 +206,19 @@ class PlaceMap(Keyframes):
         model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
         query = Query(len(self), keyframe.descriptor, image, query_spectra(image))
-        comparer = KeyframeComparison(self._motion, NO_DRIFT, config)
-        fits = comparer.compare(query, self)
+        comparison = KeyframeComparison(self._motion, NO_DRIFT, config)
+        fits = comparison.compare(query, self)
         order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
         answers = []
         for row in order[np.sort(first)][:candidates].tolist():
-            one = comparer.candidate(query, fits, row, self)
-            sensors = keyframe.mounting, self.mounting(one.match).scaled(self.scale)
-            loop = planar_loop(*one[:3], probability=float(model.probability(one.evidence)), sensors=sensors)
-            loop = in_metres(to_lidar(loop, query=sensors[0], match=sensors[1]), self.scale)
-            pose = self.world_from_place[one.match] @ loop.match_from_query
-            answers.append(Relocalization(self.index.ids[one.match], pose, loop))
+            candidate = comparison.candidate(query, fits, row, self)
+            place, probability = candidate.match, float(model.probability(candidate.evidence))
+            mountings = keyframe.mounting, self.mounting(place).scaled(self.scale)
+            loop = planar_loop(*candidate[:3], probability=probability, sensors=mountings)
+            loop = in_metres(to_lidar(loop, query=mountings[0], match=mountings[1]), self.scale)
+            world_from_query = self.world_from_place[place] @ loop.match_from_query
+            answers.append(Relocalization(self.index.ids[place], world_from_query, loop))
         return with_shared_probability(answers, apart_m=NEGATIVE_M / self.scale)
 
     @property
@@ -230,9 +233,9 @@ class PlaceMap(Keyframes):
     @functools.cached_property
     def _motion(self) -> BevOdometry:
         """Poses of the scaled places, and a last frame of unknown pose for queries. The world is level."""
-        found = BevOdometry.of(self.upright_poses(self.scale))
-        found.add(0.0, continues=False)
-        return found
+        motion = BevOdometry.of(self.upright_poses(self.scale))
+        motion.add(0.0, continues=False)
+        return motion
 
     def upright_poses(self, scale: Scale = 1) -> Float[np.ndarray, "n 4 4"]:
         """Pose of the gravity-aligned frame of the sensor at each place. All lengths are multiplied by `scale`."""
@@ -265,18 +268,18 @@ class PlaceMap(Keyframes):
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
         """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
-        index, more = Index.load_with(path, weights_hash=weights_hash)
-        left_out = [name for name, column in ARRAYS.items() if name not in more and not column.optional]
-        if left_out:
-            raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
+        index, arrays = Index.load_with(path, weights_hash=weights_hash)
+        missing = [name for name, column in ARRAYS.items() if name not in arrays and not column.optional]
+        if missing:
+            raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(missing)}")
         with naming(path):
-            _check(index, more)
-        return cls(index, **{name: more.get(name, np.full((len(index), 2), np.nan)) for name in ARRAYS})
+            _check(index, arrays)
+        return cls(index, **{name: arrays.get(name, np.full((len(index), 2), np.nan)) for name in ARRAYS})
 
-    def _contents(self) -> Iterator[tuple[bytes, bytes]]:
+    def _contents(self) -> list[tuple[bytes, bytes]]:
         """Descriptor and pose of each place, as bytes."""
-        for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
-            yield descriptor.tobytes(), pose.tobytes()
+        places = zip(self.index.descriptors, self.world_from_place, strict=True)
+        return [(descriptor.tobytes(), pose.tobytes()) for descriptor, pose in places]
 
 
 def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
@@ -307,20 +310,20 @@ def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict
     return dict(zip(place_names(recording), np.asarray(poses, np.float64), strict=True))
 
 
-def _free_names(names: Sequence[str], coming: Mapping[str, Content], *, taken: Mapping[str, Content]) -> list[str]:
+def _free_names(names: Sequence[str], drive: Mapping[str, Content], *, taken: Mapping[str, Content]) -> list[str]:
     """Names for new places, with the first suffix of "", ~2, ~3, ... after the recording that makes them free.
 
-    `coming` has all scans of the drive, because the suffix must not depend on how much of it is mapped. `taken` has the
+    `drive` has all scans of the drive, because the suffix must not depend on how much of it is mapped. `taken` has the
     places of the map.
     """
     recordings = {name.rpartition("/")[0] for name in names}
-    drive = {name: content for name, content in coming.items() if name.rpartition("/")[0] in recordings}
+    drive = {name: content for name, content in drive.items() if name.rpartition("/")[0] in recordings}
 
     def is_free(suffix: str) -> bool:
         """Whether no scan of the drive has, with the suffix, the name of another place."""
         for name, (descriptor, pose) in drive.items():
-            there = taken.get(_with_suffix(name, suffix))
-            if there is not None and (there[1] != pose or descriptor not in (None, there[0])):
+            place = taken.get(_with_suffix(name, suffix))
+            if place is not None and (place[1] != pose or descriptor not in (None, place[0])):
                 return False
         return True
 

@@ -9,10 +9,10 @@ from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.data.formats.scan_files import found_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
+from sglpr_jax.data.readers.ros import ENDINGS
 from sglpr_jax.data.recording import Recording, scan_of_file
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.pose_graph.odometry_files import BAGS
 
 
 def read_query(
@@ -32,24 +32,23 @@ def read_query(
       ValueError: If `path` is a bag, or if height and tilt cannot be estimated, because the scan shows no ground.
         Errors of `scan_of_file` and `read_image` are raised, too.
     """
+    expected = f"{path}: expected one scan or image"
     if path.is_dir():
-        raise IsADirectoryError(
-            f"{path}: expected one scan or image, found a folder; name a file in it, or use --frame"
-        )
-    if path.suffix in BAGS:
-        raise ValueError(f"{path}: expected one scan or image, found a bag; use --frame")
+        raise IsADirectoryError(f"{expected}, found a folder; name a file in it, or use --frame")
+    if path.suffix in ENDINGS:
+        raise ValueError(f"{expected}, found a bag; use --frame")
     if path.suffix == ".png":
         return Scan(image=read_image(path))
     scan = scan_of_file(path, format=found_format(path) if format == "auto" else format)
-    assert scan.points is not None
     if sensor_height == "auto":
-        return dataclasses.replace(scan, mounting=places.query_mounting(scan.points))
-    if sensor_height != "estimate":
-        return dataclasses.replace(scan, mounting=Mounting(float(sensor_height)))
-    found = estimate_mounting(scan.points)
-    if found is None:
+        mounting = places.query_mounting(scan.cloud)
+    elif sensor_height == "estimate":
+        mounting = estimate_mounting(scan.cloud)
+    else:
+        mounting = Mounting(float(sensor_height))
+    if mounting is None:
         raise ValueError(f"{path}: expected ground to estimate the sensor's height, found none; state the height")
-    return dataclasses.replace(scan, mounting=found)
+    return dataclasses.replace(scan, mounting=mounting)
 
 
 def query_of(recording: Recording, frame: int) -> Scan:
@@ -59,6 +58,6 @@ def query_of(recording: Recording, frame: int) -> Scan:
     """
     rows = np.flatnonzero(recording.numbers == frame)
     if not rows.size:
-        there = f"{len(recording)} scans from {recording.numbers[0]} to {recording.numbers[-1]}"
-        raise ValueError(f"{recording.name}: expected the number of a scan, found {frame}; it has {there}")
+        scans = f"{len(recording)} scans from {recording.numbers[0]} to {recording.numbers[-1]}"
+        raise ValueError(f"{recording.name}: expected the number of a scan, found {frame}; it has {scans}")
     return recording.scan(int(rows[0]), labels=False)

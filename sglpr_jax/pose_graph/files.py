@@ -26,8 +26,8 @@ UPPER = np.triu_indices(6)
 """Indices of the 21 numbers of an information matrix, row by row, translation before rotation."""
 Ids = Sequence[str] | Mapping[int, str]
 """Id of each frame, by its number."""
-COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
-OF_RECORDINGS = ("query_recording", "match_recording")
+CSV_COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
+CSV_RECORDINGS = ("query_recording", "match_recording")
 """Further columns of a table of several recordings."""
 
 
@@ -52,30 +52,22 @@ def write_g2o(
     Arguments:
       path: File to write.
       loops: Loops. Their frames are vertices.
-      chains: Vertices and poses of the LiDAR for each session with odometry. Without them, the file has only the edges
-        of the loops.
+      chains: Vertices and poses of the LiDAR for each session with odometry. Without them, only the loops are written.
       drift: Drift of the odometry, which determines the information matrices of its edges (`step_deviations`).
-      comments: Lines at the beginning of the file. Readers ignore them.
+      comments: Lines at the beginning of the file, which readers ignore.
 
-    Raises:
-      WriteError: If the file cannot be written.
+    Raises WriteError if the file cannot be written.
     """
     lines = [f"# {comment}" for comment in comments]
     for vertices, odometry in chains:
-        lines += _chain(vertices.tolist(), odometry, drift)
-    for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
-        lines.append(f"{EDGE} {loop.match} {loop.query} {row} {_numbers(loop.information[UPPER])}")
+        lines += [f"{VERTEX} {i} {pose}" for i, pose in zip(vertices, _pose_texts(odometry), strict=True)]
+        steps = _pose_texts(inverse(odometry[:-1]) @ odometry[1:])
+        variances = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
+        for (i, j), step, variance in zip(itertools.pairwise(vertices), steps, variances, strict=True):
+            lines.append(f"{EDGE} {i} {j} {step} {_nine_digits(np.diag(1 / variance)[UPPER])}")
+    for loop, pose in zip(loops, _pose_texts([loop.match_from_query for loop in loops]), strict=True):
+        lines.append(f"{EDGE} {loop.match} {loop.query} {pose} {_nine_digits(loop.information[UPPER])}")
     write_text(Path(path), "".join(f"{line}\n" for line in lines))
-
-
-def _chain(vertices: list[int], odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel) -> list[str]:
-    """Lines of the vertices of a recording, and of the edges of its odometry."""
-    lines = [f"{VERTEX} {i} {row}" for i, row in zip(vertices, _pose_rows(odometry), strict=True)]
-    steps = _pose_rows(inverse(odometry[:-1]) @ odometry[1:])
-    spread = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
-    information = (_numbers(np.diag(1 / row)[UPPER]) for row in spread)
-    ends = itertools.pairwise(vertices)
-    return lines + [f"{EDGE} {i} {j} {row} {next(information)}" for (i, j), row in zip(ends, steps, strict=True)]
 
 
 def read_g2o(path: Path | str) -> Graph:
@@ -90,8 +82,8 @@ def read_g2o(path: Path | str) -> Graph:
     path, graph, columns = Path(path), Graph({}, []), 0
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a g2o file, found none")
-    for i, line in enumerate(path.read_text(errors="replace").splitlines()):
-        words, where = line.split(), f"{path}, line {i + 1}"
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        words, where = line.split(), f"{path}, line {number}"
         if words and words[0] == VERTEX:
             values = numbers_of(words[1:], columns=8, where=where)
             (frame,) = _frames(values[:1], where)
@@ -101,24 +93,34 @@ def read_g2o(path: Path | str) -> Graph:
         elif words and words[0] == EDGE:
             columns = columns or (9 if len(words) == 10 else 30)  # the same for all: another line is cut
             values = numbers_of(words[1:], columns=columns, where=where)
-            information = _information(values[9:])
+            information = np.eye(6)
+            if columns == 30:
+                information[UPPER] = values[9:]
+                information = np.triu(information, 1).T + information
             first, second = _frames(values[:2], where)
             graph.edges.append((first, second, _pose(values[2:9], where), information))
     return graph
 
 
-def _information(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "6 6"]:
-    """Symmetric matrix of its 21 upper numbers, or the unit matrix if an edge has none."""
-    if not len(values):
-        return np.eye(6)
-    upper = np.zeros((6, 6))
-    upper[UPPER] = values
-    return np.triu(upper, 1).T + upper
+def _frames(values: Float[np.ndarray, " n"], where: str) -> list[int]:
+    """Frame numbers. Raises ValueError if a value is negative or not an integer."""
+    if (values < 0).any() or (values != np.round(values)).any():
+        raise ValueError(f"{where}: expected frames, counted from 0, found {' '.join(map(str, values))}")
+    return [int(value) for value in values]
+
+
+def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
+    """Pose of x y z qx qy qz qw."""
+    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
+        length = np.linalg.norm(values[3:])
+    if abs(length - 1) > 0.01:
+        raise ValueError(f"{where}: expected a quaternion of length 1, found {values[3:]}")
+    return from_quaternions(values[None, :3], values[None, 3:])[0]
 
 
 def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " n"]) -> None:
     """Write a TUM file: a line `time x y z qx qy qz qw` for each pose, in seconds and metres."""
-    lines = (f"{time:.9f} {row}\n" for time, row in zip(times, _pose_rows(poses), strict=True))
+    lines = (f"{time:.9f} {pose}\n" for time, pose in zip(times, _pose_texts(poses), strict=True))
     write_text(Path(path), "".join(lines))
 
 
@@ -128,99 +130,61 @@ def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
     write_text(Path(path), "".join(f"{_all_digits(pose[:3].reshape(-1))}\n" for pose in camera))
 
 
-def write_loops_jsonl(
-    path: Path | str, loops: Sequence[LoopClosure], ids: Ids | None = None, recordings: Ids | None = None
-) -> None:
-    """Write loops, one JSON object a line, with the `ids` and the `recordings` of the frames if they are given."""
-    write_text(Path(path), loop_lines(loops, ids, recordings))
-
-
-def loop_lines(loops: Sequence[LoopClosure], ids: Ids | None = None, recordings: Ids | None = None) -> str:
-    """Return the lines of a file of `write_loops_jsonl`."""
-    names = ("match_from_query", "covariance", "probability", "overlap")
-    return "".join(_line(loop, names, ids, recordings) for loop in loops)
-
-
-def write_rejected_jsonl(
-    path: Path | str, rejected: Sequence[RejectedClosure], ids: Ids | None = None, recordings: Ids | None = None
-) -> None:
-    """Write rejected pairs, one JSON object a line, with the `ids` and the `recordings` of the frames if given."""
-    names = ("reason", "probability", "overlap", "match_from_query")
-    lines = (_line(one.loop, names, ids, recordings, reason=one.reason) for one in rejected)
-    write_text(Path(path), "".join(lines))
-
-
-def _line(loop: LoopClosure, names: Sequence[str], ids: Ids | None, recordings: Ids | None, **more: str) -> str:
-    """The frames of a loop, their ids and recordings if given, and the values of these `names`, as a line of JSON."""
-    row: dict[str, Any] = {"query": loop.query, "match": loop.match}
-    for suffix, known in (("id", ids), ("recording", recordings)):
-        if known is not None:
-            row |= {f"query_{suffix}": known[loop.query], f"match_{suffix}": known[loop.match]}
-    row |= {name: more[name] if name in more else getattr(loop, name) for name in names}
-    return json.dumps(row, default=np.ndarray.tolist) + "\n"
-
-
-def read_loops_jsonl(path: Path | str) -> list[LoopClosure]:
-    """Read a file of `write_loops_jsonl`. Raises the errors of `read_g2o`."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
-    lines = path.read_bytes().splitlines()
-    return [_from_json(line, f"{path}, line {i + 1}") for i, line in enumerate(lines)]
-
-
 def write_loops_csv(path: Path | str, loops: Sequence[LoopClosure], recordings: Ids | None = None) -> None:
-    """Write a csv table with the columns `COLUMNS`. The overlap is empty if it is unknown.
+    """Write a csv table with the columns `CSV_COLUMNS`. The overlap is empty if it is unknown.
 
-    If the `recordings` of the frames are given, the table also has the columns `OF_RECORDINGS`.
+    If the `recordings` of the frames are given, the table also has the columns `CSV_RECORDINGS`.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS if recordings is None else (*COLUMNS, *OF_RECORDINGS))
-    for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
+    table.writerow(CSV_COLUMNS if recordings is None else (*CSV_COLUMNS, *CSV_RECORDINGS))
+    for loop, pose in zip(loops, _pose_texts([loop.match_from_query for loop in loops]), strict=True):
         overlap = "" if loop.overlap is None else f"{loop.overlap:.4f}"
         names = [] if recordings is None else [recordings[loop.query], recordings[loop.match]]
-        table.writerow([loop.query, loop.match, *row.split(), f"{loop.probability:.6f}", overlap, *names])
+        table.writerow([loop.query, loop.match, *pose.split(), f"{loop.probability:.6f}", overlap, *names])
     write_text(Path(path), text.getvalue())
 
 
-def _poses_of(loops: Sequence[LoopClosure]) -> Float[np.ndarray, "n 4 4"]:
-    return np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
+def write_loops_jsonl(
+    path: Path | str,
+    loops: Sequence[LoopClosure | RejectedClosure],
+    ids: Ids | None = None,
+    recordings: Ids | None = None,
+) -> None:
+    """Write loops or rejected pairs, one JSON object a line (`loop_lines`)."""
+    write_text(Path(path), loop_lines(loops, ids, recordings))
 
 
-def _pose_rows(poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
-    """x y z qx qy qz qw of each pose, with all digits: coordinates in a country's grid have seven before the point."""
-    if not len(poses):
-        return []
-    return [_all_digits(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
+def loop_lines(
+    loops: Sequence[LoopClosure | RejectedClosure], ids: Ids | None = None, recordings: Ids | None = None
+) -> str:
+    """Return a line of JSON for each loop or rejected pair, with ids and recordings of its frames if they are given."""
+    lines = []
+    for closure in loops:
+        loop = closure.loop if isinstance(closure, RejectedClosure) else closure
+        fields = ("match_from_query", "covariance", "probability", "overlap")
+        row: dict[str, Any] = {"query": loop.query, "match": loop.match}
+        for suffix, names in (("id", ids), ("recording", recordings)):
+            if names is not None:
+                row |= {f"query_{suffix}": names[loop.query], f"match_{suffix}": names[loop.match]}
+        if isinstance(closure, RejectedClosure):
+            row["reason"], fields = closure.reason, ("probability", "overlap", "match_from_query")
+        row |= {name: getattr(loop, name) for name in fields}
+        lines.append(json.dumps(row, default=np.ndarray.tolist) + "\n")
+    return "".join(lines)
 
 
-def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
-    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
-        length = np.linalg.norm(values[3:])
-    if abs(length - 1) > 0.01:
-        raise ValueError(f"{where}: expected a quaternion of length 1, found {values[3:]}")
-    return from_quaternions(values[None, :3], values[None, 3:])[0]
+def read_loops_jsonl(path: Path | str) -> list[LoopClosure]:
+    """Read the loops of a file of `write_loops_jsonl`. Raises the errors of `read_g2o`."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
+    lines = enumerate(path.read_bytes().splitlines(), start=1)
+    return [_loop_of_json(line, f"{path}, line {number}") for number, line in lines]
 
 
-def _frames(values: Float[np.ndarray, " n"], where: str) -> tuple[int, ...]:
-    """Frame numbers. Raises ValueError if a value is negative or not an integer."""
-    if (values < 0).any() or (values != np.round(values)).any():
-        raise ValueError(f"{where}: expected frames, counted from 0, found {' '.join(map(str, values))}")
-    return tuple(int(value) for value in values)
-
-
-def _all_digits(values: Float[np.ndarray, " n"]) -> str:
-    """Shortest text that reads back as the same float64 values."""
-    short = ((value, f"{value:.9g}") for value in values.tolist())
-    return " ".join(text if float(text) == value else repr(value) for value, text in short)
-
-
-def _numbers(values: Float[np.ndarray, " n"]) -> str:
-    return " ".join(f"{value:.9g}" for value in values)
-
-
-def _from_json(line: bytes, where: str) -> LoopClosure:
+def _loop_of_json(line: bytes, where: str) -> LoopClosure:
+    """Loop of a line. Raises ValueError if it has no valid loop."""
     value = parse_json(line, source=where)
     try:
         query, match = value["query"], value["match"]
@@ -238,3 +202,21 @@ def _from_json(line: bytes, where: str) -> LoopClosure:
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
     return loop
+
+
+def _pose_texts(poses: Sequence[np.ndarray] | Float[np.ndarray, "n 4 4"]) -> list[str]:
+    """x y z qx qy qz qw of each pose, with all digits: coordinates in a country's grid have seven before the point."""
+    if not len(poses):
+        return []
+    poses = np.asarray(poses, np.float64)
+    return [_all_digits(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
+
+
+def _all_digits(values: Float[np.ndarray, " n"]) -> str:
+    """Shortest text that reads back as the same float64 values."""
+    texts = ((value, f"{value:.9g}") for value in values.tolist())
+    return " ".join(text if float(text) == value else repr(value) for value, text in texts)
+
+
+def _nine_digits(values: Float[np.ndarray, " n"]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)

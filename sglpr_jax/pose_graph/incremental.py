@@ -15,7 +15,7 @@ from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.drift import step_deviations
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.pose_graph.optimize import first_factor, gtsam_library, rotation_first, step_factor
+from sglpr_jax.pose_graph.factor_graph import FactorGraph, gtsam_library, rotation_first
 from sglpr_jax.se3 import inverse
 
 CAUCHY = 3.0
@@ -52,15 +52,18 @@ class IncrementalTrajectory:
         settings.setRelinearizeThreshold(RELINEARIZE)
         settings.relinearizeSkip = 1
         self._solver = self._gtsam.ISAM2(settings)
-        self._graph, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
+        self._graph = FactorGraph()
+        """Factors and nodes since the last update of the solver."""
         self._odometry = GrowingArray(np.empty((0, 4, 4)))
+        self._travelled = GrowingArray(np.empty(0))
         self._nodes: list[int] = []
         self._segments: list[int] = []
         """Frame and segment of each node. The keys of the graph are these frames."""
-        self._placed: set[int] = set()
+        self._connected = {0}
+        """Segments in the graph."""
         self._waiting: list[LoopClosure] = []
+        """Loops between segments that are not in the graph."""
         self._last_query = 0
-        self._travelled = GrowingArray(np.empty(0))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -69,16 +72,16 @@ class IncrementalTrajectory:
     @property
     def map_from_world(self) -> Float[np.ndarray, "4 4"] | None:
         """Correction of the odometry at the last frame. None if no loop connects its segment with the first one."""
-        return self._correction(self._nodes[-1]) if self._segments[-1] in self._placed else None
+        return self._correction(self._nodes[-1]) if self._segments[-1] in self._connected else None
 
     @property
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
         """Corrected pose of the LiDAR at each frame. NaN in segments that no loop connects with the first one."""
-        found = np.full((len(self), 4, 4), np.nan)
+        poses = np.full((len(self), 4, 4), np.nan)
         for node, end, segment in zip(self._nodes, [*self._nodes[1:], len(self)], self._segments, strict=True):
-            if segment in self._placed:
-                found[node:end] = self._correction(node) @ self._odometry.rows[node:end]
-        return found
+            if segment in self._connected:
+                poses[node:end] = self._correction(node) @ self._odometry.rows[node:end]
+        return poses
 
     def add(
         self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[LoopClosure] = (), *, continues: bool = True
@@ -91,83 +94,79 @@ class IncrementalTrajectory:
         self._odometry.append(world_from_lidar)
         step = float(np.linalg.norm(world_from_lidar[:3, 3] - before[-1, :3, 3])) if frame and continues else 0.0
         self._travelled.append(self._travelled.rows[-1] + step if frame else 0.0)
-        last = self._nodes[-1] if frame else 0
-        if not frame or not continues or self._travelled.rows[-1] - self._travelled.rows[last] >= NODE_EVERY_M:
-            segment = self._segments[-1] + (not continues) if frame else 0
-            self._nodes.append(frame)
-            self._segments.append(segment)
-            if not frame:  # the first pose is fixed
-                self._placed.add(0)
-                self._values.insert(0, self._gtsam.Pose3(world_from_lidar))
-                self._graph.add(first_factor(world_from_lidar))
-            elif continues and segment in self._placed:
-                self._values.insert(frame, self._gtsam.Pose3(self._correction(last) @ world_from_lidar))
-                self._chain(last, frame)
+        if not frame:
+            self._nodes, self._segments = [0], [0]
+            self._graph.add_node(0, world_from_lidar, fixed=True)
+        else:
+            last, segment = self._nodes[-1], self._segments[-1] + (not continues)
+            if not continues or self._travelled.rows[-1] - self._travelled.rows[last] >= NODE_EVERY_M:
+                self._nodes.append(frame)
+                self._segments.append(segment)
+                if continues and segment in self._connected:
+                    self._graph.add_node(frame, self._correction(last) @ world_from_lidar)
+                    self._add_step(last, frame)
         self._waiting += loops
         self._use_loops()
-        if self._values.size() or self._graph.size():
-            self._solver.update(self._graph, self._values)
-            self._graph, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
-
-    def _chain(self, before: int, frame: int) -> None:
-        """Connect two nodes by odometry."""
-        ends = self._odometry.rows[[before, frame]]
-        (metres,), (radians,) = step_deviations(ends, self._drift)
-        self._graph.add(step_factor(before, frame, inverse(ends[0]) @ ends[1], metres, radians))
+        if self._graph.estimates.size() or self._graph.factors.size():
+            self._solver.update(self._graph.factors, self._graph.estimates)
+            self._graph = FactorGraph()
 
     def _use_loops(self) -> None:
         """Add loops with an end in the graph. Others wait until another loop connects their segments."""
-        used = True
-        while used and self._waiting:
-            connected = [
-                not {self._segment(loop.query), self._segment(loop.match)}.isdisjoint(self._placed)
-                for loop in self._waiting
-            ]
-            now, used = list(itertools.compress(self._waiting, connected)), any(connected)
-            self._waiting = list(itertools.compress(self._waiting, np.logical_not(connected)))
-            for loop in now:
+        while True:
+            usable, waiting = [], []
+            for loop in self._waiting:
+                segments = {self._segment(loop.query), self._segment(loop.match)}
+                (waiting if segments.isdisjoint(self._connected) else usable).append(loop)
+            self._waiting = waiting
+            if not usable:
+                return
+            for loop in usable:
                 self._use(loop)
 
     def _use(self, loop: LoopClosure) -> None:
         """Connect the nodes of a loop. The covariance is that of the loop, because the nodes are near its frames."""
         query, match = self._node(loop.query), self._node(loop.match)
-        ends = (loop.match, match), (loop.query, query)
-        match_moved, query_moved = (inverse(self._odometry.rows[node]) @ self._odometry.rows[one] for one, node in ends)
-        pose = match_moved @ loop.match_from_query @ inverse(query_moved)
-        if self._segment(query) not in self._placed:
-            self._place(query, self._pose(match) @ pose)
-        elif self._segment(match) not in self._placed:
-            self._place(match, self._pose(query) @ inverse(pose))
-        elif query == match or not self._is_useful(loop, query, match, pose):
+        odometry = self._odometry.rows
+        query_from_frame = inverse(odometry[query]) @ odometry[loop.query]
+        match_from_frame = inverse(odometry[match]) @ odometry[loop.match]
+        match_from_query = match_from_frame @ loop.match_from_query @ inverse(query_from_frame)
+        if self._segment(query) not in self._connected:
+            self._add_segment(query, self._pose(match) @ match_from_query)
+        elif self._segment(match) not in self._connected:
+            self._add_segment(match, self._pose(query) @ inverse(match_from_query))
+        elif query == match or not self._is_useful(loop, query, match, match_from_query):
             return
         self._last_query = query
-        covariance = self._gtsam.noiseModel.Gaussian.Covariance(rotation_first(loop.covariance))
-        robust = self._gtsam.noiseModel.mEstimator.Cauchy(CAUCHY)
-        noise = self._gtsam.noiseModel.Robust.Create(robust, covariance)
-        self._graph.add(self._gtsam.BetweenFactorPose3(match, query, self._gtsam.Pose3(pose), noise))
+        self._graph.add_loop(match, query, match_from_query, loop.covariance, cauchy=CAUCHY)
 
-    def _is_useful(self, loop: LoopClosure, query: int, match: int, pose: Float[np.ndarray, "4 4"]) -> bool:
+    def _is_useful(self, loop: LoopClosure, query: int, match: int, match_from_query: Float[np.ndarray, "4 4"]) -> bool:
         """Whether a loop between two nodes contradicts the graph, or no other loop was used for a while."""
-        way = self._travelled.rows
         if query == self._last_query:
             return False
-        if abs(way[query] - way[self._last_query]) >= LOOP_EVERY_M:
+        travelled = self._travelled.rows
+        if abs(travelled[query] - travelled[self._last_query]) >= LOOP_EVERY_M:
             return True
-        error = self._gtsam.Pose3.Logmap(
-            self._gtsam.Pose3(inverse(pose) @ inverse(self._pose(match)) @ self._pose(query))
-        )
-        return float(error @ np.linalg.solve(rotation_first(loop.covariance), error)) > AGREES**2
+        error = inverse(match_from_query) @ inverse(self._pose(match)) @ self._pose(query)
+        residual = self._gtsam.Pose3.Logmap(self._gtsam.Pose3(error))
+        return float(residual @ np.linalg.solve(rotation_first(loop.covariance), residual)) > AGREES**2
 
-    def _place(self, node: int, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Insert the nodes of a segment. The pose of one node is known."""
+    def _add_segment(self, node: int, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Add the nodes of a segment to the graph. The pose of one node is known."""
         segment = self._segment(node)
-        self._placed.add(segment)
-        nodes = [one for one, its in zip(self._nodes, self._segments, strict=True) if its == segment]
+        self._connected.add(segment)
+        nodes = [other for other in self._nodes if self._segment(other) == segment]
         map_from_world = pose @ inverse(self._odometry.rows[node])
-        for one in nodes:
-            self._values.insert(one, self._gtsam.Pose3(map_from_world @ self._odometry.rows[one]))
+        for other in nodes:
+            self._graph.add_node(other, map_from_world @ self._odometry.rows[other])
         for before, after in itertools.pairwise(nodes):
-            self._chain(before, after)
+            self._add_step(before, after)
+
+    def _add_step(self, before: int, after: int) -> None:
+        """Connect two nodes by odometry."""
+        poses = self._odometry.rows[[before, after]]
+        (metres,), (radians,) = step_deviations(poses, self._drift)
+        self._graph.add_step(before, after, inverse(poses[0]) @ poses[1], metres=metres, radians=radians)
 
     def _node(self, frame: int) -> int:
         """Last node at or before a frame."""
@@ -182,6 +181,6 @@ class IncrementalTrajectory:
 
     def _pose(self, node: int) -> Float[np.ndarray, "4 4"]:
         """Latest estimate of the pose of a node in the graph."""
-        if self._values.exists(node):
-            return self._values.atPose3(node).matrix()
+        if self._graph.estimates.exists(node):
+            return self._graph.estimates.atPose3(node).matrix()
         return self._solver.calculateEstimatePose3(node).matrix()

@@ -9,13 +9,12 @@ from jaxtyping import Float
 from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.formats.pose_files import FORMATS, format_of
 from sglpr_jax.data.poses import poses_at_scans
+from sglpr_jax.data.readers.ros import ENDINGS
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.fields import check_value
 from sglpr_jax.odometry.config import OdometryFormat
 from sglpr_jax.pose_graph.files import read_g2o
-
-BAGS = (".bag", ".mcap", ".db3")
 
 
 def read_odometry(
@@ -42,14 +41,20 @@ def read_stamped(
     """Read the poses of `read_odometry`, and their times in seconds. Only tum files have times."""
     check_value(format, OdometryFormat, f"{path}, format")
     check_value(time_unit, TimeUnit, f"{path}, time_unit")
-    if path.suffix in BAGS:
+    if path.suffix in ENDINGS:
         raise ValueError(f"{path}: expected a file of odometry, or the bag of the scans, found another bag")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected odometry, found {'a folder' if path.is_dir() else 'no file'}")
-    known = format if format != "auto" else "g2o" if path.suffix == ".g2o" else format_of(path)
-    if known == "csv":
+    file_format = format if format != "auto" else "g2o" if path.suffix == ".g2o" else format_of(path)
+    if file_format == "csv":
         raise ValueError(f"{path}: expected odometry with rotations, as tum, found csv")
-    poses, times = (_vertices(path), None) if known == "g2o" else FORMATS[known][1](path, time_unit)
+    if file_format != "g2o":
+        poses, times = FORMATS[file_format][1](path, time_unit)
+    else:
+        vertices, times = read_g2o(path).poses, None
+        if sorted(vertices) != list(range(len(vertices))):
+            raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without gaps, found others")
+        poses = np.array([vertices[i] for i in range(len(vertices))])
     if not len(poses):
         raise ValueError(f"{path}: expected at least one pose, found none")
     return poses, times
@@ -72,35 +77,32 @@ def at_scans(
     Returns:
       The recording, and a pose for each of its scans.
 
-    Raises:
-      ValueError: If most scans have no pose, or if the numbers of poses and scans differ and times are missing.
+    Raises ValueError if most scans have no pose, or if the numbers of poses and scans differ and times are missing.
     """
-    found = poses_at_scans(
+    matched = poses_at_scans(
         str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
     )
     if recording.times is None and stamps is not None:
-        said = f"times: from {path.name}"
-        return dataclasses.replace(recording, times=stamps, found=(*recording.found, said)), found.poses
-    if not found.said:
-        return recording, found.poses
-    chosen = only(recording, np.flatnonzero(found.kept).tolist())
-    said = f"odometry: {len(odometry)} poses of {path.name}, {found.said}"
-    return dataclasses.replace(chosen, found=(*chosen.found, said)), found.poses
+        message = f"times: from {path.name}"
+        return dataclasses.replace(recording, times=stamps, found=(*recording.found, message)), matched.poses
+    if not matched.said:
+        return recording, matched.poses
+    recording = only(recording, np.flatnonzero(matched.kept).tolist())
+    message = f"odometry: {len(odometry)} poses of {path.name}, {matched.said}"
+    return dataclasses.replace(recording, found=(*recording.found, message)), matched.poses
 
 
 def is_own(path: Path, root: Path) -> bool:
     """Whether `path` is the bag of the recording at `root`, so that its own poses are the odometry."""
     path, root = path.resolve(), root.resolve()
-    return path.exists() and (path == root or (path.suffix in BAGS and path.parent == root))
+    return path.exists() and (path == root or (path.suffix in ENDINGS and path.parent == root))
 
 
 def own_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
     """Poses from the messages of the recording's bag, and the recording without them.
 
-    The poses are removed, because loops found with them cannot be evaluated with them.
-
-    Raises:
-      ValueError: If the bag has no poses or the poses have no rotations.
+    The poses are removed, because loops found with them cannot be evaluated with them. Raises ValueError if the bag has
+    no poses, or if these have no rotations.
     """
     if recording.world_from_lidar is None:
         raise ValueError(
@@ -108,10 +110,3 @@ def own_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.
             f"found {recording.pose_source or 'no poses'}"
         )
     return dataclasses.replace(recording, positions=None, pose_source=None), recording.world_from_lidar
-
-
-def _vertices(path: Path) -> Float[np.ndarray, "n 4 4"]:
-    poses = read_g2o(path).poses
-    if sorted(poses) != list(range(len(poses))):
-        raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without gaps, found others")
-    return np.array([poses[i] for i in range(len(poses))]).reshape(-1, 4, 4)

@@ -5,11 +5,9 @@ The result is compared with the stated drift of the odometry.
 """
 
 import dataclasses
-import importlib
 import itertools
 from collections.abc import Mapping, Sequence
-from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,13 +16,12 @@ from sglpr_jax.data.levelling import is_tilted, uprights
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.closure import LoopClosure, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
-from sglpr_jax.loops.result import LoopSearchResult
+from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.pose_graph.factor_graph import FactorGraph, gtsam_library
 from sglpr_jax.se3 import inverse
 
-FIRST_POSE = 1e-6
-"""Standard deviation of the first pose, which stays fixed, in metres and radians."""
 MOST_RISEN_M = 2.0
 """Maximum correction of a height without a warning, in metres."""
 UNCONNECTED = 1e2
@@ -53,14 +50,14 @@ class OptimizedTrajectory(NamedTuple):
     def __str__(self) -> str:
         if not self.inliers.any():
             limit = f"{self.drift.max_deviation:g} sigmas of the stated drift ({self.drift})"
-            why = f"{len(self.inliers)} loops need more than {limit}" if len(self.inliers) else "no loops"
-            return f"trajectory not corrected: {why}"
+            reason = f"{len(self.inliers)} loops need more than {limit}" if len(self.inliers) else "no loops"
+            return f"trajectory not corrected: {reason}"
         loops = f"{self.inliers.sum()} of {len(self.inliers)} loops"
         moved = f"{self.moved_m:.2f} m at most, {self.moved_rms_m:.2f} m RMS"
         return f"trajectory corrected by {loops}: moved by {moved}, {self.deviation:.2f} sigmas of the stated drift"
 
 
-def optimize_trajectory(found: LoopSearchResult) -> OptimizedTrajectory:
+def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
     """Correct the odometry of all sessions by their loops, within the stated drift. Warns if heights move by metres.
 
     Sessions that loops connect get one frame, that of the first one. It takes about a second for a few hundred frames,
@@ -72,71 +69,93 @@ def optimize_trajectory(found: LoopSearchResult) -> OptimizedTrajectory:
 
     Example:
       found = find_loops(recording, params, odometry=odometry)
-      corrected = optimize_trajectory(found).poses
+      corrected = optimize_trajectory(result).poses
     """
-    without = next((one.recording.name for one in found.sessions if one.odometry is None), None)
+    without = next((session.recording.name for session in result.sessions if session.odometry is None), None)
     if without is not None:
         raise ValueError(f"{without}: expected loops found with odometry, found loops without it")
-    placed, sessions = placements(found), found.sessions
-    poses, inliers = dict[int, np.ndarray](), np.zeros(len(found.loops), bool)
-    solved = []
+    placed = placements(result)
+    poses, inliers = dict[int, np.ndarray](), np.zeros(len(result.loops), bool)
+    solutions = []
     for group in dict.fromkeys(group for group, _ in placed):
-        members = {number: to_first for number, (other, to_first) in enumerate(placed) if other == group}
-        rows = [row for row, loop in enumerate(found.loops) if loop.query_session in members]
-        turned = {number: uprights(sessions[number].recording)[: sessions[number].frames] for number in members}
-        given = {number: np.asarray(sessions[number].odometry)[: sessions[number].frames] for number in members}
-        upright = {number: members[number] @ given[number] @ inverse(turned[number]) for number in members}
-        level = np.eye(4)
-        level[:3, :3] = DrivenPath(upright[group], tilted=is_tilted(turned[group])).level
-        loops = []
-        for row in rows:
-            match, query = (sessions[one.session].recording.mounting_of(one.frame) for one in found.loops[row].nodes)
-            loops.append(to_upright(found.loops[row], query=query, match=match))
-        solved.append(solved_graph({k: level @ one for k, one in upright.items()}, loops, sessions[group].drift))
-        inliers[rows] = solved[-1].inliers
-        ends = np.cumsum([len(one) for one in upright.values()])[:-1]
-        for number, one in zip(members, np.split(solved[-1].poses, ends), strict=True):
-            poses[number] = inverse(level) @ one @ turned[number]
-            risen_m = np.abs(poses[number] - members[number] @ given[number])[:, 2, 3].max(initial=0)
-            if risen_m > MOST_RISEN_M:
-                warn(
-                    f"{sessions[number].recording.name}: expected heights near those of the odometry, found them moved "
-                    f"by up to {risen_m:.1f} m; only registered loops measure heights"
-                )
-    moved = [one.moved_rms_m**2 * len(one.poses) for one in solved]
+        members = {session: pose for session, (other, pose) in enumerate(placed) if other == group}
+        rows = [row for row, loop in enumerate(result.loops) if loop.query_session in members]
+        solution, solved_poses = _solve_group(result, members, [result.loops[row] for row in rows])
+        solutions.append(solution)
+        inliers[rows] = solution.inliers
+        poses |= solved_poses
+        for session, corrected in solved_poses.items():
+            _warn_of_heights(result.sessions[session], members[session], corrected)
+    squares = sum(solution.moved_rms_m**2 * len(solution.poses) for solution in solutions)
     return OptimizedTrajectory(
-        np.concatenate([poses[number] for number in range(len(found.sessions))]),
+        np.concatenate([poses[session] for session in range(len(result.sessions))]),
         inliers,
-        max(one.moved_m for one in solved),
-        float(np.sqrt(sum(moved) / max(sum(len(one.poses) for one in solved), 1))),
-        max(one.deviation for one in solved),
-        solved[0].drift,
+        max(solution.moved_m for solution in solutions),
+        float(np.sqrt(squares / max(sum(len(solution.poses) for solution in solutions), 1))),
+        max(solution.deviation for solution in solutions),
+        solutions[0].drift,
     )
 
 
-def placements(found: LoopSearchResult) -> tuple[tuple[int, Float[np.ndarray, "4 4"]], ...]:
+def _solve_group(
+    result: LoopSearchResult, members: Mapping[int, Float[np.ndarray, "4 4"]], loops: Sequence[LoopClosure]
+) -> tuple[OptimizedTrajectory, dict[int, Float[np.ndarray, "_ 4 4"]]]:
+    """Solve the graph of connected sessions, given the pose of each session's frame in that of the first one.
+
+    Returns the solution for the gravity-aligned frames, and the corrected poses of the LiDAR for each session.
+    """
+    sessions, (first, *_) = result.sessions, members
+    upright_from_lidar = {k: uprights(sessions[k].recording)[: sessions[k].frames] for k in members}
+    upright = {}
+    for k, first_from_session in members.items():
+        odometry = np.asarray(sessions[k].odometry)[: sessions[k].frames]
+        upright[k] = first_from_session @ odometry @ inverse(upright_from_lidar[k])
+    level_from_first = np.eye(4)
+    level_from_first[:3, :3] = DrivenPath(upright[first], tilted=is_tilted(upright_from_lidar[first])).level
+    upright_loops = []
+    for loop in loops:
+        match, query = (sessions[node.session].recording.mounting_of(node.frame) for node in loop.nodes)
+        upright_loops.append(to_upright(loop, query=query, match=match))
+    levelled = {k: level_from_first @ poses for k, poses in upright.items()}
+    solution = solved_graph(levelled, upright_loops, sessions[first].drift)
+    parts = np.split(solution.poses, np.cumsum([len(poses) for poses in upright.values()])[:-1])
+    first_from_level = inverse(level_from_first)
+    lidar = {k: first_from_level @ part @ upright_from_lidar[k] for k, part in zip(members, parts, strict=True)}
+    return solution, lidar
+
+
+def _warn_of_heights(
+    session: Session, first_from_session: Float[np.ndarray, "4 4"], corrected: Float[np.ndarray, "n 4 4"]
+) -> None:
+    """Warn if the correction moved a pose up or down by more than `MOST_RISEN_M`."""
+    odometry = first_from_session @ np.asarray(session.odometry)[: session.frames]
+    risen_m = np.abs(corrected - odometry)[:, 2, 3].max(initial=0)
+    if risen_m > MOST_RISEN_M:
+        warn(
+            f"{session.recording.name}: expected heights near those of the odometry, found them moved by up to "
+            f"{risen_m:.1f} m; only registered loops measure heights"
+        )
+
+
+def placements(result: LoopSearchResult) -> tuple[tuple[int, Float[np.ndarray, "4 4"]], ...]:
     """Return the group of each session, and the transform from its odometry frame to that of the group's first one.
 
     Groups are named by the number of their first session. Transforms with more loops are used first. Sessions without
     odometry, or without a common place, are groups of their own.
     """
+    links = []
+    for aligned in sorted(result.transforms, key=lambda aligned: -aligned.loops):
+        if aligned.match.is_odometry:
+            match, query, pose = aligned.match.session, aligned.query.session, aligned.match_from_query
+            links += [(match, query, pose), (query, match, inverse(pose))]
     placed: dict[int, tuple[int, np.ndarray]] = {}
-    links = sorted((one for one in found.transforms if one.match.is_odometry), key=lambda one: -one.loops)
-    ends = [
-        (known, new, pose)
-        for one in links
-        for known, new, pose in (
-            (one.match.session, one.query.session, one.match_from_query),
-            (one.query.session, one.match.session, inverse(one.match_from_query)),
-        )
-    ]
-    for root in range(len(found.sessions)):
+    for root in range(len(result.sessions)):
         placed.setdefault(root, (root, np.eye(4)))
-        while link := next((one for one in ends if one[0] in placed and one[1] not in placed), None):
+        while link := next((link for link in links if link[0] in placed and link[1] not in placed), None):
             known, new, known_from_new = link
             group, first_from_known = placed[known]
             placed[new] = group, first_from_known @ known_from_new
-    return tuple(placed[number] for number in range(len(found.sessions)))
+    return tuple(placed[session] for session in range(len(result.sessions)))
 
 
 def solved_graph(
@@ -155,20 +174,22 @@ def solved_graph(
 
     Raises ImportError if the extra `gtsam` is not installed.
     """
-    gtsam = gtsam_library()
-    sessions = np.repeat(list(odometry), [len(one) for one in odometry.values()])
+    gtsam_library()  # also without loops
+    sessions = np.repeat(list(odometry), [len(poses) for poses in odometry.values()])
     poses = np.concatenate(list(odometry.values()))
     first = {session: int(np.searchsorted(sessions, session)) for session in odometry}  # the sessions ascend
     loops = [
-        dataclasses.replace(one, match=first[one.match_session] + one.match, query=first[one.query_session] + one.query)
-        for one in loops
+        dataclasses.replace(
+            loop, match=first[loop.match_session] + loop.match, query=first[loop.query_session] + loop.query
+        )
+        for loop in loops
     ]
     used = _contradictions(loops, poses, sessions, drift) <= drift.max_deviation
     for _ in range(ROUNDS):
         if not used.any():
             break
         chosen = np.flatnonzero(used)
-        solved, fits = _solved(gtsam, poses, [loops[i] for i in chosen], sessions, drift)
+        solved, fits = _solve(poses, [loops[i] for i in chosen], sessions, drift)
         members = chosen[fits]
         bend = _bend(poses, solved, [loops[i] for i in members], sessions, drift)
         if (bend <= drift.max_deviation).all():
@@ -180,46 +201,30 @@ def solved_graph(
     return OptimizedTrajectory(poses, np.zeros(len(loops), bool), drift=drift)
 
 
-def _solved(
-    gtsam: ModuleType,
+def _solve(
     odometry: Float[np.ndarray, "n 4 4"],
     loops: Sequence[LoopClosure],
     sessions: Int[np.ndarray, " n"],
     drift: DriftModel,
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " k"]]:
     """The poses of the solution, and whether each loop is an inlier of it."""
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    gtsam, graph = gtsam_library(), FactorGraph()
     for frame, pose in enumerate(odometry):
-        start.insert(frame, gtsam.Pose3(pose))
-    graph.add(first_factor(odometry[0]))
+        graph.add_node(frame, pose, fixed=frame == 0)
     metres, radians = step_deviations(odometry, drift)
     # A large value keeps the graph solvable without loops between sessions.
-    metres, radians = (np.where(np.diff(sessions), UNCONNECTED, one) for one in (metres, radians))
-    for frame, pose in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
-        graph.add(step_factor(frame, frame + 1, pose, metres[frame], radians[frame]))
-    certain = graph.size()
+    metres, radians = (np.where(np.diff(sessions), UNCONNECTED, deviation) for deviation in (metres, radians))
+    for frame, step in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
+        graph.add_step(frame, frame + 1, step, metres=metres[frame], radians=radians[frame])
+    certain = graph.factors.size()
     for loop in loops:
-        noise = gtsam.noiseModel.Gaussian.Covariance(rotation_first(loop.covariance))
-        graph.add(gtsam.BetweenFactorPose3(loop.match, loop.query, gtsam.Pose3(loop.match_from_query), noise))
+        graph.add_loop(loop.match, loop.query, loop.match_from_query, loop.covariance)
     options = gtsam.GncLMParams()
     options.setKnownInliers(list(range(certain)))
-    solver = gtsam.GncLMOptimizer(graph, start, options)
+    solver = gtsam.GncLMOptimizer(graph.factors, graph.estimates, options)
     solution = solver.optimize()
     poses = np.stack([solution.atPose3(frame).matrix() for frame in range(len(odometry))])
     return poses, np.asarray(solver.getWeights())[certain:] > 0.5
-
-
-def first_factor(pose: Float[np.ndarray, "4 4"]) -> Any:
-    """Factor of gtsam that fixes the pose of node 0."""
-    gtsam = gtsam_library()
-    return gtsam.PriorFactorPose3(0, gtsam.Pose3(pose), gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE))
-
-
-def step_factor(before: int, after: int, step: Float[np.ndarray, "4 4"], metres: float, radians: float) -> Any:
-    """Factor of gtsam between two nodes that odometry connects, with standard deviations (`step_deviations`)."""
-    gtsam = gtsam_library()
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3))
-    return gtsam.BetweenFactorPose3(before, after, gtsam.Pose3(step), noise)
 
 
 def _contradictions(
@@ -247,37 +252,19 @@ def _bend(
     """
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
-    solved = [LoopClosure(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
-    found = _contradictions(solved, odometry, sessions, drift)
+    paths = [LoopClosure(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
+    deviation = _contradictions(paths, odometry, sessions, drift)
+    of_loops, of_neighbours = deviation[: len(loops)], deviation[len(loops) :]
     bends = []
-    for k, loop in enumerate(loops):
-        own = np.isin(frames, [loop.match, loop.query])  # a path that starts or ends at one of these counts
-        bends.append(max(found[k], *found[len(loops) :][own[:-1] | own[1:]], 0.0))
+    for loop, between in zip(loops, of_loops, strict=True):
+        is_end = np.isin(frames, [loop.match, loop.query])
+        bends.append(max(between, *of_neighbours[is_end[:-1] | is_end[1:]], 0.0))
     return np.array(bends)
 
 
 def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndarray, "n 3"]) -> float:
     """Root mean square distance of a trajectory from true positions, in metres, after rigid alignment."""
-    found, true = (each - each.mean(axis=0) for each in (poses[:, :3, 3], positions))
-    left, _, right = np.linalg.svd(found.T @ true)
+    estimated, true = (points - points.mean(axis=0) for points in (poses[:, :3, 3], positions))
+    left, _, right = np.linalg.svd(estimated.T @ true)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return float(np.sqrt(np.square(found @ (left @ flip @ right) - true).sum(axis=1).mean()))
-
-
-def rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance with rotation before translation, as in gtsam."""
-    order = np.array([3, 4, 5, 0, 1, 2])
-    return covariance[np.ix_(order, order)]
-
-
-def check_installed() -> None:
-    """Raises ImportError if the extra `gtsam` is not installed."""
-    gtsam_library()
-
-
-def gtsam_library() -> ModuleType:
-    """Import gtsam. Raises ImportError if the extra `gtsam` is not installed."""
-    try:
-        return importlib.import_module("gtsam")
-    except ImportError as error:
-        raise ImportError("optimisation of a trajectory needs gtsam: pip install 'sglpr-jax[gtsam]'") from error
+    return float(np.sqrt(np.square(estimated @ (left @ flip @ right) - true).sum(axis=1).mean()))

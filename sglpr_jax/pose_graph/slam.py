@@ -19,7 +19,8 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.odometry import kiss_icp
 from sglpr_jax.odometry.config import OdometryConfig
-from sglpr_jax.pose_graph import optimize
+from sglpr_jax.pose_graph.factor_graph import gtsam_library
+from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, optimize_trajectory
 
 
 class Slam(NamedTuple):
@@ -28,7 +29,7 @@ class Slam(NamedTuple):
     odometry: Float[np.ndarray, "n 4 4"]
     """Pose of the LiDAR at each scan, in the frame of the first scan."""
     loops: LoopSearchResult
-    trajectory: optimize.OptimizedTrajectory
+    trajectory: OptimizedTrajectory
 
     def __str__(self) -> str:
         return f"{self.loops}\n{self.trajectory}"
@@ -68,7 +69,7 @@ def slam(
       result = sglpr_jax.slam("my_scans")
       print(result.trajectory.poses.shape, len(result.loops.loops))
     """
-    optimize.check_installed()
+    gtsam_library()  # an error before the search
     opened = recording if isinstance(recording, Recording) else open_recording(Path(recording))
     folder = None if kept_in is None else Path(kept_in)
     poses = kiss_icp.scan_odometry(
@@ -88,4 +89,4 @@ def slam(
         on_bad_scan=on_bad_scan,
         kept_in=None if folder is None else folder / "loops",
     )
-    return Slam(poses, found, optimize.optimize_trajectory(found))
+    return Slam(poses, found, optimize_trajectory(found))

@@ -44,9 +44,8 @@ class Experiment:
 
     kind: Literal["table", "figure"]
     title: str
-    variants: tuple[str, ...] = (FULL,)
-    labels: tuple[str, ...] = ()
-    """Names of the variants in this experiment, if they differ from `Variant.label`."""
+    variants: Mapping[str, str] = field(default_factory=lambda: {FULL: "SG-LPR"})
+    """Label of each variant in this experiment, by the variant's name."""
     rotated: bool = False
     """Whether every scan of the test recordings is rotated by its own random angle."""
     beside_handcrafted: bool = False
@@ -59,20 +58,13 @@ class Experiment:
     needs_labels: bool = False
     """Whether the experiment draws labels or compares variants that learn from them."""
 
-    def names(self) -> dict[str, str]:
-        """Return the label of each variant, by the variant's name."""
-        labels = self.labels or tuple(VARIANTS[name].label for name in self.variants)
-        return dict(zip(self.variants, labels, strict=True))
-
-
-_WITH_FIGURE_9 = ("categories-6", "categories-15", FULL, "categories-25", "categories-34")
 
 EXPERIMENTS: dict[str, Experiment] = {
     "table1": Experiment("table", "F1max beside other methods", beside_handcrafted=True, protocols=(TOP1, PAIRS)),
     "table2": Experiment(
         "table",
         "F1max, every scan rotated",
-        (FULL, "no-rotation"),
+        {FULL: "SG-LPR", "no-rotation": "SG-LPR, not rotated in training"},
         rotated=True,
         beside_handcrafted=True,
         protocols=(TOP1, PAIRS),
@@ -86,24 +78,31 @@ EXPERIMENTS: dict[str, Experiment] = {
     "table4": Experiment(
         "table",
         "CBAM and NetVLAD",
-        ("convolutions", "no-cbam", FULL),
-        ("convolutions", "convolutions, NetVLAD", "convolutions, CBAM, NetVLAD"),
+        {"convolutions": "convolutions", "no-cbam": "convolutions, NetVLAD", FULL: "convolutions, CBAM, NetVLAD"},
     ),
     "table5": Experiment(
-        "table", "The segmentation branch", (NO_SEGMENTATION, FULL), ("without", "with"), needs_labels=True
+        "table", "The segmentation branch", {NO_SEGMENTATION: "without", FULL: "with"}, needs_labels=True
     ),
     "table6": Experiment(
         "table",
         "Input of the place head",
-        ("counts", "labels", "counts-and-labels", FULL),
-        ("RB: counts", "RS: labels", "RB+RS: counts and labels", "HS: features"),
+        {
+            "counts": "RB: counts",
+            "labels": "RS: labels",
+            "counts-and-labels": "RB+RS: counts and labels",
+            FULL: "HS: features",
+        },
         needs_labels=True,
     ),
     "table7": Experiment(
         "table",
         "Terms of the loss",
-        (NO_SEGMENTATION, "no-dice", "no-cross-entropy", FULL),
-        ("triplet", "triplet, cross-entropy", "triplet, Dice", "triplet, cross-entropy, Dice"),
+        {
+            NO_SEGMENTATION: "triplet",
+            "no-dice": "triplet, cross-entropy",
+            "no-cross-entropy": "triplet, Dice",
+            FULL: "triplet, cross-entropy, Dice",
+        },
         needs_labels=True,
     ),
     "figure5": Experiment("figure", "Precision and recall", beside_handcrafted=True),
@@ -112,22 +111,27 @@ EXPERIMENTS: dict[str, Experiment] = {
     "figure8": Experiment(
         "figure",
         "Feature heat maps with and without the segmentation branch",
-        (FULL, NO_SEGMENTATION),
+        {FULL: "with", NO_SEGMENTATION: "without"},
         across_sessions=True,
         needs_labels=True,
     ),
     "figure9": Experiment(
         "figure",
         "Number of semantic categories",
-        (NO_SEGMENTATION, *_WITH_FIGURE_9),
-        ("0", "6", "15", "20", "25", "34"),
+        {
+            NO_SEGMENTATION: "0",
+            "categories-6": "6",
+            "categories-15": "15",
+            FULL: "20",
+            "categories-25": "25",
+            "categories-34": "34",
+        },
         needs_labels=True,
     ),
     "normalisation": Experiment(
         "table",
         "Point counts as input (not in the paper)",
-        ("raw-counts", "clipped-counts", FULL),
-        ("n", "min(n, 10) / 10", "log(1 + n)"),
+        {"raw-counts": "n", "clipped-counts": "min(n, 10) / 10", FULL: "log(1 + n)"},
     ),
 }
 
@@ -136,10 +140,11 @@ def variant_config(preset: TrainConfig, variant: str) -> TrainConfig:
     """Return the preset with the changes of a variant."""
     config = preset
     for name, value in VARIANTS[variant].changes.items():
-        config = _with_field(config, name.split("."), value)
+        config = _with_field(config, name, value)
     return without_untrained_head(config)
 
 
-def _with_field(config: Any, path: list[str], value: Any) -> Any:
-    name, *rest = path
+def _with_field(config: Any, path: str, value: Any) -> Any:
+    """Return a configuration with another value of the field at a dotted path."""
+    name, _, rest = path.partition(".")
     return dataclasses.replace(config, **{name: _with_field(getattr(config, name), rest, value) if rest else value})

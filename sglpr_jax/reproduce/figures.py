@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.evaluation_page import semantic_figure
+from sglpr_jax.evaluation.segmentation import draw_map
 from sglpr_jax.files import file_name
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL, NO_SEGMENTATION
-from sglpr_jax.reproduce.tables import Reproduction, scored
-from sglpr_jax.retrieval.image_maps import heat_maps
+from sglpr_jax.reproduce.reproduction import Reproduction
+from sglpr_jax.retrieval.image_maps import heat_maps, semantic_map
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -23,41 +22,43 @@ Figures = Iterator[tuple[str, "matplotlib.figure.Figure"]]
 HEAT_MAPS = ("decoder", "CBAM")
 
 
-def precision_recall(found: Reproduction) -> Figures:
+def precision_recall(reproduction: Reproduction) -> Figures:
     """Figure 5: a plot for each recording with a line for each method."""
-    for seq in found.seqs:
-        results = {label: scored(found.runs, method, seq) for method, label in found.labels("figure5").items()}
-        curves = {label: result.curve for label, result in results.items() if result.curve is not None}
-        if curves:
-            yield seq, figures.precision_recall(curves, title=seq)
+    for seq in reproduction.seqs:
+        labels = reproduction.labels("figure5").items()
+        curves = {label: reproduction.score(method, seq).curve for method, label in labels}
+        lines = {label: curve for label, curve in curves.items() if curve is not None}
+        if lines:
+            yield seq, figures.precision_recall(lines, title=seq)
 
 
-def trajectories(found: Reproduction) -> Figures:
+def trajectories(reproduction: Reproduction) -> Figures:
     """Figure 6: a plot for each recording with the model's decisions along the trajectory."""
-    for seq in found.seqs:
-        positions, decisions = found.runs.recording(seq).positions, scored(found.runs, FULL, seq).decisions
+    for seq in reproduction.seqs:
+        positions, decisions = reproduction.recording(seq).positions, reproduction.score(FULL, seq).decisions
         if decisions is not None and positions is not None:
             yield seq, figures.trajectory(positions, decisions, title=seq)
 
 
-def semantic_maps(found: Reproduction) -> Figures:
+def semantic_maps(reproduction: Reproduction) -> Figures:
     """Figure 7: a scan from the middle of each recording, labelled by the model that was not trained on it."""
-    for seq in found.seqs:
-        recording = found.runs.recording(seq)
+    for seq in reproduction.seqs:
+        recording, params = reproduction.recording(seq), reproduction.params(FULL, seq)
         row = len(recording) // 2
+        semantic, labelled = semantic_map(params, recording.scan(row)), bool(recording.labelled[row])
         title = f"{seq}, scan {recording.ids[row]}"
-        yield seq, semantic_figure(recording, found.runs.params(FULL, seq), row, title=title)
+        yield seq, draw_map(semantic, params.config, labelled=labelled, title=title)
 
 
-def feature_heat_maps(found: Reproduction) -> Figures:
+def feature_heat_maps(reproduction: Reproduction) -> Figures:
     """Figure 8: feature maps of two scans by models without and with the segmentation branch.
 
     The scans are from the middle of the first test recording, without which both models were trained, and from the
     middle of the last session.
     """
-    runs, seq, root, model = found.runs, found.seqs[0], found.sessions(), found.runs.config.model
-    models = {"without": runs.params(NO_SEGMENTATION, seq), "with": runs.params(FULL, seq)}
-    for recording in (runs.recording(seq), open_recording(root, recording_names(root)[-1])):
+    seq, model = reproduction.seqs[0], reproduction.config.model
+    models = {"without": reproduction.params(NO_SEGMENTATION, seq), "with": reproduction.params(FULL, seq)}
+    for recording in (reproduction.recording(seq), reproduction.session_recordings()[-1]):
         row = len(recording) // 2
         image = np.asarray(view(recording.scan(row, labels=False), model.grid, image=model.image).image)
         maps = {
@@ -70,12 +71,12 @@ def feature_heat_maps(found: Reproduction) -> Figures:
         yield recording.name, figures.heat_maps(image, maps, title=title)
 
 
-def categories(found: Reproduction) -> Figures:
+def categories(reproduction: Reproduction) -> Figures:
     """Figure 9: the score of every recording over the number of categories."""
-    variants = EXPERIMENTS["figure9"].names()
+    variants = EXPERIMENTS["figure9"].variants.items()
     curves = {
-        seq: [(int(number), scored(found.runs, variant, seq).score) for variant, number in variants.items()]
-        for seq in found.seqs
+        seq: [(int(number), reproduction.score(variant, seq).score) for variant, number in variants]
+        for seq in reproduction.seqs
     }
     yield "", figures.learning_curves({"top-1 F1max": curves}, xlabel="categories")
 
@@ -89,10 +90,10 @@ FIGURES: Mapping[str, Callable[[Reproduction], Figures]] = {
 }
 
 
-def write_figures(name: str, found: Reproduction, folder: Path) -> list[Path]:
+def write_figures(reproduction: Reproduction, name: str) -> list[Path]:
     """Draw and write the pictures of a figure. Returns their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = {folder / f"{name}{seq and f'-{file_name(seq)}'}.png": figure for seq, figure in FIGURES[name](found)}
-    for path, figure in drawn.items():
-        figures.save(figure, path)
-    return list(drawn)
+    paths = []
+    for seq, figure in list(FIGURES[name](reproduction)):
+        paths.append(reproduction.folder / f"{name}{seq and f'-{file_name(seq)}'}.png")
+        figures.save(figure, paths[-1])
+    return paths

@@ -8,11 +8,12 @@ from typing import NamedTuple
 import jax
 
 from sglpr_jax.data.readers import recording_names
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.registry import method_with_weights
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
-from sglpr_jax.reproduce.runs import Runs, content_of
+from sglpr_jax.reproduce.reproduction import Reproduction, content_of
 from sglpr_jax.revisits import revisits
 from sglpr_jax.training.batches import batches_of, tuple_pool
 from sglpr_jax.training.image_network import ImageNetwork
@@ -21,64 +22,54 @@ from sglpr_jax.training.step import train_step
 TIMED_STEPS = 3
 
 
-def check(
-    runs: Runs,
-    names: Sequence[str],
-    seqs: Sequence[str],
-    methods: Sequence[str],
-    nclt: Path | None = None,
-    *,
-    weights: Sequence[str] = (),
-    trained: bool = True,
-) -> None:
+def check(reproduction: Reproduction, names: Sequence[str], nclt: Path | None = None) -> None:
     """Check recordings, methods, weights and sessions for the chosen tables and figures.
 
     Raises ValueError, FileNotFoundError or ImportError (matplotlib) that names what is unknown or missing.
     """
     if not names:
         raise ValueError(f"expected tables or figures, found none; choose from all, {', '.join(EXPERIMENTS)}")
-    recordings, chosen = recording_names(runs.data), {name: EXPERIMENTS[name] for name in names}
-    if not seqs:
-        found = ", ".join(recordings)
+    data, trained = reproduction.data, reproduction.trained
+    recordings, experiments = recording_names(data), {name: EXPERIMENTS[name] for name in names}
+    if not reproduction.seqs:
         raise ValueError(
-            f"{runs.data}: expected recordings named as in the paper, found {found}; choose yours with --seq"
+            f"{data}: expected recordings named as in the paper, found {', '.join(recordings)}; choose yours with --seq"
         )
-    if any(one.kind == "figure" for one in chosen.values()) and not figures.can_draw():
+    if any(experiment.kind == "figure" for experiment in experiments.values()) and not figures.can_draw():
         raise ImportError("figures need matplotlib: pip install 'sglpr-jax[viz]'")
-    alone = [name for name, one in chosen.items() if not one.beside_handcrafted]
-    if not trained and (alone or not (methods or weights)):
+    alone = [name for name, experiment in experiments.items() if not experiment.beside_handcrafted]
+    if not trained and (alone or not (reproduction.methods or reproduction.weights)):
         what = f"{', '.join(alone)}, which compares trained variants" if alone else "no --weights and no --method"
         raise ValueError(f"with --no-train, expected tables 1 to 3 or figure 5 of other methods, found {what}")
     if trained and len(recordings) < 2:
         raise ValueError(
-            f"{runs.data}: expected two recordings or more, to train and test on, found {', '.join(recordings)}"
+            f"{data}: expected two recordings or more, to train and test on, found {', '.join(recordings)}"
         )
-    for seq in (*seqs, *(recordings if trained else [])):
-        if runs.recording(seq).positions is None:
-            raise ValueError(f"{runs.data}: sequence {seq} has no poses; training and scoring need them")
-    if nclt is not None and any(one.across_sessions for one in chosen.values()):
+    for seq in (*reproduction.seqs, *(recordings if trained else [])):
+        if reproduction.recording(seq).positions is None:
+            raise ValueError(f"{data}: sequence {seq} has no poses; training and scoring need them")
+    if nclt is not None and any(experiment.across_sessions for experiment in experiments.values()):
         sessions = recording_names(nclt)  # the first is the database, the others are queries
         if len(sessions) < 2:
             raise ValueError(f"{nclt}: expected two sessions or more, found {', '.join(sessions)}")
-    for name in weights:
+    for name in reproduction.weights:
         method_with_weights(name)  # raises an error if the weights are missing or damaged
-    for name, one in chosen.items():
-        unlabelled = [seq for seq in recordings if one.needs_labels and not runs.recording(seq).has_labels]
-        if unlabelled:
-            expected = f"expected labels in sequence {unlabelled[0]} of {runs.data}, found none"
-            raise ValueError(f"{name} is about semantics: {expected}")
-    if len(alone) < len(chosen):
-        _check_methods(runs, seqs, methods, weights)
+    for name in (name for name, experiment in experiments.items() if experiment.needs_labels):
+        for seq in recordings:
+            if not reproduction.recording(seq).has_labels:
+                raise ValueError(f"{name} is about semantics: expected labels in sequence {seq} of {data}, found none")
+    if len(alone) < len(experiments):
+        _check_methods(reproduction)
 
 
-def _check_methods(runs: Runs, seqs: Sequence[str], methods: Sequence[str], weights: Sequence[str]) -> None:
-    for name in methods:
+def _check_methods(reproduction: Reproduction) -> None:
+    for name in reproduction.methods:
         if name not in HANDCRAFTED:
             raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
-    for name in (*methods, *weights):
+    for name in (*reproduction.methods, *reproduction.weights):
         needs = content_of(name)
-        for seq in seqs:
-            recording = runs.recording(seq)
+        for seq in reproduction.seqs:
+            recording = reproduction.recording(seq)
             if needs != "images" and recording.has_images:
                 raise ValueError(f"{name} needs points, found images in sequence {seq}; leave it out")
             if needs == "labelled points" and not recording.has_labels:
@@ -109,27 +100,29 @@ class Plan(NamedTuple):
         return "\n".join(lines)
 
 
-def make_plan(runs: Runs, names: Sequence[str], seqs: Sequence[str]) -> Plan:
-    """Return the plan for these experiments and test recordings.
+def make_plan(reproduction: Reproduction, names: Sequence[str]) -> Plan:
+    """Return the plan for these experiments.
 
     Experiments across sessions need only one run of each variant. Raises ValueError if a run has other settings.
     """
-    needed = {
-        (variant, seq): None
-        for name in names
-        for variant in EXPERIMENTS[name].variants
-        for seq in (seqs[:1] if EXPERIMENTS[name].across_sessions else seqs)
-    }
-    missing = tuple(run for run in needed if not runs.is_trained(*run))
-    scored = () if all(EXPERIMENTS[name].across_sessions for name in names) else seqs
-    places = {seq: (runs.recording(seq).positions, runs.recording(seq).times) for seq in scored}
-    straight = [seq for seq, (xyz, times) in places.items() if xyz is not None and not revisits(xyz, times=times).any()]
-    return Plan(tuple(needed), missing, runs.config.steps, tuple(straight))
+    runs, scored = {}, {}
+    for experiment in (EXPERIMENTS[name] for name in names):
+        seqs = reproduction.seqs[:1] if experiment.across_sessions else reproduction.seqs
+        scored |= {} if experiment.across_sessions else dict.fromkeys(seqs)
+        runs |= dict.fromkeys((variant, seq) for variant in experiment.variants for seq in seqs)
+    missing = tuple(run for run in runs if not reproduction.is_trained(*run))
+    straight = [seq for seq in scored if not _has_revisits(reproduction.recording(seq))]
+    return Plan(tuple(runs), missing, reproduction.config.steps, tuple(straight))
 
 
-def time_a_step(runs: Runs, variant: str, seq: str) -> float:
+def _has_revisits(recording: Recording) -> bool:
+    assert recording.positions is not None  # checked by `check`
+    return bool(revisits(recording.positions, times=recording.times).any())
+
+
+def time_a_step(reproduction: Reproduction, variant: str, seq: str) -> float:
     """Measure the duration of a training step in seconds, on the first batches of the run, without compilation."""
-    config, recordings = runs.config_of(variant), runs.recordings_but(seq)
+    config, recordings = reproduction.config_of(variant), reproduction.recordings_but(seq)
     network, batches = ImageNetwork(config), batches_of(recordings, tuple_pool(recordings, config), config)
     state, start = network.new_state(), 0.0
     for step in range(1 + TIMED_STEPS):

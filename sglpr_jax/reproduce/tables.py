@@ -1,24 +1,19 @@
 """Tables 1 to 7 with the reproduced and the published numbers, for the terminal, as JSON and as Markdown."""
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.evaluation.protocols import PROTOCOLS
-from sglpr_jax.evaluation.protocols.protocol import Result
 from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL
 from sglpr_jax.evaluation.published import TABLES
 from sglpr_jax.evaluation.report import PrintsItself, TextTable, score_or_none
 from sglpr_jax.files import write_json, write_text
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1
-from sglpr_jax.reproduce.runs import Runs, content_of
+from sglpr_jax.reproduce.reproduction import Reproduction, content_of
 
 OURS, PUBLISHED = "here", "published"
-NONE, NO_REVISITS = "-", "no revisits"
-"""Text of a cell without a number, and of a missing score of a reproduced row."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +28,12 @@ class Row:
 
     def mean(self, columns: Sequence[str]) -> float | None:
         """Return the mean over the columns, or None if a column is missing: such means are not comparable."""
-        values = [self.scores.get(name) for name in columns]
-        return None if None in values or not values else sum(values) / len(values)  # type: ignore[arg-type]
+        return _mean([self.scores.get(name) for name in columns])
+
+
+def _mean(scores: Sequence[float | None]) -> float | None:
+    known = [score for score in scores if score is not None]
+    return sum(known) / len(known) if known and len(known) == len(scores) else None
 
 
 @dataclass(frozen=True, repr=False)
@@ -47,13 +46,13 @@ class PaperTable(PrintsItself):
     caption: str
 
     def __rich__(self) -> TextTable:
-        head, *rows = self._lines()
-        return TextTable(head, rows, head[2:], self.title, self.caption)
+        header, *rows = self._lines()
+        return TextTable(header, rows, header[2:], self.title, self.caption)
 
     def markdown(self) -> str:
         """Return the table as Markdown."""
-        head, *rows = self._lines()
-        table = "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
+        header, *rows = self._lines()
+        table = "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows))
         return f"**{self.title}**\n\n{table}\n\n{self.caption}\n"
 
     def to_json(self) -> list[dict[str, Any]]:
@@ -71,103 +70,81 @@ class PaperTable(PrintsItself):
 
     def _lines(self) -> list[list[str]]:
         """Return the cells of the header and of each row."""
-        has_change = any(row.change is not None for row in self.rows)
-        lines = [["method", "source", *self.columns, "mean", *(["change"] if has_change else [])]]
+        with_change = any(row.change is not None for row in self.rows)
+        lines = [["method", "source", *self.columns, "mean", *(["change"] if with_change else [])]]
         for row in self.rows:
-            missing = NO_REVISITS if row.source == OURS else NONE
+            missing = "no revisits" if row.source == OURS else "-"
             scores = (_text(row.scores.get(name), missing) for name in self.columns)
-            change = NONE if row.change is None else f"{row.change:+.3f}"
-            cells = [row.label, row.source, *scores, _text(row.mean(self.columns)), change]
-            lines.append(cells[: len(lines[0])])
+            change = [_text(row.change, format="+.3f")] if with_change else []
+            lines.append([row.label, row.source, *scores, _text(row.mean(self.columns)), *change])
         return lines
 
 
-@dataclass(frozen=True)
-class Reproduction:
-    """Finished runs, test recordings and compared methods: the input of tables and figures."""
+def _text(number: float | None, missing: str = "-", *, format: str = ".3f") -> str:
+    return missing if number is None else f"{number:{format}}"
 
-    runs: Runs
-    seqs: tuple[str, ...]
-    """Test recordings."""
-    methods: tuple[str, ...]
-    """Handcrafted methods and weights for comparison."""
-    sessions: Callable[[], Path]
-    """Returns the folder of sessions in NCLT's layout. Called only by experiments that need sessions."""
-    trained: bool = True
-    """Whether there are runs of the variants."""
 
-    def tables(self, name: str) -> dict[str, PaperTable]:
-        """Return the tables with the reproduced numbers and the paper's, one for each protocol, by file name."""
-        if EXPERIMENTS[name].across_sessions:
-            return {name: self._across_sessions(name)}
-        return {
-            name if protocol == TOP1 else f"{name}-{protocol}": self._of_protocol(name, protocol)
-            for protocol in EXPERIMENTS[name].protocols
-        }
+def tables(reproduction: Reproduction, name: str) -> dict[str, PaperTable]:
+    """Return the tables with the reproduced numbers and the paper's, one for each protocol, by file name."""
+    if EXPERIMENTS[name].across_sessions:
+        return {name: _across_sessions(reproduction, name)}
+    return {
+        name if protocol == TOP1 else f"{name}-{protocol}": _by_protocol(reproduction, name, protocol)
+        for protocol in EXPERIMENTS[name].protocols
+    }
 
-    def labels(self, name: str) -> Mapping[str, str]:
-        """Return the label of each variant of a table or figure by its name, and of the methods compared with them."""
-        experiment = EXPERIMENTS[name]
-        variants = experiment.names() if self.trained else {}
-        return variants | ({other: other for other in self.methods} if experiment.beside_handcrafted else {})
 
-    def _of_protocol(self, name: str, protocol: str) -> PaperTable:
-        """Return table 1, 2, 4, 5, 6 or 7 by one protocol, the reproduced rows first.
+def _by_protocol(reproduction: Reproduction, name: str, protocol: str) -> PaperTable:
+    """Return table 1, 2, 4, 5, 6 or 7 by one protocol. With rotated scans, rows have the change of their mean."""
+    experiment, seqs, rows = EXPERIMENTS[name], reproduction.seqs, []
 
-        With rotated scans, rows have the change of their mean.
-        """
-        experiment, rows = EXPERIMENTS[name], []
-        for method, label in self.labels(name).items():
-            row = self._row(method, label, protocol, rotated=experiment.rotated)
-            if experiment.rotated:
-                after = row.mean(self.seqs)
-                before = self._row(method, label, protocol, rotated=False).mean(self.seqs)
-                row = replace(row, change=None if after is None or before is None else after - before)
-            rows.append(row)
-        published = protocol if len(experiment.protocols) > 1 else None
-        poses = dict.fromkeys(self.runs.recording(seq).pose_source for seq in self.seqs)
-        caption = [f"{protocol} ({PROTOCOLS[protocol].rule})", f"poses: {', '.join(map(str, poses))}"]
-        return self._table(name, self.seqs, rows, "leave-one-out", caption, protocol=published)
+    def scores_of(method: str, *, rotated: bool) -> dict[str, float | None]:
+        return {seq: score_or_none(reproduction.score(method, seq, protocol, rotated=rotated).score) for seq in seqs}
 
-    def _row(self, method: str, label: str, protocol: str, *, rotated: bool) -> Row:
-        results = {seq: scored(self.runs, method, seq, protocol=protocol, rotated=rotated) for seq in self.seqs}
-        return Row(label, OURS, {seq: score_or_none(result.score) for seq, result in results.items()})
+    for method, label in reproduction.labels(name).items():
+        scores, change = scores_of(method, rotated=experiment.rotated), None
+        if experiment.rotated:
+            after, before = (_mean(list(one.values())) for one in (scores, scores_of(method, rotated=False)))
+            change = None if after is None or before is None else after - before
+        rows.append(Row(label, OURS, scores, change))
+    poses = dict.fromkeys(str(reproduction.recording(seq).pose_source) for seq in seqs)
+    caption = ("leave-one-out", f"{protocol} ({PROTOCOLS[protocol].rule})", f"poses: {', '.join(poses)}")
+    published = published_rows(name, seqs, protocol=protocol if len(experiment.protocols) > 1 else None)
+    return _table(reproduction, name, seqs, [*rows, *published], *caption)
 
-    def _across_sessions(self, name: str) -> PaperTable:
-        """Return Recall@1 of each later session in the first one.
 
-        The model was trained without the first test recording and has seen none of the sessions. Methods that need
-        labels are omitted if the sessions have no labels.
-        """
-        root, seq = self.sessions(), self.seqs[0]
-        database, *queries = (open_recording(root, session) for session in recording_names(root))
-        ours = []
-        for method, label in self.labels(name).items():
-            if method in self.methods and content_of(method) == "labelled points" and not database.has_labels:
-                continue
-            there = self.runs.descriptors(method, seq, of=database)
-            found = {q.name: BEVPLACE_NCLT_RECALL(there, self.runs.descriptors(method, seq, of=q)) for q in queries}
-            ours.append(Row(label, OURS, {name: score_or_none(result.score) for name, result in found.items()}))
-        columns = [query.name for query in queries]
-        return self._table(name, columns, ours, f"without recording {seq}", ["Recall@1 within 5 m"])
+def _across_sessions(reproduction: Reproduction, name: str) -> PaperTable:
+    """Return Recall@1 of each later session in the first one.
 
-    def _table(
-        self,
-        name: str,
-        columns: Sequence[str],
-        ours: Sequence[Row],
-        split: str,
-        caption: Sequence[str],
-        *,
-        protocol: str | None = None,
-    ) -> PaperTable:
-        """Return the reproduced rows and then the published ones, of one protocol if it is given."""
-        published = published_rows(name, columns, protocol=protocol)
-        steps = f"here: preset {Path(self.runs.preset).stem}, {self.runs.config.steps} steps, {split}"
-        source = ["published: the paper's numbers, on the real dataset"] if published else []
-        caption = [*([steps] if self.trained else []), *caption, *source]
-        title = f"{name}: {EXPERIMENTS[name].title}"
-        return PaperTable(title, [*ours, *published], list(columns), "; ".join(caption))
+    The model was trained without the first test recording and has seen none of the sessions. Methods that need labels
+    are omitted if the sessions have no labels.
+    """
+    (database, *queries), seq, rows = reproduction.session_recordings(), reproduction.seqs[0], []
+    compared = (*reproduction.weights, *reproduction.methods)
+    for method, label in reproduction.labels(name).items():
+        if method in compared and content_of(method) == "labelled points" and not database.has_labels:
+            continue
+        file = reproduction.descriptors(method, seq, of=database)
+        scores = {}
+        for query in queries:
+            result = BEVPLACE_NCLT_RECALL(file, reproduction.descriptors(method, seq, of=query))
+            scores[query.name] = score_or_none(result.score)
+        rows.append(Row(label, OURS, scores))
+    columns = [query.name for query in queries]
+    rows += published_rows(name, columns)
+    return _table(reproduction, name, columns, rows, f"without recording {seq}", "Recall@1 within 5 m")
+
+
+def _table(
+    reproduction: Reproduction, name: str, columns: Sequence[str], rows: Sequence[Row], split: str, *caption: str
+) -> PaperTable:
+    """Return a table with a caption that says how its rows were made. `split` describes the training recordings."""
+    parts = list(caption)
+    if reproduction.trained:
+        parts.insert(0, f"here: preset {Path(reproduction.preset).stem}, {reproduction.config.steps} steps, {split}")
+    if any(row.source == PUBLISHED for row in rows):
+        parts.append("published: the paper's numbers, on the real dataset")
+    return PaperTable(f"{name}: {EXPERIMENTS[name].title}", rows, list(columns), "; ".join(parts))
 
 
 def published_rows(name: str, columns: Sequence[str], *, protocol: str | None = None) -> list[Row]:
@@ -188,21 +165,10 @@ def published_rows(name: str, columns: Sequence[str], *, protocol: str | None = 
     ]
 
 
-@functools.cache
-def scored(runs: Runs, method: str, seq: str, *, protocol: str = TOP1, rotated: bool = False) -> Result:
-    """Return the result of a variant, a handcrafted method or weights, by default by the paper's protocol."""
-    return PROTOCOLS[protocol](runs.descriptors(method, seq, rotated=rotated))
-
-
-def write_tables(name: str, found: Reproduction, folder: Path) -> list[PaperTable]:
+def write_tables(reproduction: Reproduction, name: str) -> list[PaperTable]:
     """Compute the tables of an experiment and write them as JSON and as Markdown. Returns the tables."""
-    tables = found.tables(name)
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, table in tables.items():
+    by_file, folder = tables(reproduction, name), reproduction.folder
+    for file, table in by_file.items():
         write_text(folder / f"{file}.md", table.markdown())
         write_json(folder / f"{file}.json", table.to_json())
-    return list(tables.values())
-
-
-def _text(score: float | None, missing: str = NONE) -> str:
-    return missing if score is None else f"{score:.3f}"
+    return list(by_file.values())

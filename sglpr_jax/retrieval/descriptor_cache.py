@@ -1,4 +1,4 @@
-"""Descriptor files of a method and a corruption, reused only if they were made with the same settings."""
+"""Descriptor files of a method, reused only if they were made with the same settings; hashes of recordings."""
 
 import contextlib
 import dataclasses
@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sglpr_jax.data.corruption import CLEAN, ROTATION, Corruption, corrupted
+from sglpr_jax.data.corruption import CLEAN, ROTATION
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import json_in_short
 from sglpr_jax.methods.method import Method
@@ -25,38 +25,54 @@ def embed_or_reuse(
     path: Path,
     method: Method,
     recording: Recording,
-    corruption: Corruption,
     *,
-    seed: int,
+    rotation_seed: int | None = None,
     batch: int,
     title: str = "",
     progress: Progress = no_progress,
 ) -> DescriptorFile:
-    """Describe the corrupted recording and write the descriptor file. If the file exists, read it instead.
+    """Describe a recording and write the descriptor file. If the file exists, read it instead.
 
     Arguments:
       path: Descriptor file.
       method: Method that describes the scans.
-      recording: Recording without corruption.
-      corruption: Corruption of the scans.
-      seed: Seed of the corruption.
+      recording: The scans.
+      rotation_seed: With a seed, every scan is first rotated about z by its own random angle.
       batch: Number of scans that a model describes at a time.
       title: Title of the progress display.
       progress: Progress display.
 
-    Raises:
-      ValueError: If the existing file was made with other settings, scans or weights.
+    Raises ValueError if the existing file was made with other settings, scans or weights.
     """
-    wanted = _settings(method, recording, corruption, seed)
+    settings = {
+        "seed": rotation_seed,
+        "scans": fingerprint(recording),
+        "poses": recording.pose_source,
+        "corruption": dataclasses.asdict(CLEAN if rotation_seed is None else ROTATION),
+        "weights": method.weights_hash,
+        "method": method.about,
+    }
+    settings = json.loads(json.dumps(settings))  # tuples become lists, as in a file
     if path.exists():
-        return _checked(path, wanted)
-    rotated = corruption == ROTATION
-    source = recording if rotated or corruption == CLEAN else corrupted(recording, corruption, seed=seed)
+        file = DescriptorFile.load(path)
+        _check_settings(path, file.config.get(SETTINGS), settings)
+        return file
     with progress(title, len(recording)) as show:
-        file = embed(method, source, rotation_seed=seed if rotated else None, batch=batch, on_progress=show)
-    file = dataclasses.replace(file, config={**file.config, SETTINGS: wanted})
+        file = embed(method, recording, rotation_seed=rotation_seed, batch=batch, on_progress=show)
+    file = dataclasses.replace(file, config={**file.config, SETTINGS: settings})
     file.save(path)
     return file
+
+
+def _check_settings(path: Path, stored: Any, wanted: dict[str, Any]) -> None:
+    """Raise ValueError if the settings of a descriptor file are others."""
+    stored = stored if isinstance(stored, dict) else {}
+    for name in {**wanted, **stored}:
+        if name not in stored or name not in wanted or stored[name] != wanted[name]:
+            raise ValueError(
+                f"{path}: expected descriptors made with {name} {json_in_short(wanted.get(name))}, found "
+                f"{json_in_short(stored.get(name))}; choose another --out, or delete the file"
+            )
 
 
 def fingerprint(recording: Recording, *, contents: Literal["none", "some", "all"] = "none") -> str:
@@ -66,15 +82,15 @@ def fingerprint(recording: Recording, *, contents: Literal["none", "some", "all"
     by chance, so with `contents="some"` the bytes of the first, the middle and the last scan count, too. With "all" the
     bytes of all files count instead. Copies then have equal hashes.
     """
-    state = _content if contents == "all" else _state
     files = (recording.containers or recording.paths, recording.label_paths)
+    state = _content_hash if contents == "all" else _size_and_time
     scans, labels = ([None if path is None or not path.is_file() else state(path) for path in paths] for paths in files)
     mounting = None if recording.mounting is None else recording.mounting.fields
     digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
-    each = None
+    mountings = None
     if recording.mountings is not None:
-        each = np.array([(one.height_m, *one.up) for one in recording.mountings])
-    for values in (recording.positions, recording.times, each):
+        mountings = np.array([(mounting.height_m, *mounting.up) for mounting in recording.mountings])
+    for values in (recording.positions, recording.times, mountings):
         if values is not None:
             digest.update(values.tobytes())
     if contents == "some" and len(recording):
@@ -83,14 +99,13 @@ def fingerprint(recording: Recording, *, contents: Literal["none", "some", "all"
     return digest.hexdigest()[:16]
 
 
-def _state(path: Path) -> tuple[int, int]:
-    """Size and modification time of a file."""
-    found = path.stat()
-    return found.st_size, found.st_mtime_ns
+def _size_and_time(path: Path) -> tuple[int, int]:
+    """Size and modification time of a file, in bytes and nanoseconds."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
-def _content(path: Path) -> str:
-    """Hash of the bytes of a file."""
+def _content_hash(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -104,28 +119,3 @@ def _scan_bytes(recording: Recording, row: int) -> bytes:
         with contextlib.suppress(ValueError, OSError):
             return recording.points(row).tobytes()
     return b""
-
-
-def _settings(method: Method, recording: Recording, corruption: Corruption, seed: int) -> dict[str, Any]:
-    settings = {
-        "seed": None if corruption == CLEAN else seed,
-        "scans": fingerprint(recording),
-        "poses": recording.pose_source,
-        "corruption": dataclasses.asdict(corruption),
-        "weights": method.weights_hash,
-        "method": method.about,
-    }
-    return json.loads(json.dumps(settings))  # Tuples become lists, as in a file.
-
-
-def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
-    file = DescriptorFile.load(path)
-    stored = file.config.get(SETTINGS)
-    found = stored if isinstance(stored, dict) else {}
-    for name in {**wanted, **found}:
-        if name not in found or name not in wanted or found[name] != wanted[name]:
-            raise ValueError(
-                f"{path}: expected descriptors made with {name} {json_in_short(wanted.get(name))}, found "
-                f"{json_in_short(found.get(name))}; choose another --out, or delete the file"
-            )
-    return file

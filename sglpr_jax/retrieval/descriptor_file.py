@@ -17,13 +17,10 @@ from sglpr_jax.numpy_files import read_arrays
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT = "sglpr-jax descriptors 2"
-"""Format in every file. The number increases if older readers cannot read the new files."""
+FORMAT, FORMAT_1 = "sglpr-jax descriptors 2", "sglpr-jax descriptors 1"
+"""Format in every file, and an older one without a distance, whose descriptors are compared by L2."""
 SKIPPED = "skipped"
 """Key of `config` for the rows of a recording that were skipped."""
-FORMAT_1 = "sglpr-jax descriptors 1"
-"""Older format, without a distance. Its descriptors are compared by L2."""
-
 REQUIRED = ("about", "ids", "descriptors")
 ABOUT = {"sequence": str, "pose_source": str | None, "config": dict, "weights_hash": str, "distance": str}
 """Fields of `about` besides the format, and their types."""
@@ -65,11 +62,10 @@ class DescriptorFile:
         n = len(self.ids)
         if n == 0:
             raise ValueError("expected at least one scan, found none")
-        twice = next((name for name, times in Counter(self.ids).items() if times > 1), None)
-        if twice is not None:
-            raise ValueError(f"expected a unique id for each scan, found {twice!r} {self.ids.count(twice)} times")
-        arrays = {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
-        check_columns(arrays, COLUMNS, n=n)
+        ((most_frequent, count),) = Counter(self.ids).most_common(1)
+        if count > 1:
+            raise ValueError(f"expected a unique id for each scan, found {most_frequent!r} {count} times")
+        check_columns(self._arrays, COLUMNS, n=n)
         if self.descriptors.shape[1] == 0:
             raise ValueError(f"expected descriptors with at least one number, found {self.descriptors.shape}")
         if self.times is not None:
@@ -81,11 +77,16 @@ class DescriptorFile:
         return len(self.ids)
 
     @property
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Arrays of the file by name, without missing ones."""
+        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
+
+    @property
     def scale(self) -> Scale:
         """Factor for all lengths of the scans (`data.scaled`). Raises ValueError if that in `config` is invalid."""
-        found = self.config.get(SCALE, 1)
-        check_value(found, Scale, SCALE)
-        return found
+        scale = self.config.get(SCALE, 1)
+        check_value(scale, Scale, SCALE)
+        return scale
 
     @property
     def recorded(self) -> np.ndarray:
@@ -101,20 +102,18 @@ class DescriptorFile:
 
     def only(self, rows: np.ndarray) -> "DescriptorFile":
         """Return the file with only the scans that the mask `rows` selects."""
-        arrays = {name: getattr(self, name) for name in ("positions", "times", "descriptors")}
-        chosen = {name: None if array is None else array[rows] for name, array in arrays.items()}
         recorded = self.recorded
         recorded[recorded] = rows
         config = {**self.config, SKIPPED: np.flatnonzero(~recorded).tolist()}
-        return replace(self, ids=tuple(np.array(self.ids)[rows].tolist()), config=config, **chosen)
+        arrays = {name: array[rows] for name, array in self._arrays.items()}
+        return replace(self, ids=tuple(np.array(self.ids)[rows].tolist()), config=config, **arrays)
 
     def save(self, path: Path | str) -> None:
         """Write the file atomically. If writing fails, the previous file at `path` stays."""
         about = {"format": FORMAT, **{name: getattr(self, name) for name in ABOUT}}
-        arrays = {"descriptors": self.descriptors, "positions": self.positions, "times": self.times}
-        present = {name: array for name, array in arrays.items() if array is not None}
+        arrays: dict[str, Any] = {"about": np.array(json.dumps(about)), "ids": np.array(self.ids), **self._arrays}
         with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, about=np.array(json.dumps(about)), ids=np.array(self.ids), **present)
+            np.savez(stream, **arrays)
 
     @classmethod
     def load(cls, path: Path | str) -> "DescriptorFile":
@@ -128,10 +127,12 @@ class DescriptorFile:
         arrays = read_arrays(path, expected="a descriptor file (.npz)")
         if not set(REQUIRED) <= set(arrays):
             raise ValueError(f"{path}: expected arrays {', '.join(REQUIRED)}; found {', '.join(arrays) or 'none'}")
-        about = _read_about(path, arrays["about"])
+        about, ids = _read_about(path, arrays["about"]), arrays["ids"]
         with naming(path):
+            if ids.ndim != 1 or ids.dtype.kind != "U":
+                raise ValueError(f"expected ids as an array (n,) of strings, found {ids.dtype} {ids.shape}")
             return cls(
-                ids=_ids(arrays["ids"]),
+                ids=tuple(ids.tolist()),
                 descriptors=arrays["descriptors"],
                 positions=arrays.get("positions"),
                 times=arrays.get("times"),
@@ -146,8 +147,8 @@ def check_made_alike(expected: Mapping[str, Any], found: Mapping[str, Any], *, o
     """
     for name, value in found.items():
         if value is not None and value != expected[name]:
-            wanted, other = (json_in_short(one) or "(none)" for one in (expected[name], value))
-            raise ValueError(f"expected {of} with {name} {wanted}, found {other}: they are not comparable")
+            shown, shown_other = (json_in_short(one) or "(none)" for one in (expected[name], value))
+            raise ValueError(f"expected {of} with {name} {shown}, found {shown_other}: they are not comparable")
 
 
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
@@ -155,18 +156,19 @@ def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
 
     The recordings and the rotations may differ.
     """
-    check_made_alike(_made_by(a), _made_by(b), of=f"descriptors of {b.sequence}, as those of {a.sequence},")
 
+    def made_by(file: DescriptorFile) -> dict[str, Any]:
+        model = [file.config.get(name) for name in ("model", "grid")]
+        return {
+            "numbers": file.descriptors.shape[1],
+            "distance": file.distance,
+            "method": file.config.get("method", ""),
+            "model": json.loads(json.dumps(model)),  # tuples become lists
+            "weights": file.weights_hash,
+            "scale": file.scale,
+        }
 
-def _made_by(file: DescriptorFile) -> dict[str, Any]:
-    return {
-        "numbers": file.descriptors.shape[1],
-        "distance": file.distance,
-        "method": file.config.get("method", ""),
-        "model": json.loads(json.dumps([file.config.get(name) for name in ("model", "grid")])),  # tuples become lists
-        "weights": file.weights_hash,
-        "scale": file.scale,
-    }
+    check_made_alike(made_by(a), made_by(b), of=f"descriptors of {b.sequence}, as those of {a.sequence},")
 
 
 def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
@@ -180,10 +182,3 @@ def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
         check_about(about, ABOUT, format=FORMAT)
         distance_function(about["distance"])
     return about
-
-
-def _ids(names: np.ndarray) -> tuple[str, ...]:
-    """Return the ids of an archive. Raises ValueError if they are not an array (n,) of strings."""
-    if names.ndim != 1 or names.dtype.kind != "U":
-        raise ValueError(f"expected ids as an array (n,) of strings, found {names.dtype} {names.shape}")
-    return tuple(names.tolist())

@@ -69,37 +69,77 @@ def embed(
     def prepare(row: int, scan: Scan) -> Any:
         return method.prepare(scan, None if angles is None else float(angles[row]))
 
-    labels = method.takes in LABELLED
-    options = {"labels": labels, "ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    rows, waiting, found = [], [], []
+    options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD}
+    rows, waiting, descriptors = [], [], []
 
     def describe_waiting() -> None:
-        names = [f"scan {recording.ids[row]} of sequence {recording.name}" for row in rows[-len(waiting) :]]
+        names = [_scan_name(recording, row) for row in rows[-len(waiting) :]]
         inputs = _stacked(method, waiting + [waiting[-1]] * (batch - len(waiting)), names)
-        found.append(method.describe(inputs))
-        found[-2:-1] = [np.asarray(one, np.float32) for one in found[-2:-1]]  # JAX computes the last batch meanwhile
+        descriptors.append(method.describe(inputs))
+        if len(descriptors) > 1:  # JAX is still computing the last batch
+            descriptors[-2] = np.asarray(descriptors[-2], np.float32)
         waiting.clear()
 
-    for row, seen in scan_stream(recording, prepare, **options):
-        if seen is not None:
+    for row, content in scan_stream(recording, prepare, on_bad_scan=on_bad_scan, on_progress=on_progress, **options):
+        if content is not None:
             rows.append(row)
-            waiting.append(seen)
+            waiting.append(content)
             if len(waiting) == batch:
                 describe_waiting()
     if waiting:
         describe_waiting()
-    return _file(method, recording, rows, found, rotation_seed=rotation_seed)
+    return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
+
+
+def _scan_name(recording: Recording, row: int) -> str:
+    return f"scan {recording.ids[row]} of sequence {recording.name}"
 
 
 def _stacked(method: Method, inputs: list[Any], names: list[str]) -> Any:
-    """Stack the inputs of a batch along a new axis. Raises ValueError, with the method and the scan, if their shapes
-    differ."""
-    shapes = [[leaf.shape for leaf in jax.tree.leaves(one)] for one in inputs]
-    for scan, shape in zip(names, shapes, strict=False):
+    """Stack the inputs of a batch along a new axis. Raises ValueError for an input of another shape."""
+    shapes = [[leaf.shape for leaf in jax.tree.leaves(content)] for content in inputs]
+    for name, shape in zip(names, shapes, strict=False):
         if shape != shapes[0]:
-            found, expected = shape[0], shapes[0][0]
-            raise ValueError(f"{method.name}: expected an input {expected} of {scan} as of {names[0]}, found {found}")
-    return jax.tree.map(lambda *each: np.stack(each), *inputs)
+            expected = f"expected an input {shapes[0][0]} of {name} as of {names[0]}"
+            raise ValueError(f"{method.name}: {expected}, found {shape[0]}")
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *inputs)
+
+
+def _file(
+    method: Method, recording: Recording, rows: list[int], descriptors: list[Any], *, rotation_seed: int | None
+) -> DescriptorFile:
+    """Return the descriptor file of some rows. Raises ValueError if there are no rows.
+
+    `descriptors` are batches. The last one may have additional rows at its end.
+    """
+    check_readable(recording, len(rows))
+    sizes = sorted({batch.shape[1] for batch in descriptors})
+    if len(sizes) > 1:
+        raise ValueError(f"{method.name}: expected descriptors of one length, found {sizes}")
+    together = np.concatenate([np.asarray(batch, np.float32) for batch in descriptors])[: len(rows)]
+    if method.weights_hash:
+        check_descriptors(method.name, together, [_scan_name(recording, row) for row in rows])
+    config: dict[str, Any] = {"data": recording.name}
+    if recording.mounting is not None:
+        config["sensor"] = str(recording.mounting)
+    config |= {name: value for name, value in recording.read_options.items() if name in (DESKEWED, SUBMAPS)}
+    if scale_of(recording) != 1:
+        config[SCALE] = scale_of(recording)
+    config |= {**method.about, "rotation_seed": rotation_seed}
+    skipped = sorted(set(range(len(recording))) - set(rows))
+    if skipped:  # needed to add poses of all scans later
+        config[SKIPPED] = skipped
+    return DescriptorFile(
+        sequence=recording.name,
+        ids=tuple(recording.ids[row] for row in rows),
+        positions=None if recording.positions is None else recording.positions[rows],
+        times=None if recording.times is None else recording.times[rows],
+        descriptors=together,
+        pose_source=recording.pose_source,
+        config=config,
+        weights_hash=method.weights_hash,
+        distance=method.distance,
+    )
 
 
 def scan_image(
@@ -119,42 +159,8 @@ def scan_image(
         model looks.
     """
     scan = Scan(points=points, mounting=mounting, name="the scan")
-    seen = checked_view(scan, None, grid=config.grid, image=config.image, field=field_of_view(config)[0])
-    return jnp.asarray(seen.image)
-
-
-def _file(
-    method: Method, recording: Recording, rows: list[int], descriptors: list[Any], *, rotation_seed: int | None
-) -> DescriptorFile:
-    """Return the descriptor file of the given rows. Raises ValueError if there are no rows.
-
-    `descriptors` may contain additional rows at the end, the padding of the last batch.
-    """
-    check_readable(recording, len(rows))
-    sizes = sorted({one.shape[1] for one in descriptors})
-    if len(sizes) > 1:
-        raise ValueError(f"{method.name}: expected descriptors of one length, found {sizes}")
-    together = np.concatenate([np.asarray(one, np.float32) for one in descriptors])[: len(rows)]
-    if method.weights_hash:
-        check_descriptors(
-            method.name, together, [f"scan {recording.ids[row]} of sequence {recording.name}" for row in rows]
-        )
-    sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
-    skipped = sorted(set(range(len(recording))) - set(rows))  # needed to add poses of all scans later
-    made = {name: value for name, value in recording.read_options.items() if name in (DESKEWED, SUBMAPS)}
-    scale = {SCALE: scale_of(recording)} if scale_of(recording) != 1 else {}
-    config = {"data": recording.name, **sensor, **made, **scale, **method.about, "rotation_seed": rotation_seed}
-    return DescriptorFile(
-        sequence=recording.name,
-        ids=tuple(recording.ids[row] for row in rows),
-        positions=None if recording.positions is None else recording.positions[rows],
-        times=None if recording.times is None else recording.times[rows],
-        descriptors=together,
-        pose_source=recording.pose_source,
-        config={**config, SKIPPED: skipped} if skipped else config,
-        weights_hash=method.weights_hash,
-        distance=method.distance,
-    )
+    view = checked_view(scan, None, grid=config.grid, image=config.image, field=field_of_view(config)[0])
+    return jnp.asarray(view.image)
 
 
 def whiten(
@@ -175,10 +181,11 @@ def whiten(
       on_progress: Called with the number of finished scans of a recording.
     """
     params = unwhitened(params)
-    found = np.concatenate([embed(params, each, on_progress=on_progress).descriptors for each in recordings])
-    n, d = found.shape
+    files = [embed(params, recording, on_progress=on_progress) for recording in recordings]
+    descriptors = np.concatenate([file.descriptors for file in files])
+    n, d = descriptors.shape
     if n <= d:
         warn(
             f"expected more than {d} scans for whitening (the length of a descriptor), better ten times that, found {n}"
         )
-    return whitened(params, found, power=power)
+    return whitened(params, descriptors, power=power)

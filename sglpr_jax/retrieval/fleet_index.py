@@ -43,19 +43,13 @@ class FleetIndex:
             self._connection = lancedb.connect(self.place, read_consistency_interval=timedelta(0), **options)
             self.table: Any = None  # until the first `add`
             if TABLE in self._connection.list_tables().tables:
-                self.table = self._opened()
+                try:
+                    self.table = self._connection.open_table(TABLE)
+                except ValueError as error:  # another process creates it: its folder is there before its first version
+                    if "was not found" not in str(error):
+                        raise
         if self.table is not None:
             self._check(self.about)
-
-    def _opened(self) -> Any:
-        """Return the listed table, or None if another process is about to create it: its folder is there before its
-        first version."""
-        try:
-            return self._connection.open_table(TABLE)
-        except ValueError as error:
-            if "was not found" not in str(error):
-                raise
-            return None
 
     def __len__(self) -> int:
         with usable(self.place):
@@ -100,18 +94,19 @@ class FleetIndex:
         """
         if self.table is None:
             raise ValueError(f"{self.place}: expected an index with places, found none")
-        asked = checked_rows(descriptors, self.table.schema.field("descriptor").type.list_size)
-        check_asked(k, queries=len(asked), places=k)
+        queries = checked_rows(descriptors, self.table.schema.field("descriptor").type.list_size)
+        check_asked(k, queries=len(queries), places=k)
         with usable(self.place):
-            search = self.table.search(list(asked) if len(asked) > 1 else asked[0], vector_column_name="descriptor")
+            vectors = list(queries) if len(queries) > 1 else queries[0]
+            search = self.table.search(vectors, vector_column_name="descriptor")
             search = search.distance_type("l2").select([KEY, *columns, "_distance"]).limit(k)
             search = search.where(where, prefilter=True) if where else search
             search = search.bypass_vector_index() if probes is None else search.nprobes(probes).refine_factor(refine)
-            found = search.to_arrow()
-        query = found["query_index"].to_numpy() if len(asked) > 1 else np.zeros(len(found), np.int32)
-        distance = np.sqrt(np.maximum(found["_distance"].to_numpy(), 0))
-        found = found.select([KEY, *columns]).append_column("query", [query]).append_column("distance", [distance])
-        return found.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
+            answers = search.to_arrow()
+        query = answers["query_index"].to_numpy() if len(queries) > 1 else np.zeros(len(answers), np.int32)
+        distance = np.sqrt(np.maximum(answers["_distance"].to_numpy(), 0))
+        answers = answers.select([KEY, *columns]).append_column("query", [query]).append_column("distance", [distance])
+        return answers.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
     def optimize(self, config: Any = None) -> None:
         """Merge small files and index new places. Trains missing indexes first, or one by LanceDB's `config`."""
@@ -120,13 +115,15 @@ class FleetIndex:
         columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}
         with usable(self.place):
             if config is not None or not self.table.list_indices():
-                for name, one in (columns | {"descriptor": config or IvfSq(distance_type="l2")}).items():
-                    self.table.create_index(name, config=one)
+                indexes = columns | {"descriptor": config or IvfSq(distance_type="l2")}
+                for name, index in indexes.items():
+                    self.table.create_index(name, config=index)
             self.table.optimize()
 
-    def _check(self, found: dict[str, Any]) -> None:
+    def _check(self, about: dict[str, Any]) -> None:
         """Raise ValueError if places are not comparable with those of the table, or have other weights than asked."""
-        expected = found if self.table is None else self.about
-        asked = {} if self.weights_hash is None else {"weights_hash": self.weights_hash}
+        expected = dict(about if self.table is None else self.about)
+        if self.weights_hash is not None:
+            expected["weights_hash"] = self.weights_hash
         with naming(self.place):
-            check_made_alike(expected | asked, found, of="places")
+            check_made_alike(expected, about, of="places")

@@ -44,12 +44,12 @@ def semantic_map(params: Params, scan: Scan, *, min_confidence: float = 0.0) -> 
 
     Arguments:
       params: Weights of the model.
-      record: Scan, or ready-made image that is cropped to the model's grid. Cells above 0 are occupied. Labels of the
-        record become the true map.
+      scan: Scan, or ready-made image that is cropped to the model's grid. Cells above 0 are occupied. Labels of the
+        scan become the true map.
       min_confidence: Minimum probability of the most probable class. Cells below it stay unlabelled.
 
     Example:
-      found = semantic_map(params, recording.record(0))
+      found = semantic_map(params, recording.scan(0))
     """
     config = params.config
     categories = 0 if scan.labels is None else config.categories
@@ -77,13 +77,13 @@ def _predict(
 
     The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds more.
     """
-    seen = (counts > 0) & field_of_view(params.config)[0]
+    occupied = (counts > 0) & field_of_view(params.config)[0]
     logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
     as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])
     probability = (as_it_is + mirrored[:, ::-1]) / 2
     predicted = probability.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
     sure = probability.max(-1) >= min_confidence
-    return jnp.where(seen & sure, predicted, UNLABELLED), jnp.where(seen, truth, UNLABELLED)
+    return jnp.where(occupied & sure, predicted, UNLABELLED), jnp.where(occupied, truth, UNLABELLED)
 
 
 def heat_maps(
@@ -101,8 +101,8 @@ def heat_maps(
     Returns:
       Maps by title, with NaN outside the field of view of the model.
     """
-    found = jax.device_get(_strengths(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
-    shown = {title: found[name] - np.nanmin(found[name]) for title, name in params.config.pictures.items()}
+    strengths = jax.device_get(_strengths(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
+    shown = {title: strengths[name] - np.nanmin(strengths[name]) for title, name in params.config.pictures.items()}
     return {title: values / max(np.nanmax(values), 1e-9) for title, values in shown.items()}
 
 

@@ -6,6 +6,7 @@ A query takes time in proportion to the number of places; adding a place does no
 
 import dataclasses
 import hashlib
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -99,7 +100,7 @@ class Index:
         """Create an index from the places of a descriptor file."""
         about = {"weights_hash": file.weights_hash, "distance": file.distance, "scale": file.scale}
         index = cls.empty(file.descriptors.shape[1], **about)
-        index.add_file(file)
+        index.add(file.descriptors, ids=file.ids, times=file.times, positions=file.positions)
         return index
 
     def __len__(self) -> int:
@@ -175,13 +176,7 @@ class Index:
         self._last = None
         for column in (self._lengths, *self._columns.values()):
             column.keep(flags)
-        self.ids = [name for name, kept in zip(self.ids, flags, strict=True) if kept]
-
-    def add_file(self, file: DescriptorFile) -> None:
-        """Add the places of a descriptor file. Raises ValueError if another model, method or scale made it."""
-        self.check(scale=file.scale, distance=file.distance)
-        about = {"times": file.times, "positions": file.positions, "weights_hash": file.weights_hash}
-        self.add(file.descriptors, ids=file.ids, **about)
+        self.ids = list(itertools.compress(self.ids, flags))
 
     def query(
         self,
@@ -202,20 +197,23 @@ class Index:
         Returns:
           Rows and distances, nearest first. Equal distances keep the order of the places. Missing rows are -1.
 
-        Raises:
-          ValueError: If descriptors have another width or weights, or if too much is asked for (`check_asked`).
+        Raises ValueError if descriptors have another width or weights, or if too much is asked for (`check_asked`).
         """
         self.check(weights=weights_hash)
         queries = checked_rows(descriptors, self.width)
         check_asked(k, queries=len(queries), places=len(self))
-        allowed = ~self._excluded(exclude)
+        excluded = np.zeros(len(self), bool) if exclude is None else np.asarray(exclude)
+        if excluded.dtype != bool and excluded.size:
+            raise ValueError(f"expected flags (True or False) of places to exclude, found {excluded.dtype}")
+        if excluded.shape != (len(self),):
+            raise ValueError(f"expected one flag for each of {len(self)} places to exclude, found {excluded.shape}")
+        allowed = ~excluded.astype(bool)
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
-        there = min(k, int(allowed.sum()))
-        if there:
-            for start in range(0, len(queries), BLOCK):
-                block = slice(start, start + BLOCK)
-                rows[block, :there], distances[block, :there] = self._nearest(queries[block], allowed, there)
+        count = min(k, int(allowed.sum()))
+        for start in range(0, len(queries), BLOCK) if count else ():
+            block = slice(start, start + BLOCK)
+            rows[block, :count], distances[block, :count] = self._nearest(queries[block], allowed, count)
         shape = (*np.shape(descriptors)[:-1], k)
         return Found(rows.reshape(shape), distances.reshape(shape))
 
@@ -260,9 +258,7 @@ class Index:
         path = Path(path)
         about, arrays = _read(path)
         columns = {name: GrowingArray(arrays.pop(name)) for name in COLUMNS if name in arrays}
-        index = cls(
-            about["width"], about["weights_hash"], about["distance"], about["ids"], columns, scale=about["scale"]
-        )
+        index = cls(**{name: about[name] for name in ABOUT}, _columns=columns)
         with naming(path):
             index.check(weights=weights_hash)
         return index, arrays
@@ -271,35 +267,26 @@ class Index:
         """Raise ValueError if descriptors have other `weights` (hash), `scale` or `distance`. None skips a check."""
         check_made_alike({"weights": self.weights_hash, "scale": self.scale, "distance": self.distance}, found)
 
-    def _excluded(self, flags: ArrayLike | None) -> Bool[np.ndarray, " n"]:
-        """Convert the flags of excluded places to an array. Raises ValueError unless they are a boolean a place."""
-        excluded = np.zeros(len(self), bool) if flags is None else np.asarray(flags)
-        if excluded.dtype != bool and excluded.size:
-            raise ValueError(f"expected flags (True or False) of places to exclude, found {excluded.dtype}")
-        if excluded.shape != (len(self),):
-            raise ValueError(f"expected one flag for each of {len(self)} places to exclude, found {excluded.shape}")
-        return excluded.astype(bool)
-
     def _nearest(
         self, queries: Float[np.ndarray, "q d"], allowed: Bool[np.ndarray, " n"], k: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed."""
         rows = np.flatnonzero(allowed)
         if self.distance != "l2":
-            every = distance_function(self.distance)(queries, self.descriptors[rows])
-            order = smallest(every, k)
-            return rows[order], np.take_along_axis(every, order, axis=1)
-        few = min(k + SPARE, len(rows))
+            distances = distance_function(self.distance)(queries, self.descriptors[rows])
+            order = smallest(distances, k)
+            return rows[order], np.take_along_axis(distances, order, axis=1)
+        count = min(k + SPARE, len(rows))
         if len(rows) * FEW <= len(self):
             rough = self._squares()[rows] - 2 * queries @ self.descriptors[rows].T
-            near = rows[np.argpartition(rough, few - 1, axis=1)[:, :few]]
+            near = rows[np.argpartition(rough, count - 1, axis=1)[:, :count]]
         else:
-            near = np.argpartition(np.where(allowed, self._rough(queries), np.inf), few - 1, axis=1)[:, :few]
+            near = np.argpartition(np.where(allowed, self._rough(queries), np.inf), count - 1, axis=1)[:, :count]
         near = np.sort(near, axis=1)  # equal distances keep the order of the rows
         pairs = zip(queries.astype(np.float64), near, strict=True)
-        apart = np.stack([np.linalg.norm(query - self.descriptors[row], axis=1) for query, row in pairs])
-        order = np.argsort(apart, axis=1, kind="stable")[:, :k]
-        return np.take_along_axis(near, order, axis=1), np.take_along_axis(apart, order, axis=1)
+        distances = np.stack([np.linalg.norm(query - self.descriptors[row], axis=1) for query, row in pairs])
+        order = np.argsort(distances, axis=1, kind="stable")[:, :k]
+        return np.take_along_axis(near, order, axis=1), np.take_along_axis(distances, order, axis=1)
 
     def _rough(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
         """Return the squared distances in float32, without the squared lengths of the queries.
@@ -310,9 +297,9 @@ class Index:
         last = self._last  # read once, because another thread may replace it
         if last is not None and last[0] == key:
             return last[1]
-        found = self._squares() - 2 * queries @ self.descriptors.T
-        self._last = None if key is None else (key, found)
-        return found
+        distances = self._squares() - 2 * queries @ self.descriptors.T
+        self._last = None if key is None else (key, distances)
+        return distances
 
     def _squares(self) -> Float[np.ndarray, " n"]:
         """Return the squared lengths of all descriptors, after computing those of new places."""

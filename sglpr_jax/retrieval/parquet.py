@@ -69,8 +69,7 @@ def place_rows(
       source: Address of the recording, for programs that read its scans again.
       rotations: Rotation of the LiDAR at each scan of the file, in the frame of the positions. None if unknown.
 
-    Raises:
-      ValueError: If another distance compares the descriptors.
+    Raises ValueError if another distance compares the descriptors.
     """
     import pyarrow
 
@@ -97,19 +96,17 @@ def place_rows(
     return pyarrow.table(columns, schema=schema(about))
 
 
-def about_of(found: "pyarrow.Schema", source: str) -> dict[str, Any]:
+def about_of(stored: "pyarrow.Schema", source: str) -> dict[str, Any]:
     """Return how the places of a table were made. Raises ValueError, naming `source`, if its columns are others."""
-    about = parse_json((found.metadata or {}).get(b"about", b"null"), source=f"{source}, `about`")
+    about = parse_json((stored.metadata or {}).get(b"about", b"null"), source=f"{source}, `about`")
     with naming(source):
         check_about(about, ABOUT, format=FORMAT)
         about = {name: about[name] for name in ABOUT}
-        columns = {field.name: str(field.type) for field in found}
+        kinds = {field.name: str(field.type) for field in stored}
         for field in schema(about):
-            kind = columns.get(field.name, "none").replace("item:", "element:")
-            if kind != str(field.type).replace("item:", "element:"):
-                raise ValueError(
-                    f"expected a column {field.name} of {field.type}, found {columns.get(field.name, 'none')}"
-                )
+            kind = kinds.get(field.name, "none")
+            if kind.replace("item:", "element:") != str(field.type).replace("item:", "element:"):
+                raise ValueError(f"expected a column {field.name} of {field.type}, found {kind}")
     return about
 
 
@@ -119,11 +116,11 @@ def usable(address: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        more = "pip install 'sglpr-jax[fleet]', and s3fs for s3://, gcsfs for gs://"
-        raise ImportError(f"{address}: expected the extra `fleet` ({more}), found: {in_short(error)}") from error
+        command = "pip install 'sglpr-jax[fleet]', and s3fs for s3://, gcsfs for gs://"
+        raise ImportError(f"{address}: expected the extra `fleet` ({command}), found: {in_short(error)}") from error
     except Exception as error:
-        found = in_short(error, most=200)
-        raise ValueError(f"{address}: expected a store that can be read and written, found: {found}") from error
+        reason = in_short(error, most=200)
+        raise ValueError(f"{address}: expected a store that can be read and written, found: {reason}") from error
 
 
 class Stored(NamedTuple):
@@ -150,18 +147,16 @@ def embed_to_store(
       source: Address of the recording.
       options: Options of `embed`.
 
-    Raises:
-      ValueError: If another distance compares the descriptors, or the store cannot be read or written.
+    Raises ValueError if another distance compares the descriptors, or the store cannot be read or written.
 
     Example:
       embed_to_store("s3://bucket/places", sglpr_jax.load("sglpr"), recording, site="berlin")
     """
     method = network(method) if isinstance(method, Params) else method
-    made = [method.weights_hash, method.about, options.get("rotation_seed"), scale_of(recording)]
-    hashed = hashlib.sha256(json.dumps(made).encode()).hexdigest()[:12]
+    settings = [method.weights_hash, method.about, options.get("rotation_seed"), scale_of(recording)]
+    settings_hash = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:12]
     name = file_name(f"{recording.name}-{fingerprint(recording, contents='all')}")
-    folder = f"{store.rstrip('/')}/{file_name(method.about['method'])}-{hashed}"
-    address = f"{folder}/{name}.parquet"
+    address = f"{store.rstrip('/')}/{file_name(method.about['method'])}-{settings_hash}/{name}.parquet"
     with usable(address):
         filesystem, path = _open(address)
         if filesystem.exists(path):
@@ -169,7 +164,17 @@ def embed_to_store(
     file, poses = embed(method, recording, **options), recording.world_from_lidar
     rotations = None if poses is None else poses[file.recorded][:, :3, :3]
     rows = place_rows(file, name, site=site, source=source, rotations=rotations)
-    _put(address, rows)
+    content = io.BytesIO()
+    with usable(address):
+        import pyarrow.parquet
+        from fsspec.implementations.local import LocalFileSystem
+
+        pyarrow.parquet.write_table(rows, content)
+        if isinstance(filesystem, LocalFileSystem):
+            with replacing(Path(path)) as temporary:
+                temporary.write_bytes(content.getbuffer())
+        else:  # an object appears when it is complete
+            filesystem.pipe_file(path, content.getvalue())
     return Stored(address, len(rows))
 
 
@@ -177,8 +182,8 @@ def stored_places(store: str) -> list[str]:
     """Return the addresses of all Parquet files of a store. Raises ValueError if it cannot be read."""
     with usable(store):
         filesystem, path = _open(store)
-        names = [found for found in sorted(filesystem.find(path)) if not found.rpartition("/")[2].startswith(".")]
-        return [filesystem.unstrip_protocol(name) for name in names if name.endswith(".parquet")]
+        paths = [path for path in sorted(filesystem.find(path)) if path.endswith(".parquet")]
+        return [filesystem.unstrip_protocol(path) for path in paths if not path.rpartition("/")[2].startswith(".")]
 
 
 def read_places(address: str) -> "pyarrow.Table":
@@ -190,22 +195,6 @@ def read_places(address: str) -> "pyarrow.Table":
         rows = pyarrow.parquet.read_table(io.BytesIO(filesystem.cat_file(path)))
     about_of(rows.schema, address)
     return rows
-
-
-def _put(address: str, rows: "pyarrow.Table") -> None:
-    """Write a Parquet file. In object storage, an object appears when it is complete."""
-    content = io.BytesIO()
-    with usable(address):
-        import pyarrow.parquet
-        from fsspec.implementations.local import LocalFileSystem
-
-        pyarrow.parquet.write_table(rows, content)
-        filesystem, path = _open(address)
-        if isinstance(filesystem, LocalFileSystem):
-            with replacing(Path(path)) as temporary:
-                temporary.write_bytes(content.getbuffer())
-        else:
-            filesystem.pipe_file(path, content.getvalue())
 
 
 def _open(address: str) -> tuple[Any, str]:

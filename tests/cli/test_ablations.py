@@ -9,7 +9,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.cli.train import TrainCommand
-from sglpr_jax.evaluation import final_test
+from sglpr_jax.evaluation import final_test, learning_curves
 from sglpr_jax.training import recipe
 from sglpr_jax.training.config import without_untrained_head
 from sglpr_jax.training.metrics_log import read_metrics
@@ -29,7 +29,7 @@ def run(town, preset, tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(final_test, "final_test", lambda *_, **__: None)
             patch.setattr(recipe, "training_recall", lambda *_: lambda _: {"score": 0.0})
-            patch.setattr(final_test.LearningCurves, "on_end", lambda *_: None)
+            patch.setattr(learning_curves.LearningCurves, "on_end", lambda *_: None)
             options = ("--data", town, "--preset", preset, "--out", tmp_path / "run", "--steps", 2, *flags.split())
             ended = run_command("train", "--seq", "08", *options)
         assert ended.status == 0, ended.error

@@ -1,20 +1,16 @@
-import errno
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 import sglpr_jax
-from sglpr_jax.cli.relocalize import _table
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.maps import build
 from sglpr_jax.maps.build import map_recording
-from sglpr_jax.maps.place_map import PlaceMap, Relocalization
+from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.retrieval.index import Index
@@ -140,27 +136,6 @@ def places_file(tmp_path):
     return tmp_path / "one.safetensors"
 
 
-@pytest.mark.slow
-def test_a_full_disk_leaves_the_map_as_it_was_and_what_was_seen(command, run, places_file, tmp_path, monkeypatch):
-    before, write = places_file.read_bytes(), Path.write_bytes
-
-    def full(path, content):
-        if path.name.startswith(".one.safetensors."):
-            write(path, content[:100])
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return write(path, content)
-
-    run = (*run, "--out", places_file, "--add-to", places_file)
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", full)
-        ended = command(*run)
-    assert_one_line_error(ended, "one.safetensors: cannot be written: No space left on device")
-    assert places_file.read_bytes() == before
-    assert {path.name for path in tmp_path.iterdir()} == {"08", "one.safetensors", "one.unfinished", "poses.tum"}
-    assert command(*run).status == 0
-    assert len(PlaceMap.load(places_file)) > 1 and not (tmp_path / "one.unfinished").exists()
-
-
 def test_wrong_queries_and_maps_are_one_clear_error(command, scans, places_file, tmp_path):
     def ask(scan):
         return command("relocalize", scan, "--map", places_file, "--out", tmp_path / "pose.json")
@@ -174,20 +149,6 @@ def test_wrong_queries_and_maps_are_one_clear_error(command, scans, places_file,
     places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
     assert_one_line_error(ask(tmp_path / "dot.bin"), "expected an index with a valid checksum, found a damaged one")
     assert not (tmp_path / "pose.json").exists()
-
-
-def test_brackets_in_a_name_are_no_style_and_answers_that_share_the_probability_say_so(capsys):
-    far = np.eye(4)
-    far[0, 3] = 55.0
-    answers = [
-        Relocalization(f"[red]08/{i:06d}", pose, LoopClosure(2, i, pose, np.eye(6), 0.5))
-        for i, pose in enumerate((np.eye(4), far))
-    ]
-    for few, words in ((answers, True), (answers[:1], False)):
-        Console(width=140).print(_table("[bold]scan.bin", few))
-        shown = capsys.readouterr().out
-        assert "[red]08/000000" in shown and "[bold]scan.bin in the map" in shown
-        assert ("Answers more than 20 m apart share the probability" in shown) == words
 
 
 def test_a_frame_of_a_recording_is_asked_in_the_map(command, town, places_file, monkeypatch):

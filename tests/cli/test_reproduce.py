@@ -8,7 +8,7 @@ from sglpr_jax.methods.learned.disco import DISCO
 from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
 from sglpr_jax.reproduce.plan import make_plan
-from sglpr_jax.reproduce.runs import Runs
+from sglpr_jax.reproduce.reproduction import Reproduction
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.training.metrics_log import read_metrics
@@ -104,7 +104,7 @@ def test_a_mean_needs_every_column():
 
 def test_the_plan_tells_the_recordings_that_never_come_back(town, images, preset, tmp_path):
     def plan(data, names, *seqs):
-        return make_plan(Runs(tmp_path, data, str(preset), load_preset(str(preset))), names, seqs)
+        return make_plan(Reproduction(tmp_path, data, str(preset), load_preset(str(preset)), seqs), names)
 
     straight = plan(images, ["table1"], "00", "06")
     assert straight.without_revisits == ("00", "06")

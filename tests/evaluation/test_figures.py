@@ -6,7 +6,7 @@ from PIL import Image
 from scenes import place, relative, seen_from
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.protocols.protocol import Decision
+from sglpr_jax.evaluation.protocols.result import Decision
 from sglpr_jax.labels import CATEGORIES, taxonomy
 from sglpr_jax.metrics import PrecisionRecallCurve
 from sglpr_jax.se3 import transform

@@ -8,7 +8,7 @@ import pytest
 from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs import check_agreement, read_input, read_methods
 from sglpr_jax.evaluation.protocols import check_names, chosen_protocols, protocols_taking
-from sglpr_jax.evaluation.protocols.source import ScoredPairs, TopK
+from sglpr_jax.evaluation.protocols.protocol import ScoredPairs, TopK, kind_of
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.evaluation.scoring import evaluate_methods
 
@@ -41,16 +41,6 @@ def test_a_matrix_is_scored_as_the_file_it_would_make(read, make_file, two_laps)
     times = np.arange(800) * 0.5
     assert TOP1_F1MAX(found).score == TOP1_F1MAX(make_file(two_laps, rows, times=times)).score
     assert read("mine.npy", rows, distance="cosine").distance == "cosine"
-
-
-def test_own_files_keep_what_nothing_replaces(tmp_path, make_file, two_laps, poses):
-    file = dataclasses.replace(make_file(two_laps + 1, two_laps), distance="cosine")
-    file.save(tmp_path / "own.npz")
-    same = read_input(tmp_path / "own.npz", None, sequence="x")
-    assert (same.sequence, same.distance, same.pose_source) == ("town", "cosine", "made up")
-    other = read_input(tmp_path / "own.npz", poses, sequence="x")
-    assert (other.distance, other.pose_source) == ("cosine", "laps.csv (csv)")
-    np.testing.assert_array_equal(other.positions, poses.positions)
 
 
 def test_poses_of_other_times_are_interpolated_at_those_of_an_own_file(tmp_path, make_file, two_laps):
@@ -125,12 +115,8 @@ def test_top_k_lists_and_scored_pairs(read):
 @pytest.mark.parametrize(
     ("name", "content", "error"),
     [
-        ("few.npy", np.ones((700, 4)), "expected 800 descriptors, one for each pose of laps.csv .csv., found 700"),
         ("pickle.npy", np.full((800, 2), None), "found no valid .npy file .*allow_pickle=False"),
         ("pairs.txt", "5 0 .5\n5 800 .5\n", r"line 2: expected frames from 0 to 799 \(laps.csv .csv.\), found 800"),
-        ("pairs.txt", "5 0 nan\n", "line 1: expected a finite score, found 'nan'"),
-        ("pairs.txt", "5 0 .5 1\n6 0 .5\n", "line 2: expected 4 numbers `i j score .label.`, found '6 0 .5'"),
-        ("list.txt", "5: 0\n6 3\n", "line 2: expected `query: frame frame ...`, found '6 3'"),
         ("list.txt", "5: 0=.5 3\n", "expected a score for every retrieved frame or for none, found 1 without"),
     ],
 )
@@ -140,21 +126,11 @@ def test_bad_input_is_one_error_that_names_the_file(read, monkeypatch, name, con
         read(name, content)
 
 
-def test_a_distance_is_for_descriptors_and_positions_are_needed(read, tmp_path):
-    for name in ("list.txt", "own.npz"):
-        with pytest.raises(ValueError, match=rf"{name}: expected a \.npy beside --distance"):
-            read(name, "5: 0\n", distance="l2")
-    with pytest.raises(ValueError, match=r"b.txt: expected positions to score against \(--poses, .*found none"):
-        read("b.txt", "1: 0\n", trajectory=None)
-    with pytest.raises(FileNotFoundError, match=r"no\.npy: expected .*found none"):
-        read_input(tmp_path / "no.npy", None, sequence="x")
-
-
 def test_protocols_fit_the_input(read):
-    matrix, pairs = read("a.npy", np.ones((800, 2))), read("p.txt", "5 0 .5\n")
-    bare = read("b.txt", "5: 0\n")
+    inputs = read("a.npy", np.ones((800, 2))), read("p.txt", "5 0 .5\n"), read("b.txt", "5: 0\n")
+    matrix, pairs, bare = map(kind_of, inputs)
     assert chosen_protocols(matrix, ()) == ["top1-f1max", "pairs-f1max", "bevplace-recall-at-1"]
-    assert chosen_protocols(matrix, ["all"]) == list(protocols_taking("descriptors"))
+    assert chosen_protocols(matrix, ["all"]) == list(protocols_taking(matrix))
     assert chosen_protocols(bare, ()) == ["bevplace-recall-at-1"]
     assert chosen_protocols(pairs, ()) == chosen_protocols(pairs, ["all"]) == ["listed-pairs-f1max"]
     assert chosen_protocols(matrix, ["ssc-recall", "ssc-recall"]) == ["ssc-recall"]
@@ -169,10 +145,6 @@ def test_protocols_fit_the_input(read):
     ("change", "message"),
     [
         ({"ids": ("000000", "000001", "000005")}, "3 with '000002', found 3 with '000005'"),
-        (
-            {"positions": np.zeros((3, 3))},
-            r"positions of the first file, \[6.0, 7.0, 8.0\] in row 2, found \[0.0, 0.0, 0.0\]",
-        ),
         ({"times": np.array([0.0, 1.0, 2.5])}, "times of the first file, 2.0 in row 2, found 2.5"),
     ],
 )

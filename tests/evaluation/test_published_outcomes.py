@@ -5,8 +5,8 @@ import pytest
 from recordings import kitti_trajectory
 
 from sglpr_jax.evaluation.protocols.pairs import frame_pairs, is_revisit
+from sglpr_jax.evaluation.protocols.protocol import TopK
 from sglpr_jax.evaluation.protocols.recall import SSC_RECALL
-from sglpr_jax.evaluation.protocols.source import TopK
 from sglpr_jax.evaluation.protocols.top1 import CONTOUR_CONTEXT_F1MAX, TOP1_F1MAX
 
 

@@ -5,8 +5,7 @@ import pytest
 from rich.console import Console
 
 from sglpr_jax.evaluation import report
-from sglpr_jax.evaluation.protocols import protocols_taking
-from sglpr_jax.evaluation.scoring import score
+from sglpr_jax.evaluation.protocols import protocols_taking, score
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL, POINTNETVLAD_RECALL
-from sglpr_jax.evaluation.published import TABLE_3
-from sglpr_jax.evaluation.sessions import evaluate_sessions, published_rows
+from sglpr_jax.evaluation.published import TABLE_3, table_3_rows
+from sglpr_jax.evaluation.sessions import evaluate_sessions
 
 MAP, NCLT = "2012-01-15", TABLE_3.columns
 
@@ -64,7 +64,7 @@ def test_published_rows_are_table_3s_in_the_same_columns(session, evaluate):
     whole = evaluate(session(MAP), queries, ["bevplace-nclt-recall"], published=True)
     assert [row[0] for row in whole.published] == [f"published: {row.method}" for row in TABLE_3.rows]
     assert whole.published[-1][1:] == ("0.947", "0.936", "0.931", "0.916", "0.914", "0.913", "0.926")
-    part = published_rows(MAP, [NCLT[5], "2013-04-05", NCLT[0]])
+    part = table_3_rows(MAP, [NCLT[5], "2013-04-05", NCLT[0]])
     assert part[-1] == ("published: SG-LPR", "0.913", "", "0.947", "0.930")
 
 

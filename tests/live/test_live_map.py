@@ -12,7 +12,7 @@ from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.live.live_map import FRAMES, LOOPS, OLD, SETTINGS, LiveMap
-from sglpr_jax.live.results import CorrectedTrajectory, write_results
+from sglpr_jax.live.results import write_results
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
@@ -104,24 +104,22 @@ def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(
     for number, scan in itertools.islice(FrameLog(whole[0] / FRAMES).records(), HALF):
         log.append(number, scan)
     log.close()
-    live = opened(params, tmp_path, said)
-    assert live.recall() == [] and len(live) == HALF
+    live = opened(params, tmp_path, said, expects_odometry=True)
+    assert live.map_from_world is None and live.recall() == [] and len(live) == HALF
     edges, again = [], inverse(poses[HALF]) @ poses[HALF:]
-    corrected = CorrectedTrajectory(live)
-    assert corrected.map_from_world is None
     for i, pose in enumerate(again, HALF):
         edges += live.add(live_frame(drive, i, pose=pose, received=float(drive.times[i]) + 1e9))
-        corrected.update()
     assert ("restart", "the odometry is taken as unknown, and begins in a frame of its own after the restart") in said
     across = [edge for edge in edges if edge.match < HALF]
     assert len(across) > 3
     for edge in across:
         assert np.linalg.norm(drive.positions[edge.query] - drive.positions[edge.match]) < 12
         assert edge.world_from_match is None and np.array_equal(edge.world_from_query, again[edge.query - HALF])
-    apart = np.linalg.norm(corrected.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
+    corrected = live.trajectory.poses
+    apart = np.linalg.norm(corrected[:, :3, 3] - poses[:, :3, 3], axis=1)
     assert apart[:HALF].max() < 1 and apart[HALF:].max() < 5
-    np.testing.assert_allclose(corrected.map_from_world @ again[-1], corrected.poses[-1], atol=1e-9)
-    paths = {path.name for path in write_results(live, tmp_path, corrected=corrected)}
+    np.testing.assert_allclose(live.map_from_world @ again[-1], corrected[-1], atol=1e-9)
+    paths = {path.name for path in write_results(live, tmp_path)}
     tables = {"loops.g2o", "loops.csv", "rejected.jsonl"}
     assert paths == {*tables, "trajectory.tum", "trajectory-optimized.tum"}
     assert len(read_tum(tmp_path / "trajectory-optimized.tum")[0]) == len(live)

@@ -8,7 +8,7 @@ import pytest
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.live.endpoints import open_sink
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.live.messages import AGAIN_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Reports
+from sglpr_jax.live.messages import AGAIN_S, FrameStatus, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.node import Node
 from sglpr_jax.live.options import LiveOptions
 
@@ -25,7 +25,7 @@ class FakeMap(LiveMap):
             stored = (1, 2, 3)
 
     def __init__(self):
-        self.added = []
+        self.added, self.trajectory = [], None
 
     def __len__(self) -> int:
         return len(self.added)
@@ -91,14 +91,6 @@ def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said):
         "Kept is left out: connection lost",
     ]
     assert str(node).endswith("4 dropped, 2 left out, 1 loops; the map has 3 scans, 5 MB")
-
-
-def test_a_newer_item_replaces_one_that_waits():
-    latest = LatestScan()
-    assert latest.take(0.0) is None
-    for item in range(3):
-        latest.put(item)
-    assert latest.take(0.0) == 2 and latest.dropped == 2 and latest.take(0.0) is None
 
 
 def test_equal_kinds_share_a_line():

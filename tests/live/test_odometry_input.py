@@ -38,7 +38,7 @@ def test_a_clock_continues_after_a_restart(said):
 
 def placed(continuity: Continuity, given) -> list[bool | None]:
     """Whether each scan continues; None: left out."""
-    found = [continuity.placed(pose, time) for time, pose in given]
+    found = [continuity.add(pose, time) for time, pose in given]
     return [None if one is None else one.continues for one in found]
 
 
@@ -66,7 +66,7 @@ def test_the_first_scans_wait_for_odometry(said):
     assert placed(continuity, [(5.0, None), (6.0, at(0))]) == [None, True]
     late = Continuity(said, expected=True)
     assert placed(late, [(5.0, None), (5.0 + WAIT_S, None), (16.0, at(0))]) == [None, True, True]
-    assert late.placed(at(0), 17.0).pose is None
+    assert late.add(at(0), 17.0).pose is None
     assert said.kinds == ["wait", "wait", "wait over", "odometry", "odometry"]
 
 
@@ -83,13 +83,13 @@ def test_the_first_scans_wait_for_odometry(said):
 def test_after_a_restart_the_way_is_known_only_if_the_odometry_continues(said, last, pose, seconds, continues):
     continuity = Continuity(said, expected=False)
     continuity.resume(last, 100.0)
-    first = continuity.placed(pose, 100.0 + seconds)
+    first = continuity.add(pose, 100.0 + seconds)
     assert first.continues == continues and said.kinds == ["restart"]
-    assert continuity.placed(pose, 100.1 + seconds).continues
+    assert continuity.add(pose, 100.1 + seconds).continues
 
 
 def test_the_mounting_is_that_of_the_first_scans(drive):
     first = FirstScans()
-    found = [first.see(drive.points(i)) for i in range(SCANS + 1)]
+    found = [first.add(drive.points(i)) for i in range(SCANS + 1)]
     assert found[-1] == found[-2] and abs(found[-1].height_m - 1.73) < 0.15
-    assert FirstScans(2.5).see(drive.points(0)).height_m == 2.5
+    assert FirstScans(2.5).add(drive.points(0)).height_m == 2.5

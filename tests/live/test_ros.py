@@ -39,8 +39,9 @@ def transport() -> Memory:
 
 
 @pytest.fixture
-def source(transport, said) -> RosSource:
-    return RosSource(transport, LiveOptions(topic="points", odometry_topic="/odom"), said, missing_s=0.0)
+def source(transport, said, monkeypatch) -> RosSource:
+    monkeypatch.setattr("sglpr_jax.live.ros.MISSING_S", 0.0)
+    return RosSource(transport, LiveOptions(topic="points", odometry_topic="/odom"), said)
 
 
 def test_a_scan_has_points_time_and_pose(transport, source, said):

@@ -8,12 +8,9 @@ from sglpr_jax.live.messages import LoopEdge
 from sglpr_jax.live.ros_messages import (
     CLOUD,
     EDGE,
-    MARKERS,
     TRANSFORMS,
     decode_cloud,
     edge_message,
-    marker_message,
-    transform_message,
     typestore,
 )
 from tests.live.messages import LIVOX, POINTS, cloud, decoded, livox
@@ -68,19 +65,6 @@ def test_an_edge_has_times_and_pose_and_its_covariance_is_about_the_axes_of_the_
 def test_a_time_that_no_stamp_holds_becomes_zero(time):
     found = decoded(edge_message(edge(query_time=time)), EDGE)
     assert (found.header.stamp.sec, found.header.stamp.nanosec) == (0, 0)
-
-
-def test_markers_are_lines_between_the_scans():
-    ends = [np.array([[0, 0, 0], [1, 2, 3.0]]), np.array([[4, 4, 4], [5, 6, 7.0]])]
-    (marker,) = decoded(marker_message(ends, time=8.0, frame="odom"), MARKERS).markers
-    assert (marker.type, marker.action, marker.header.frame_id) == (marker.LINE_LIST, marker.ADD, "odom")
-    assert [(one.x, one.y, one.z) for one in marker.points] == [(0, 0, 0), (1, 2, 3), (4, 4, 4), (5, 6, 7)]
-
-
-def test_a_transform_names_both_frames():
-    (one,) = decoded(transform_message(POSE, time=2.0, frame="map", child="odom"), TRANSFORMS).transforms
-    assert (one.header.frame_id, one.child_frame_id, one.header.stamp.sec) == ("map", "odom", 2)
-    assert one.transform.translation.x == 1.5
 
 
 def test_hashes_of_types_are_those_of_ros():

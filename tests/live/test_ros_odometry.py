@@ -25,13 +25,6 @@ def drive(live: LiveOdometry, *seconds: float, child: str = "lidar", at: float |
         live.receive(received(ODOMETRY, odometry(one, (2 * one, 0, 0), child=child), at=now))
 
 
-def test_a_pose_is_interpolated(live, said):
-    drive(live, 10.0, 10.1, 10.2)
-    np.testing.assert_allclose(live.pose(10.15, "lidar", wait_s=0.0)[:3, 3], [20.3, 0, 0])
-    np.testing.assert_allclose(live.pose(10.2, "lidar", wait_s=0.0)[:3, 3], [20.4, 0, 0])
-    assert not said
-
-
 def test_a_scan_waits_for_the_pose_after_it(live, said):
     drive(live, 10.0, 10.1)
     later = threading.Timer(0.05, lambda: drive(live, 10.2))

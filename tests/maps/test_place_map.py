@@ -44,11 +44,6 @@ def test_a_map_comes_back_from_its_file(places, tmp_path):
     assert len(again) == len(places) == PLACES and again.index.ids == places.index.ids
     np.testing.assert_array_equal(again.images, places.images)
     np.testing.assert_array_equal(again.world_from_place, places.world_from_place)
-    whole = path.read_bytes()
-    for place in np.linspace(0, len(whole) - 1, 5).astype(int):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        with pytest.raises(ValueError, match=r"town\.safetensors: expected an index"):
-            PlaceMap.load(path)
 
 
 @pytest.mark.slow

@@ -11,10 +11,8 @@ from session_pairs import found_pair
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.files import WriteError
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.result import LoopSearchResult, Session
-from sglpr_jax.pose_graph import folder
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl
 from sglpr_jax.pose_graph.folder import FIRST_VERTEX, unique_names, vertices, write_found
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
@@ -60,32 +58,6 @@ def test_all_files_are_of_the_searched_frames(found, tmp_path):
         read_kitti(tmp_path / "out" / "trajectory.kitti"), found.sessions[0].odometry[:5], atol=1e-6
     )
     assert len(read_loops_jsonl(tmp_path / "out/loops.jsonl")) == 1 == len(table(tmp_path / "out/loops.csv"))
-
-
-def test_trajectories_of_an_earlier_run_stay_with_a_warning(found, tmp_path):
-    out = tmp_path / "out"
-    written = {path.name: path.read_bytes() for path in write_found(found, out, optimized=corrected(found))}
-    assert len(written) == 8
-    with pytest.warns(DataWarning, match=r"out: trajectory-optimized.tum, trajectory-optimized.kitti are from an ear"):
-        assert len(write_found(found, out)) == 6
-    with pytest.warns(DataWarning, match=r"out: trajectory.tum, .* are from an earlier run"):
-        assert len(write_found(with_session(found, odometry=None), out)) == 4
-    for name in written.keys() - {"loops.g2o"}:
-        assert (out / name).read_bytes() == written[name]
-
-
-def test_a_full_disk_leaves_the_files_of_the_earlier_run(found, tmp_path, monkeypatch):
-    write_found(found, tmp_path, optimized=corrected(found), texts={"index.html": "old"})
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-
-    def full(path, *args, **options):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(folder, "write_kitti", full)
-    none = with_session(dataclasses.replace(found, loops=()), odometry=2 * found.sessions[0].odometry)
-    with pytest.raises(WriteError, match=rf"^{tmp_path}/trajectory.kitti: cannot be written: No space left on device"):
-        write_found(none, tmp_path, optimized=corrected(found), texts={"index.html": "new"})
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_frames_keep_the_numbers_of_the_recording_and_rejected_pairs_have_a_file(found, tmp_path):

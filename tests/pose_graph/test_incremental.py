@@ -1,9 +1,6 @@
 """A drifted drive is corrected while it goes on; wrong loops barely bend it; an unknown motion waits for a loop."""
 
-import sys
-
 import numpy as np
-import pytest
 
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.pose_graph.incremental import LOOP_EVERY_M, IncrementalTrajectory
@@ -81,9 +78,3 @@ def test_a_route_driven_again_and_again_needs_few_loops():
     loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._nodes)
     travelled = 3 * 2 * np.pi * 40
     assert travelled / LOOP_EVERY_M - 2 <= loops <= travelled / LOOP_EVERY_M + 1
-
-
-def test_without_gtsam_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(ImportError, match=r"gtsam: pip install 'sglpr-jax\[gtsam\]'"):
-        IncrementalTrajectory()

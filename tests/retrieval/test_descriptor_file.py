@@ -51,10 +51,6 @@ def test_a_file_comes_back_as_it_was_saved(tmp_path, file, absent):
             "expected at least one scan",
         ),
         ({"ids": ("0", "1", "0")}, "expected a unique id for each scan, found '0' 2 times"),
-        (
-            {"descriptors": np.zeros((3, 0), np.float32)},
-            r"expected descriptors with at least one number, found \(3, 0\)",
-        ),
         ({"times": np.array([0.0, 2.0, 1.0])}, "expected times in ascending order, found an earlier time in row 2"),
     ],
 )
@@ -83,9 +79,7 @@ def test_a_file_of_format_1_is_compared_by_l2(tmp_path, file):
     ("changed", "message"),
     [
         ({"ids": None}, "expected arrays about, ids, descriptors; found descriptors, about"),
-        ({"about": np.array("{")}, ".*expected JSON, found invalid JSON"),
         ({"about": np.array("{}")}, "expected format 'sglpr-jax descriptors 2', found None"),
-        ({"about": np.array(["{}", "{}"])}, r"expected JSON in `about`, found an array <U2 \(2,\)"),
         ({"about": np.array([{"a": 1}], dtype=object)}, "expected a descriptor file .* broken"),
         ({"ids": np.array([["0", "1", "2"]])}, r"expected ids as an array \(n,\) of strings, found <U1 \(1, 3\)"),
         ({"positions": np.zeros((5, 3))}, r"expected positions as float64 \(3, 3\), found float64 \(5, 3\)"),
@@ -106,10 +100,7 @@ def test_arrays_that_cannot_be_are_refused(tmp_path, file, changed, message):
     ("change", "what"),
     [
         ({"weights_hash": "f" * 64}, "weights"),
-        ({"distance": "cosine"}, "distance"),
-        ({"config": {"method": "m2dp"}}, "method"),
         ({"config": {"method": "sglpr", "model": {"polar": [64, 128]}}}, "model"),
-        ({"descriptors": np.ones((3, 5), np.float32)}, "numbers"),
         ({"config": {"method": "sglpr", "model": {"polar": (64, 256)}, "scale": 2}}, "scale"),
     ],
 )

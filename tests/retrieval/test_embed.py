@@ -11,7 +11,6 @@ from recordings import of_images, of_scans, with_points
 
 from sglpr_jax.bev import rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.views import rotated
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
@@ -207,20 +206,6 @@ def test_points_are_described_scan_by_scan(scans):
     assert found.config == {"data": "08", "method": "mean", "rotation_seed": None}
 
 
-def test_points_that_are_not_finite_are_left_out_with_their_labels(scans, tmp_path):
-    raw = [np.resize(np.array([10, 50, 71], "<u4"), len(cloud)) for cloud in clouds()]
-
-    def points_of(path):
-        points = scans.read(path, None, False).points.copy()
-        points[0] = np.nan
-        return points
-
-    labelled = with_labels(with_points(scans, points_of), raw, tmp_path)
-    found = embed_scans(mean_point, labelled, distance="l2", labels=True)
-    classes = np.select([raw[0] == 10, raw[0] == 50], [1, 13], 16)
-    np.testing.assert_allclose(found.descriptors[0], [*clouds()[0][1:].mean(axis=0), classes[1:].mean()], rtol=1e-5)
-
-
 def mean_of(scan):
     return scan.upright_points.mean(axis=0)
 
@@ -232,16 +217,6 @@ def learned(prepare=mean_of, describe=lambda inputs: inputs, takes="points") -> 
         return prepare(scan if angle is None else rotated_scan(scan, angle))
 
     return Method({"method": "mine"}, takes, prepared, describe, weights_hash="hash")
-
-
-def test_scans_and_images_of_a_learned_method_are_rotated(scans, pictures):
-    file, angles = embed(learned(), scans, rotation_seed=3), drawn_angles(3)
-    expected = [rotated(cloud, float(angle)).mean(axis=0) for cloud, angle in zip(clouds(), angles, strict=True)]
-    np.testing.assert_allclose(file.descriptors, expected, atol=1e-5)
-    on_images = learned(prepare=lambda scan: scan.image.reshape(-1), takes="images")
-    found = embed(on_images, pictures, rotation_seed=3).descriptors
-    expected = [np.asarray(rotate_image(pictures.image(row), angle)) for row, angle in enumerate(angles)]
-    np.testing.assert_allclose(found, np.reshape(expected, (SCANS, -1)), atol=1e-4)
 
 
 @pytest.mark.parametrize(("value", "words"), [(np.nan, "values that are not finite"), (0, "only zeros")])
@@ -259,8 +234,3 @@ def test_other_lengths_from_scan_to_scan_are_errors(scans):
         embed(odd, scans)
     with pytest.raises(ValueError, match="mine: expected 7 descriptors"):
         embed(learned(describe=lambda inputs: np.ones((len(inputs), 2, 2))), scans)
-
-
-def test_missing_points_are_an_error(pictures):
-    with pytest.raises(ValueError, match="mine needs points, found only images in sequence 06"):
-        embed(learned(), pictures)

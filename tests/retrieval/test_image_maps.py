@@ -124,17 +124,3 @@ def test_the_maps_that_a_preset_names_are_there_and_have_the_form_of_its_image(p
     for title, name in config.pictures.items():
         _, rows, columns, _ = maps[name].shape
         assert height % rows == 0 and width % columns == 0, title
-
-
-def test_a_head_without_a_backbone_shows_its_own_maps_or_what_it_reads(random_params):
-    """Table 6, with and without CBAM and convolutions."""
-    bare = dataclasses.replace(HEAD, input="counts", cbam=False)
-    none = dataclasses.replace(bare, tap="tokens", channels=(), kernels=(), strides=())
-    titles = {
-        "CBAM": dataclasses.replace(HEAD, input="counts"),
-        "place head, first": bare,
-        "input of the place head": none,
-    }
-    for title, head in titles.items():
-        params = random_params(dataclasses.replace(CONFIG, head=head))
-        assert list(heat_maps(params, np.arange(256).reshape(16, 16))) == [title]

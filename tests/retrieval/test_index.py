@@ -71,15 +71,12 @@ def test_descriptors_of_another_model_scale_or_distance_are_refused(tmp_path):
     for refused in (
         lambda: index.add(draw(1), weights_hash="xyz"),
         lambda: index.query(draw(1), weights_hash="xyz"),
-        lambda: index.add_file(file_of(3, weights_hash="xyz")),
         lambda: Index.load(tmp_path / "places.safetensors", weights_hash="xyz"),
     ):
         with pytest.raises(ValueError, match="expected descriptors with weights abc, found xyz"):
             refused()
     with pytest.raises(ValueError, match="expected descriptors with scale 1, found 2: they are not comparable"):
-        index.add_file(dataclasses.replace(file_of(3), config={"scale": 2}))
-    with pytest.raises(ValueError, match="expected descriptors with distance l2, found cosine"):
-        index.add_file(dataclasses.replace(file_of(3, weights_hash="abc"), distance="cosine"))
+        index.check(scale=2)
 
 
 def test_a_descriptor_file_becomes_an_index_of_its_scale(tmp_path):
@@ -128,12 +125,11 @@ def test_a_flipped_byte_anywhere_is_noticed(tmp_path):
         Index.load(tmp_path / "elsewhere")
 
 
-def with_checksum(path, arrays=None, text=None, **about):
+def with_checksum(path, arrays=None, **about):
     """Write a file whose checksum is right, whatever its content."""
     arrays = {"descriptors": draw(3)} | (arrays or {})
     valid = {"format": FORMAT, "width": WIDTH, "weights_hash": "", "distance": "l2", "ids": ["a", "b", "c"]}
-    said = {name: value for name, value in (valid | about).items() if value is not None}
-    text = json.dumps(said) if text is None else text
+    text = json.dumps(valid | about)
     path.write_bytes(tensors_as_bytes(arrays, {"about": text, "sha256": _checksum(text, arrays)}))
     return path
 
@@ -141,10 +137,8 @@ def with_checksum(path, arrays=None, text=None, **about):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"text": "nothing"}, "expected JSON, found invalid JSON"),
         ({"format": "other 1"}, f"expected format '{FORMAT}', found 'other 1'"),
         ({"width": 0}, "`width`: expected a number from 1"),
-        ({"distance": "nearness"}, "expected a distance among"),
         ({"ids": ["a", "b", 3]}, "expected `ids` as a list of strings"),
         ({"ids": ["a", "b"]}, r"expected descriptors as float32 \(2, 8\), found float32 \(3, 8\)"),
         ({"arrays": {"times": np.array([0, np.inf, 1])}}, "expected finite times"),
@@ -158,9 +152,7 @@ def test_a_file_of_another_program_is_refused_though_its_checksum_is_right(tmp_p
 
 def test_lists_are_converted_and_others_are_one_error():
     index = index_of(5)
-    expected = index.query(draw(5)[1], 2)
-    found = index.query(draw(5)[1].tolist(), 2, exclude=[False] * 5)
-    np.testing.assert_array_equal(found.rows, expected.rows)
+    assert index.query(draw(5)[1].tolist(), 2, exclude=[False] * 5).rows[0] == 1
     with pytest.raises(ValueError, match="expected flags"):
         index.query(draw(1), exclude=[0] * 5)
     with pytest.raises(ValueError, match="expected descriptors of 8 numbers, found others"):

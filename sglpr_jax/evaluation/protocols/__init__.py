@@ -8,8 +8,8 @@ import difflib
 from collections.abc import Mapping, Sequence
 
 from sglpr_jax.evaluation.protocols import pairs, recall, top1
-from sglpr_jax.evaluation.protocols.protocol import Protocol
-from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, Source, kind_of
+from sglpr_jax.evaluation.protocols.protocol import Input, Kind, Protocol, kind_of
+from sglpr_jax.evaluation.protocols.result import Result
 
 PROTOCOLS: Mapping[str, Protocol] = {
     protocol.name: protocol
@@ -45,40 +45,38 @@ def protocols_taking(kind: Kind) -> dict[str, Protocol]:
     return {name: protocol for name, protocol in PROTOCOLS.items() if kind in protocol.takes}
 
 
-def protocol_named(name: str, among: Mapping[str, Protocol] = PROTOCOLS) -> Protocol:
-    """Return a protocol by name. Raises ValueError with the nearest name if the protocol does not exist."""
-    if name not in among:
-        nearest = difflib.get_close_matches(name, among, n=1, cutoff=0)
-        raise ValueError(
-            f"expected a protocol, found {name!r}; did you mean {nearest[0]!r}? Available: {', '.join(among)}"
-        )
-    return among[name]
-
-
 def check_names(names: Sequence[str]) -> None:
     """Raise ValueError if a name is neither a protocol of one recording nor `all`. The message has the nearest name."""
     across_sessions = protocols_taking("sessions")
+    available = [name for name in PROTOCOLS if name not in across_sessions]
     for name in names:
         if name in across_sessions:
             raise ValueError(f"expected --database with a descriptor file for protocol {name}, found none")
-        if name != ALL:
-            protocol_named(name, {other: PROTOCOLS[other] for other in PROTOCOLS if other not in across_sessions})
+        if name not in (*available, ALL):
+            (nearest,) = difflib.get_close_matches(name, available, n=1, cutoff=0)
+            raise ValueError(
+                f"expected a protocol, found {name!r}; did you mean {nearest!r}? Available: {', '.join(available)}"
+            )
 
 
-def chosen_protocols(source: Source | ScoredPairs, names: Sequence[str]) -> list[str]:
-    """Return the names of the protocols that score `source`.
+def chosen_protocols(kind: Kind, names: Sequence[str]) -> list[str]:
+    """Return the names of the protocols that score this kind of input.
 
     Without names, the default protocols (`Protocol.headline`) that fit are returned. If none of them fits, or for the
     name `all`, every protocol that fits is returned. Raises ValueError if a named protocol does not fit.
     """
-    kind = kind_of(source)
-    known = protocols_taking(kind)
+    fitting = protocols_taking(kind)
     if not names:
-        return [name for name, protocol in known.items() if protocol.headline] or list(known)
+        return [name for name, protocol in fitting.items() if protocol.headline] or list(fitting)
     if ALL in names:
-        return list(known)
-    unfit = [name for name in names if name not in known]
-    if unfit:
-        kind_in_words = _IN_WORDS.get(kind, kind)
-        raise ValueError(f"expected protocols for {kind_in_words}, which are {', '.join(known)}; found {unfit[0]}")
+        return list(fitting)
+    for name in names:
+        if name not in fitting:
+            kind_in_words = _IN_WORDS.get(kind, kind)
+            raise ValueError(f"expected protocols for {kind_in_words}, which are {', '.join(fitting)}; found {name}")
     return list(dict.fromkeys(names))
+
+
+def score(source: Input, names: Sequence[str] = ()) -> list[Result]:
+    """Return the result of each named protocol (`chosen_protocols`). Raises ValueError if positions are missing."""
+    return [PROTOCOLS[name](source) for name in chosen_protocols(kind_of(source), names)]

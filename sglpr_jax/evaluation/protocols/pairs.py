@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.evaluation.protocols.protocol import Protocol, Result, with_f1_max
-from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, positions_of
+from sglpr_jax.evaluation.protocols.protocol import Kind, Protocol, ScoredPairs, positions_of
+from sglpr_jax.evaluation.protocols.result import Result, with_f1_max
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.se3 import distances
@@ -24,7 +24,7 @@ PAIR_BLOCK = 1 << 10
 PARTNERS = 64
 """The number of partners of a frame is padded to a multiple of this number."""
 
-Keep = Callable[[Float[np.ndarray, "i j"], Int[np.ndarray, "i j"]], Bool[np.ndarray, "i j"]]
+PairFilter = Callable[[Float[np.ndarray, "i j"], Int[np.ndarray, "i j"]], Bool[np.ndarray, "i j"]]
 """Selects pairs of frames (i, j), given their distance in metres and the number of frames i - j between them."""
 
 
@@ -49,7 +49,7 @@ class DrawnPairs(Protocol):
     published_on: str = "KITTI's own poses"
     dimensions: Literal[2, 3] = 2
     takes: tuple[Kind, ...] = ("descriptors",)
-    positive: Keep = is_revisit
+    positive: PairFilter = is_revisit
     """Selects positive pairs."""
     negatives_per_positive: int | None = None
     """Negative pairs for each positive pair, drawn without replacement. None or too few negatives: all of them."""
@@ -59,17 +59,17 @@ class DrawnPairs(Protocol):
     def __call__(self, source: DescriptorFile, *, seed: int = 0) -> Result:
         """Score a descriptor file. `seed` draws the negatives and the resamples."""
         positions, rng = positions_of(source, self.dimensions), np.random.default_rng(seed)
-        positive, drawn = frame_pairs(positions, self.positive), "all negatives"
-        if self.negatives_per_positive is None:
-            negative = frame_pairs(positions, are_apart)
-        else:
+        positive = frame_pairs(positions, self.positive)
+        if self.negatives_per_positive is not None:
             most = self.negatives_per_positive * len(positive)
             negative = drawn_frame_pairs(positions, are_apart, most=most, rng=rng)
-            drawn = f"{self.negatives_per_positive} negatives per positive, seed {seed}"
+            words = f"{self.negatives_per_positive} negatives per positive, seed {seed}"
+        else:
+            negative, words = frame_pairs(positions, are_apart), "all negatives"
         if self.negatives_share is not None:
             negative = negative[rng.random(len(negative)) < self.negatives_share]
-            drawn = f"no gap, {self.negatives_share:.1%} of the negatives, seed {seed}"
-        result = self.result(f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m, {drawn}", source)
+            words = f"no gap, {self.negatives_share:.1%} of the negatives, seed {seed}"
+        result = self.result(f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m, {words}", source)
         pairs = np.stack(np.divmod(np.concatenate([positive, negative]), len(source)))
         is_positive = np.arange(pairs.shape[1]) < len(positive)
         scores = -pair_distances(source, pairs) if len(positive) else np.zeros(pairs.shape[1])
@@ -143,33 +143,34 @@ LISTED_PAIRS_F1MAX = ListedPairs(
 )
 
 
-def frame_pairs(positions: Float[np.ndarray, "n d"], keep: Keep) -> Int[np.ndarray, " pairs"]:
-    """Return every ordered pair (i, j) that `keep` selects as i * n + j, in increasing order."""
-    return np.concatenate([first + np.flatnonzero(kept) for first, kept in _kept_in_blocks(positions, keep)])
+def frame_pairs(positions: Float[np.ndarray, "n d"], is_selected: PairFilter) -> Int[np.ndarray, " pairs"]:
+    """Return every selected pair of frames (i, j) as i * n + j, in increasing order."""
+    blocks = _selected_in_blocks(positions, is_selected)
+    return np.concatenate([first + np.flatnonzero(selected) for first, selected in blocks])
 
 
 def drawn_frame_pairs(
-    positions: Float[np.ndarray, "n d"], keep: Keep, *, most: int, rng: np.random.Generator
+    positions: Float[np.ndarray, "n d"], is_selected: PairFilter, *, most: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " pairs"]:
     """Draw up to `most` pairs of `frame_pairs` without replacement, in increasing order.
 
     The result equals `rng.choice` on all pairs, but the list of all pairs is never stored.
     """
-    ends = np.cumsum([np.count_nonzero(kept) for _, kept in _kept_in_blocks(positions, keep)])
+    ends = np.cumsum([np.count_nonzero(selected) for _, selected in _selected_in_blocks(positions, is_selected)])
     ranks = np.sort(rng.choice(ends[-1], min(most, ends[-1]), replace=False))
-    of_blocks = np.split(ranks, np.searchsorted(ranks, ends[:-1]))
-    blocks = zip(_kept_in_blocks(positions, keep), of_blocks, [0, *ends[:-1]], strict=True)
-    return np.concatenate([first + np.flatnonzero(kept)[ranks - before] for (first, kept), ranks, before in blocks])
+    ranks_of_blocks = np.split(ranks, np.searchsorted(ranks, ends[:-1]))
+    blocks = zip(_selected_in_blocks(positions, is_selected), ranks_of_blocks, [0, *ends[:-1]], strict=True)
+    return np.concatenate([first + np.flatnonzero(selected)[rows - start] for (first, selected), rows, start in blocks])
 
 
-def _kept_in_blocks(
-    positions: Float[np.ndarray, "n d"], keep: Keep
+def _selected_in_blocks(
+    positions: Float[np.ndarray, "n d"], is_selected: PairFilter
 ) -> Iterator[tuple[int, Bool[np.ndarray, "block n"]]]:
     """Yield the number of the first pair (i, j) and the selected pairs, for blocks of frames i."""
     n = len(positions)
     for start in range(0, n, BLOCK):
         gap = np.arange(start, min(start + BLOCK, n))[:, None] - np.arange(n)[None, :]
-        yield start * n, keep(distances(positions[start : start + BLOCK], positions), gap)
+        yield start * n, is_selected(distances(positions[start : start + BLOCK], positions), gap)
 
 
 def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
@@ -183,10 +184,9 @@ def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> F
     # Other distances are between sets: each first frame is compared with all its partners. These are repeated up to a
     # multiple of `PARTNERS`, so that a jitted distance compiles for few shapes.
     compare, order = distance_function(file.distance), np.argsort(pairs[0], kind="stable")
-    for of_one in np.split(order, np.flatnonzero(np.diff(pairs[0][order])) + 1):
-        partners = np.resize(pairs[1, of_one], -(-len(of_one) // PARTNERS) * PARTNERS)
-        found = compare(file.descriptors[pairs[0, of_one[:1]]], file.descriptors[partners])
-        apart[of_one] = found[0, : len(of_one)]
+    for rows in np.split(order, np.flatnonzero(np.diff(pairs[0][order])) + 1):
+        partners = np.resize(pairs[1, rows], -(-len(rows) // PARTNERS) * PARTNERS)
+        apart[rows] = compare(file.descriptors[pairs[0, rows[:1]]], file.descriptors[partners])[0, : len(rows)]
     return apart
 
 

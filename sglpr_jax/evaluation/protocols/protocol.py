@@ -1,69 +1,140 @@
-"""Types of a protocol and of its result, and F1max with its bootstrap interval."""
+"""Base class of the protocols, their inputs (descriptors, top-k lists, scored pairs), and retrieval in these inputs."""
 
 import abc
-from dataclasses import dataclass, field, replace
-from enum import IntEnum
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int64
+from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.evaluation.protocols.source import Kind, ScoredPairs, Source
-from sglpr_jax.metrics import PrecisionRecallCurve, decision_curve
+from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.distances import distance_function, smallest
+from sglpr_jax.revisits import Near
 
-RETRIEVAL: tuple[Kind, ...] = ("descriptors", "top-k list", "scored top-k list")
-"""Kinds of input that a recall needs."""
-SCORED_RETRIEVAL: tuple[Kind, ...] = ("descriptors", "scored top-k list")
-"""Kinds of input with scored answers, which a threshold can accept or reject."""
-RESAMPLES = 500
-"""Number of bootstrap resamples."""
-CONFIDENCE = 0.95
-"""Confidence level of the intervals."""
-THRESHOLDS = 256
-"""Maximum number of thresholds tried in each resample."""
-
-
-class Decision(IntEnum):
-    """Decision for one frame as a query, at the threshold of F1max."""
-
-    NOT_A_QUERY = 0
-    TRUE_POSITIVE = 1
-    FALSE_POSITIVE = 2
-    FALSE_NEGATIVE = 3
-    TRUE_NEGATIVE = 4
-    UNCOUNTED = 5
-    """Query that the protocol does not count, for example a query answered with a frame 3 to 20 m away."""
+Kind = Literal["descriptors", "top-k list", "scored top-k list", "scored pairs", "sessions"]
+"""Kind of input: a descriptor file, retrieved frames without or with scores, pairs of frames with scores, or descriptor
+files of several sessions. The first session is the database."""
+BLOCK = 512
+"""Number of queries compared with the whole database at a time."""
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """Score of one input by one protocol, with the rule and counts that define it."""
+class TopK:
+    """Top-k list: the frames that a method retrieved for some frames of a sequence, best first.
 
-    name: str
-    rule: str
-    """Rule of the protocol in words, with its distances."""
-    dimensions: int | None
-    """Dimensions of distances between frames: 2 for x and y, 3 for x, y and z, None if labels were given instead."""
+    A query that is not listed has no answer and counts as missed. Raises ValueError if a frame is out of range, if a
+    query is listed twice, if numbers of rows differ, or if a value is not finite.
+    """
+
+    sequence: str
+    """Name of the sequence."""
+    positions: Float[np.ndarray, "_n 3"]
+    """Position of every frame in metres, z up."""
+    times: Float[np.ndarray, "_n"] | None
+    """Time of every frame in seconds, or None."""
     pose_source: str | None
     """Source of the poses, in words."""
-    published_on: str
-    """Poses of the published numbers of the protocol. Scores on other poses differ."""
-    counts: dict[str, int] = field(default_factory=dict)
-    """Numbers of queries and revisits, or of pairs."""
-    score: float = np.nan
-    """Score, NaN for a sequence without a revisit."""
-    interval: tuple[float, float] | None = None
-    """95 % bootstrap interval of the score, or None without a score."""
-    curve: PrecisionRecallCurve | None = None
-    """Curve with negated descriptor distances as thresholds. None for a recall and without a revisit."""
-    recalls: dict[int, float] = field(default_factory=dict)
-    """Recall@N by N, if the protocol defines it."""
-    decisions: Int8[np.ndarray, " n"] | None = None
-    """`Decision` of each frame. None for pairs and across sessions."""
-    answers: Int64[np.ndarray, " n"] | None = None
-    """Answer to each frame, -1 for frames without an answer. None if the protocol applies no threshold."""
-    answer_distances: Float64[np.ndarray, " n"] | None = None
-    """Descriptor distance of each answer, infinite for frames without an answer."""
+    queries: Int[np.ndarray, "_q"]
+    """Listed query frames."""
+    nearest: Int[np.ndarray, "_q _k"]
+    """Retrieved frames of each query. Shorter rows are padded with -1."""
+    scores: Float[np.ndarray, "_q _k"] | None = None
+    """Score of each retrieved frame. Higher means closer. F1max needs scores."""
+
+    def __post_init__(self):
+        q = len(self.queries)
+        if q == 0:
+            raise ValueError("expected a list with at least one query, found none")
+        if self.positions.shape != (len(self), 3) or not np.isfinite(self.positions).all():
+            raise ValueError(
+                f"expected finite positions (n, 3), found shape {self.positions.shape} or values that are not finite"
+            )
+        if self.times is not None and self.times.shape != (len(self),):
+            raise ValueError(f"expected {len(self)} times, one for each position, found {self.times.shape}")
+        if self.nearest.ndim != 2 or len(self.nearest) != q or self.nearest.shape[1] == 0:
+            raise ValueError(f"expected {q} rows of retrieved frames, found {self.nearest.shape}")
+        _check_frames("query", self.queries, 0, len(self))
+        _check_frames("retrieved", self.nearest, -1, len(self))
+        if len(np.unique(self.queries)) < q:
+            raise ValueError("expected every query once, found one listed twice")
+        if self.scores is not None and (
+            self.scores.shape != self.nearest.shape or not np.isfinite(self.scores[self.nearest >= 0]).all()
+        ):
+            raise ValueError("expected a finite score for every retrieved frame, found missing or non-finite scores")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def lookup(
+        self, queries: Int[np.ndarray, " q"], ends: Int[np.ndarray, " q"], k: int
+    ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
+        """Same as `nearest_frames`. Listed frames outside the database of a query are ignored."""
+        row = np.full(len(self), -1)
+        row[self.queries] = np.arange(len(self.queries))
+        row = row[queries]
+        allowed = (row >= 0)[:, None] & (self.nearest[row] >= 0) & (self.nearest[row] < ends[:, None])
+        order = np.argsort(~allowed, axis=1, kind="stable")
+        nearest = np.take_along_axis(np.where(allowed, self.nearest[row], -1), order, axis=1)[:, :k]
+        distance = np.full(len(queries), np.inf)
+        if self.scores is not None:
+            best = np.take_along_axis(self.scores[row], order[:, :1], axis=1)[:, 0]
+            distance = np.where(nearest[:, 0] >= 0, -best, np.inf)
+        return np.pad(nearest, ((0, 0), (0, k - nearest.shape[1])), constant_values=-1), distance
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredPairs:
+    """Pairs of frames of a sequence with scores and optional labels.
+
+    Raises ValueError if the list is empty, if a frame is out of range, if the numbers of rows differ, or if both labels
+    and positions are missing.
+    """
+
+    pairs: Int[np.ndarray, "_p 2"]
+    """Frames of each pair, the query first."""
+    scores: Float[np.ndarray, "_p"]
+    """Score of each pair. Higher means closer."""
+    labels: Bool[np.ndarray, "_p"] | None = None
+    """Whether the frames of each pair show the same place. If None, labels are computed from the positions."""
+    positions: Float[np.ndarray, "_n 3"] | None = None
+    """Position of every frame in metres, z up. Required without labels."""
+    pose_source: str | None = None
+    """Source of the poses, in words."""
+
+    def __post_init__(self):
+        p = len(self.pairs)
+        if p == 0:
+            raise ValueError("expected a list with at least one pair, found none")
+        if self.pairs.shape != (p, 2) or len(self.scores) != p or (self.labels is not None and len(self.labels) != p):
+            raise ValueError(
+                f"expected {p} pairs of frames with {p} scores, and {p} labels or none, found other numbers of rows"
+            )
+        if self.labels is None and self.positions is None:
+            raise ValueError("expected labels, or positions to compute them from, found neither")
+        n = np.iinfo(np.int64).max if self.positions is None else len(self.positions)
+        _check_frames("pairs of", self.pairs, 0, n)
+
+
+Source = DescriptorFile | TopK
+Input = Source | ScoredPairs
+
+
+def kind_of(source: Input) -> Kind:
+    """Return the kind of `source`."""
+    if isinstance(source, ScoredPairs):
+        return "scored pairs"
+    if isinstance(source, TopK):
+        return "top-k list" if source.scores is None else "scored top-k list"
+    return "descriptors"
+
+
+def _check_frames(what: str, frames: Int[np.ndarray, "..."], first: int, n: int) -> None:
+    """Raise ValueError if a frame is not in the range from `first` to n - 1. The message names the first such row."""
+    for index in np.argwhere((frames < first) | (frames >= n))[:1]:
+        outside = frames[tuple(index)]
+        raise ValueError(f"expected {what} frames from {first} to {n - 1}, found {outside} in row {index[0]}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,80 +159,74 @@ class Protocol(abc.ABC):
     """Whether the protocol is used by default, if no protocol is named."""
 
     @abc.abstractmethod
-    def __call__(self, *sources: Source | ScoredPairs, seed: int = 0) -> Result:
+    def __call__(self, *sources: Input, seed: int = 0) -> Result:
         """Score one source or several sessions. `seed` is that of the bootstrap interval and of drawn pairs.
 
         Raises ValueError if positions are missing.
         """
 
-    def result(self, rule: str, *sources: Source | ScoredPairs) -> Result:
+    def result(self, rule: str, *sources: Input) -> Result:
         """Return a result of these sources without a score. `rule` has the distances in words."""
         poses = ", ".join(dict.fromkeys(source.pose_source for source in sources if source.pose_source)) or None
         return Result(self.title, rule, self.dimensions, poses, self.published_on)
 
 
-def with_f1_max(
-    result: Result,
-    scores: Float[np.ndarray, " n"],
-    *,
-    query: Int[np.ndarray, " n"],
-    seed: int,
-    thresholds: Float[np.ndarray, " k"] | None = None,
-    **flags: Bool[np.ndarray, " n"],
-) -> Result:
-    """Add F1max, its curve and its interval. Scores, `flags` and `thresholds` are those of `metrics.decision_curve`."""
-    curve = decision_curve(scores, thresholds=thresholds, **flags)
-    interval = percentile_interval(resampled_f1_max(scores, query=query, seed=seed, **flags))
-    return replace(result, score=curve.f1_max, curve=curve, interval=interval)
+def positions_of(source: Source, dimensions: int = 3) -> Float[np.ndarray, "n {dimensions}"]:
+    """Return the positions, only x and y for 2 dimensions. Raises ValueError if positions are missing."""
+    if source.positions is None:
+        raise ValueError(f"expected positions to score sequence {source.sequence} against, found none")
+    return source.positions[:, :dimensions]
 
 
-def percentile_interval(scores: Float[np.ndarray, " resamples"]) -> tuple[float, float]:
-    """Return the interval of resampled scores.
+def nearest_frames(
+    source: Source, queries: Int[np.ndarray, " q"], ends: Int[np.ndarray, " q"], *, k: int = 1
+) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
+    """Return the best k of the first `ends` frames for each query, best first, and the distance of the best.
 
-    Neighbouring frames of a recording are correlated, so the true uncertainty is larger.
+    Rows with fewer than k frames are padded with -1. The distance is infinite for a query without an answer.
     """
-    low, high = np.quantile(scores, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)
+    if isinstance(source, TopK):
+        return source.lookup(queries, ends, k)
+    return nearest_descriptors(source.descriptors[queries], source.descriptors, ends, k=k, distance=source.distance)
 
 
-def resampled_means(found: Bool[np.ndarray, " q"], rng: np.random.Generator) -> Float[np.ndarray, " resamples"]:
-    """Return the share of found queries in each resample of q >= 1 queries."""
-    # The number of found queries among q draws with replacement is binomial, so single draws are not needed.
-    return rng.binomial(len(found), np.mean(found), RESAMPLES) / len(found)
-
-
-def resampled_f1_max(
-    scores: Float[np.ndarray, " n"],
+def nearest_descriptors(
+    queries: Float[np.ndarray, "q d"],
+    database: Float[np.ndarray, "n d"],
+    ends: Int[np.ndarray, " q"],
     *,
-    true_if_accepted: Bool[np.ndarray, " n"],
-    false_if_accepted: Bool[np.ndarray, " n"],
-    missed_if_rejected: Bool[np.ndarray, " n"],
-    query: Int[np.ndarray, " n"],
-    seed: int,
-) -> Float[np.ndarray, " resamples"]:
-    """Return F1max of each resample. Scores and flags are those of `metrics.decision_curve`.
+    k: int,
+    distance: str,
+) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
+    """Return the nearest k of the first `ends` >= 1 descriptors for each query, and the distance of the nearest.
 
-    The items of a query are drawn or omitted together. With the same seed, methods that answer the same queries get the
-    same resamples. Each resample has its own best threshold. Candidates are at most 256 scores of items that are right
-    or could be missed, because accepting other items cannot increase F1.
+    `distance` is a name in `distances.DISTANCES`. Rows with fewer than k descriptors are padded with -1.
     """
-    if not np.any(true_if_accepted & np.isfinite(scores)):
-        return np.zeros(RESAMPLES)
-    edges = np.unique(scores[(true_if_accepted | missed_if_rejected) & np.isfinite(scores)])
-    edges = edges[np.unique(np.linspace(0, len(edges) - 1, THRESHOLDS).round().astype(np.int64))]
-    bins = np.searchsorted(edges, scores, side="right")  # an item is accepted at the thresholds edges[:bins]
-    queries, row = np.unique(query, return_inverse=True)
-    n, shape = len(queries), (len(queries), len(edges) + 1)
+    nearest, best = np.full((len(queries), k), -1, dtype=np.int64), np.zeros(len(queries))
+    exact = database.astype(np.float64)
+    norms, compare = np.sum(exact**2, axis=1), distance_function(distance)
+    for start in range(0, len(queries), BLOCK):
+        rows = slice(start, start + BLOCK)
+        if distance == "l2":
+            # |q - d|^2 without |q|^2, which is constant in a row. In float64: the terms cancel far from zero.
+            ranking = norms[None, :] - 2 * queries[rows].astype(np.float64) @ exact.T
+        else:
+            ranking = compare(queries[rows], database)
+        ranking[np.arange(len(database)) >= ends[rows, None]] = np.inf
+        nearest[rows, : min(k, len(database))] = smallest(ranking, min(k, len(database)))
+        best[rows] = np.take_along_axis(ranking, nearest[rows, :1], axis=1)[:, 0]
+    if distance == "l2":
+        best = np.linalg.norm(queries - database[nearest[:, 0]], axis=1).astype(np.float64)
+    return np.where(nearest < ends[:, None], nearest, -1), best
 
-    def accepted(flags: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "queries edges"]:
-        cells = np.bincount(row[flags] * shape[1] + bins[flags], minlength=shape[0] * shape[1]).reshape(shape)
-        return np.cumsum(cells[:, ::-1], axis=1)[:, ::-1].astype(np.float32)
 
-    right, wrong, caught = accepted(true_if_accepted), accepted(false_if_accepted), accepted(missed_if_rejected)
-    twice_right = 2 * right[:, 1:]
-    # F1 = 2 TP / (2 TP + FP + FN). Each count is a sum over queries, weighted by the number of times a query is drawn.
-    draws = np.random.default_rng(seed).integers(n, size=(RESAMPLES, n)) + n * np.arange(RESAMPLES)[:, None]
-    drawn = np.bincount(draws.ravel(), minlength=RESAMPLES * n).reshape(RESAMPLES, n).astype(np.float32)
-    whole = drawn @ (twice_right + wrong[:, 1:] + caught[:, :1] - caught[:, 1:])
-    f1 = np.divide(drawn @ twice_right, whole, out=np.zeros_like(whole), where=whole > 0)
-    return f1.max(axis=1).astype(np.float64)
+def near_answers(
+    queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], nearest: Int[np.ndarray, "q k"], near: Near
+) -> Bool[np.ndarray, "q k"]:
+    """Return whether each retrieved frame is near its query, given positions in metres. False for padding."""
+    return near(np.linalg.norm(queries[:, None] - database[nearest], axis=2)) & (nearest >= 0)
+
+
+def recall_at(hits: Bool[np.ndarray, "q k"], numbers: Iterable[int]) -> dict[int, float]:
+    """Return Recall@N for each N, given whether each of the k answers to a query is right."""
+    return {n: float(np.mean(hits[:, :n].any(axis=1))) for n in numbers}

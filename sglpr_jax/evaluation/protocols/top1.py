@@ -5,16 +5,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Decision, Protocol, Result, with_f1_max
-from sglpr_jax.evaluation.protocols.source import (
+from sglpr_jax.evaluation.protocols.protocol import (
     Kind,
+    Protocol,
     Source,
     TopK,
-    first_true,
+    near_answers,
     nearest_frames,
     positions_of,
     recall_at,
 )
+from sglpr_jax.evaluation.protocols.result import Decision, Result, with_f1_max
 from sglpr_jax.revisits import Near, database_end, has_near
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
@@ -29,13 +30,13 @@ class Top1(Protocol):
     of revisits with a right answer among the nearest N frames, without a threshold.
     """
 
-    takes: tuple[Kind, ...] = SCORED_RETRIEVAL
+    takes: tuple[Kind, ...] = ("descriptors", "scored top-k list")
     metres: str
     """Distances of right and wrong answers, in words."""
     right: Near
     """Whether an answer at this distance in metres is right."""
-    wrong: Near
-    """Whether an answer at this distance in metres is wrong."""
+    wrong: Near | None = None
+    """Whether an answer at this distance in metres is wrong. None: every answer that is not right."""
     gap: int | None = None
     """Gap between query and database in frames, as published. None: 30 s (`revisits.database_end`)."""
     min_age: int = 0
@@ -56,14 +57,14 @@ class Top1(Protocol):
         queries = np.flatnonzero(ends)
         numbers = sorted({*self.numbers, max(round(n / 100), 1)} if self.one_percent else self.numbers)
         nearest, distance = nearest_frames(source, queries, ends[queries], k=numbers[-1])
-        apart = np.linalg.norm(positions[queries, None] - positions[nearest], axis=2)
-        right, wrong = (near(apart) & (nearest >= 0) for near in (self.right, self.wrong))
+        is_wrong = self.wrong or (lambda apart: ~self.right(apart))
+        right, wrong = (near_answers(positions[queries], positions, nearest, near) for near in (self.right, is_wrong))
         revisited = has_near(positions[queries], positions, ends[queries], self.right)
-        recalls = recall_at(first_true(right)[revisited], numbers) if revisited.any() else {}
+        recalls = recall_at(right[revisited], numbers) if revisited.any() else {}
 
         late = queries >= self.first_thresholded
         queries, distance, revisited = queries[late], distance[late], revisited[late]
-        nearest, right, wrong = (first[late, 0] for first in (nearest, right, wrong))
+        nearest, right, wrong = (columns[late, 0] for columns in (nearest, right, wrong))
         answers, distances = np.full(n, -1, dtype=np.int64), np.full(n, np.inf)
         answers[queries], distances[queries] = nearest, distance
         result = replace(
@@ -123,7 +124,6 @@ SCAN_CONTEXT_F1MAX = Top1(
     dimensions=2,
     metres="5 m",
     right=lambda apart: apart < 5,
-    wrong=lambda apart: apart >= 5,
     gap=50,
     min_age=49,
     last_is_query=False,
@@ -140,7 +140,6 @@ CONTOUR_CONTEXT_F1MAX = Top1(
     dimensions=3,
     metres="5 m",
     right=lambda apart: apart < 5,
-    wrong=lambda apart: apart >= 5,
     gap=150,
     min_age=151,
 )
@@ -156,7 +155,6 @@ OVERLAP_TRANSFORMER_F1MAX = Top1(
     dimensions=2,
     metres="15 m in place of overlaps",
     right=lambda apart: apart < 15,
-    wrong=lambda apart: apart >= 15,
     gap=100,
     min_age=101,
     last_is_query=False,

@@ -1,7 +1,7 @@
-"""Trained models and descriptors for the tables, in one folder per run. Missing ones are created."""
+"""A reproduction: its trained models, descriptors and scores, in one folder per run. Missing ones are created."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +9,9 @@ from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.data.corruption import CLEAN, ROTATION
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.evaluation.final_test import LearningCurves
+from sglpr_jax.evaluation.learning_curves import LearningCurves
+from sglpr_jax.evaluation.protocols import PROTOCOLS
+from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.files import file_name, read_json, write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
@@ -19,7 +21,7 @@ from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.progress import Progress, no_progress
-from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
+from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1, VARIANTS, variant_config
 from sglpr_jax.retrieval.descriptor_cache import embed_or_reuse
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.training.callbacks import Callbacks, ProgressBar
@@ -40,13 +42,26 @@ def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
 
 
 @dataclass(frozen=True)
-class Runs:
-    """Leave-one-out runs: `folder`/VARIANT/SEQ contains a model trained on all recordings of `data` except SEQ."""
+class Reproduction:
+    """Leave-one-out runs and the methods that they are compared with.
+
+    `folder`/VARIANT/SEQ contains a model trained on all recordings of `data` except SEQ.
+    """
 
     folder: Path
     data: Path
     preset: str
     config: TrainConfig
+    seqs: tuple[str, ...]
+    """Test recordings."""
+    methods: tuple[str, ...] = ()
+    """Handcrafted methods for comparison."""
+    weights: tuple[str, ...] = ()
+    """Weights for comparison: shipped names or folders."""
+    sessions: Callable[[], Path] = Path
+    """Returns the folder of sessions in NCLT's layout. Called only by experiments that need sessions."""
+    trained: bool = True
+    """Whether variants are trained."""
     pose_source: PoseChoice = "auto"
     progress: Progress = no_progress
     """Shows the progress of embeddings."""
@@ -60,17 +75,17 @@ class Runs:
         folder = self._folder(variant, seq)
         if not (folder / CONFIG_FILE).is_file():  # a process that was killed early leaves a folder without a run
             return False
-        settings = run_settings(self.config_of(variant), self._settings(seq))
-        require_same_settings(folder, settings, limits=LIMITS)
-        done = folder / DONE_FILE
-        steps = read_json(done) if done.is_file() else {"steps": 0}
-        if not isinstance(steps, dict) or type(steps := steps.get("steps")) is not int:
-            raise ValueError(f'{done}: expected {{"steps": a number}}, found {steps!r:.60}')
+        require_same_settings(folder, run_settings(self.config_of(variant), self._settings(seq)), limits=LIMITS)
+        path = folder / DONE_FILE
+        done = read_json(path) if path.is_file() else {"steps": 0}
+        steps = done.get("steps") if isinstance(done, dict) else done
+        if type(steps) is not int:
+            raise ValueError(f'{path}: expected {{"steps": a number}}, found {steps!r:.60}')
         if steps > self.config.steps:
             raise ValueError(f"{folder}: expected a run of up to {self.config.steps} steps, found {steps}")
         return steps == self.config.steps
 
-    def train(self, variant: str, seq: str, *, stopped: Callable[[], bool] = lambda: False) -> TrainResult:
+    def train(self, variant: str, seq: str, *, stopped: Callable[[], bool]) -> TrainResult:
         """Train the remaining steps of a run. Raises ValueError if it was started with other settings."""
         folder = self._folder(variant, seq)
         result = train(
@@ -99,6 +114,17 @@ class Runs:
         """Return the training recordings of the runs for `seq`."""
         return [self.recording(name) for name in recording_names(self.data) if name != seq]
 
+    def session_recordings(self) -> list[Recording]:
+        """Open the sessions. The first is the database."""
+        root = self.sessions()
+        return [open_recording(root, session) for session in recording_names(root)]
+
+    def labels(self, name: str) -> Mapping[str, str]:
+        """Return the label of each variant of a table or figure by its name, and of the methods compared with them."""
+        experiment = EXPERIMENTS[name]
+        compared = (*self.weights, *self.methods) if experiment.beside_handcrafted else ()
+        return {**(experiment.variants if self.trained else {}), **{method: method for method in compared}}
+
     def descriptors(
         self, method: str, seq: str, *, of: Recording | None = None, rotated: bool = False
     ) -> DescriptorFile:
@@ -114,12 +140,16 @@ class Runs:
             folder / "descriptors" / f"{file_name(recording.name)}-{corruption.name}.npz",
             self._method(method, seq, recording),
             recording,
-            corruption,
-            seed=ROTATION_SEED,
+            rotation_seed=ROTATION_SEED if rotated else None,
             batch=BATCH,
             title=f"embed {method} {recording.name}",
             progress=self.progress,
         )
+
+    @functools.cache  # noqa: B019  a process has one reproduction
+    def score(self, method: str, seq: str, protocol: str = TOP1, *, rotated: bool = False) -> Result:
+        """Return the result of a variant, a handcrafted method or weights, by default by the paper's protocol."""
+        return PROTOCOLS[protocol](self.descriptors(method, seq, rotated=rotated))
 
     def _method(self, method: str, seq: str, recording: Recording) -> Method:
         if method in VARIANTS:

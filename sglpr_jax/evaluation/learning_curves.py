@@ -1,0 +1,37 @@
+"""Learning curves of a training run, drawn when it ends."""
+
+from pathlib import Path
+
+from sglpr_jax.evaluation import figures
+from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.loss import TERM_NAMES
+from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.trainer import METRICS_FILE
+
+PICTURE = "learning-curves.png"
+PANELS = {
+    "loss": ("loss", *TERM_NAMES),
+    "score: recall@1 of held-out or training places": ("score",),
+    "gradient norm": ("gradient_norm",),
+}
+"""Title of each panel, and the names of its curves in the metrics file."""
+
+
+class LearningCurves(Callback):
+    """Draws the learning curves of the run in `folder` when training ends, if matplotlib (extra `viz`) is installed."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+
+    def on_end(self, step: int) -> None:
+        """Draw loss terms, score and gradient norm of the whole run, including those of earlier processes."""
+        lines = read_metrics(self._folder / METRICS_FILE)
+        if not lines or not figures.can_draw():
+            return
+        panels = {}
+        for title, names in PANELS.items():
+            curves = {
+                name: [(line["step"], line[name]) for line in lines if line.get(name) is not None] for name in names
+            }
+            panels[title] = {name: points for name, points in curves.items() if points}
+        figures.save(figures.learning_curves(panels), self._folder / PICTURE)

@@ -1,0 +1,66 @@
+"""Factor graph of gtsam (extra `gtsam`) with the noise of odometry and loops."""
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+FIRST_POSE = 1e-6
+"""Standard deviation of the first pose, which stays fixed, in metres and radians."""
+
+
+def gtsam_library() -> ModuleType:
+    """Import gtsam. Raises ImportError if the extra `gtsam` is not installed."""
+    try:
+        return importlib.import_module("gtsam")
+    except ImportError as error:
+        raise ImportError("optimisation of a trajectory needs gtsam: pip install 'sglpr-jax[gtsam]'") from error
+
+
+class FactorGraph:
+    """Factors between poses of nodes, and the first estimates of these poses."""
+
+    def __init__(self):
+        self._gtsam = gtsam_library()
+        self.factors, self.estimates = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
+
+    def add_node(self, node: int, pose: Float[np.ndarray, "4 4"], *, fixed: bool = False) -> None:
+        """Add a node with an estimate of its pose, which does not change if it is `fixed`."""
+        self.estimates.insert(node, self._gtsam.Pose3(pose))
+        if fixed:
+            noise = self._gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
+            self.factors.add(self._gtsam.PriorFactorPose3(node, self._gtsam.Pose3(pose), noise))
+
+    def add_step(
+        self, before: int, after: int, step: Float[np.ndarray, "4 4"], *, metres: float, radians: float
+    ) -> None:
+        """Connect two nodes by odometry, with the standard deviations of `step_deviations`."""
+        self._connect(before, after, step, self._gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3)))
+
+    def add_loop(
+        self,
+        match: int,
+        query: int,
+        match_from_query: Float[np.ndarray, "4 4"],
+        covariance: Float[np.ndarray, "6 6"],
+        *,
+        cauchy: float | None = None,
+    ) -> None:
+        """Connect two nodes by a loop. With `cauchy`, the residual in standard deviations at which it has half its
+        weight, its cost is robust."""
+        noise = self._gtsam.noiseModel.Gaussian.Covariance(rotation_first(covariance))
+        if cauchy is not None:
+            robust = self._gtsam.noiseModel.mEstimator.Cauchy(cauchy)
+            noise = self._gtsam.noiseModel.Robust.Create(robust, noise)
+        self._connect(match, query, match_from_query, noise)
+
+    def _connect(self, first: int, second: int, pose: Float[np.ndarray, "4 4"], noise: Any) -> None:
+        self.factors.add(self._gtsam.BetweenFactorPose3(first, second, self._gtsam.Pose3(pose), noise))
+
+
+def rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance with rotation before translation, as in gtsam."""
+    order = np.array([3, 4, 5, 0, 1, 2])
+    return covariance[np.ix_(order, order)]
