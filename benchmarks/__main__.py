@@ -22,14 +22,11 @@ class Program(NamedTuple):
 
 PROGRAMS = {
     "goldens": Program("goldens", "main", "whether the commands write the same as before a change"),
-    "loops simulated": Program("quality.loops", "simulated", "loops of simulated drives, ours and other methods'"),
+    "loops": Program("quality.loops", "loops", "loops of simulated drives, ours and other methods'"),
     "loops images": Program("quality.loops", "images", "loops of ready-made images, and F1max after verification"),
-    "repeating render": Program("quality.repeating", "render", "renders drives where places repeat"),
-    "repeating search": Program("quality.repeating", "search", "wrong loops and recall in rendered drives"),
-    "repeating evidence": Program("quality.missing_evidence", "evidence", "the right place beside the best lookalike"),
-    "repeating fit": Program("quality.fit_loops", "fit_model", "fits and writes loops/probability.json"),
-    "sessions render": Program("quality.sessions", "render", "renders pairs of drives through one town"),
-    "sessions search": Program("quality.sessions", "search", "transforms between them, and invented ones"),
+    "loops evidence": Program("quality.lookalikes", "evidence", "the right place beside the best lookalike"),
+    "loops fit": Program("quality.fit", "fit_model", "fits and writes loops/probability.json"),
+    "sessions": Program("quality.sessions", "sessions", "transforms between pairs of drives, and invented ones"),
     "poses pairs": Program("quality.poses", "pairs", "errors of pairs of revisits against their covariances"),
     "poses search": Program("quality.poses", "search", "roll, pitch and height of loops of whole drives"),
     "maps cloud": Program("quality.maps", "cloud", "relocalisation in a point cloud map"),
@@ -45,7 +42,6 @@ PROGRAMS = {
     "speed loops": Program("speed.loops", "loops", "memory and time of the loop detector on a long drive"),
     "speed live": Program("speed.live", "live", "latency, dropped scans and memory of bin/live"),
     "speed start-up": Program("speed.start_up", "start_up", "time until a command starts"),
-    "speed index": Program("speed.index", "index", "a query among a million places beside faiss"),
     "speed training": Program("speed.training", "training", "training steps, and their share of the device's peak"),
     "speed profile": Program("speed.profile_step", "profile", "parts of a training step"),
     "torch describe": Program("torch_peer.compare", "describe", "descriptors beside the same network in PyTorch"),
@@ -69,16 +65,21 @@ PROGRAMS = {
 }
 
 
-def main(arguments: list[str]) -> None:
-    """Run the program that the first words name."""
-    for words in (2, 1):
-        name = " ".join(arguments[:words])
-        if name in PROGRAMS:
-            tyro.cli(PROGRAMS[name].load(), args=arguments[words:], prog=f"python -m benchmarks {name}")
-            return
-    print("\n".join(f"{name:20} {one.summary}" for name, one in PROGRAMS.items()))
-    if arguments and not arguments[0].startswith("-"):
-        raise SystemExit(f"error: expected one of these programs, found {' '.join(arguments[:2])!r}")
+def name_of(words: list[str]) -> str | None:
+    """The program that the first words name."""
+    return next((name for name in (" ".join(words[:2]), *words[:1]) if name in PROGRAMS), None)
+
+
+def main(words: list[str]) -> None:
+    """Run a program with its flags."""
+    name = name_of(words)
+    if name is not None:
+        flags = words[len(name.split()) :]
+        tyro.cli(PROGRAMS[name].load(), args=flags, prog=f"python -m benchmarks {name}")
+        return
+    print("\n".join(f"{name:20} {program.summary}" for name, program in PROGRAMS.items()))
+    if words and not words[0].startswith("-"):
+        raise SystemExit(f"error: expected one of these programs, found {' '.join(words[:2])!r}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""Simulated drives by name, and the odometry with which they are searched."""
+"""Simulated drives of the benchmarks, their scans in memory or on disk, and their odometry."""
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -13,8 +14,8 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
 from sglpr_jax.se3 import inverse, transform
 from sglpr_jax.sim.drive import CARRIERS
-from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
-from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, simulate_repeating
+from sglpr_jax.sim.routes import REVISITS
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
 from sglpr_jax.sim.styles import SCENERIES
@@ -31,9 +32,20 @@ LIDARS = {
 }
 OTHER_M = 20.0
 """In towns, frames farther apart than this show different places."""
+STEPS = {"hdl64e": 900, "hdl32e": 1080}
+"""Default firings per turn, of other sensors all."""
+CARS = (("hdl64e", "vehicle"), ("vlp16", "vehicle"))
+WALKERS = (("os0-32", "backpack"), ("os0-32-140", "handheld"))
+MOUNTED = {
+    **dict.fromkeys(("hall", "yard"), WALKERS),
+    **dict.fromkeys(("campus", "warehouse"), (*CARS, ("os0-32", "cart"))),
+    "forest": (*CARS, ("os0-32", "backpack")),
+    "storeys": (("hdl32e", "vehicle"), ("vlp16", "vehicle")),
+}
+"""Sensors and carriers of a scenery, if they are not `CARS`."""
 
 
-class Case(NamedTuple):
+class Drive(NamedTuple):
     """A simulated drive."""
 
     world: str
@@ -42,45 +54,90 @@ class Case(NamedTuple):
     """Route of a town, or its kind of revisits: "none", "same" or "opposite". Sceneries that repeat have only these."""
     seed: int
     sensor: str
-    """Name in `LIDARS`, with a plus sign and the name of the carrier if it is not a vehicle."""
+    carrier: str
 
-    @classmethod
-    def of(cls, text: str, *, sensor: str = "hdl64e") -> "Case":
-        """The drive WORLD:ROUTE:SEED or WORLD:ROUTE:SEED:SENSOR."""
-        world, route, seed, *own = text.split(":")
-        return cls(world, route, int(seed), own[0] if own else sensor)
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        return "-".join(map(str, self))
 
     @property
     def other_m(self) -> float:
         """Frames farther apart than this show different places, in metres."""
         return OTHER_M if self.world in SCENERIES else REPEATING[self.world].other_m
 
-    def simulate(self, *, scans: int, azimuth_steps: int | None, rate_hz: float | None = None) -> SimulatedRecording:
-        """The recording. None as `azimuth_steps` keeps those of the sensor."""
-        name, _, carrier = self.sensor.partition("+")
-        options: dict[str, Any] = {"scans": scans, "seed": self.seed, "sensor": lidar(name, azimuth_steps)}
-        options["carrier"] = CARRIERS[carrier or "vehicle"]
-        options |= {} if rate_hz is None else {"rate_hz": rate_hz}
-        if self.world not in SCENERIES:
-            return simulate_repeating(self.world, revisit=self.route, **options)  # type: ignore[arg-type]
-        routes = ROUTES.get(self.route, (self.route,))
-        return simulate_recording(routes[self.seed % len(routes)], scenery=SCENERIES[self.world], **options)
+
+@dataclasses.dataclass(frozen=True)
+class Drives:
+    """Drives of a benchmark: each world with each route, seed, sensor and carrier."""
+
+    drives: tuple[str, ...] = ()
+    """WORLD:ROUTE:SEED, in place of the next three."""
+    world: tuple[str, ...] = (*REPEATING, *SCENERIES)
+    """Sceneries that repeat, and sceneries of towns."""
+    route: tuple[str, ...] = REVISITS
+    """Kinds of revisits: none, same or opposite. Towns also have routes: 00 has revisits in the same direction, 08 in
+    the opposite one."""
+    seed: tuple[int, ...] = (1,)
+    sensor: tuple[str, ...] = ()
+    """Names of sensors. Without them, sensors and carriers are those of the scenery."""
+    carrier: tuple[str, ...] = ("vehicle",)
+    scans: int = 300
+    azimuth_steps: int | None = 900
+    """Maximum number of firings of a sensor per turn. None: 900 of hdl64e, 1080 of hdl32e, all of others."""
+    rate_hz: float | None = None
+    """Scans per second. None: the rate of the carrier or of the scenery."""
+
+    def __iter__(self) -> Iterator[Drive]:
+        """All drives."""
+        named = [text.split(":") for text in self.drives]
+        for world, route, seed in named or (
+            (w, r, s) for s, r, w in itertools.product(self.seed, self.route, self.world)
+        ):
+            mounted = tuple(itertools.product(self.sensor, self.carrier)) or MOUNTED.get(world, CARS)
+            yield from (Drive(world, route, int(seed), *each) for each in mounted)
+
+    def simulate(self, drive: Drive, *, scans: int | None = None) -> SimulatedRecording:
+        """The recording of a drive."""
+        steps = STEPS.get(drive.sensor) if self.azimuth_steps is None else self.azimuth_steps
+        options: dict[str, Any] = {
+            "scans": scans or self.scans,
+            "seed": drive.seed,
+            "sensor": lidar(drive.sensor, steps),
+        }
+        options["carrier"] = CARRIERS[drive.carrier]
+        options |= {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
+        if drive.world not in SCENERIES:
+            return simulate_repeating(drive.world, revisit=drive.route, **options)  # type: ignore[arg-type]
+        routes = ROUTES.get(drive.route, (drive.route,))
+        return simulate_recording(routes[drive.seed % len(routes)], scenery=SCENERIES[drive.world], **options)
+
+
+EVERYWHERE = Drives()
+WALKS = Drives(
+    drives=("town:08:620", "town:00:621", "outskirts:06:622", "gardens:08:623"),
+    sensor=("hdl64e",),
+    carrier=("handheld",),
+    scans=360,
+    azimuth_steps=None,
+)
+"""Walks through towns with a sensor in the hand."""
 
 
 def lidar(name: str, azimuth_steps: int | None) -> Sensor:
     """A sensor with at most this number of firings a turn, if it turns. Raises ValueError for an unknown one."""
     if name not in LIDARS:
         raise ValueError(f"expected a sensor among {', '.join(LIDARS)}, found {name!r}")
-    known = LIDARS[name]
-    if azimuth_steps is None or known.pattern != "rings":
-        return known
-    return dataclasses.replace(known, azimuth_steps=min(azimuth_steps, known.azimuth_steps))
+    sensor = LIDARS[name]
+    if azimuth_steps is None or sensor.pattern != "rings":
+        return sensor
+    return dataclasses.replace(sensor, azimuth_steps=min(azimuth_steps, sensor.azimuth_steps))
 
 
 def in_memory(recording: SimulatedRecording, frames: Sequence[int] | np.ndarray | None = None) -> Recording:
     """The recording, with all scans or those of some frames rendered once."""
-    chosen = range(len(recording)) if frames is None else frames
-    rendered = {recording.paths[i]: recording.points(int(i)) for i in chosen}
+    frames = range(len(recording)) if frames is None else frames
+    rendered = {recording.paths[i]: recording.points(int(i)) for i in frames}
     return dataclasses.replace(recording, read=lambda path, labels, lasers: Scan(points=rendered[path]))
 
 
@@ -98,16 +155,16 @@ def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
     return dataclasses.replace(recording, read=read, label_paths=())
 
 
-def recording_of(name: str, records: Sequence[Scan], times: Float[np.ndarray, " n"] | None = None) -> Recording:
+def recording_of(name: str, scans: Sequence[Scan], times: Float[np.ndarray, " n"] | None = None) -> Recording:
     """A recording of scans or images in memory."""
-    paths = tuple(Path(f"{i:06d}") for i in range(len(records)))
-    found = dict(zip(paths, records, strict=True))
+    paths = tuple(Path(f"{i:06d}") for i in range(len(scans)))
+    scan_of = dict(zip(paths, scans, strict=True))
     return Recording(
         name=name,
         ids=tuple(map(str, paths)),
         times=times,
         paths=paths,
-        read=lambda path, labels, lasers: found[path],
+        read=lambda path, labels, lasers: scan_of[path],
         on_disk=False,
     )
 
@@ -128,12 +185,12 @@ def drifted(poses: Float[np.ndarray, "n 4 4"], *, seed: int, turn_deg: float = 0
     turn = np.radians(turn_deg) * (
         rng.choice([-1, 1]) * metres / 100 + rng.normal(size=len(steps)) * np.sqrt(metres / 100)
     )
-    found = [np.eye(4)]
+    odometry = [np.eye(4)]
     for step, scale, angle in zip(steps, length, turn, strict=True):
         step = step.copy()
         step[:3, 3] *= scale
-        found.append(found[-1] @ step @ transform(0.0, 0.0, angle))
-    return np.stack(found)
+        odometry.append(odometry[-1] @ step @ transform(0.0, 0.0, angle))
+    return np.stack(odometry)
 
 
 def revisited(
@@ -141,8 +198,8 @@ def revisited(
 ) -> Bool[np.ndarray, " n"]:
     """Which scans come within `near_m` of an earlier one. Their progress, a time or travelled distance, differs by at
     least `apart`."""
-    found = np.zeros(len(positions), bool)
+    is_revisit = np.zeros(len(positions), bool)
     for i, position in enumerate(positions):
         old = positions[progress <= progress[i] - apart]
-        found[i] = len(old) > 0 and np.linalg.norm(old - position, axis=1).min() < near_m
-    return found
+        is_revisit[i] = len(old) > 0 and np.linalg.norm(old - position, axis=1).min() < near_m
+    return is_revisit

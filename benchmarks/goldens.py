@@ -14,7 +14,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +21,8 @@ import numpy as np
 import safetensors.numpy
 import tyro
 from jaxtyping import Shaped
+
+from benchmarks.timing import run_command
 
 TOWNS = ("08", "00", "06")
 SCANS = Path("towns", "sequences", "00", "velodyne")
@@ -74,22 +75,22 @@ def main(out: tyro.conf.Positional[Path], *, beside: Path | None = None, within:
     if out.exists():
         raise SystemExit(f"{out}: expected a new folder")
     out.mkdir(parents=True)
-    for step in simulations():
-        _run(step, out)
+    for line in simulations():
+        _run(line, out)
     for number, scan in enumerate(sorted((out / SCANS).iterdir())):
         half = out / "halves" / str(number % 2)
         half.mkdir(parents=True, exist_ok=True)
         shutil.copy(scan, half)
-    for step in steps(None if beside is None else beside.resolve()):
-        _run(step, out)
+    for line in steps(None if beside is None else beside.resolve()):
+        _run(line, out)
     if beside is None:
         return
-    found = [] if text_of(out / POSE) == text_of(out / "pose.json") else ["the pose in the earlier map differs"]
+    different = [] if text_of(out / POSE) == text_of(out / "pose.json") else ["the pose in the earlier map differs"]
     (out / POSE).unlink()
     shutil.rmtree(out / SCORES)
-    found += differences(beside, out, within=within)
-    print(*(found or ["everything is the same"]), sep="\n")
-    if found:
+    different += differences(beside, out, within=within)
+    print(*(different or ["everything is the same"]), sep="\n")
+    if different:
         raise SystemExit(1)
 
 
@@ -97,20 +98,18 @@ def _run(line: str, folder: Path) -> None:
     """Run a command line in the folder of the goldens."""
     print(line, flush=True)
     command, *arguments = shlex.split(line)
-    program = (str(Path(__file__).parents[1] / "bin" / command), *arguments)
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{command} failed ({done.returncode}):\n{done.stdout}{done.stderr}")
+    program = (Path(__file__).parents[1] / "bin" / command, *arguments)
+    run_command(program, os.environ | {"JAX_PLATFORMS": "cpu"}, folder)
 
 
 def differences(before: Path, after: Path, *, within: float) -> list[str]:
     """What differs between two folders, one line for a file."""
     names = [set(map(str, _compared(folder))) for folder in (before, after)]
-    found = [f"{name}: in one folder only" for name in sorted(names[0] ^ names[1])]
-    both = sorted(names[0] & names[1])
-    found += [f"{name}: differs" for name in both if not same(before / name, after / name, within=within)]
-    return found
+    lines = [f"{name}: in one folder only" for name in sorted(names[0] ^ names[1])]
+    for name in sorted(names[0] & names[1]):
+        if not same(before / name, after / name, within=within):
+            lines.append(f"{name}: differs")
+    return lines
 
 
 def _compared(folder: Path) -> Iterator[Path]:
@@ -124,27 +123,27 @@ def same(first: Path, second: Path, *, within: float) -> bool:
     """Whether two files are equal or, if `within` is not 0, have numbers that nearly are."""
     if first.suffix in (".html", ".png") or first.read_bytes() == second.read_bytes():
         return True
-    if first.suffix in TEXT:
-        one, other = text_of(first), text_of(second)
-        numbers = [np.array(NUMBER.findall(text), np.float64) for text in (one, other)]
-        return one == other or (NUMBER.sub("#", one) == NUMBER.sub("#", other) and _near(*numbers, within=within))
-    if first.suffix in (".npz", ".safetensors"):
-        one, other = _arrays(first), _arrays(second)
-        equal = {key: np.array_equal(one[key], other[key]) for key in set(one) & set(other)}
-        return set(one) == set(other) and all(equal[key] or _near(one[key], other[key], within=within) for key in one)
-    return False
+    if first.suffix not in (*TEXT, ".npz", ".safetensors"):
+        return False
+    one, other = _arrays(first), _arrays(second)
+    return set(one) == set(other) and all(_near(one[key], other[key], within=within) for key in one)
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of a file."""
+    """Arrays of a file; of a text its numbers and the text between them."""
     if path.suffix == ".safetensors":
         return safetensors.numpy.load_file(path)
-    with np.load(path) as file:
-        return dict(file)
+    if path.suffix == ".npz":
+        with np.load(path) as file:
+            return dict(file)
+    text = text_of(path)
+    return {"numbers": np.array(NUMBER.findall(text), np.float64), "text": np.array(NUMBER.sub("#", text))}
 
 
 def _near(one: Shaped[np.ndarray, "..."], other: Shaped[np.ndarray, "..."], *, within: float) -> bool:
     """Whether numbers differ by at most `within`, relative to the first ones, or absolutely below 1."""
+    if np.array_equal(one, other):
+        return True
     numeric = one.dtype.kind in "fiu" and other.dtype.kind in "fiu" and one.shape == other.shape
     return within > 0 and numeric and bool((np.abs(one - other) <= within * np.maximum(1.0, np.abs(one))).all())
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
-from rich.table import Table
+
+from benchmarks.table import Table
 
 Job = Callable[[], Any]
 SPREAD = (0.1, 0.9)
@@ -56,10 +56,12 @@ def median_seconds(job: Job, *, repeats: int) -> float:
     return float(np.median(in_turn([clocked(job)], repeats=repeats)))
 
 
-def run_command(command: Sequence[str | Path], environment: Mapping[str, str] = os.environ) -> tuple[float, float]:
-    """Seconds and processor seconds of a command. Raises SystemExit if it fails."""
+def run_command(
+    command: Sequence[str | Path], environment: Mapping[str, str] = os.environ, folder: Path | str | None = None
+) -> tuple[float, float]:
+    """Run a command in a folder. Returns its seconds and processor seconds, or raises SystemExit if it fails."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder)
     seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if ended.returncode:
         raise SystemExit(f"{command[:3]} failed: {ended.stderr[-2000:]}")
@@ -88,16 +90,12 @@ class Contender:
         return self.run()[1]
 
     def forget_peak(self) -> None:
-        """Let `peak_mb` and `processor_s` begin anew: compiling needs memory, too."""
+        """Let `usage` begin anew: compiling needs memory, too."""
         self._ask("forget peak")
 
-    def processor_s(self) -> float:
-        """Median of the processor seconds, over all threads, of the runs since `forget_peak` or its start."""
-        return self._ask("processor")
-
-    def peak_mb(self) -> float:
-        """The most resident memory of the process, in 10^6 bytes, since `forget_peak` or its start."""
-        return self._ask("peak")
+    def usage(self) -> tuple[float, float]:
+        """Median processor seconds of a run over all threads, and peak of resident memory in 10^6 bytes."""
+        return self._ask("usage")
 
     def _ask(self, question: str) -> Any:
         try:
@@ -112,19 +110,19 @@ def _serve(pipe, threads: int, make_job: Callable[..., Job], arguments: tuple) -
     job, processor_s = make_job(*arguments), []
     while True:
         try:
-            asked = pipe.recv()
+            question = pipe.recv()
         except EOFError:
             return
-        if asked == "run":
+        if question == "run":
             start, used = time.perf_counter(), time.process_time()
             value = job()
             pipe.send((value, time.perf_counter() - start))
             processor_s.append(time.process_time() - used)
-        elif asked == "forget peak":
+        elif question == "forget peak":
             processor_s.clear()
             pipe.send(Path("/proc/self/clear_refs").write_text("5"))  # of all that it can clear: VmHWM
         else:
-            pipe.send({"peak": peak_mb, "processor": lambda: float(np.median(processor_s))}[asked]())
+            pipe.send((float(np.median(processor_s)), peak_mb()))
 
 
 def peak_mb() -> float:
@@ -169,8 +167,7 @@ def report(
     low, middle, high = np.quantile(seconds / others, (SPREAD[0], 0.5, SPREAD[1]))
     table = Table("", f"{against}, ms", f"{name}, ms", f"{name} / {against}", "spread")
     milliseconds = (f"{1e3 * np.median(each):.4g}" for each in (others, seconds))
-    table.add_row(title, *milliseconds, f"{middle:.3f}", f"{low:.3f} to {high:.3f}")
-    Console(width=120).print(table)
+    table.add(title, *milliseconds, f"{middle:.3f}", f"{low:.3f} to {high:.3f}")
     print(f"Medians of {len(seconds)} repeats. Below 1 {name} is faster. Spread: the 10 % and 90 % quantiles.")
     print(f"{threads} threads each; GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")
     print("\n".join(about(*packages).values()))

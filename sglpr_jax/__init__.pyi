@@ -85,7 +85,7 @@ from .retrieval.index import Index as Index
 from .sim.dataset import simulate as simulate
 from .sim.drive import CARRIERS as CARRIERS
 from .sim.recording import simulate_recording as simulate_recording
-from .sim.repeating import simulate_repeating as simulate_repeating
+from .sim.recording import simulate_repeating as simulate_repeating
 from .sim.sensor import SENSORS as SENSORS
 from .training.presets import preset as preset
 from .training.recipe import TrainResult as TrainResult

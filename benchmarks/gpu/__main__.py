@@ -1,18 +1,17 @@
-"""All that is measured and made on a GPU, in three commands of some minutes each; docs/guides/gpu.md.
+"""Measurements, datasets and trainings on a GPU, in three commands of some minutes each; docs/guides/gpu.md.
 
     python -m benchmarks.gpu simulate --out towns
     python -m benchmarks.gpu train --data towns --preset sglpr --out runs/sglpr
     python -m benchmarks.gpu measure
 
-Each stops by itself after --minutes; given once more it goes on where it stopped. It runs from a checkout that is not
-installed, where there is no tyro.
+Each stops by itself after --minutes. The same command continues where it stopped. It runs from a checkout that is not
+installed, without tyro.
 """
 
 import argparse
 import math
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 ROUTES = ("00", "02", "05", "06", "07", "08")
@@ -20,40 +19,32 @@ PRESETS = ("circular", "sglpr", "paper-112", "paper")
 TYPES = ("bfloat16", "float32")
 TRAINING_SHARE = 0.85
 """Of the minutes; in the rest of them a checkpoint is written and the weights are tested."""
-GO_ON = "stopped in time; the same command goes on"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Parse and do it: bad input ends in one line on stderr and exit status 1 (2 where no such option is known)."""
-    asked = parser().parse_args(arguments)
-    stopped = time_limit(asked.minutes * (TRAINING_SHARE if asked.work == "train" else 1))
+    """Run a command. Bad input ends in one line on stderr and exit status 1 (2 for an unknown option)."""
+    flags = parser().parse_args(arguments)
+    end = time.monotonic() + 60 * flags.minutes * (TRAINING_SHARE if flags.command == "train" else 1)
     from benchmarks.gpu import commands  # brings JAX, which --help does not need
-    from benchmarks.gpu.commands import told
 
     try:
-        what, finished = getattr(commands, asked.work)(asked, stopped)
+        result, finished = getattr(commands, flags.command)(flags, lambda: time.monotonic() > end)
     except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"error: {' '.join(str(error).split())}")
-    print(f"{what}: {'finished' if finished else GO_ON}\n{told(asked.results)}")
-
-
-def time_limit(minutes: float) -> Callable[[], bool]:
-    """A function that tells whether so many minutes are over since now."""
-    end = time.monotonic() + 60 * minutes
-    return lambda: time.monotonic() > end
+    state = "finished" if finished else "stopped in time; the same command continues"
+    print(f"{result}: {state}\n{commands.summary_of(flags.results)}")
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = made.add_subparsers(required=True)
-    for work, (add, about) in WORKS.items():
-        command = commands.add_parser(work, description=about, help=about)
-        command.set_defaults(work=work)
+    whole = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = whole.add_subparsers(required=True, dest="command")
+    for name, (add, about) in COMMANDS.items():
+        command = commands.add_parser(name, description=about, help=about)
         command.add_argument("--minutes", type=_positive, default=9.0, help="it stops by itself after these (9)")
         command.add_argument("--results", type=Path, default=Path("build/gpu"), help="folder of results (build/gpu)")
         add(command)
-    return made
+    return whole
 
 
 def _add_simulate(command: argparse.ArgumentParser) -> None:
@@ -65,9 +56,6 @@ def _add_simulate(command: argparse.ArgumentParser) -> None:
     add("--sensor", default="hdl64e", help="as of bin/simulate")
     add("--azimuth-steps", type=_count, help="firings per turn (the real sensor's)")
     add("--seed", type=int, default=0)
-    add("--batch", type=_count, default=16, help="scans and clouds in one call, beside one (16)")
-    add("--points", type=_count, default=120_000, help="of a cloud that is rasterised (120000)")
-    add("--repeats", type=_count, default=10, help="how often everything is timed (10)")
 
 
 def _add_train(command: argparse.ArgumentParser) -> None:
@@ -95,7 +83,7 @@ def _add_measure(command: argparse.ArgumentParser) -> None:
     add("--peak-tflops", type=_positive, default=989.0, help="nominal peak in bfloat16 (989, an H100's)")
 
 
-WORKS = {
+COMMANDS = {
     "simulate": (_add_simulate, "Rates of the simulator and of images, and a dataset."),
     "train": (_add_train, "A training, and the scores of its weights so far."),
     "measure": (_add_measure, "Steps and descriptors of presets."),

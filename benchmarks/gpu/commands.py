@@ -1,11 +1,12 @@
-"""The three commands for a GPU: each stops when its time is over, and goes on there when it is given once more."""
+"""The three commands for a GPU: each stops when its time is over, and continues there when it is started again."""
 
 import argparse
+import contextlib
 import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,133 +32,113 @@ from sglpr_jax.training.run_folder import CONFIG_FILE
 from sglpr_jax.training.trainer import METRICS_FILE
 
 Row = dict[str, Any]
-MOST_FILES = 8
-MOST_BYTES = 16 * 10**6
-"""Of one file."""
+Stopped = Callable[[], bool]
+Flags = argparse.Namespace
+MAX_FILES, MAX_BYTES = 8, 16 * 10**6
+"""Maximum number of files in the results, and maximum size of one."""
 HEADER_BYTES = 10**5
 """Room for what a file of weights has beside its numbers."""
 SUMMARY_FILE = "summary.json"
-MOST_LINES = 2000
-"""Of the measurements in a summary; the run's folder has all."""
-Stopped = Callable[[], bool]
-Asked = argparse.Namespace
+MAX_LINES = 2000
+"""Maximum number of measurements in a summary; the run's folder has all."""
 
 
-class KeptRows:
-    """A table in a JSON file that is written after each row: a program that is cut goes on there.
+class StoredRows:
+    """A table in a JSON file that is written after each row, so that an interrupted program continues there.
 
-    `about` is written beside the rows. Raises ValueError if the file that is there is no such table.
+    The device is written beside the rows. Raises ValueError if the file that exists is no such table.
     """
 
-    def __init__(self, path: Path, *, about: Mapping[str, Any]):
-        self._path, self._about = path, about
-        found = read_json(path) if path.exists() else {"rows": []}
-        rows = found.get("rows") if isinstance(found, dict) else None
+    def __init__(self, path: Path):
+        self._path, self._about = path, about_device()
+        content = read_json(path) if path.exists() else {"rows": []}
+        rows = content.get("rows") if isinstance(content, dict) else None
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             raise ValueError(f"{path}: expected a table with rows, found none; remove the file to measure all anew")
         self.rows: list[Row] = rows
 
-    def find(self, key: Row) -> Row | None:
-        """The row with the values of `key`."""
-        return next((row for row in self.rows if key.items() <= row.items()), None)
+    def has(self, key: Row) -> bool:
+        """Whether there is a row with the values of `key` of this device."""
+        return any((key | {"device": self._about["device"]}).items() <= row.items() for row in self.rows)
 
     def add(self, key: Row, measure: Callable[[], Row]) -> None:
-        """Measure a row and write it, unless it is there. Raises WriteError if the file cannot be written."""
-        if self.find(key) is None:
-            self.rows.append({**key, **measure()})
-            write_json(self._path, {"rows": self.rows, **self._about})
+        """Measure a row and write it. Raises WriteError if the file cannot be written."""
+        self.rows.append({**key, "device": self._about["device"], **measure()})
+        write_json(self._path, {"rows": self.rows, **self._about})
 
 
-def half_fits(parameters: int) -> bool:
-    """Whether so many weights fit one file as float16."""
-    return 2 * parameters + HEADER_BYTES <= MOST_BYTES
-
-
-def told(folder: Path) -> str:
-    """One line on what a folder of results holds, and whether that is more than can be counted on to be copied."""
+def summary_of(folder: Path) -> str:
+    """One line about a folder of results, with a warning if it is too large to be copied."""
     sizes = {path: path.stat().st_size for path in sorted(folder.rglob("*")) if path.is_file()}
-    large = [str(path) for path, size in sizes.items() if size > MOST_BYTES]
-    found = f"{folder}: {len(sizes)} files, {sum(sizes.values()) / 1e6:.1f} MB"
-    if large or len(sizes) > MOST_FILES:
-        found += f" (expected at most {MOST_FILES} files of {MOST_BYTES / 1e6:.0f} MB; too large: {large or 'none'})"
-    return found
+    large = [str(path) for path, size in sizes.items() if size > MAX_BYTES]
+    line = f"{folder}: {len(sizes)} files, {sum(sizes.values()) / 1e6:.1f} MB"
+    if large or len(sizes) > MAX_FILES:
+        line += f" (expected at most {MAX_FILES} files of {MAX_BYTES / 1e6:.0f} MB; too large: {large or 'none'})"
+    return line
 
 
 class OutOfTime(Exception):
-    """The time for a dataset is over; it can be gone on with."""
+    """The time for a dataset is over. The dataset can be continued."""
 
 
-def simulate(asked: Asked, stopped: Stopped) -> tuple[str, bool]:
+def simulate(flags: Flags, stopped: Stopped) -> tuple[str, bool]:
     """Measure the rates of the simulator and of images, then write what is missing of a dataset."""
-    rows, device = KeptRows(asked.results / "simulate.json", about=about_device()), {"device": _device()}
-    sizes = {"batch": asked.batch, "points": asked.points, "repeats": asked.repeats}
-    route, scans = asked.seq[0], max(asked.batch, 2)
-    for key, measure in measurements(asked.sensor, asked.azimuth_steps, route=route, scans=scans, **sizes):
-        if stopped():
-            return _scans_in_words(asked), False
-        rows.add(key | device, measure)
-    if not _is_whole(asked) and not stopped():
+    rows, sensor = StoredRows(flags.results / "simulate.json"), lidar(flags.sensor, flags.azimuth_steps)
+    for key, measure in measurements(flags.sensor, sensor, route=flags.seq[0]):
+        if not rows.has(key) and not stopped():
+            rows.add(key, measure)
+    dataset = Simulated(flags.out, tuple(flags.seq), flags.scans, flags.layout, sensor)
+    wanted = flags.scans * len(flags.seq)
+    if (dataset.missing or _scans_in(flags) < wanted) and not stopped():
         call = 1 + sum(row["what"] == "dataset" for row in rows.rows)
-        key = {"what": "dataset", "call": call, "out": str(asked.out), "layout": asked.layout}
-        rows.add(key | device, lambda: _write(asked, stopped))
-    return _scans_in_words(asked), _is_whole(asked)
+        key = {"what": "dataset", "call": call, "out": str(flags.out), "layout": flags.layout}
+        rows.add(key, lambda: _write_scans(flags, stopped))
+    scans = _scans_in(flags)
+    return f"{scans} of {wanted} scans in {flags.out}", scans == wanted and not dataset.missing
 
 
-def _write(asked: Asked, stopped: Stopped) -> Row:
-    """Write scans until all are there or the time is over; how many a second, building and compiling included."""
+def _write_scans(flags: Flags, stopped: Stopped) -> Row:
+    """Write scans until all exist or the time is over. The rate includes building the town and compiling."""
 
     def look(done: int) -> None:
         if stopped():
             raise OutOfTime
 
-    options = {name: getattr(asked, name) for name in ("scans", "sensor", "azimuth_steps", "seed")}
-    images, vary = asked.layout != "scans", asked.layout == "varied"
-    before, start, finished = _scans_there(asked), time.perf_counter(), False
-    try:
-        simulate_dataset(asked.out, routes=tuple(asked.seq), images=images, vary=vary, on_progress=look, **options)
+    options = {name: getattr(flags, name) for name in ("scans", "sensor", "azimuth_steps", "seed")}
+    images, vary = flags.layout != "scans", flags.layout == "varied"
+    before, start, finished = _scans_in(flags), time.perf_counter(), False
+    with contextlib.suppress(OutOfTime):
+        simulate_dataset(flags.out, routes=tuple(flags.seq), images=images, vary=vary, on_progress=look, **options)
         finished = True
-    except OutOfTime:
-        pass
-    seconds, made = time.perf_counter() - start, _scans_there(asked) - before
-    return {"scans": made, "seconds": seconds, "scans_per_second": made / seconds, "finished": finished}
+    seconds, scans = time.perf_counter() - start, _scans_in(flags) - before
+    return {"scans": scans, "seconds": seconds, "scans_per_second": scans / seconds, "finished": finished}
 
 
-def _scans_there(asked: Asked) -> int:
-    """How many scans are on the disk."""
-    files_of = LAYOUTS[asked.layout].files_of_scan
-    scans = ((name, f"{i:06d}") for name in asked.seq for i in range(asked.scans))
-    return sum(all(file.exists() for file in files_of(asked.out, name, id)) for name, id in scans)
+def _scans_in(flags: Flags) -> int:
+    """Number of scans of the dataset on the disk."""
+    files_of = LAYOUTS[flags.layout].files_of_scan
+    scans = ((name, f"{i:06d}") for name in flags.seq for i in range(flags.scans))
+    return sum(all(file.exists() for file in files_of(flags.out, name, scan)) for name, scan in scans)
 
 
-def _is_whole(asked: Asked) -> bool:
-    """Whether all of the dataset is on the disk."""
-    sensor = lidar(asked.sensor, asked.azimuth_steps)
-    missing = Simulated(asked.out, tuple(asked.seq), asked.scans, asked.layout, sensor).missing
-    return not missing and _scans_there(asked) == asked.scans * len(asked.seq)
-
-
-def _scans_in_words(asked: Asked) -> str:
-    return f"{_scans_there(asked)} of {asked.scans * len(asked.seq)} scans in {asked.out}"
-
-
-def train(asked: Asked, stopped: Stopped) -> tuple[str, bool]:
-    """Train a preset until all steps are made or the time is over, test what there is, and write small results.
+def train(flags: Flags, stopped: Stopped) -> tuple[str, bool]:
+    """Train a preset until all steps are made or the time is over, test the weights, and write small results.
 
     The summary is RUN.json in the results, RUN being the name of the run's folder; weights go to the folder RUN there
     if they fit as float16. Nothing is tested again if no step was made since.
     """
-    changes = {name: getattr(asked, name) for name in ("chunk", "steps") if getattr(asked, name) is not None}
-    config = dataclasses.replace(configured(load_preset(asked.preset), asked.compute), **changes)
-    recordings, test = leave_one_out(asked.data, asked.test)
-    settings = {"data": str(asked.data), "preset": asked.preset, "test": asked.test}
+    changes = {name: getattr(flags, name) for name in ("chunk", "steps") if getattr(flags, name) is not None}
+    config = dataclasses.replace(configured(load_preset(flags.preset), flags.compute), **changes)
+    recordings, test = leave_one_out(flags.data, flags.test)
+    settings = {"data": str(flags.data), "preset": flags.preset, "test": flags.test}
     try:
         result = train_network(
             config,
             recordings,
-            out=asked.out,
+            out=flags.out,
             test=test,
-            resume=(asked.out / CONFIG_FILE).exists(),
-            cache=asked.packs,
+            resume=(flags.out / CONFIG_FILE).exists(),
+            cache=flags.packs,
             callback=ProgressBar(),
             stopped=stopped,
             settings=settings,
@@ -165,22 +146,22 @@ def train(asked: Asked, stopped: Stopped) -> tuple[str, bool]:
     except KeyboardInterrupt:  # how `train` stops while it packs recordings
         if not stopped():
             raise
-        return f"recordings are packed in {asked.packs}", False
-    path = asked.out / SUMMARY_FILE
+        return f"recordings are packed in {flags.packs}", False
+    path = flags.out / SUMMARY_FILE
     summary = read_json(path) if path.exists() else {}
     if summary.get("steps_made") != result.steps:
-        scores = final_test(result.params, test, asked.out / "test", methods=()).to_json()
+        scores = final_test(result.params, test, flags.out / "test", methods=()).to_json()
         summary = {**settings, "steps_made": result.steps, "scores": scores, **about_device()}
-    summary |= _how_it_went(result) | {"weights": _hand_out(result, asked.results)}
+    summary |= _measurements_of(result) | {"weights": _copy_weights(result, flags.results)}
     write_json(path, summary)
-    write_json(asked.results / f"{asked.out.name}.json", summary)
+    write_json(flags.results / f"{flags.out.name}.json", summary)
     return str(result), result.finished
 
 
-def _how_it_went(result: TrainResult) -> dict[str, Any]:
+def _measurements_of(result: TrainResult) -> dict[str, Any]:
     """Steps, speed and measurements: all scores, and of the other lines every n-th."""
     config, speed, lines = result.config, result.throughput, read_metrics(result.folder / METRICS_FILE)
-    every = math.ceil(len(lines) / MOST_LINES)
+    every = math.ceil(len(lines) / MAX_LINES)
     return {
         "steps": config.steps,
         "finished": result.finished,
@@ -192,48 +173,44 @@ def _how_it_went(result: TrainResult) -> dict[str, Any]:
     }
 
 
-def _hand_out(result: TrainResult, results: Path) -> str:
-    """Write the weights if they fit; says where they are."""
+def _copy_weights(result: TrainResult, results: Path) -> str:
+    """Write the weights to the results if they fit as float16, and return where they are."""
     parameters = sum(leaf.size for leaf in jax.tree.leaves(result.params.weights))
-    if not half_fits(parameters):
+    if 2 * parameters + HEADER_BYTES > MAX_BYTES:
         return f"in the run's folder alone: {parameters} parameters, as float16 {2 * parameters / 1e6:.0f} MB"
     save(result.params, results / result.folder.name, half=True)
     return f"{result.folder.name}, as float16: {parameters} parameters"
 
 
-def measure(asked: Asked, stopped: Stopped) -> tuple[str, bool]:
+def measure(flags: Flags, stopped: Stopped) -> tuple[str, bool]:
     """Measure descriptors and training steps of presets, those rows that are not in measure.json yet."""
-    rows = KeptRows(asked.results / "measure.json", about=about_device())
-    timing = Timing(asked.repeats, asked.calls, asked.size, asked.products, asked.peak_tflops)
-    changes = {} if asked.chunk is None else {"chunk": asked.chunk}
-    presets = {name: dataclasses.replace(load_preset(name), **changes) for name in asked.preset}
+    rows = StoredRows(flags.results / "measure.json")
+    timing = Timing(flags.repeats, flags.calls, flags.size, flags.products, flags.peak_tflops)
+    changes = {} if flags.chunk is None else {"chunk": flags.chunk}
+    presets = {name: dataclasses.replace(load_preset(name), **changes) for name in flags.preset}
     for name, preset in presets.items():
-        for compute in asked.compute:
-            for key, work in _jobs(configured(preset, compute), asked):
-                key = {"preset": Path(name).stem, "compute": compute, "device": _device(), **key}
-                if rows.find(key) is not None:
+        for compute in flags.compute:
+            for job, work in _jobs(configured(preset, compute), flags):
+                key = {"preset": Path(name).stem, "compute": compute, **job}
+                if rows.has(key):
                     continue
                 if stopped():
                     return "presets", False
                 rows.add(key, functools.partial(measured, work, compute, timing))
-                print(_in_words(rows.rows[-1]), flush=True)
+                print(_line_of(rows.rows[-1]), flush=True)
     return "presets", True
 
 
-def _jobs(config: TrainConfig, asked: Asked) -> Iterator[tuple[Row, Callable[[], Any]]]:
+def _jobs(config: TrainConfig, flags: Flags) -> Iterator[tuple[Row, Callable[[], Any]]]:
     """The key of each row of a model, and its work; rows that need less memory first."""
-    for batch in asked.batch:
-        yield {"what": "describe", "images": batch}, functools.partial(describe_work, config, batch, asked.calls)
+    for batch in flags.batch:
+        yield {"what": "describe", "images": batch}, functools.partial(describe_work, config, batch, flags.calls)
     key = {"what": "step", "images": config.images, "chunk": config.chunk}
-    yield key, functools.partial(step_work, config, asked.calls)
+    yield key, functools.partial(step_work, config, flags.calls)
 
 
-def _in_words(row: Row) -> str:
+def _line_of(row: Row) -> str:
     name = f"{row['preset']}, {row['compute']}, {row['what']} of {row['images']} image(s)"
     if "error" in row:
         return f"{name}: {row['error']}"
     return f"{name}: {1e3 * row['seconds']:.4g} ms, {row['share_of_peak']:.3f} of the measured peak"
-
-
-def _device() -> str:
-    return about_device()["device"]

@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.drives import lidar
 from benchmarks.speed.inputs import random_scans
 from benchmarks.timing import median_seconds
 from sglpr_jax.bev import rasterize
@@ -20,14 +19,16 @@ from sglpr_jax.sim.world import build_world
 
 GRID = Grid(height=224, width=224)
 """The paper's, onto which clouds are rasterised."""
+BATCH, POINTS, REPEATS = 16, 120_000, 10
+"""Scans and clouds in one call, points of a cloud, and how often everything is timed."""
 Row = dict[str, Any]
 
 
-class Along:
+class TownDrive:
     """A drive through its town, and the sensor that makes it."""
 
-    def __init__(self, seq: str, scans: int, sensor: Sensor):
-        path = plan_path(np.random.default_rng(0), seq, scans=scans)
+    def __init__(self, route: str, scans: int, sensor: Sensor):
+        path = plan_path(np.random.default_rng(0), route, scans=scans)
         xy, yaw, self.times = (values[scan_rows(path, scans)] for values in path)
         self.world = build_world(0, xy, self.times)
         self.poses = poses_on(self.world.ground.relief, xy, yaw, height_m=sensor.height_m)
@@ -47,24 +48,21 @@ class Along:
             list(pool.map(self.scan, range(len(self.poses))))
 
 
-def measurements(
-    sensor: str, azimuth_steps: int | None, *, route: str, scans: int, batch: int, points: int, repeats: int
-) -> Iterator[tuple[Row, Callable[[], Row]]]:
+def measurements(name: str, sensor: Sensor, *, route: str) -> Iterator[tuple[Row, Callable[[], Row]]]:
     """The key of each row, and a function that measures its rest."""
-    one = lidar(sensor, azimuth_steps)
-    drive = functools.cache(lambda: Along(route, scans, one))
-    rays = {"sensor": sensor, "rays": [len(one.elevations_deg), one.azimuth_steps]}
-    yield {"what": "scan", **rays}, lambda: _whole_scans(drive(), repeats)
-    for number in (1, batch):
-        key = {"what": "cast", "batch": number, **rays}
-        yield key, functools.partial(_casts, drive, number, repeats)
-    for number in (1, batch):
-        key = {"what": "rasterize", "batch": number, "points": points}
-        yield key, functools.partial(_rasterized, number, points, repeats)
-    yield {"what": "density_bev on the host", "points": points}, functools.partial(_densities, points, repeats)
+    drive = functools.cache(lambda: TownDrive(route, BATCH, sensor))
+    rays = {"sensor": name, "rays": [len(sensor.elevations_deg), sensor.azimuth_steps]}
+    yield {"what": "scan", **rays}, lambda: _whole_scans(drive())
+    for size in (1, BATCH):
+        key = {"what": "cast", "batch": size, **rays}
+        yield key, lambda size=size: _casts(drive(), size)
+    for size in (1, BATCH):
+        key = {"what": "rasterize", "batch": size, "points": POINTS}
+        yield key, functools.partial(_rasterized, size)
+    yield {"what": "density_bev on the host", "points": POINTS}, _densities
 
 
-def _whole_scans(drive: Along, repeats: int) -> Row:
+def _whole_scans(drive: TownDrive) -> Row:
     """Scans from the town to the host's memory: stages, and the rate in one and two threads.
 
     The cast is done twice to tell it from the returns, which follow it.
@@ -77,31 +75,31 @@ def _whole_scans(drive: Along, repeats: int) -> Row:
         "cast and returns": lambda: jax.block_until_ready(cast_turn(drive.key, view, sensor=drive.sensor)),
         "copy": lambda: returned_points(turn),
     }
-    row = {f"{name}_s": median_seconds(job, repeats=repeats) for name, job in stages.items()}
+    row = {f"{name}_s": median_seconds(job, repeats=REPEATS) for name, job in stages.items()}
     row["returns_s"] = row.pop("cast and returns_s") - row["cast_s"]
-    one, two = (median_seconds(lambda n=n: drive.scans_in(n), repeats=repeats) for n in (1, 2))
+    one, two = (median_seconds(lambda n=n: drive.scans_in(n), repeats=REPEATS) for n in (1, 2))
     count = len(drive.poses)
     return {**row, "scans_per_second": count / one, "scans_per_second_in_2_threads": count / two}
 
 
-def _casts(drive: Callable[[], Along], batch: int, repeats: int) -> Row:
-    """The device's part alone: the rays of so many scans in one call, all they may meet on the device already."""
-    along, keys = drive(), jax.random.split(jax.random.key(0), batch)
-    views = [along.view(i % len(along.poses)) for i in range(batch)]
+def _casts(drive: TownDrive, batch: int) -> Row:
+    """The device's part alone: the rays of this number of scans in one call, all surfaces on the device already."""
+    keys = jax.random.split(jax.random.key(0), batch)
+    views = [drive.view(i % len(drive.poses)) for i in range(batch)]
     stacked = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *views))
-    cast = jax.jit(jax.vmap(functools.partial(cast_turn, sensor=along.sensor)))
-    seconds = median_seconds(lambda: jax.block_until_ready(cast(keys, stacked)), repeats=repeats)
+    cast = jax.jit(jax.vmap(functools.partial(cast_turn, sensor=drive.sensor)))
+    seconds = median_seconds(lambda: jax.block_until_ready(cast(keys, stacked)), repeats=REPEATS)
     return {"seconds": seconds, "scans_per_second": batch / seconds}
 
 
-def _rasterized(batch: int, points: int, repeats: int) -> Row:
-    clouds = jax.device_put(random_scans(batch, points, grid=GRID)[0])
-    seconds = median_seconds(lambda: jax.block_until_ready(rasterize(clouds, grid=GRID)), repeats=repeats)
-    return {"seconds": seconds, "points_per_second": batch * points / seconds}
+def _rasterized(batch: int) -> Row:
+    clouds = jax.device_put(random_scans(batch, POINTS, grid=GRID)[0])
+    seconds = median_seconds(lambda: jax.block_until_ready(rasterize(clouds, grid=GRID)), repeats=REPEATS)
+    return {"seconds": seconds, "points_per_second": batch * POINTS / seconds}
 
 
-def _densities(points: int, repeats: int) -> Row:
+def _densities() -> Row:
     """The density image, which numpy makes: no device takes part."""
-    cloud = random_scans(points, grid=GRID)[0]
-    seconds = median_seconds(lambda: density_bev(cloud), repeats=repeats)
-    return {"seconds": seconds, "points_per_second": points / seconds}
+    cloud = random_scans(POINTS, grid=GRID)[0]
+    seconds = median_seconds(lambda: density_bev(cloud), repeats=REPEATS)
+    return {"seconds": seconds, "points_per_second": POINTS / seconds}

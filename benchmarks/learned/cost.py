@@ -4,9 +4,7 @@ Contenders take turns, so that other programs slow all of them. The time is that
 descriptor, one scan at a time: the image or graph is part of it. A product and a sum are two operations.
 """
 
-import functools
 import json
-from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +16,13 @@ from benchmarks.learned.data import TEST, folders
 from benchmarks.learned.score import Entry, entry
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import write_json
-from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.describe import apply_network
+from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.weights_file import example_inputs, random_variables
-from sglpr_jax.models.sglpr import describe, init
-from sglpr_jax.models.shipped import shipped_weights
-from sglpr_jax.models.weights_file import load
+from sglpr_jax.models.sglpr import describe
 
 TOWN = "town-601"
-DescribeRecord = Callable[[Scan], np.ndarray]
-"""Maps a scan to its descriptor."""
 
 
 def cost(
@@ -51,45 +42,37 @@ def cost(
         out: file to write.
         scans: number of scans that each contender describes.
     """
-    recording = open_recording(next(one for one in folders(data, TEST) if one.name == TOWN), "00")
+    recording = open_recording(next(folder for folder in folders(data, TEST) if folder.name == TOWN), "00")
     contenders = [entry(name, runs) for name in entries]
-    describers = [_describer(one, recording) for one in contenders]
-    records, found = [recording.scan(row) for row in range(scans + 1)], {}
-    jobs = [clocked(functools.partial(_describe_next, of_scan, iter(records))) for of_scan in describers]
-    seconds = np.median(in_turn(jobs, repeats=scans), axis=0).tolist()
-    for one, of_scan, taken in zip(contenders, describers, seconds, strict=True):
-        numbers = np.asarray(of_scan(records[0])).size
-        found[one.name] = {"ms": 1e3 * taken, "numbers": numbers, "bytes": 4 * numbers, **_network(one)}
-        print(one.name, json.dumps(found[one.name]), flush=True)
-    write_json(out, found)
+    methods = [contender.method(recording) for contender in contenders]
 
-
-def _describe_next(of_scan: DescribeRecord, records: Iterator[Scan]) -> None:
-    of_scan(next(records))
-
-
-def _describer(contender: Entry, recording: Recording) -> DescribeRecord:
-    """Return a function from a scan to its descriptor."""
-    method = contender.method(recording)
-
-    def of_scan(scan: Scan) -> np.ndarray:
-        inputs = jax.tree.map(lambda one: np.asarray(one)[None], method.prepare(scan, None))
+    def describe_row(method: Any, row: int) -> np.ndarray:
+        inputs = jax.tree.map(lambda value: np.asarray(value)[None], method.prepare(recording_scans[row], None))
         return np.asarray(method.describe(inputs))
 
-    return of_scan
+    recording_scans, costs = [recording.scan(row) for row in range(scans + 1)], {}
+    rows = [iter(range(scans + 1)) for _ in methods]
+    jobs = [
+        clocked(lambda method=method, left=left: describe_row(method, next(left)))
+        for method, left in zip(methods, rows, strict=True)
+    ]
+    seconds = np.median(in_turn(jobs, repeats=scans), axis=0).tolist()
+    for contender, method, taken in zip(contenders, methods, seconds, strict=True):
+        numbers = describe_row(method, 0).size
+        costs[contender.name] = {"ms": 1e3 * taken, "numbers": numbers, "bytes": 4 * numbers, **_network(contender)}
+        print(contender.name, json.dumps(costs[contender.name]), flush=True)
+    write_json(out, costs)
 
 
-def _network(contender: Entry) -> Mapping[str, Any]:
+def _network(contender: Entry) -> dict[str, Any]:
     """Return the number of weights and the operations of one image, in GFLOP; nothing for a handcrafted method."""
-    name = contender.name.split("@")[0]
-    if name in LEARNED:
-        method = LEARNED[name]
-        variables, inputs = random_variables(method, seed=0), example_inputs(method)
-        cost = apply_network.lower(variables, inputs, method=method).cost_analysis()
-        return {"weights": method.weights, "gflop": float(cost["flops"]) / 1e9}
-    if name in HANDCRAFTED:
+    network = contender.network
+    if network is None:
         return {}
-    params = load(name) if name in shipped_weights() else init(jax.random.key(0), preset=name)
-    grid = params.config.grid
-    cost = jax.jit(describe).lower(params, np.zeros((1, grid.height, grid.width), np.float32)).cost_analysis()
-    return {"weights": sum(leaf.size for leaf in jax.tree.leaves(params)), "gflop": float(cost["flops"]) / 1e9}
+    if isinstance(network, LearnedMethod):
+        variables, inputs = random_variables(network, seed=0), example_inputs(network)
+        lowered, weights = apply_network.lower(variables, inputs, method=network), network.weights
+    else:
+        grid, weights = network.config.grid, sum(leaf.size for leaf in jax.tree.leaves(network))
+        lowered = jax.jit(describe).lower(network, np.zeros((1, grid.height, grid.width), np.float32))
+    return {"weights": weights, "gflop": float(lowered.cost_analysis()["flops"]) / 1e9}

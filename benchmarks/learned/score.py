@@ -4,9 +4,9 @@ A contender is called by a handcrafted method (`scan-context`), shipped weights 
 (`rinet@random:0`), or a folder of weights (`rinet-0`, `rinet-0/weights-4000`) in the folder of the runs.
 """
 
-import dataclasses
 import functools
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -18,8 +18,8 @@ import tyro
 from jaxtyping import Float32
 
 import sglpr_jax
-from benchmarks.learned.data import TEST, folders
-from sglpr_jax.data.readers import open_recording, recording_names
+from benchmarks.learned.data import TEST, folders, recordings_of
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation.protocols.pairs import PAIRS_F1MAX
@@ -29,6 +29,7 @@ from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
+from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.weights_file import RANDOM
 from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
@@ -46,7 +47,7 @@ from sglpr_jax.training.peers import SCORES_FILE
 from sglpr_jax.training.validation import FOUND_M
 
 GRID = model_preset("sglpr").grid
-"""Grid of handcrafted methods on images."""
+"""Grid of handcrafted methods on images, and of the images for verification."""
 ROTATION_SEED = 0
 CANDIDATES = 5
 """Number of places that are verified for each query."""
@@ -54,14 +55,15 @@ SPLIT = ("00", "02", "05", "06")
 """Sequences of KITTI with a published split into map and queries."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A contender."""
 
     name: str
     takes: Takes
     method: Callable[[Recording], Method]
     """Returns the method for the scans of a recording."""
+    network: LearnedMethod | sglpr_jax.Params | None = None
+    """Network of another publication, or weights of our own networks."""
     images: int | None = None
     """Number of images that it was trained with. None: not trained here."""
     seconds: float | None = None
@@ -74,17 +76,18 @@ def entry(name: str, runs: Path) -> Entry:
         return Entry(name, HANDCRAFTED[name].takes, lambda recording: handcrafted(name, recording, GRID))
     method, _, weights = name.rpartition("@")
     if name in sglpr_jax.shipped_weights():
-        takes, made, seen = "images", network(sglpr_jax.load(name)), ()
-    elif weights.startswith(RANDOM) and method in LEARNED:
-        takes, made, seen = LEARNED[method].takes, trained_method(LEARNED[method], weights), (0, 0.0)
-    elif weights.startswith(RANDOM):
+        params = sglpr_jax.load(name)
+        return Entry(name, "images", lambda recording: network(params), params)
+    if weights.startswith(RANDOM) and method in LEARNED:
+        learned = LEARNED[method]
+        return Entry(name, learned.takes, lambda recording: trained_method(learned, weights), learned, 0, 0.0)
+    if weights.startswith(RANDOM):
         params = init(jax.random.key(int(weights.removeprefix(RANDOM))), preset=method)
-        takes, made, seen = "images", network(params), (0, 0.0)
-    else:
-        folder = runs / name
-        folder = folder / LAST if (folder / LAST / "config.json").is_file() else folder
-        takes, made, seen = content_of(str(folder)), method_with_weights(str(folder)), _seen(folder)
-    return Entry(name, takes, lambda recording: made, *seen)
+        return Entry(name, "images", lambda recording: network(params), params, 0, 0.0)
+    folder = runs / name
+    folder = folder / LAST if (folder / LAST / "config.json").is_file() else folder
+    trained = method_with_weights(str(folder))
+    return Entry(name, content_of(str(folder)), lambda recording: trained, None, *_seen(folder))
 
 
 def _seen(folder: Path) -> tuple[int, float]:
@@ -135,36 +138,33 @@ def score(
         only: beginning of the names of the test recordings to score on.
         verify: also score after verification of the nearest places.
     """
-    tests = [one for one in [*_simulated(data, part), *_kitti(kitti)] if one.name.startswith(only)]
+    tests = [test for test in [*_simulated(data, part), *_kitti(kitti)] if test.name.startswith(only)]
     for name in entries:
         contender = entry(name, runs)
         for test in tests:
             if _fits(contender, test):
-                found = _result(contender, test, out / name.replace("/", "_").replace(":", "-"), verify=verify)
-                scores = (f"{key} {value:.3f}" for key, value in found["scores"].items())
+                result = _result(contender, test, out / name.replace("/", "_").replace(":", "-"), verify=verify)
+                scores = (f"{key} {value:.3f}" for key, value in result["scores"].items())
                 print(f"{name}, {test.name}: {', '.join(scores)}", flush=True)
 
 
 def _simulated(data: Path, part: str) -> Iterator[Test]:
     for folder in folders(data, part):
-        names = recording_names(folder)
+        recordings = recordings_of(folder)
         if folder.name.startswith("days"):
-            first, second = (open_recording(folder, name) for name in names)
-            yield Test(folder.name, second, first)
+            yield Test(folder.name, recordings[1], recordings[0])
             continue
-        for name in names:
-            recording = open_recording(folder, name)
-            yield Test(f"{folder.name}-{name}", recording)
-            yield Test(f"{folder.name}-{name}-rotated", recording, rotated=True)
+        for recording in recordings:
+            yield from _raw_and_rotated(f"{folder.name}-{recording.name}", recording)
 
 
 def _kitti(root: Path | None) -> Iterator[Test]:
-    if root is None:
-        return
-    for seq in ("00", "02", "06"):
-        recording = open_recording(root, seq)
-        yield Test(f"kitti-{seq}", recording)
-        yield Test(f"kitti-{seq}-rotated", recording, rotated=True)
+    for seq in () if root is None else ("00", "02", "06"):
+        yield from _raw_and_rotated(f"kitti-{seq}", open_recording(root, seq))
+
+
+def _raw_and_rotated(name: str, recording: Recording) -> tuple[Test, Test]:
+    return Test(name, recording), Test(f"{name}-rotated", recording, rotated=True)
 
 
 def _fits(contender: Entry, test: Test) -> bool:
@@ -190,10 +190,10 @@ def _result(contender: Entry, test: Test, folder: Path, *, verify: bool) -> Mapp
         images = _images(test.recording)
         scores |= {f"verified {name}": score for name, score in _scores(_verified(file, images)).items()}
     about = {"images": contender.images, "seconds": contender.seconds, "numbers": file.descriptors.shape[1]}
-    found = {"entry": contender.name, "test": test.name, **about, "weights": file.weights_hash, "scores": scores}
+    result = {"entry": contender.name, "test": test.name, **about, "weights": file.weights_hash, "scores": scores}
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(path, found)
-    return found
+    write_json(path, result)
+    return result
 
 
 def _described(contender: Entry, recording: Recording, *, rotated: bool = False) -> DescriptorFile:
@@ -204,41 +204,34 @@ def _described(contender: Entry, recording: Recording, *, rotated: bool = False)
 @functools.lru_cache(maxsize=4)
 def _images(recording: Recording) -> Float32[np.ndarray, "n h w"]:
     """The density images of scans or images of a recording, in the window of `sglpr`."""
-    grid = model_preset("sglpr").grid
-    records = (recording.scan(row, labels=False) for row in range(len(recording)))
-    return np.stack([np.asarray(view(one, grid, image="density").image, np.float32) for one in records])
+    scans = (recording.scan(row, labels=False) for row in range(len(recording)))
+    return np.stack([np.asarray(view(scan, GRID, image="density").image, np.float32) for scan in scans])
 
 
 def _scores(source: Source, *, split: bool = False) -> dict[str, float]:
     """Return top-1 F1max, F1max of pairs, Recall@1 within 5 m and, for a split sequence, that of BEVPlace++."""
     top1 = TOP1_F1MAX(source)
-    found = {"top1": top1.score}
+    scores = {"top1": top1.score}
     if not isinstance(source, TopK):
-        found["pairs"] = PAIRS_F1MAX(source).score
-    found["recall"] = _recall(source, top1.answers)
+        scores["pairs"] = PAIRS_F1MAX(source).score
+    scores["recall"] = _recall(source, top1.answers)
     if split and not isinstance(source, TopK):
-        found["split recall"] = BEVPLACE_RECALL_AT_1(source).score
-    return found
+        scores["split recall"] = BEVPLACE_RECALL_AT_1(source).score
+    return scores
 
 
 def _recall(source: Source, answers: np.ndarray | None) -> float:
-    """Return the fraction of the revisits that are answered with a place within 5 m, in x and y."""
-    assert source.positions is not None
-    assert answers is not None
+    """Return the fraction of the revisits that are answered with a place within 5 m, in x and y; NaN without any."""
+    assert source.positions is not None and answers is not None
     places = source.positions[:, :2]
     queries = np.flatnonzero(ends := database_end(len(places), times=source.times))
     revisited = queries[has_near(places[queries], places, ends[queries], lambda apart: apart <= FOUND_M)]
     apart = np.linalg.norm(places[revisited] - places[answers[revisited]], axis=1)
-    return float(np.mean((apart <= FOUND_M) & (answers[revisited] >= 0)))
+    return math.nan if not len(revisited) else float(np.mean((apart <= FOUND_M) & (answers[revisited] >= 0)))
 
 
 def _verified(file: DescriptorFile, images: Float32[np.ndarray, "n h w"]) -> TopK:
-    """Return the nearest places of each frame, ordered by the correlation of their images.
-
-    Arguments:
-      file: Descriptors of a recording.
-      images: Image of each frame.
-    """
+    """Return the nearest places of each frame, ordered by the correlation of their images."""
     ends = database_end(len(file), times=file.times)
     queries = np.flatnonzero(ends)
     nearest, _ = nearest_frames(file, queries, ends[queries], k=CANDIDATES)
@@ -260,5 +253,4 @@ def _correlations(images: np.ndarray, query: int, nearest: np.ndarray) -> np.nda
     """Return the correlation of a frame with each of its nearest places; -1 where there is no further place."""
     peaks = search(query_spectra(images[query]), match_spectra(images[nearest]))
     aligned = (refined(images[query], images[place], peaks.at(k)) for k, place in enumerate(nearest))
-    found = [float(one.correlation) for one in aligned]
-    return np.where(nearest >= 0, found, -1.0)
+    return np.where(nearest >= 0, [float(one.correlation) for one in aligned], -1.0)

@@ -94,31 +94,20 @@ def finals(scores: Mapping[str, Scores]) -> list[str]:
     return [name for name in scores if "/" not in name and "," not in name]
 
 
-def images_of(found: Scores) -> int:
+def images_of(results: Scores) -> int:
     """The number of images that a contender was trained with."""
-    return next(iter(found.values()))["images"] or 0
+    return next(iter(results.values()))["images"] or 0
 
 
-def mean(found: Scores, column: Column, score: str = "recall") -> float | None:
+def mean(results: Scores, column: Column, score: str = "recall") -> float | None:
     """The mean of a score over recordings, or None if one is missing."""
-    values = [found[test]["scores"].get(score) if test in found else None for test in column.tests]
+    values = [results[test]["scores"].get(score) if test in results else None for test in column.tests]
     return None if None in values else sum(values) / len(values)  # type: ignore[arg-type]
 
 
-def _scores_of(found: Scores, column: Column, *scores: str) -> str:
-    """A cell of several scores, or of none."""
-    texts = [text(mean(found, column, score)) for score in scores]
-    return "-" if set(texts) == {"-"} else ", ".join(texts)
-
-
-def both(a: float | None, b: float | None) -> str:
-    """A cell of two values to compare."""
-    return f"{text(a)} / {text(b)}"
-
-
-def text(value: float | None) -> str:
-    """A score as a cell."""
-    return "-" if value is None else f"{value:.3f}"
+def text(*values: float | None) -> str:
+    """A cell of scores to compare."""
+    return " / ".join("-" if value is None else f"{value:.3f}" for value in values)
 
 
 def number(value: float | None, digits: int = 0) -> str:
@@ -131,36 +120,33 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
+def titles(columns: Sequence[Column]) -> list[str]:
+    """Titles of columns."""
+    return [column.title for column in columns]
+
+
 def tables(results: Mapping[str, Any]) -> dict[str, Any]:
     """Values of the page's template: its tables, and facts in its text."""
-    costs, runs = results["costs"], results["runs"]
-    means = {name: sum(mean(one, column) or 0 for column in LABELLED) for name, one in results["scores"].items()}
-    scores = results["scores"]
-    by_recall = {name: scores[name] for name in sorted(scores, key=lambda name: -means[name])}
+    scores, costs = results["scores"], results["costs"]
+    sums = {name: sum(mean(one, column) or 0 for column in LABELLED) for name, one in scores.items()}
+    by_recall = {name: scores[name] for name in sorted(scores, key=lambda name: -sums[name])}
     finished = [name for name in finals(scores) if images_of(scores[name]) and not name.startswith("sglpr")]
-    after, ahead_after = _beside_ours(scores, [(name, OURS) for name in finished])
-    equal, ahead_equal = _beside_ours(scores, [pair for name in finished if (pair := _equal_images(scores, name))])
-    beside, near = _baselines(scores)
-    orders, pairs = _published_orders(scores)
-    by_images, by_seconds = _along_trainings(runs)
-    return {
-        "summary": _summary(by_recall, costs),
-        "after_training": after,
-        "ahead_after_training": ahead_after,
-        "equal_images": equal,
-        "ahead_at_equal_images": ahead_equal,
-        "published_recall": _published_recall(by_recall),
-        "baselines": beside,
-        "near_baselines": near,
-        "labels": _labels(scores),
-        "published_orders": orders,
-        "published_pairs": pairs,
-        "costs": _costs(costs),
-        "simulated": _all_scores(by_recall, [*PLACES, *(column.rotated for column in PLACES)], verified=True),
-        "kitti": _all_scores(by_recall, [each for one in SEQS for each in (one, one.rotated)]),
-        "by_images": by_images,
-        "by_seconds": by_seconds,
+    values = {
+        ("after_training", "ahead_after_training"): _beside_ours(scores, [(name, OURS) for name in finished]),
+        ("equal_images", "ahead_at_equal_images"): _beside_ours(
+            scores, [pair for name in finished if (pair := _equal_images(scores, name))]
+        ),
+        ("baselines", "near_baselines"): _baselines(scores),
+        ("published_orders", "published_pairs"): _published_orders(scores),
+        ("by_images", "by_seconds"): _along_trainings(results["runs"]),
+        ("simulated", "kitti"): (
+            _all_scores(by_recall, [*PLACES, *(column.rotated for column in PLACES)], verified=True),
+            _all_scores(by_recall, [column for seq in SEQS for column in (seq, seq.rotated)]),
+        ),
+        ("summary", "costs"): (_summary(by_recall, costs), _costs(costs)),
+        ("labels", "published_recall"): (_labels(scores), _published_recall(by_recall)),
     }
+    return {name: value for names, pair in values.items() for name, value in zip(names, pair, strict=True)}
 
 
 def _summary(scores: Mapping[str, Scores], costs: Mapping[str, Any]) -> str:
@@ -168,38 +154,47 @@ def _summary(scores: Mapping[str, Scores], costs: Mapping[str, Any]) -> str:
     by_method, columns = {method_of(name): cost for name, cost in costs.items()}, (*SIMULATED, KITTI)
     rows = []
     for name in finals(scores):
-        cost, seen = by_method.get(method_of(name), {}), next(iter(scores[name].values()))
-        trained = (number(seen["images"]), number(seen["seconds"]))
-        described = (number(cost.get("ms"), 1), number(cost.get("bytes")))
-        rows.append([f"`{name}`", *(text(mean(scores[name], column)) for column in columns), *trained, *described])
+        cost, result = by_method.get(method_of(name), {}), next(iter(scores[name].values()))
+        numbers = (
+            number(result["images"]),
+            number(result["seconds"]),
+            number(cost.get("ms"), 1),
+            number(cost.get("bytes")),
+        )
+        rows.append([f"`{name}`", *(text(mean(scores[name], column)) for column in columns), *numbers])
     more = ("images seen", "training (s)", "description (ms)", "descriptor (bytes)")
-    return markdown(["", *(column.title for column in columns), *more], rows)
+    return markdown(["", *titles(columns), *more], rows)
 
 
 def _all_scores(scores: Mapping[str, Scores], columns: Sequence[Column], *, verified: bool = False) -> str:
     """All scores of the contenders that have one in these columns, and those of the town after verification."""
+
+    def cell(results: Scores, column: Column, *names: str) -> str:
+        values = [mean(results, column, name) for name in names]
+        return "-" if set(values) == {None} else ", ".join(map(text, values))
+
     rows = []
-    for name, found in scores.items():
-        if any(mean(found, column) is not None for column in columns):
-            cells = [_scores_of(found, column, *SCORES) for column in columns]
-            more = [_scores_of(found, TOWN, "verified top1", "verified recall")] if verified else []
-            rows.append([f"`{name}`", *cells, *more])
-    return markdown(["", *(column.title for column in columns), *(["town, verified"] if verified else [])], rows)
+    for name, results in scores.items():
+        if any(mean(results, column) is not None for column in columns):
+            cells = [cell(results, column, *SCORES) for column in columns]
+            cells += [cell(results, TOWN, "verified top1", "verified recall")] if verified else []
+            rows.append([f"`{name}`", *cells])
+    return markdown(["", *titles(columns), *(["town, verified"] if verified else [])], rows)
 
 
 def _published_recall(scores: Mapping[str, Scores]) -> str:
     """Recall@1 by the published split into map and queries."""
-    ours = {name: [mean(found, column, "split recall") for column in SEQS] for name, found in scores.items()}
-    rows = [[f"`{name}`", *map(text, found)] for name, found in ours.items() if any(found)]
-    rows += [[f"{name}, published", *map(text, found)] for name, found in PUBLISHED_RECALL.items()]
-    return markdown(["", *(column.title for column in SEQS)], rows)
+    ours = {f"`{name}`": [mean(one, column, "split recall") for column in SEQS] for name, one in scores.items()}
+    published = {f"{name}, published": values for name, values in PUBLISHED_RECALL.items()}
+    rows = [[name, *map(text, values)] for name, values in (ours | published).items() if any(values)]
+    return markdown(["", *titles(SEQS)], rows)
 
 
 def _along_trainings(runs: Mapping[str, Any]) -> tuple[str, str]:
     """Recall@1 on the held-out town along the trainings, by images and by seconds."""
 
-    def recall(found: Sequence[Mapping[str, float]]) -> str:
-        return text(found[0]["recall_at_1"] if found else None)
+    def recall(snapshots: Sequence[Mapping[str, float]]) -> str:
+        return text(snapshots[0]["recall_at_1"] if snapshots else None)
 
     marks, by_images, by_seconds = [1000 * 2**k for k in range(8)], [], []
     for name, run in runs.items():
@@ -211,10 +206,10 @@ def _along_trainings(runs: Mapping[str, Any]) -> tuple[str, str]:
                 [one for one in curve if one["seconds"] <= 1.01 * mark] if mark <= 1.01 * end["seconds"] else []
                 for mark in MARKS_S
             )
-            by_images.append([f"`{name}`", searched, *(recall(found[:1]) for found in after)])
+            by_images.append([f"`{name}`", searched, *(recall(snapshots[:1]) for snapshots in after)])
             numbers = (text(end["recall_at_1"]), number(end["images"]), number(end["seconds"]))
             losses = ", ".join(f"{loss:.3g}" for loss in run["losses"] or ()) or "-"
-            by_seconds.append([f"`{name}`", *(recall(found[-1:]) for found in until), *numbers, losses])
+            by_seconds.append([f"`{name}`", *(recall(snapshots[-1:]) for snapshots in until), *numbers, losses])
     return (
         markdown(["", "searched learning rate", *(f"{mark:,}" for mark in marks)], by_images),
         markdown(["", *map(str, MARKS_S), "end", "images", "seconds", "loss"], by_seconds),
@@ -225,7 +220,7 @@ def _costs(costs: Mapping[str, Any]) -> str:
     """Times and sizes."""
     digits = {"ms": 1, "bytes": 0, "weights": 0, "gflop": 3}
     rows = [
-        [f"`{method_of(name)}`", *(number(cost.get(key), each) for key, each in digits.items())]
+        [f"`{method_of(name)}`", *(number(cost.get(key), places) for key, places in digits.items())]
         for name, cost in costs.items()
     ]
     return markdown(["", "ms", "bytes", "weights", "GFLOP"], rows)
@@ -234,56 +229,47 @@ def _costs(costs: Mapping[str, Any]) -> str:
 def _equal_images(scores: Mapping[str, Scores], name: str) -> tuple[str, str] | None:
     """Weights of a run and of ours with nearly the same number of images, the last such pair."""
     theirs, ours = ([one for one in scores if one == run or one.startswith(f"{run}/")] for run in (name, OURS))
-    pairs = [(images_of(scores[b]), a, b) for a in theirs for b in ours if _near(scores[a], scores[b])]
+    pairs = [(images_of(scores[b]), images_of(scores[a]), a, b) for a in theirs for b in ours]
+    pairs = [(fewer, a, b) for fewer, more, a, b in pairs if 0 < fewer <= more <= NEARLY * fewer]
     return max(pairs)[1:] if pairs else None
-
-
-def _near(theirs: Scores, ours: Scores) -> bool:
-    return 0 < images_of(ours) <= images_of(theirs) <= NEARLY * images_of(ours)
 
 
 def _beside_ours(scores: Mapping[str, Scores], pairs: Sequence[tuple[str, str]]) -> tuple[str, str]:
     """Recall@1 of peers beside ours, and those that are ahead."""
     rows, ahead = [], []
-    for name, own in pairs:
-        cells = [(column, mean(scores[name], column), mean(scores[own], column)) for column in SIMULATED]
-        titles = [column.title for column, a, b in cells if a and b and a >= b + AHEAD]
-        ahead += [f"`{name}` ({'all columns' if len(titles) == len(cells) else '; '.join(titles)})"] if titles else []
-        counts = (f"{images_of(scores[one]):,}" for one in (name, own))
-        rows.append([f"`{name}`", *counts, *(both(a, b) for _, a, b in cells)])
-    head = ["", "its images", f"images of `{OURS}`", *(column.title for column in SIMULATED)]
-    return markdown(head, rows), ", ".join(ahead) or "none"
+    for name, ours in pairs:
+        cells = [(mean(scores[name], column), mean(scores[ours], column)) for column in SIMULATED]
+        better = [column.title for column, (a, b) in zip(SIMULATED, cells, strict=True) if a and b and a >= b + AHEAD]
+        ahead += [f"`{name}` ({'all columns' if len(better) == len(cells) else '; '.join(better)})"] if better else []
+        counts = (f"{images_of(scores[one]):,}" for one in (name, ours))
+        rows.append([f"`{name}`", *counts, *(text(*pair) for pair in cells)])
+    return markdown(["", "its images", f"images of `{OURS}`", *titles(SIMULATED)], rows), ", ".join(ahead) or "none"
 
 
 def _baselines(scores: Mapping[str, Scores]) -> tuple[str, str]:
     """Each network beside its untrained self, and those that are not far above it."""
-    rows, near = [], []
+    rows, close = [], []
     for name in finals(scores):
         untrained, recall = scores.get(f"{method_of(name)}@random:0", {}), mean(scores[name], TOWN)
         if not images_of(scores[name]) or recall is None:
             continue
-        against = mean(untrained, TOWN)
-        near += [f"`{name}`"] if against is not None and recall < against + FAR else []
+        baseline = mean(untrained, TOWN)
+        close += [f"`{name}`"] if baseline is not None and recall < baseline + FAR else []
         directions = [Column("", (test,)) for test in (*TOWN.tests, *TRAINED_TOWN)]
-        cells = (both(*(mean(one, column) for one in (scores[name], untrained))) for column in directions)
-        rows.append([f"`{name}`", text(recall), text(against), *cells])
+        cells = (text(mean(scores[name], column), mean(untrained, column)) for column in directions)
+        rows.append([f"`{name}`", text(recall), text(baseline), *cells])
     towns = ("same direction", "opposite direction", "training town, same", "training town, opposite")
-    return markdown(["", "trained", "untrained", *towns], rows), ", ".join(near) or "none"
+    return markdown(["", "trained", "untrained", *towns], rows), ", ".join(close) or "none"
 
 
 def _labels(scores: Mapping[str, Scores]) -> str:
     """What labels are worth."""
-    rows = [
-        [
-            f"`{name.split(',')[0].split('/')[0]}`",
-            kind,
-            number(images_of(scores[name])),
-            *(text(mean(scores[name], column)) for column in LABELLED),
-        ]
-        for name, kind in LABELS.items()
-        if name in scores
-    ]
-    return markdown(["", "labels", "images seen", *(column.title for column in LABELLED)], rows)
+    rows = []
+    for name, kind in LABELS.items():
+        if name in scores:
+            recalls = (text(mean(scores[name], column)) for column in LABELLED)
+            rows.append([f"`{name.split(',')[0].split('/')[0]}`", kind, number(images_of(scores[name])), *recalls])
+    return markdown(["", "labels", "images seen", *titles(LABELLED)], rows)
 
 
 def _published_orders(scores: Mapping[str, Scores]) -> tuple[str, int]:
@@ -299,5 +285,5 @@ def _published_orders(scores: Mapping[str, Scores]) -> tuple[str, int]:
         if row.mean >= against.mean + REVERSED:
             pairs += 1
             if here <= there - REVERSED:
-                rows.append([f"{row.method}, {against.method}", both(row.mean, against.mean), both(here, there)])
+                rows.append([f"{row.method}, {against.method}", text(row.mean, against.mean), text(here, there)])
     return markdown(["", "published", "here"], rows), pairs

@@ -11,7 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -68,28 +68,18 @@ def train(
         search_seconds: training time of each of the three learning rates. Further seeds use the rate of the first.
         learning_rate: rate of all runs, in place of the search.
     """
+    (held_out,) = folders(data, HELD_OUT)
     for method in methods:
         for seed in seeds:
-            run, first = out / f"{method}-{seed}", out / f"{method}-{seeds[0]}"
-            limits = {"seed": seed, "seconds": seconds, "images": images, "search-seconds": search_seconds}
-            rate = learning_rate or (None if run == first else _rate_of(first))
-            _train_method(method, data, run, limits | ({} if rate is None else {"learning-rate": rate}))
-
-
-def _train_method(method: str, data: Path, run: Path, flags: Mapping[str, float]) -> None:
-    """Train one method, or continue its run."""
-    (held_out,) = folders(data, HELD_OUT)
-    command = ["train", method, *folders(data, TRAIN), "--out", run, "--held-out", held_out, "--cache", data / "cache"]
-    command += [text for name, value in flags.items() for text in (f"--{name}", value)]
-    command += ["--resume"] if run.exists() else []
-    print(f"{run}", file=sys.stderr, flush=True)
-    program = [sys.executable, "-m", "sglpr_jax.cli", "peers", *map(str, command)]
-    subprocess.run(program, check=True, env={**os.environ, **ONE_CORE})
-
-
-def _rate_of(run: Path) -> float:
-    """Return the learning rate that the search of a run found."""
-    return json.loads((run / RATES / RATES_FILE).read_text())["best"]
+            run, first = out / f"{method}-{seed}", out / f"{method}-{seeds[0]}" / RATES / RATES_FILE
+            rate = learning_rate or (json.loads(first.read_text())["best"] if seed != seeds[0] else None)
+            command = ["train", method, *folders(data, TRAIN), "--out", run, "--held-out", held_out]
+            command += ["--cache", data / "cache", "--seed", seed, "--seconds", seconds, "--images", images]
+            command += ["--search-seconds", search_seconds, *(["--resume"] if run.exists() else [])]
+            command += [] if rate is None else ["--learning-rate", rate]
+            print(run, file=sys.stderr, flush=True)
+            program = [sys.executable, "-m", "sglpr_jax.cli", "peers", *map(str, command)]
+            subprocess.run(program, check=True, env={**os.environ, **ONE_CORE})
 
 
 def stages(folder: Path) -> Iterator[Path]:
@@ -187,16 +177,14 @@ def _config(settings: Settings, rate: float) -> TrainConfig:
 
 def _best_rate(settings: Settings, recordings: list[Recording], held_out: list[Recording]) -> float:
     """Return the learning rate of the highest Recall@1 on the held-out town. Finished trainings are not repeated."""
-    folder, scores = settings.folder / RATES, {}
-    preset = sglpr_jax.preset(settings.preset).optimizer.learning_rate
+    folder, recalls = settings.folder / RATES, dict[float, float]()
+    short = dataclasses.replace(settings, seconds=settings.search_seconds)
     for factor in RATE_FACTORS:
-        rate = preset * factor
-        short = dataclasses.replace(settings, seconds=settings.search_seconds)
+        rate = sglpr_jax.preset(settings.preset).optimizer.learning_rate * factor
         _train(_config(short, rate), recordings, folder / f"rate-{rate:g}", short, held_out)
-        scores[rate] = _scores(folder / f"rate-{rate:g}")[-1]["recall_at_1"]
-    best = max(scores, key=lambda rate: scores[rate])
-    recalls = {f"{rate:g}": found for rate, found in scores.items()}
-    write_json(folder / RATES_FILE, {"seconds": settings.search_seconds, "recall_at_1": recalls, "best": best})
+        recalls[rate] = _scores(folder / f"rate-{rate:g}")[-1]["recall_at_1"]
+    best, named = max(recalls, key=lambda rate: recalls[rate]), {f"{rate:g}": value for rate, value in recalls.items()}
+    write_json(folder / RATES_FILE, {"seconds": settings.search_seconds, "recall_at_1": named, "best": best})
     return best
 
 
@@ -210,25 +198,21 @@ def _train(
             continue  # the weights of this end, or later ones, are kept already
         upright = images <= settings.upright_images
         run = folder / UPRIGHT if upright else folder
-        done = 0 if upright else settings.upright_images
-        staged = dataclasses.replace(config, steps=(images - done) // per_step, rotate=not upright)
+        before = 0 if upright else settings.upright_images
+        staged = dataclasses.replace(config, steps=(images - before) // per_step, rotate=not upright)
         clock = Clock(folder, limit_s=settings.seconds)
         if clock.over:
             return
-        start_from = folder / UPRIGHT / WEIGHTS if done else None
+        options = {"resume": (run / "config.json").is_file(), "callback": clock}
+        options["weights"] = folder / UPRIGHT / WEIGHTS if before else None
         stage = [one for one in recordings if not upright or one.name != OPPOSITE]
         with stop_on_signal() as stopped:
-            options = {"resume": (run / "config.json").is_file(), "weights": start_from, "callback": clock}
-            result = sglpr_jax.train(staged, stage, out=run, stopped=_any(stopped, clock), **options)
-        seen = done + result.steps * per_step
+            result = sglpr_jax.train(staged, stage, out=run, stopped=lambda: stopped() or clock.over, **options)  # noqa: B023
+        seen = before + result.steps * per_step
         print(f"{run}: {seen} images, {clock.seconds:.0f} s", file=sys.stderr, flush=True)
         if stopped():
             sys.exit(stopped.exit_status)
         _keep(folder, result.params, seen, clock.seconds, held_out)
-
-
-def _any(stopped: Callable[[], bool], clock: Clock) -> Callable[[], bool]:
-    return lambda: stopped() or clock.over
 
 
 def _ends(settings: Settings) -> Iterator[int]:
@@ -244,17 +228,14 @@ def _keep(folder: Path, params: sglpr_jax.Params, images: int, seconds: float, h
         return
     shutil.rmtree(folder / f"weights-{images}", ignore_errors=True)
     sglpr_jax.save(params, folder / f"weights-{images}")
-    recall = float(np.mean([_recall(params, recording) for recording in held_out]))
-    line = {"images": images, "seconds": round(seconds, 1), "recall_at_1": recall}
+    files = [sglpr_jax.embed(params, recording) for recording in held_out]
+    recalls = [
+        recall_at_1(file.descriptors, file.positions, file.times, distance_function(file.distance)) for file in files
+    ]
+    line = {"images": images, "seconds": round(seconds, 1), "recall_at_1": float(np.mean(recalls))}
     with (folder / SCORES_FILE).open("a") as file:
         print(json.dumps(line), file=file)
     print(f"{folder}: {line}", file=sys.stderr, flush=True)
-
-
-def _recall(params: sglpr_jax.Params, recording: Recording) -> float:
-    file = sglpr_jax.embed(params, recording)
-    assert file.positions is not None
-    return recall_at_1(file.descriptors, file.positions, file.times, distance_function(file.distance))
 
 
 def _scores(folder: Path) -> list[dict[str, float]]:

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import os
 import subprocess
 import sys
 import time
@@ -10,73 +11,93 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float, Float32, Int
-from rich.console import Console
-from rich.table import Table
 
 import sglpr_jax
-from benchmarks.drives import Case, odometry_of, on_disk
-from benchmarks.quality.scoring import Closure, closures_of, counted, repeating_rule, told, town_rule
+from benchmarks import described
+from benchmarks.described import DescribedDrive, replay
+from benchmarks.drives import EVERYWHERE, Drives, Odometry, odometry_of, on_disk
+from benchmarks.quality.scoring import (
+    STOREY_M,
+    Closure,
+    Counts,
+    closures_of,
+    counted,
+    pose_errors,
+    rule_of,
+    told,
+    town_rule,
+)
+from benchmarks.table import Table
 from benchmarks.timing import run_command
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.evaluation.protocols.protocol import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
+from sglpr_jax.loops.acceptance import accepted
 from sglpr_jax.loops.calibration import reliability_of
-from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Keyframe, StoredScans
+from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
-from sglpr_jax.models.params import Params
 from sglpr_jax.pose_graph.files import read_loops_jsonl
 from sglpr_jax.pose_graph.optimize import trajectory_error
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import SimulatedRecording
-from sglpr_jax.sim.styles import SCENERIES
 
 PEERS = Path(__file__).resolve().parent / "peers"
 KEPT, NO_LOOP = 1000.0, -100.0
 """Log odds that a returned loop gets in addition, so that it is answered first, and those of pairs that are none."""
+COLUMNS = ("scans", "loops", "right", "wrong", "recall", "wrong poses", "of these in the plane", "recall by poses")
 
 
-class Drive(NamedTuple):
-    """A simulated drive, and the folder of its files."""
+class Task(NamedTuple):
+    """A drive to search."""
 
-    case: Case
-    recording: SimulatedRecording
-    folder: Path
+    drive: DescribedDrive
+    simulate: Callable[[], SimulatedRecording]
+    """Returns the recording of the drive."""
+    odometry: Float[np.ndarray, "n 4 4"] | None
+    params: sglpr_jax.Params
+    weights: str
+    environment: Path
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the scans."""
+        return self.drive.path.with_suffix("")
 
     def files(self) -> Path:
-        """The folder of the scans in KITTI's format, with their times."""
-        on_disk(self.recording, self.folder)
-        np.savetxt(self.folder / "times.txt", self.recording.poses.times)
+        """The folder, with the scans in KITTI's format and their times."""
+        on_disk(self.simulate(), self.folder)
+        np.savetxt(self.folder / "times.txt", self.drive.times)
         return self.folder
 
 
-class Found(NamedTuple):
-    """What a method found, and what it took."""
+class Answer(NamedTuple):
+    """What a method returns."""
 
     closures: list[Closure]
-    trajectory: Float[np.ndarray, "n 4 4"] | None
-    seconds: float
-    processor_seconds: float
+    trajectory: Float[np.ndarray, "n 4 4"] | None = None
     loops: Sequence[Any] = ()
     """Loops of two scans with their poses, if the method has such loops."""
 
 
-def _ours(drive: Drive, *, weights: str, **_: Any) -> Found:
-    """`find_loops` without odometry."""
-    params, start = sglpr_jax.load(weights), (time.perf_counter(), time.process_time())
-    loops = sglpr_jax.find_loops(drive.recording, params, registered=False).loops
-    taken = time.perf_counter() - start[0], time.process_time() - start[1]
-    return Found(closures_of(loops), None, *taken, loops)
+def _by_detector(task: Task, detector: LoopDetector) -> Answer:
+    """All loops of the detector that the odometry does not contradict."""
+    for _ in replay(detector, task.drive, task.odometry):
+        pass
+    loops, drift = detector.loops, detector.finder.present_drift
+    loops = loops if task.odometry is None else accepted(loops, detector.finder.motion.path, drift=drift)[0]
+    return Answer(closures_of(loops), None, loops)
 
 
-class _ByScanContext(StoredScans):
+class _StoredByScanContext(StoredScans):
     """Stored scans whose nearest ones are those by Scan Context."""
 
     def nearest(
@@ -88,56 +109,45 @@ class _ByScanContext(StoredScans):
         return allowed[np.argsort(apart, kind="stable")[:k]]
 
 
-class _ScanContextFinder(CandidateSearch):
-    """Candidates by Scan Context: its distance over all rotations."""
-
-    def __init__(self, params: Params):
-        super().__init__(params)
-        self.stored = _ByScanContext(Index.empty(NUMBERS, weights_hash=self.index.weights_hash))
-
-    def keyframe(self, scan: Scan) -> Keyframe:
-        """The matrix of Scan Context in place of the descriptor."""
-        return super().keyframe(scan)._replace(descriptor=scan_context(np.asarray(scan.points)[:, :3]))
-
-
-def _scan_context(drive: Drive, *, weights: str, **_: Any) -> Found:
+def _by_scan_context(task: Task) -> Answer:
     """Scan Context chooses the candidates and nothing else: motion, comparison of images and decision are ours."""
-    detector = LoopDetector(sglpr_jax.load(weights))
-    detector.finder = _ScanContextFinder(detector.finder.params)
-    start = time.perf_counter(), time.process_time()
-    for i, stamp in enumerate(drive.recording.poses.times.tolist()):
-        detector.add(drive.recording.scan(i, labels=False), time=stamp)
-    taken = time.perf_counter() - start[0], time.process_time() - start[1]
-    return Found(closures_of(detector.loops), None, *taken, detector.loops)
+    detector, recording = LoopDetector(task.params), task.simulate()
+    index = Index.empty(NUMBERS, weights_hash=detector.finder.index.weights_hash)
+    detector.finder.stored = _StoredByScanContext(index)
+    keyframes = [
+        keyframe._replace(descriptor=scan_context(recording.points(i)))
+        for i, keyframe in enumerate(task.drive.keyframes)
+    ]
+    return _by_detector(task._replace(drive=task.drive._replace(keyframes=keyframes)), detector)
 
 
-def _bin_loops(drive: Drive, *, weights: str, **_: Any) -> Found:
+def _by_bin_loops(task: Task) -> Answer:
     """`bin/loops --odometry auto --optimize`, with imports, compilation and the pages that it writes."""
-    out = drive.folder.with_name(f"{drive.folder.name}-ours")
-    mounting = drive.recording.mounting or Mounting(MODEL_HEIGHT_M)
-    flags = ["--format", "kitti", "--odometry", "auto", "--optimize", "--out", out, "--weights", weights]
+    out = task.folder.with_name(f"{task.folder.name}-ours")
+    mounting = task.simulate().mounting or Mounting(MODEL_HEIGHT_M)
+    flags = ["--format", "kitti", "--odometry", "auto", "--optimize", "--out", out, "--weights", task.weights]
     flags += ["--sensor-height", str(mounting.height_m)]
-    taken = run_command([sys.executable, "-m", "sglpr_jax.cli", "loops", drive.files(), *flags])
+    run_command([sys.executable, "-m", "sglpr_jax.cli", "loops", task.files(), *flags])
     loops = read_loops_jsonl(out / "loops.jsonl")
-    return Found(closures_of(loops), read_tum(out / "trajectory-optimized.tum")[0], *taken, loops)
+    return Answer(closures_of(loops), read_tum(out / "trajectory-optimized.tum")[0], loops)
 
 
-def _local_maps(drive: Drive, *, method: str, environment: Path, **_: Any) -> Found:
+def _by_local_maps(task: Task, *, method: str) -> Answer:
     """A program that closes loops between local maps. MapClosures does not correct kiss-icp's odometry."""
-    out = drive.folder.with_name(f"{drive.folder.name}-{method}.json")
-    taken = run_command([_peer_python(environment), PEERS / "run.py", method, drive.files(), out])
-    said = json.loads(out.read_text())
-    maps = [np.arange(*ends) for ends in said["maps"]]
-    closed = [sorted((one["source"], one["target"]), reverse=True) for one in said["closures"]]
-    return Found([Closure(maps[newer], maps[older]) for newer, older in closed], np.array(said["trajectory"]), *taken)
+    out = task.folder.with_name(f"{task.folder.name}-{method}.json")
+    run_command([_peer_python(task.environment), PEERS / "run.py", method, task.files(), out])
+    answer = json.loads(out.read_text())
+    maps = [np.arange(*ends) for ends in answer["maps"]]
+    pairs = [sorted((one["source"], one["target"]), reverse=True) for one in answer["closures"]]
+    return Answer([Closure(maps[newer], maps[older]) for newer, older in pairs], np.array(answer["trajectory"]))
 
 
-METHODS: dict[str, Callable[..., Found]] = {
-    "sglpr": _ours,
-    "scan-context": _scan_context,
-    "bin-loops": _bin_loops,
-    "kiss-slam": functools.partial(_local_maps, method="kiss-slam"),
-    "map-closures": functools.partial(_local_maps, method="map-closures"),
+METHODS: dict[str, Callable[[Task], Answer]] = {
+    "sglpr": lambda task: _by_detector(task, LoopDetector(task.params)),
+    "scan-context": _by_scan_context,
+    "bin-loops": _by_bin_loops,
+    "kiss-slam": functools.partial(_by_local_maps, method="kiss-slam"),
+    "map-closures": functools.partial(_by_local_maps, method="map-closures"),
 }
 
 
@@ -150,55 +160,86 @@ def _peer_python(environment: Path) -> Path:
     return python.absolute()
 
 
-def simulated(
+def loops(
+    drives: tyro.conf.OmitArgPrefixes[Drives] = EVERYWHERE,
     *,
-    drives: tuple[str, ...] = ("town:08:101", "town:00:102", "town:06:103"),
-    sensors: tuple[str, ...] = ("hdl64e",),
-    methods: tuple[str, ...] = ("sglpr",),
-    scans: int = 1000,
-    azimuth_steps: int = 900,
+    method: tuple[str, ...] = ("sglpr",),
+    odometry: Odometry = "none",
+    scale: Scale = 1,
     weights: str = "sglpr",
     environment: Path = Path("build/peers"),
     out: Path = Path("build/loops"),
 ) -> None:
-    """Search simulated drives, 10 scans a second, by several methods. Prints a row for each drive and method.
+    """Search simulated drives by several methods. Prints a row for each drive and method, and sums.
 
     A loop in a town is right if its scans are within 10 m and wrong beyond 20 m; recall is that of scans within 5 m of
     one that is 30 s older. Where places repeat, a loop is wrong beyond the scenery's `other_m`; recall is that of scans
     within 3 m of one that was 30 m of path before. kiss-slam and MapClosures close loops between local maps of 100 m:
-    such a loop is right if two of its scans are near each other, and wrong if all are far apart. The error of a
-    trajectory is the root mean square of positions after rigid alignment. Methods in processes of their own
-    (kiss-slam, map-closures, bin-loops) read files; their seconds contain imports and compilation.
+    such a loop is right if two of its scans are near each other, and wrong if all are far apart.
+
+    Poses of loops of two scans are wrong by `scoring.PoseErrors`. Recall by poses is that of scans within 3 m of one
+    that was 30 m of path before, on the same storey.
+
+    Described scans are kept in `out`, so that a further search does not render them. The error of a trajectory is the
+    root mean square of positions after rigid alignment. Methods in processes of their own (kiss-slam, map-closures,
+    bin-loops) read files; their seconds contain imports and compilation.
 
     Args:
-        drives: WORLD:ROUTE:SEED[:SENSOR]. In a town, route 00 revisits places in the same direction, 08 in the opposite
-            one. In a scenery that repeats, the route is none, same or opposite.
-        sensors: sensors of drives without one, with +CARRIER.
-        methods: sglpr, scan-context, bin-loops, kiss-slam, map-closures.
-        scans: scans of each drive.
-        azimuth_steps: firings of the sensor per turn.
+        drives: drives to search.
+        method: sglpr, scan-context, bin-loops, kiss-slam, map-closures.
+        odometry: poses that sglpr and scan-context are given.
+        scale: factor for all lengths before a scan is described; another scale needs another folder.
         weights: model that describes the scans.
         environment: folder of the environment of kiss-slam and MapClosures, made if it does not exist.
-        out: folder of the files for other processes.
+        out: folder of the drives.
     """
-    columns = ("drive", "method", "s", "processor s", "loops", "right", "wrong", "recall", "error m")
-    table = Table(*columns)
-    for text in drives:
-        for sensor in sensors if text.count(":") == 2 else (text.split(":")[-1],):
-            case = Case.of(text, sensor=sensor)
-            recording = case.simulate(scans=scans, azimuth_steps=azimuth_steps, rate_hz=10.0)
-            poses, positions = recording.poses.world_from_lidar, recording.poses.world_from_lidar[:, :3, 3]
-            in_town = case.world in SCENERIES
-            rule = town_rule(positions, recording.times) if in_town else repeating_rule(poses, case.other_m)
-            drive = Drive(case, recording, out / f"{'-'.join(map(str, case))}-{scans}x{azimuth_steps}")
-            for method in methods:
-                found = METHODS[method](drive, weights=weights, environment=environment)
-                counts = counted(found.closures, positions, rule)
-                error = "-" if found.trajectory is None else f"{trajectory_error(found.trajectory, positions):.2f}"
-                cells = (f"{found.seconds:.0f}", f"{found.processor_seconds:.0f}", *map(str, counts[:3]))
-                table.add_row(f"{text}, {sensor}", method, *cells, counts.recall, error)
-                print(text, sensor, method, *cells, counts.recall, error, told(found.loops, poses), flush=True)
-    Console(width=140).print(table)
+    params, sums = sglpr_jax.load(weights), dict[tuple[str, str, str], list[np.ndarray]]()
+    table = Table("drive", "method", "s", "processor s", *COLUMNS, "error m", "poses of loops")
+    for drive in drives:
+        simulate = functools.cache(functools.partial(drives.simulate, drive))
+        path = out / f"{drive.name}-{drives.scans}x{drives.azimuth_steps}.npz"
+        if not path.exists():
+            described.store(path, simulate(), params, scale=scale, **drive._asdict())
+        stored = described.read(path)
+        given = stored.odometry(odometry, drive.seed)
+        poses = scaled_poses(stored.world_from_lidar, 1 / stored.scale)
+        rule = rule_of(drive, poses, stored.times)
+        for name in method:
+            start = time.perf_counter(), _processor_s()
+            answer = METHODS[name](Task(stored, simulate, given, params, weights, environment))
+            seconds = time.perf_counter() - start[0], _processor_s() - start[1]
+            counts = counted(answer.closures, poses[:, :3, 3], rule)
+            numbers = np.array([len(stored.keyframes), *counts, *_pose_counts(stored, answer.loops)])
+            error = "-" if answer.trajectory is None else f"{trajectory_error(answer.trajectory, poses[:, :3, 3]):.2f}"
+            errors = told(answer.loops, stored.world_from_lidar)
+            table.add(drive.name, name, *(f"{value:.0f}" for value in seconds), *_cells(numbers), error, errors)
+            sums.setdefault((drive.world, drive.route, name), []).append(numbers)
+    table = Table("world", "revisits", "method", *COLUMNS)
+    for key, counts in sums.items():
+        table.add(*key, *_cells(np.sum(counts, axis=0)))
+
+
+def _processor_s() -> float:
+    """Processor time of this process and its children, in seconds."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _cells(numbers: Int[np.ndarray, " 10"]) -> list[str]:
+    """Cells of `COLUMNS`."""
+    scans, *counts, wrong, in_plane, recalled, revisits = numbers.tolist()
+    known = Counts(*counts)
+    recall = f"{recalled / revisits:.3f}" if revisits else ""
+    return [*map(str, (scans, *known[:3])), known.recall, str(wrong), str(in_plane), recall]
+
+
+def _pose_counts(drive: DescribedDrive, loops: Sequence[Any]) -> list[int]:
+    """Wrong poses, those of them in the plane, revisits with a right pose, and revisits."""
+    poses = np.array([one.match_from_query for one in loops])
+    errors = pose_errors([(one.query, one.match) for one in loops], poses, drive.world_from_lidar)
+    right = {loop.query for loop, is_right in zip(loops, errors.right, strict=True) if is_right}
+    revisits, in_plane = set(np.flatnonzero(drive.revisits).tolist()), errors.wrong & (errors.storey_m <= STOREY_M)
+    return [int(errors.wrong.sum()), int(in_plane.sum()), len(right & revisits), len(revisits)]
 
 
 def images(
@@ -237,8 +278,9 @@ def _report_top1(
     Frames without a candidate are answered by the nearest descriptor that is old enough, with the least log odds.
     """
     assert found.model is not None
-    pairs = [(one.query, one.match) for one in found.sessions[0].candidates]
-    log_odds = found.model.log_odds(Evidence.stack([one.evidence for one in found.sessions[0].candidates]))
+    session = found.sessions[0]
+    pairs = [(one.query, one.match) for one in session.candidates]
+    log_odds = found.model.log_odds(Evidence.stack([one.evidence for one in session.candidates]))
     for frame in sorted({*range(EXCLUDED_FRAMES, len(poses))} - {query for query, _ in pairs}):
         apart = np.linalg.norm(descriptors[: frame - EXCLUDED_FRAMES + 1] - descriptors[frame], axis=1)
         pairs.append((frame, int(apart.argmin())))
@@ -246,17 +288,15 @@ def _report_top1(
     kept = {(one.query, one.match) for one in found.loops}
     bonus = np.array([KEPT * (pair in kept) for pair in pairs])
     for title, scores in (("most probable", log_odds), ("most probable, loops first", log_odds + bonus)):
-        best: dict[int, int] = {}
-        for i in np.argsort(scores, kind="stable").tolist():
-            best[pairs[i][0]] = i
-        queries = np.array(sorted(best))
-        chosen = np.array([best[query] for query in queries.tolist()])
+        best = {pairs[i][0]: i for i in np.argsort(scores, kind="stable").tolist()}
+        queries = sorted(best)
+        chosen = np.array([best[query] for query in queries])
         source = TopK(
-            sequence=found.sessions[0].recording.name,
+            sequence=session.recording.name,
             positions=poses[:, :3, 3],
-            times=found.sessions[0].recording.times,
-            pose_source=found.sessions[0].recording.pose_source,
-            queries=queries,
+            times=session.recording.times,
+            pose_source=session.recording.pose_source,
+            queries=np.array(queries),
             nearest=np.array([pairs[i][1] for i in chosen])[:, None],
             scores=scores[chosen][:, None],
         )

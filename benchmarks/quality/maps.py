@@ -10,17 +10,17 @@ from jaxtyping import Bool, Float, Float32
 import sglpr_jax
 from benchmarks.drives import lidar, on_disk
 from benchmarks.quality.submaps import APART_M, PASSES, RIGHT_M, rendered, scored, submaps_of_passes
+from benchmarks.table import Table
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.loops.candidates import CandidateSearch
-from sglpr_jax.loops.keyframes import Keyframe
+from sglpr_jax.loops.keyframes import Keyframe, described
 from sglpr_jax.odometry.kiss_icp import scan_odometry
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import distances, inverse, yaw_of
+from sglpr_jax.sim.recording import plan_sessions
 from sglpr_jax.sim.sensor import SENSORS
-from sglpr_jax.sim.sessions import plan_sessions
 
 WELL_M, WELL_DEG, SURE = 0.5, 2.0, 0.99
 """Largest errors of a right pose, and the probability of an answer that should not be wrong."""
@@ -44,10 +44,6 @@ class Drive(NamedTuple):
     scans: Recording
     world_from_lidar: Float[np.ndarray, "n 4 4"]
     sensor: str
-
-    def recording(self) -> Recording:
-        """The recording of the folder, with the sensor's height."""
-        return sglpr_jax.open_recording(self.folder, format="kitti", sensor_height=SENSORS[self.sensor].height_m)
 
 
 def _driven(root: Path, *, seed: int, sensor: str, day: int, scans: int, azimuth_steps: int) -> Drive:
@@ -89,7 +85,7 @@ def cloud(
         out: folder of the scans and clouds.
     """
     params, total = sglpr_jax.load(weights), dict[str, np.ndarray]()
-    print("| seed | query | right | of them probability >= .9 | queries |\n|---|---|---|---|---|")
+    table = Table("seed", "query", "right", "of them probability >= .9", "queries")
     for seed in seeds:
         steps = {"scans": map_scans, "azimuth_steps": map_azimuth_steps}
         first = _driven(out, seed=seed, sensor="hdl64e", day=0, **steps)
@@ -101,20 +97,24 @@ def cloud(
             query = _driven(out, seed=seed, sensor=sensor, day=1, scans=scans, azimuth_steps=900)
             found = np.array(_located_in(places, params, query, first, poses, every))
             total[sensor] = total.get(sensor, 0) + found
-            print(f"| {seed} | {sensor} | {found[0]} | {found[1]} | {found[2]} |", flush=True)
+            table.add(seed, sensor, *found)
         jax.clear_caches()
     for sensor, (right, sure, count) in total.items():
-        print(f"| all | {sensor} | {right / count:.3f} | {sure / count:.3f} | {count} |")
+        table.add("all", sensor, f"{right / count:.3f}", f"{sure / count:.3f}", count)
 
 
 def _cloud_map(drive: Drive) -> Recording:
     """The recording of the cloud and the trajectory that kiss-icp makes, in files that are kept."""
     trajectory, path = (drive.folder.with_name(f"{drive.folder.name}-kiss.{suffix}") for suffix in ("tum", "pcd"))
     if not trajectory.exists():
-        poses = scan_odometry(drive.recording())
+        height_m = SENSORS[drive.sensor].height_m
+        poses = scan_odometry(sglpr_jax.open_recording(drive.folder, format="kitti", sensor_height=height_m))
         write_tum(trajectory, poses, 0.5 + np.arange(len(poses)) * DRIVE_S / len(poses))
     if not path.exists():
-        _write_pcd(path, _cloud_of(drive, sglpr_jax.read_odometry(trajectory, format="tum")))
+        points = _cloud_of(drive, sglpr_jax.read_odometry(trajectory, format="tum"))
+        count = len(points)
+        header = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
+        path.write_bytes((header + "DATA binary\n").encode() + points.astype("<f4").tobytes())
     recording = sglpr_jax.open_recording(path, poses=trajectory)
     print("; ".join(recording.description), flush=True)
     return recording
@@ -133,13 +133,6 @@ def _cloud_of(drive: Drive, poses: Float[np.ndarray, "n 4 4"]) -> Float32[np.nda
     return np.stack([np.bincount(voxel, weights=axis) / counts for axis in points.T], axis=1).astype(np.float32)
 
 
-def _write_pcd(path: Path, points: Float32[np.ndarray, "n 3"]) -> None:
-    """Write a file in the Point Cloud Library's format."""
-    count = len(points)
-    header = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
-    path.write_bytes((header + "DATA binary\n").encode() + points.astype("<f4").tobytes())
-
-
 def _located_in(
     places: sglpr_jax.PlaceMap, params: sglpr_jax.Params, query: Drive, first: Drive, poses: np.ndarray, every: int
 ) -> tuple[int, int, int]:
@@ -155,11 +148,11 @@ def _located_in(
     return right, sure, count
 
 
-class Driven(NamedTuple):
+class MappedDrive(NamedTuple):
     """A map of the first pass, and the described scans of the other passes."""
 
     places: sglpr_jax.PlaceMap
-    keyframe: list[Keyframe]
+    keyframes: list[Keyframe]
     poses: Float[np.ndarray, "n 4 4"]
     """True pose of each query."""
 
@@ -192,38 +185,36 @@ def sensors(
         weights: the model that describes the scans.
         out: folder of the scans.
     """
-    params, found = sglpr_jax.load(weights), dict[str, list[Driven]]()
-    finder = CandidateSearch(params)
+    params, passes = sglpr_jax.load(weights), dict[str, list[MappedDrive]]()
     for sensor in sensors:
         for seed in seeds:
             drive = rendered(sensor, seed, metres, azimuth_steps, out)
             recording = submaps_of_passes(drive, length_m, seed=seed)
             rows = np.array(scored(drive))
             mapped = rows[drive.passes[rows] == 0]
-            some = only(recording, mapped.tolist())
-            places = sglpr_jax.map_recording(some, params, drive.poses[mapped], spacing_m=spacing_m).places
+            first_pass = only(recording, mapped.tolist())
+            places = sglpr_jax.map_recording(first_pass, params, drive.poses[mapped], spacing_m=spacing_m).places
             numbers = [list(PASSES).index(name) for name in ("opposite", "same")]
             asked = rows[np.isin(drive.passes[rows], numbers)][:: max(1, round(spacing_m))]
-            keyframe = [finder.keyframe(recording.scan(row)) for row in asked.tolist()]
-            found.setdefault(sensor, []).append(Driven(places, keyframe, drive.poses[asked]))
-    print("| map | query | recall@1 | right | wrong at .99 | queries |\n|---|---|---|---|---|---|")
+            keyframes = [described(params, recording.scan(row)) for row in asked.tolist()]
+            passes.setdefault(sensor, []).append(MappedDrive(places, keyframes, drive.poses[asked]))
+    table = Table("map", "query", "recall@1", "right", "wrong at .99", "queries")
     for mapped in sensors:
         for asked in sensors:
-            pairs = [_located(*both) for both in zip(found[mapped], found[asked], strict=True)]
-            near, right, wrong = np.concatenate(pairs, axis=1)
-            shares = f"{near.mean():.3f} | {right.mean():.3f} | {wrong.sum()}"
-            print(f"| {mapped} | {asked} | {shares} | {len(near)} |", flush=True)
+            results = [_located(*both) for both in zip(passes[mapped], passes[asked], strict=True)]
+            near, right, wrong = np.concatenate(results, axis=1)
+            table.add(mapped, asked, f"{near.mean():.3f}", f"{right.mean():.3f}", wrong.sum(), len(near))
 
 
-def _located(mapped: Driven, asked: Driven) -> Bool[np.ndarray, "3 n"]:
+def _located(mapped: MappedDrive, asked: MappedDrive) -> Bool[np.ndarray, "3 n"]:
     """For each query near the map: found by its descriptor, relocated right, and relocated wrong but sure."""
     apart = distances(asked.poses[:, :2, 3], mapped.places.world_from_place[:, :2, 3])
     rows = np.flatnonzero(apart.min(axis=1) < APART_M)
     found = np.zeros((3, len(rows)), bool)
     for i, row in enumerate(rows.tolist()):
-        nearest = mapped.places.index.query(asked.keyframe[row].descriptor).rows[0]
+        nearest = mapped.places.index.query(asked.keyframes[row].descriptor).rows[0]
         found[0, i] = apart[row, nearest] <= RIGHT_M
-        answers = mapped.places.relocate_keyframe(asked.keyframe[row], weights_hash=mapped.places.index.weights_hash)
+        answers = mapped.places.relocate_keyframe(asked.keyframes[row], weights_hash=mapped.places.index.weights_hash)
         if answers:
             pose, true = answers[0].world_from_query, asked.poses[row]
             found[1, i] = is_right(pose, true)

@@ -6,20 +6,19 @@ constants of the library were fitted on seeds 200 to 207 and 500 to 507.
 """
 
 import dataclasses
-import itertools
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterator
 
 import jax
 import numpy as np
+import tyro
 from jaxtyping import Float, Int
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 from scipy.stats import chi2
 
 import sglpr_jax
-from benchmarks.drives import Case, drifted, in_memory
+from benchmarks.drives import WALKS, Drive, Drives, drifted, in_memory
 from benchmarks.quality.scoring import LOOP_M, closures_of, counted, is_alias, relative_errors, town_rule, twist
+from benchmarks.table import Table
 from sglpr_jax.data.choices import Gravity
 from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import upright_from_lidar
@@ -38,82 +37,66 @@ from sglpr_jax.sim.styles import SCENERIES
 
 APART_M, APART_S = 10.0, 30.0
 """The scans of a pair are at most so many metres and at least so many seconds apart."""
-STEPS = {"hdl64e": 900, "hdl32e": 1080}
-"""Firings per turn of sensors, if they are not all."""
 PLANAR, UNSEEN = np.array([0, 1, 5]), np.array([3, 4, 2])
 """x, y and yaw, and roll, pitch and height, in an error of 6 degrees of freedom."""
-TOWNS = (
-    *("town:00:300", "town:06:302", "town:08:304", "outskirts:00:301", "outskirts:08:303", "outskirts:06:305"),
-    *("lanes:00:306", "gardens:06:307"),
-)
-WALKS = ("town:08:620", "town:00:621", "outskirts:06:622", "gardens:08:623")
+TOWNS = ("town:00:300", "outskirts:00:301", "town:06:302", "outskirts:08:303", "town:08:304", "outskirts:06:305",
+         "lanes:00:306", "gardens:06:307")  # fmt: skip
 REPEATED = tuple(f"{name}:{way}:{400 + i}" for i, name in enumerate(REPEATING) for way in ("same", "opposite"))
+PAIRS = Drives((*TOWNS, *REPEATED), sensor=("hdl64e", "hdl32e", "vlp16"), scans=600, azimuth_steps=None)
 ERRORS = ("roll, pitch [deg]", "height [m]", "roll/pitch/height in 2 sigma", "95 % (7.81)")
 
 
-def simulated(text: str, sensor: str, scans: int) -> SimulatedRecording:
-    """The recording of a drive WORLD:ROUTE:SEED."""
-    return Case.of(text, sensor=sensor).simulate(scans=scans, azimuth_steps=STEPS.get(sensor.partition("+")[0]))
-
-
 def pairs(
+    drives: tyro.conf.OmitArgPrefixes[Drives] = PAIRS,
     *,
-    drives: tuple[str, ...] = (*TOWNS, *REPEATED),
-    sensors: tuple[str, ...] = ("hdl64e", "hdl32e", "vlp16"),
     pairs: int = 80,
-    scans: int = 600,
     gravity: Gravity | None = None,
     registered: bool = False,
 ) -> None:
-    """Compare errors of pairs of revisits with their covariances. Prints a row for each scenery and sensor.
+    """Compare errors of pairs of revisits with their covariances. Prints a row for each world and sensor.
 
     The normalised error is that of x, y and yaw, or of 6 degrees of freedom if scans are registered. Beside it are
-    roll, pitch and height: errors, the share within 2 standard deviations, and the normalised error.
+    roll, pitch and height: errors, the share within 2 standard deviations, and the normalised error. Drives where
+    places repeat have 300 scans.
 
     Args:
-        drives: WORLD:ROUTE:SEED.
-        sensors: their names, with +CARRIER.
+        drives: drives of the pairs.
         pairs: pairs of each drive.
-        scans: scans of each drive in a town; 300 where places repeat.
         gravity: how gravity is found, as by `--gravity`. None: the true mounting.
         registered: register the scans in 6 degrees of freedom (extra slam).
     """
     median, high = chi2.ppf([0.5, 0.95], 6 if registered else 3)
     columns = ("pairs", "aliases", f"median ({median:.2f})", f"95 % ({high:.2f})", "deviation, m", *ERRORS)
-    table = Table("scenery", "sensor", *columns)
-    for world, of_world in itertools.groupby(sorted(drives), key=lambda text: text.split(":")[0]):
-        texts = list(of_world)
-        for sensor in sensors:
-            each = [
-                _errors(text, sensor, scans if world in SCENERIES else 300, pairs, gravity, registered=registered)
-                for text in track(texts, description=f"{world}, {sensor}")
-            ]
-            errors, covariances, squares, aliases = (np.concatenate(values) for values in zip(*each, strict=True))
-            deviations = np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1])
-            numbers = (np.median(squares), np.quantile(squares, 0.95), np.median(deviations)) if len(squares) else ()
-            cells = (f"{number:.2f}" for number in numbers)
-            unseen = _cells(errors, covariances) if len(squares) else ()
-            table.add_row(world, sensor, str(len(aliases)), str(aliases.sum()), *cells, *unseen)
-    Console(width=170).print(table)
+    table, groups = Table("world", "sensor", "carrier", *columns), dict[tuple[str, str, str], list[Drive]]()
+    for drive in sorted(drives):
+        groups.setdefault((drive.world, drive.sensor, drive.carrier), []).append(drive)
+    for key, group in groups.items():
+        scans = drives.scans if key[0] in SCENERIES else 300
+        recordings = ((drives.simulate(drive, scans=scans), drive.seed) for drive in group)
+        of_drives = [_errors(*one, pairs, gravity, registered=registered) for one in recordings]
+        errors, covariances, squares, aliases = (np.concatenate(values) for values in zip(*of_drives, strict=True))
+        deviations = np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1])
+        numbers = (np.median(squares), np.quantile(squares, 0.95), np.median(deviations)) if len(squares) else ()
+        cells = [f"{number:.2f}" for number in numbers] or ["-"] * 3
+        table.add(*key, len(aliases), aliases.sum(), *cells, *_cells(errors, covariances))
 
 
 def _errors(
-    text: str, sensor: str, scans: int, count: int, gravity: Gravity | None, *, registered: bool
+    drive: SimulatedRecording, seed: int, count: int, gravity: Gravity | None, *, registered: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Errors (k, 6), covariances (k, 6, 6), normalised errors squared (k,), and aliases (n,) among all pairs."""
-    drive = simulated(text, sensor, scans)
-    chosen = _revisits(drive, count, np.random.default_rng(int(text.split(":")[2])))
-    frames = np.unique(chosen)
+    frames_of_pairs = _revisits(drive, count, np.random.default_rng(seed))
+    frames = np.unique(frames_of_pairs)
     recording, poses = only(in_memory(drive, frames), frames.tolist()), drive.poses.world_from_lidar[frames]
     if gravity is not None:
         recording = mounted(dataclasses.replace(recording, mounting=None), "auto", gravity=gravity, known=False)
-    loops = list(_aligned(recording, np.searchsorted(frames, chosen)))
+    loops = list(_aligned(recording, np.searchsorted(frames, frames_of_pairs)))
     if registered:
         loops = [_registered(recording, loop) for loop in loops]
     errors = relative_errors(loops, poses)
     aliases = np.array([is_alias(error) for error in errors], bool)
-    found = [loop.covariance for loop, alias in zip(loops, aliases, strict=True) if not alias]
-    covariances = np.array(found).reshape(-1, 6, 6)
+    true_peaks = [loop.covariance for loop, alias in zip(loops, aliases, strict=True) if not alias]
+    covariances = np.array(true_peaks).reshape(-1, 6, 6)
     twists = np.array([twist(error) for error in errors[~aliases]]).reshape(-1, 6)
     if registered:
         return twists, covariances, _squares(twists, covariances, np.arange(6)), aliases
@@ -121,10 +104,10 @@ def _errors(
     return twists, covariances, _squares(twists, level, PLANAR), aliases
 
 
-def _squares(errors: np.ndarray, covariances: np.ndarray, own: np.ndarray) -> Float[np.ndarray, " k"]:
+def _squares(errors: np.ndarray, covariances: np.ndarray, axes: np.ndarray) -> Float[np.ndarray, " k"]:
     """Normalised errors squared of some degrees of freedom."""
-    some = errors[:, own]
-    return np.einsum("ni,nij,nj->n", some, np.linalg.inv(covariances[:, own[:, None], own]), some)
+    part = errors[:, axes]
+    return np.einsum("ni,nij,nj->n", part, np.linalg.inv(covariances[:, axes[:, None], axes]), part)
 
 
 def _revisits(recording: SimulatedRecording, count: int, rng: np.random.Generator) -> Int[np.ndarray, "n 2"]:
@@ -150,56 +133,41 @@ def _aligned(recording: Recording, pairs: np.ndarray) -> Iterator[LoopClosure]:
 
 def _registered(recording: Recording, loop: LoopClosure) -> LoopClosure:
     points = [recording.points(frame) for frame in (loop.query, loop.match)]
-    found = register(*points, initial=loop.match_from_query, initial_covariance=loop.covariance)
-    return dataclasses.replace(loop, **found._asdict())
+    registration = register(*points, initial=loop.match_from_query, initial_covariance=loop.covariance)
+    return dataclasses.replace(loop, **registration._asdict())
 
 
-def search(
-    *,
-    drives: tuple[str, ...] = WALKS,
-    sensors: tuple[str, ...] = ("hdl64e+handheld",),
-    scans: int = 360,
-    weights: str = "sglpr",
-) -> None:
+def search(drives: tyro.conf.OmitArgPrefixes[Drives] = WALKS, *, weights: str = "sglpr") -> None:
     """Search whole drives of a sensor that tilts, without and with odometry that drifts.
 
     Prints right loops (within 10 m), wrong ones (beyond 20 m), the share of revisits (within 5 m) that have a loop, and
     errors of roll, pitch and height of the right ones as `pairs` does.
 
     Args:
-        drives: WORLD:ROUTE:SEED.
-        sensors: their names, with +CARRIER.
-        scans: scans of each drive.
+        drives: drives to search.
         weights: the model that describes the scans.
     """
     params = sglpr_jax.load(weights)
-    table = Table("drive", "sensor", "gravity", "odometry", "6 DoF", "right", "wrong", "recall", *ERRORS)
-    for name in drives:
-        for sensor in sensors:
-            recording = simulated(name, sensor, scans)
-            poses, unknown = recording.poses.world_from_lidar, dataclasses.replace(in_memory(recording), mounting=None)
-            rule = town_rule(poses[:, :3, 3], recording.poses.times)
-            odometry = drifted(poses, seed=int(name.split(":")[-1]))
-            for gravity, given in (("recording", None), ("auto", None), ("auto", odometry)):
-                opened = mounted(unknown, "auto", gravity=gravity, known=False)
-                found = sglpr_jax.find_loops(opened, params, odometry=given, registered=False)
-                print(*found.sessions[0].recording.found, sep="\n")
-                fine = [_registered(found.sessions[0].recording, loop) for loop in found.loops]
-                for how, loops in (("no", found.loops), ("yes", fine)):
-                    counts = counted(closures_of(loops), poses[:, :3, 3], rule)
-                    about = (gravity, "no" if given is None else "yes", how, str(counts.right), str(counts.wrong))
-                    right = [one for one, ok in zip(loops, _are_near(loops, poses), strict=True) if ok]
-                    errors = np.array([twist(one) for one in relative_errors(right, poses)]).reshape(-1, 6)
-                    covariances = np.array([one.covariance for one in right]).reshape(-1, 6, 6)
-                    row = (name, sensor, *about, counts.recall, *_cells(errors, covariances))
-                    print(*row, flush=True)
-                    table.add_row(*row)
-    Console(width=170).print(table)
-
-
-def _are_near(loops: Sequence[LoopClosure], poses: Float[np.ndarray, "n 4 4"]) -> list[bool]:
-    """Whether the scans of each loop were taken at one place."""
-    return [bool(np.linalg.norm(poses[one.query, :3, 3] - poses[one.match, :3, 3]) <= LOOP_M) for one in loops]
+    table = Table("drive", "gravity", "odometry", "6 DoF", "right", "wrong", "recall", *ERRORS)
+    for drive in drives:
+        recording = drives.simulate(drive)
+        poses, unknown = recording.poses.world_from_lidar, dataclasses.replace(in_memory(recording), mounting=None)
+        rule = town_rule(poses[:, :3, 3], recording.poses.times)
+        odometry = drifted(poses, seed=drive.seed)
+        for gravity, given in (("recording", None), ("auto", None), ("auto", odometry)):
+            opened = mounted(unknown, "auto", gravity=gravity, known=False)
+            found = sglpr_jax.find_loops(opened, params, odometry=given, registered=False)
+            session = found.sessions[0].recording
+            print(*session.found, sep="\n", file=sys.stderr)
+            registered = [_registered(session, loop) for loop in found.loops]
+            for how, loops in (("no", found.loops), ("yes", registered)):
+                counts = counted(closures_of(loops), poses[:, :3, 3], rule)
+                apart = [np.linalg.norm((poses[one.query] - poses[one.match])[:3, 3]) for one in loops]
+                right = [one for one, metres in zip(loops, apart, strict=True) if metres <= LOOP_M]
+                errors = np.array([twist(one) for one in relative_errors(right, poses)]).reshape(-1, 6)
+                covariances = np.array([one.covariance for one in right]).reshape(-1, 6, 6)
+                about = (gravity, "no" if given is None else "yes", how, counts.right, counts.wrong, counts.recall)
+                table.add(drive.name, *about, *_cells(errors, covariances))
 
 
 def _cells(errors: Float[np.ndarray, "k 6"], covariances: Float[np.ndarray, "k 6 6"]) -> list[str]:

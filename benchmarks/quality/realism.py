@@ -7,10 +7,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
 import sglpr_jax
+from benchmarks.table import Table
 from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
@@ -79,8 +78,7 @@ def compare(
         raise SystemExit("nothing to measure: name datasets with --real, --real-range or --simulated")
     table = Table("total variation from the real drives, %", *sources)
     for measure, (title, _) in HISTOGRAMS.items():
-        table.add_row(title, *(_distance_from_real(name, measure, sources) for name in sources))
-    Console(width=200).print(table)
+        table.add(title, *(_distance_from_real(name, measure, sources) for name in sources))
     save(_draw(sources), out / "histograms.png")
     print(out / "histograms.png")
 
@@ -103,8 +101,8 @@ def _measures(drive: Recording, row: int) -> Measures:
 
 def _measured_range_images(folder: Path) -> Iterator[tuple[str, Measures]]:
     """Mean measures of each drive of a folder of range images."""
-    for name, of_drive in itertools.groupby(_range_image_paths(folder), key=lambda path: path.stem[:2]):
-        yield f"real range images {name}", _mean([_scan_measures(*_read_range_image(path)) for path in of_drive])
+    for name, images in itertools.groupby(_range_images(folder), key=lambda image: image[0]):
+        yield f"real range images {name}", _mean([_scan_measures(points, classes) for _, points, classes in images])
 
 
 def _mean(each: Sequence[Measures]) -> Measures:
@@ -188,18 +186,14 @@ def _share_of_classes(classes: np.ndarray) -> np.ndarray:
     return counts / max(counts.sum(), 1)
 
 
-def _range_image_paths(folder: Path) -> list[Path]:
-    """The files of a folder, in order; ends the program where there are none."""
+def _range_images(folder: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Drive, points (n, 3) in metres and class of each point (n,) of the files of a folder."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise SystemExit(f"{folder}: expected range images (*.npz), found none")
-    return paths
-
-
-def _read_range_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) in metres and the class of each (n,)."""
-    with np.load(path, allow_pickle=False) as file:
-        return np.ascontiguousarray(file["points"][:, :3]), file["label"].astype(np.int32)
+    for path in paths:
+        with np.load(path, allow_pickle=False) as file:
+            yield path.stem[:2], np.ascontiguousarray(file["points"][:, :3]), file["label"].astype(np.int32)
 
 
 def semantics(
@@ -238,12 +232,11 @@ def semantics(
     totals["all"] = np.sum(list(totals.values()), axis=0)
     for source, matrices in totals.items():
         ours, guess = map(score_confusion, matrices)
-        table = Table("class", "share of the cells", "IoU", "IoU of each cell's commonest class", title=source)
+        table = Table(source, "share of the cells", "IoU", "IoU of each cell's commonest class")
         for i in np.flatnonzero(ours.shares).tolist():
-            table.add_row(CATEGORIES[i], f"{ours.shares[i]:.2%}", f"{ours.iou[i]:.3f}", f"{guess.iou[i]:.3f}")
-        table.add_row(f"mean of {ours.present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
-        table.add_row(f"{CATEGORIES[ours.majority]} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
-        Console(width=120).print(table)
+            table.add(CATEGORIES[i], f"{ours.shares[i]:.2%}", f"{ours.iou[i]:.3f}", f"{guess.iou[i]:.3f}")
+        table.add(f"mean of {ours.present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
+        table.add(f"{CATEGORIES[ours.majority]} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
 
 
 def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Iterator[tuple[str, Scan]]:
@@ -254,9 +247,8 @@ def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Itera
             for row, labelled in enumerate(recording.labelled):
                 if labelled and not recording.has_images:
                     yield f"scans of {name}", recording.scan(row)
-    for path in _range_image_paths(range_images) if range_images else ():
-        points, classes = _read_range_image(path)
-        yield f"range images of {path.stem[:2]}", Scan(points=points, labels=to_raw(classes))
+    for name, points, classes in _range_images(range_images) if range_images else ():
+        yield f"range images of {name}", Scan(points=points, labels=to_raw(classes))
 
 
 def _commonest_by_cell(params: Params, root: Path, scans: int) -> np.ndarray:

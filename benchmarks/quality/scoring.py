@@ -7,16 +7,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from benchmarks.drives import revisited
+from benchmarks.described import REPEATING_M, WAY_M
+from benchmarks.drives import Drive, revisited
 from sglpr_jax.se3 import distances, inverse, travelled, yaw_of
+from sglpr_jax.sim.styles import SCENERIES
 
 Poses = Float[np.ndarray, "n 4 4"]
 LOOP_M, OTHER_M, REVISIT_M = 10.0, 20.0, 5.0
 """In towns, a loop is right up to the first distance and wrong beyond the second; a revisit is within the third."""
 OLDER_S, OLDER_FRAMES = 30.0, 291
 """A revisit is of a place that was seen this time before, or this number of frames before if scans have no times."""
-REPEATING_M, WAY_M = 3.0, 30.0
-"""Where places repeat, a revisit is within the first distance after this length of path, in metres."""
 RIGHT, WRONG = (1.5, 6.0), (3.0, 15.0)
 """Largest errors of a right pose, and smallest errors of a wrong one, in metres and degrees."""
 STOREY_M, SLOPE = 1.6, 0.3
@@ -58,27 +58,30 @@ class Counts(NamedTuple):
 
 
 def town_rule(positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " n"] | None) -> Rule:
-    """The rule of towns and of KITTI."""
+    """The rule of towns and of KITTI. A loop is right within 10 m; a revisit is within 5 m after 30 s."""
     progress = np.arange(len(positions), dtype=float) if times is None else times
     apart = OLDER_FRAMES if times is None else OLDER_S
     return Rule(LOOP_M, OTHER_M, revisited(positions, progress, near_m=REVISIT_M, apart=apart))
 
 
-def repeating_rule(poses: Poses, other_m: float) -> Rule:
-    """The rule where places repeat: scans more than `other_m` metres apart show different places."""
-    near_m = min(REPEATING_M, other_m / 2)
-    return Rule(other_m, other_m, revisited(poses[:, :3, 3], travelled(poses), near_m=near_m, apart=WAY_M))
+def rule_of(drive: Drive, poses: Poses, times: Float[np.ndarray, " n"]) -> Rule:
+    """The rule of a simulated drive. Where places repeat, scans more than `other_m` apart show different places."""
+    if drive.world in SCENERIES:
+        return town_rule(poses[:, :3, 3], times)
+    near_m = min(REPEATING_M, drive.other_m / 2)
+    is_revisit = revisited(poses[:, :3, 3], travelled(poses), near_m=near_m, apart=WAY_M)
+    return Rule(drive.other_m, drive.other_m, is_revisit)
 
 
 def counted(closures: Sequence[Closure], positions: Float[np.ndarray, "n 3"], rule: Rule) -> Counts:
     """Count loops. A loop is right if two of its scans are near each other, and wrong if all are far apart."""
-    right, wrong, found = 0, 0, set[int]()
+    right, wrong, matched = 0, 0, set[int]()
     for newer, older in closures:
         apart = distances(positions[newer], positions[older]).min(axis=1)
         right, wrong = right + int(apart.min() <= rule.right_m), wrong + int(apart.min() > rule.wrong_m)
-        found |= set(newer[apart <= rule.right_m].tolist())
-    again = set(np.flatnonzero(rule.revisits).tolist())
-    return Counts(len(closures), right, wrong, len(again & found), len(again))
+        matched |= set(newer[apart <= rule.right_m].tolist())
+    revisits = set(np.flatnonzero(rule.revisits).tolist())
+    return Counts(len(closures), right, wrong, len(revisits & matched), len(revisits))
 
 
 def closures_of(loops: Sequence[Any]) -> list[Closure]:

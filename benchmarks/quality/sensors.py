@@ -6,14 +6,15 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import tyro
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation, RotationSpline
 
 import sglpr_jax
-from benchmarks.drives import in_memory, lidar, recording_of
-from benchmarks.quality.poses import WALKS, simulated
+from benchmarks.drives import WALKS, Drives, in_memory, lidar, recording_of
+from benchmarks.table import Table
 from sglpr_jax.data.deskew import deskew as deskew_points
 from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
@@ -42,14 +43,13 @@ MOTIONS = {"car": (10.0, 25.0), "robot": (1.0, 90.0), "hand": (1.4, 180.0)}
 """Speed in m/s and maximum yaw rate in degrees per second."""
 AZIMUTHS = 900
 OTHER_PLACE_M = 20.0
+CARRIED = dataclasses.replace(WALKS, sensor=("vlp16",))
 BATCH = 64
 
 
 def imu(
+    drives: tyro.conf.OmitArgPrefixes[Drives] = CARRIED,
     *,
-    drives: tuple[str, ...] = WALKS,
-    sensor: str = "vlp16",
-    scans: int = 360,
     blind: float = 0.0,
 ) -> None:
     """Compare roll and pitch of a sensor in a hand by its IMU and by the ground of its scans.
@@ -59,23 +59,23 @@ def imu(
     of errors within 2 standard deviations. The constants of the library were fitted on seeds 500 and 503.
 
     Args:
-        drives: WORLD:ROUTE:SEED.
-        sensor: name of the sensor.
-        scans: scans of a drive.
+        drives: drives to measure.
         blind: share of the scans that do not see the ground.
     """
-    print("| drive | gravity | roll, pitch [deg] | 95 % | within 2 sigma |\n|---|---|---|---|---|")
-    for name in drives:
-        recording = simulated(name, f"{sensor}+handheld", scans)
-        measured = _measured_imu(recording.poses, np.random.default_rng(int(name.split(":")[-1])))
+    table = Table("drive", "gravity", "roll, pitch [deg]", "95 %", "within 2 sigma")
+    for drive in drives:
+        recording = drives.simulate(drive)
+        measured = _measured_imu(recording.poses, np.random.default_rng(drive.seed))
         ups = measured.ups(recording.poses.times)[0]
-        print(_row_of_gravity(name, "IMU alone", ups, np.full(len(ups), IMU_TILT_DEG), recording.poses), flush=True)
+        cells = _gravity_errors(ups, np.full(len(ups), IMU_TILT_DEG), recording.poses)
+        table.add(drive.name, "IMU alone", *cells)
         rendered = dataclasses.replace(_without_ground(recording, blind), mounting=None)
         for how, read in (("ground", None), ("IMU and ground", lambda ups=ups: (ups, "an IMU"))):
             opened = mounted(dataclasses.replace(rendered, read_ups=read), "auto", gravity="scan", known=False)
-            each = opened.mountings or ()
-            found, sigmas = [one.up for one in each], [one.tilt_deviation_deg for one in each]
-            print(_row_of_gravity(name, how, np.array(found), np.array(sigmas, float), recording.poses), flush=True)
+            mountings = opened.mountings or ()
+            estimated = np.array([one.up for one in mountings])
+            sigmas_deg = np.array([one.tilt_deviation_deg for one in mountings], float)
+            table.add(drive.name, how, *_gravity_errors(estimated, sigmas_deg, recording.poses))
 
 
 def _without_ground(recording: SimulatedRecording, share: float) -> Recording:
@@ -92,14 +92,14 @@ def _without_ground(recording: SimulatedRecording, share: float) -> Recording:
     return dataclasses.replace(rendered, read=read)
 
 
-def _row_of_gravity(
-    name: str, how: str, ups: Float[np.ndarray, "n 3"], sigma_deg: Float[np.ndarray, " n"], poses: TimedPoses
-) -> str:
-    """One row of the table. The errors are those about the two horizontal axes."""
+def _gravity_errors(
+    ups: Float[np.ndarray, "n 3"], sigma_deg: Float[np.ndarray, " n"], poses: TimedPoses
+) -> tuple[str, str, str]:
+    """Median and 95 % quantile of the errors about the two horizontal axes, and the share within 2 sigma."""
     in_world = np.einsum("nij,nj->ni", poses.world_from_lidar[:, :3, :3], ups)
     sizes = np.abs(np.degrees(in_world[:, :2]))
     within = (sizes <= 2 * sigma_deg[:, None]).mean()
-    return f"| {name} | {how} | {np.median(sizes):.2f} | {np.quantile(sizes, 0.95):.2f} | {within:.3f} |"
+    return f"{np.median(sizes):.2f}", f"{np.quantile(sizes, 0.95):.2f}", f"{within:.3f}"
 
 
 def _measured_imu(poses: TimedPoses, rng: np.random.Generator) -> Imu:
@@ -176,13 +176,13 @@ def deskew(
         places: scans of each town.
         weights: the model that describes the scans.
     """
-    columns = ("sensor", "motion", "points skewed", "deskewed [m]", "descriptors skewed", "deskewed", "no motion")
-    print(f"| {' | '.join((*columns, 'elsewhere'))} |\n{'|---' * 8}|")
-    params = sglpr_jax.load(weights)
+    columns = ("points skewed", "deskewed [m]", "descriptors skewed", "deskewed", "no motion", "elsewhere")
+    params, table = sglpr_jax.load(weights), Table("sensor", "motion", *columns)
     for name in sensors:
         towns = [_town(seed, places, lidar(name, AZIMUTHS)) for seed in seeds]
-        for motion in MOTIONS:
-            print(_row_of_motion(name, motion, towns, params), flush=True)
+        for motion, (speed_mps, turn_deg) in MOTIONS.items():
+            cells = _motion_errors(speed_mps, turn_deg, towns, params)
+            table.add(name, f"{motion}, {speed_mps:g} m/s, {turn_deg:g} deg/s", *cells)
 
 
 def _town(seed: int, places: int, sensor: Sensor) -> list[_Place]:
@@ -193,9 +193,8 @@ def _town(seed: int, places: int, sensor: Sensor) -> list[_Place]:
     return [_Place(world, path.xy[i], float(path.yaw[i]), float(path.times[i]), sensor) for i in rows]
 
 
-def _row_of_motion(name: str, motion: str, towns: list[list[_Place]], params: Params) -> str:
-    """One row of the table: medians, and 95 % quantiles of the points."""
-    speed_mps, turn_deg = MOTIONS[motion]
+def _motion_errors(speed_mps: float, turn_deg: float, towns: list[list[_Place]], params: Params) -> list[str]:
+    """Median errors and distances, and 95 % quantiles of the points, as cells."""
     errors: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": []}
     apart: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": [], "again": [], "other": []}
     for places in towns:
@@ -223,13 +222,12 @@ def _row_of_motion(name: str, motion: str, towns: list[list[_Place]], params: Pa
         apart["other"].append(others.min(axis=1))
     metres = [np.concatenate(values) for values in errors.values()]
     cells = [f"{np.median(values):.3f}, 95 % {np.quantile(values, 0.95):.3f}" for values in metres]
-    cells += [f"{np.median(np.concatenate(values)):.3f}" for values in apart.values()]
-    return f"| {name} | {motion}, {speed_mps:g} m/s, {turn_deg:g} deg/s | {' | '.join(cells)} |"
+    return cells + [f"{np.median(np.concatenate(values)):.3f}" for values in apart.values()]
 
 
 def _descriptors(params: Params, clouds: list[np.ndarray]) -> Float[np.ndarray, "n d"]:
-    records = [Scan(points=np.ascontiguousarray(cloud, np.float32)) for cloud in clouds]
-    return sglpr_jax.embed(params, recording_of("scans", records)).descriptors
+    scans = [Scan(points=np.ascontiguousarray(cloud, np.float32)) for cloud in clouds]
+    return sglpr_jax.embed(params, recording_of("scans", scans)).descriptors
 
 
 def rotation(

@@ -1,11 +1,8 @@
 """Transforms between two recordings of one town, without a common frame.
 
-`render` writes pairs of short drives on two days. The second drive has its own start and route; 50 to 100 m of it lie
-on streets of the first one, in either direction. Parked cars and traffic differ. A pair is a file SEED.npz with these
-arrays for both drives (first_*, second_*), n scans each:
-
-    images (n, h, w) uint8, world_from_lidar (n, 4, 4), times (n,)
-    common_m: length of the second drive within 4 m of the first; turned: median heading between them, in degrees
+Pairs of short drives on two days are described (`described`) in files SEED-first.npz and SEED-second.npz. The second
+drive has its own start and route; 50 to 100 m of it lie on streets of the first one, in either direction. Parked cars
+and traffic differ.
 """
 
 import json
@@ -14,21 +11,17 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-import tyro
 from jaxtyping import Float, Int
 
 import sglpr_jax
-from benchmarks.drives import drifted, lidar, recording_of
+from benchmarks import described
+from benchmarks.drives import drifted, lidar
 from benchmarks.quality.scoring import OTHER_M
-from sglpr_jax.data.scan import Scan
-from sglpr_jax.files import replacing
-from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.se3 import inverse, yaw_of
 from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
-from sglpr_jax.sim.recording import drive_through
+from sglpr_jax.sim.recording import PAUSE_S, drive_through
 from sglpr_jax.sim.routes import travelled
 from sglpr_jax.sim.sensor import Sensor
-from sglpr_jax.sim.sessions import PAUSE_S
 from sglpr_jax.sim.world import build_world
 
 ROUTES = ("00", "02", "05", "06", "07", "08", "10")
@@ -49,9 +42,11 @@ class Windows(NamedTuple):
     turned_deg: float
 
 
-def render(
+def sessions(
     *,
     seeds: tuple[int, ...] = (1,),
+    odometry: Literal["exact", "drifting"] = "exact",
+    strangers: int = 20,
     scans: int = 64,
     spacing_m: float = 2.0,
     sensor: str = "hdl64e",
@@ -59,48 +54,60 @@ def render(
     weights: str = "sglpr",
     out: Path = Path("build/sessions"),
 ) -> None:
-    """Render pairs of drives. Files that exist are skipped.
+    """Find the transforms between pairs of drives, and invented ones between drives of different towns.
+
+    The frame of a recording is that of its first scan. Strangers are the second recording of a pair and the first one
+    of the next pair. `error_m` is the error of the second frame's origin by the true poses; it contains the drift of
+    both recordings between their first scans and the loops. `at_loops_m` is the error of the pose of a query in its
+    match by the transform and the given poses, the median over the loops.
 
     Args:
         seeds: one town and pair for each.
+        odometry: poses that the search is given.
+        strangers: number of pairs of different towns.
         scans: number of scans of each drive.
         spacing_m: distance between them.
         sensor: name of the LiDAR.
         azimuth_steps: firings of the sensor per turn.
-        weights: model whose images are stored.
-        out: the folder.
+        weights: the model that describes the images.
+        out: folder of the described drives. Those that exist are not rendered again.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    finder = CandidateSearch(sglpr_jax.load(weights))
+    params, rows, invented, before, done = sglpr_jax.load(weights), [], 0, None, 0
     for seed in seeds:
-        if not (out / f"{seed}.npz").exists():
+        paths = [out / f"{seed}-{name}.npz" for name in NAMES]
+        if not all(path.exists() for path in paths):
             path, windows = _plan(seed, scans=scans, spacing_m=spacing_m)
-            _render(seed, path, windows, lidar(sensor, azimuth_steps), finder, out)
-            print(f"{seed}: {windows.common_m:.0f} m in common, turned by {windows.turned_deg:.0f} degrees", flush=True)
+            _store(seed, path, windows, lidar(sensor, azimuth_steps), params, paths)
+        first, second = (_read(path, drifting=odometry == "drifting") for path in paths)
+        row = {"pair": seed, **first.facts, **_judged(_between(params, first, second), first, second)}
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+        if before is not None and done < strangers:
+            found = _between(params, first, before)
+            done, invented = done + 1, invented + bool(found.transforms)
+            print(f"  strangers: {len(found.loops)} loops, {len(found.transforms)} transforms", flush=True)
+        before = second
+    _report(rows, invented, done)
 
 
-def _render(seed: int, path: PlanarPath, windows: Windows, sensor: Sensor, finder: CandidateSearch, out: Path) -> None:
-    """Render a pair and write its file."""
+def _store(
+    seed: int, path: PlanarPath, windows: Windows, sensor: Sensor, params: sglpr_jax.Params, files: list[Path]
+) -> None:
+    """Render and describe a pair."""
     seeds = drive_seed(seed, f"pair {seed}")
     world = build_world(seeds, path.xy, path.times)
-    arrays = {}
-    for day, (name, rows) in enumerate(zip(NAMES, windows.rows, strict=True)):
+    for day, (file, rows) in enumerate(zip(files, windows.rows, strict=True)):
         drive = drive_through(
             world,
             path,
             rows,
-            name=name,
-            ids=tuple(f"{i:06d}" for i in range(len(rows))),
+            name=file.stem,
             times=path.times[rows] - path.times[rows[0]],
             sensor=sensor,
             key=jax.random.fold_in(jax.random.key(seed), day),
             rng=np.random.default_rng((*seeds, 2 + day)),
         )
-        images = [finder.keyframe(drive.scan(i, labels=False)).image for i in range(len(drive))]
-        arrays |= {f"{name}_images": np.stack(images), f"{name}_times": drive.poses.times}
-        arrays[f"{name}_world_from_lidar"] = drive.poses.world_from_lidar
-    with replacing(out / f"{seed}.npz") as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, common_m=windows.common_m, turned_deg=windows.turned_deg, **arrays)
+        described.store(file, drive, params, common_m=windows.common_m, turned_deg=windows.turned_deg)
 
 
 def _plan(seed: int, *, scans: int, spacing_m: float) -> tuple[PlanarPath, Windows]:
@@ -138,54 +145,19 @@ class Drive(NamedTuple):
     recording: sglpr_jax.Recording
     true: Float[np.ndarray, "n 4 4"]
     given: Float[np.ndarray, "n 4 4"]
+    facts: dict[str, float]
+    """Length of the second drive within 4 m of the first, and median angle between their headings, in degrees."""
 
 
-def search(
-    pairs: tyro.conf.Positional[Path],
-    *,
-    odometry: Literal["exact", "drifting"] = "exact",
-    strangers: int = 20,
-    seeds: tuple[int, ...] = (),
-    weights: str = "sglpr",
-) -> None:
-    """Find the transforms of rendered pairs, and invented ones between drives of different towns.
-
-    The frame of a recording is that of its first scan. Strangers are the second recording of a pair and the first one
-    of the next pair. `error_m` is the error of the second frame's origin by the true poses; it contains the drift of
-    both recordings between their first scans and the loops. `at_loops_m` is the error of the pose of a query in its
-    match by the transform and the given poses, the median over the loops.
-
-    Args:
-        pairs: folder of `render`.
-        odometry: poses that the search is given.
-        strangers: number of pairs of different towns.
-        seeds: pairs to search; without them all.
-        weights: the model that describes the images.
-    """
-    params, rows, invented, before, done = sglpr_jax.load(weights), [], 0, None, 0
-    files = sorted(pairs.glob("*.npz"), key=lambda path: int(path.stem))
-    for path in (path for path in files if not seeds or int(path.stem) in seeds):
-        with np.load(path) as file:
-            content = dict(file)
-        first, second = (_drive(content, name, drifting=odometry == "drifting") for name in NAMES)
-        about = {"pair": path.stem, **{name: float(content[name]) for name in ("common_m", "turned_deg")}}
-        rows.append(about | _judged(_found(params, first, second), first, second))
-        print(json.dumps(rows[-1]), flush=True)
-        if before is not None and done < strangers:
-            found = _found(params, first, before)
-            done, invented = done + 1, invented + bool(found.transforms)
-            print(f"  strangers: {len(found.loops)} loops, {len(found.transforms)} transforms", flush=True)
-        before = second
-    _report(rows, invented, done)
+def _read(path: Path, *, drifting: bool) -> Drive:
+    drive = described.read(path)
+    true = drive.world_from_lidar
+    given = drifted(true, seed=int(1e3 * drive.times[-1])) if drifting else inverse(true[0]) @ true
+    facts = {name: float(drive.facts[name]) for name in ("common_m", "turned_deg")}
+    return Drive(drive.recording, true, given, facts)
 
 
-def _drive(content: dict[str, np.ndarray], name: str, *, drifting: bool) -> Drive:
-    images, true, times = (content[f"{name}_{part}"] for part in ("images", "world_from_lidar", "times"))
-    given = drifted(true, seed=int(1e3 * times[-1])) if drifting else inverse(true[0]) @ true
-    return Drive(recording_of(name, [Scan(image=image) for image in images], times), true, given)
-
-
-def _found(params: sglpr_jax.Params, first: Drive, second: Drive) -> Any:
+def _between(params: sglpr_jax.Params, first: Drive, second: Drive) -> Any:
     """Loops and transforms between two drives."""
     recordings, odometry = (first.recording, second.recording), (first.given, second.given)
     return sglpr_jax.find_loops(recordings, params, odometry=odometry, registered=False).between(0, 1)
@@ -193,24 +165,24 @@ def _found(params: sglpr_jax.Params, first: Drive, second: Drive) -> Any:
 
 def _judged(found: Any, first: Drive, second: Drive) -> dict[str, Any]:
     """Number of loops, wrong ones and transforms, and the errors of the transform."""
-    seen = [inverse(first.true[loop.match]) @ second.true[loop.query] for loop in found.loops]
-    wrong = sum(bool(np.linalg.norm(pose[:3, 3]) > OTHER_M) for pose in seen)
+    true = [inverse(first.true[loop.match]) @ second.true[loop.query] for loop in found.loops]
+    wrong = sum(bool(np.linalg.norm(pose[:3, 3]) > OTHER_M) for pose in true)
     row: dict[str, Any] = {"loops": len(found.loops), "wrong": wrong, "transforms": len(found.transforms)}
     if not found.transforms:
         return row
-    alignment = found.transforms[0].alignment
+    alignment = found.transforms[0]
     error = inverse(inverse(first.true[0]) @ second.true[0]) @ alignment.match_from_query
-    here = [
+    at_loops = [
         inverse(first.given[loop.match] @ pose) @ alignment.match_from_query @ second.given[loop.query]
-        for loop, pose in zip(found.loops, seen, strict=True)
+        for loop, pose in zip(found.loops, true, strict=True)
     ]
     sigma = np.sqrt(np.diag(alignment.covariance))
     numbers = {
         "error_m": np.linalg.norm(error[:2, 3]),
         "error_deg": np.degrees(abs(yaw_of(error))),
         "error_z_m": abs(error[2, 3]),
-        "at_loops_m": np.median([np.linalg.norm(pose[:2, 3]) for pose in here]),
-        "at_loops_deg": np.degrees(np.median([abs(yaw_of(pose)) for pose in here])),
+        "at_loops_m": np.median([np.linalg.norm(pose[:2, 3]) for pose in at_loops]),
+        "at_loops_deg": np.degrees(np.median([abs(yaw_of(pose)) for pose in at_loops])),
         "sigma_m": np.hypot(*sigma[:2]),
         "sigma_deg": np.degrees(sigma[5]),
     }

@@ -9,11 +9,12 @@ from jaxtyping import Float, Int
 
 import sglpr_jax
 from benchmarks.drives import drifted, lidar, on_disk
+from benchmarks.table import Table
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.se3 import distances
 from sglpr_jax.sim.drive import PlanarPath, plan_path, timed
-from sglpr_jax.sim.recording import SimulatedRecording, drive_through
+from sglpr_jax.sim.recording import drive_through
 from sglpr_jax.sim.world import build_world
 
 PASSES = {"map": 0.0, "opposite": 2.4, "same": 0.4, "opposite, aside": 3.5, "same, aside": 3.5}
@@ -61,34 +62,33 @@ def recall(
         weights: the model that describes the scans.
         out: folder of the scans.
     """
-    print(f"| sensor | submap m | {' | '.join(list(PASSES)[1:])} |\n|---|---|" + "---|" * (len(PASSES) - 1))
-    params = sglpr_jax.load(weights)
+    params, table = sglpr_jax.load(weights), Table("sensor", "submap m", *list(PASSES)[1:])
     for sensor in sensors:
         drives = [rendered(sensor, seed, metres, azimuth_steps, out) for seed in seeds]
         for length_m in lengths_m:
-            print(_row(sensor, drives, params, length_m, max(1, round(spacing_m))), flush=True)
+            recalls = _recalls(drives, params, length_m, max(1, round(spacing_m)))
+            table.add(sensor, f"{length_m:g}", *(f"{value:.3f}" for value in recalls))
 
 
-def _row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: float, every: int) -> str:
-    """One row of the table."""
-    described = []
+def _recalls(drives: list[Drive], params: sglpr_jax.Params, length_m: float, every: int) -> list[float]:
+    """Recall@1 of each pass but the first."""
+    of_drives = []
     for town, drive in enumerate(drives):
         recording = submaps_of_passes(drive, length_m, seed=town)
         rows = [i for i in scored(drive) if i % every == 0]
         file = sglpr_jax.embed(params, only(recording, rows), on_bad_scan=lambda scan, error: None)
         descriptors = np.full((len(rows), file.descriptors.shape[1]), np.inf)  # of a scan that shows nothing
         descriptors[np.isin([recording.ids[i] for i in rows], file.ids)] = file.descriptors
-        described.append((descriptors, drive.poses[rows, :3, 3] + [1e5 * town, 0, 0], drive.passes[rows]))
-    descriptors, positions, passes = (np.concatenate(values) for values in zip(*described, strict=True))
-    seen = np.isfinite(descriptors).all(axis=1)
-    descriptors = np.where(seen[:, None], descriptors, 0.0)
-    mapped = (passes == 0) & seen
+        of_drives.append((descriptors, drive.poses[rows, :3, 3] + [1e5 * town, 0, 0], drive.passes[rows]))
+    descriptors, positions, passes = (np.concatenate(values) for values in zip(*of_drives, strict=True))
+    is_described = np.isfinite(descriptors).all(axis=1)
+    descriptors = np.where(is_described[:, None], descriptors, 0.0)
+    mapped = (passes == 0) & is_described
     nearest = distances(descriptors, descriptors[mapped]).argmin(axis=1)
     apart = distances(positions, positions[mapped])
-    right = (apart[np.arange(len(apart)), nearest] <= RIGHT_M) & seen
+    right = (apart[np.arange(len(apart)), nearest] <= RIGHT_M) & is_described
     answerable = apart.min(axis=1) <= RIGHT_M
-    recalls = [right[answerable & (passes == number)].mean() for number in range(1, len(PASSES))]
-    return f"| {sensor} | {length_m:g} | {' | '.join(f'{value:.3f}' for value in recalls)} |"
+    return [float(right[answerable & (passes == number)].mean()) for number in range(1, len(PASSES))]
 
 
 def scored(drive: Drive) -> list[int]:
@@ -106,14 +106,7 @@ def submaps_of_passes(drive: Drive, length_m: float, *, seed: int) -> Recording:
 
 
 def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Path) -> Drive:
-    """The drive with its scans in a folder (`on_disk`)."""
-    recording, passes = _drive(sensor, seed, metres, azimuth_steps)
-    stored = on_disk(recording, folder / f"{sensor}-{seed}-{metres}-{azimuth_steps}")
-    return Drive(stored, recording.poses.world_from_lidar, passes)
-
-
-def _drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[SimulatedRecording, Int[np.ndarray, " n"]]:
-    """The simulated drive, and the number of the pass of each scan."""
+    """The five passes, with a scan every metre in a folder (`on_disk`)."""
     line, left = _street(seed, metres)
     rng, paths, clock = np.random.default_rng((seed, 6)), [], 0.0
     for number, aside in enumerate(PASSES.values()):
@@ -130,13 +123,12 @@ def _drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[Sim
         whole,
         rows,
         name=f"{sensor}-{seed}",
-        ids=tuple(f"{i:06d}" for i in range(len(rows))),
-        times=whole.times[rows],
         sensor=lidar(sensor, azimuth_steps),
         key=jax.random.key(seed),
         rng=np.random.default_rng((seed, 8)),
     )
-    return recording, np.repeat(np.arange(len(PASSES)), metres)
+    stored = on_disk(recording, folder / f"{sensor}-{seed}-{metres}-{azimuth_steps}")
+    return Drive(stored, recording.poses.world_from_lidar, np.repeat(np.arange(len(PASSES)), metres))
 
 
 def _street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:

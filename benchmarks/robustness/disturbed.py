@@ -1,38 +1,237 @@
-"""Commands that write files, disturbed: killed, run twice at once, without room or rights, their input changed."""
+"""Commands that write files, disturbed: killed, run twice at once, without room or rights, their input changed.
+
+Inputs are so small that a command takes a second. It runs in a process forked from this one, which has imported the
+command's module but never started JAX: so it starts in no time, and whoever kills it meets it at its work.
+"""
 
 import contextlib
+import ctypes
+import dataclasses
+import fnmatch
 import functools
+import importlib
 import itertools
+import multiprocessing
 import os
 import random
+import resource
 import shutil
+import struct
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.context import ForkProcess as Process
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.table import Table
-
-from benchmarks.robustness.writers import (
-    ERRORS,
-    INPUTS,
-    OUT,
-    WRITERS,
-    Process,
-    Writer,
-    ended,
-    make_inputs,
-    said,
-    written,
-)
+from benchmarks.table import Table
 from benchmarks.timing import about
 from sglpr_jax.files import half_written
 
-Row = dict[str, Any]
-"""Titles of columns and their values."""
+INPUTS, OUT, ERRORS = "inputs", "out", "stderr"
+"""Folder of what the commands read, folder and file that a command writes. The last two are in the command's folder."""
+TIMEOUT_S = 900
+DRIVE = "--azimuth-steps 60 --sensor vlp16"
+TOWN = f"../{INPUTS}/town"
+SCANS = f"{TOWN}/sequences/08/velodyne"
+POSES = f"--poses {TOWN}/sequences/%s/poses.txt --pose-format kitti"
+TRAINED = f"--seq 08 --data {TOWN} --preset tiny --steps 8 --method solid"
+RUN_FILES = ("*/checkpoints/*", "*/environment.json", "*/metrics.jsonl", "*/learning-curves.png", "*/mining/*")
+
+
+@dataclasses.dataclass(frozen=True)
+class Writer:
+    """A command that writes into `OUT`."""
+
+    line: str
+    """Arguments."""
+    varies: tuple[str, ...] = ()
+    """Patterns of files below `OUT` with times in them, that grow, or that only a killed run leaves for the next."""
+    resumed_by: str = ""
+    """If this file exists, the command is continued by --resume."""
+    refuses: str = ""
+    """Part of the error if the command has finished before and never does its work twice."""
+
+
+WRITERS = {
+    "embed": Writer(f"--weights circular --data {TOWN} --seq 08 --out {OUT}/08.npz"),
+    "evaluate": Writer(f"../{INPUTS}/08.npz --data {TOWN} --seq 08 --out {OUT}/08"),
+    "simulate": Writer(f"--out {OUT}/town {DRIVE} --seq 08 --scans 12"),
+    "simulate images": Writer(f"--out {OUT}/town {DRIVE} --seq 08 --scans 12 --images"),
+    "export": Writer(f"--weights circular --out {OUT}/mine", refuses="not exist yet"),
+    "export stablehlo": Writer(f"--weights circular --format stablehlo --out {OUT}/mine", refuses="not exist yet"),
+    "map": Writer(f"{TOWN} --seq 08 {POSES % '08'} --out {OUT}/town.safetensors", varies=("town.unfinished/*",)),
+    "map more": Writer(
+        f"{TOWN} --seq 05 {POSES % '05'} --add-to ../{INPUTS}/town.safetensors --out {OUT}/town.safetensors",
+        varies=("town.unfinished/*",),
+    ),
+    "relocalize": Writer(f"{SCANS}/000003.bin --map ../{INPUTS}/town.safetensors --out {OUT}/pose.json"),
+    "loops": Writer(
+        f"{TOWN} --seq 08 --odometry {TOWN}/sequences/08/poses.txt --odometry-format kitti --out {OUT}/found",
+        varies=("found/unfinished/*",),
+    ),
+    "segment": Writer(f"--weights sglpr --data {TOWN} --seq 08 --out {OUT}/maps"),
+    "train": Writer(f"{TRAINED} --out {OUT}/run --cache {OUT}/packs", varies=RUN_FILES, resumed_by="run/config.json"),
+    "reproduce": Writer(f"table1 {TRAINED} --out {OUT}/paper", varies=RUN_FILES),
+}
+"""Commands by name. The first word is the command in `bin/`."""
+INPUT_LINES = (
+    f"simulate --out town {DRIVE} --seq 05 08 --scans 24 --rate-hz 1",
+    "embed --method solid --data town --seq 08 --out 08.npz",
+    "map town --seq 08 --poses town/sequences/08/poses.txt --pose-format kitti --out town.safetensors",
+)
+
+
+def start(
+    command: str,
+    arguments: Sequence[str],
+    folder: Path,
+    *,
+    errors: str = ERRORS,
+    file_bytes: int | None = None,
+    humble: bool = False,
+) -> Process:
+    """Start a command in a folder. Its stderr goes to the file `errors` there.
+
+    No file may grow beyond `file_bytes`. A `humble` process may not write where its user may not, even if that is root.
+    """
+    cache = folder.parent / "cache"
+    os.environ |= {
+        "XDG_CACHE_HOME": str(cache),
+        "JAX_PLATFORMS": "cpu",
+        "JAX_COMPILATION_CACHE_DIR": str(cache / "xla"),
+    }
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    cli = importlib.import_module("sglpr_jax.cli.__main__")
+    cli.load_command(command)  # imported once, for all processes
+
+    def work() -> None:
+        os.chdir(folder)
+        sys.argv = ["sglpr_jax.cli", command, *arguments]
+        for stream, path in ((1, os.devnull), (2, errors)):
+            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+        if file_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
+        if humble:  # without any capability, as capset(2) has it
+            assert ctypes.CDLL(None).capset(struct.pack("Ii", 0x20080522, 0), bytes(24)) == 0
+        cli.main()
+
+    process = multiprocessing.get_context("fork").Process(target=work)
+    process.start()
+    return process
+
+
+def status_of(process: Process) -> int:
+    """Wait for a process, and return its exit status. It is negative if a signal ended the process."""
+    process.join(TIMEOUT_S)
+    assert process.exitcode is not None, f"it has not ended after {TIMEOUT_S} s"
+    return process.exitcode
+
+
+class Whole(NamedTuple):
+    """An undisturbed run."""
+
+    files: dict[str, bytes]
+    seconds: float
+    changes: int
+    """Number of changes in its folder."""
+
+
+class Trial:
+    """A command in an empty folder. The folder of a command is always the same, because some files contain its path."""
+
+    def __init__(self, name: str, root: Path):
+        self.name, self.writer, self.folder = name, WRITERS[name], root / name.replace(" ", "-")
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.out = self.folder / OUT
+        self.out.mkdir(parents=True)
+
+    def start(self, **options: Any) -> Process:
+        """Start the command, or continue it. The options are those of `start`."""
+        resume = self.writer.resumed_by and (self.out / self.writer.resumed_by).exists()
+        arguments = [*self.writer.line.split(), *["--resume"] * bool(resume)]
+        return start(self.name.split()[0], arguments, self.folder, **options)
+
+    def run(self, **options: Any) -> int:
+        """Run the command to its end, and return the exit status."""
+        return status_of(self.start(**options))
+
+    def error(self, errors: str = ERRORS) -> str:
+        """What the command printed to stderr."""
+        path = self.folder / errors
+        return path.read_text() if path.exists() else ""
+
+    def files(self) -> dict[str, bytes]:
+        """Files under their final names below `OUT`, by path."""
+        paths = [path for path in sorted(self.out.rglob("*")) if path.is_file()]
+        return {
+            name: (self.out / name).read_bytes()
+            for name in (str(path.relative_to(self.out)) for path in paths)
+            if not any(part.startswith(".") for part in Path(name).parts)
+        }
+
+    def changes(self, process: Process) -> Iterator[None]:
+        """Yield for each change in what a process writes, until it ends. Looks 1000 times a second."""
+        before: list[tuple[str, int]] = []
+        while process.is_alive():
+            if (now := _sizes(self.out)) != before:
+                before = now
+                yield
+            time.sleep(1e-3)
+
+    def count_differing(self, whole: dict[str, bytes], what: str, *, complete: bool = False) -> int:
+        """Name and count files that differ from an undisturbed run, without those that vary.
+
+        With `complete`, missing files count too.
+        """
+        files = self.files()
+        differing = [name for name in ({**files, **whole} if complete else files) if files.get(name) != whole.get(name)]
+        named = [name for name in differing if not any(fnmatch.fnmatch(name, one) for one in self.writer.varies)]
+        for name in named:
+            print(f"{self.name}: {name} {what}", file=sys.stderr)
+        return len(named)
+
+
+def _sizes(folder: Path) -> list[tuple[str, int]]:
+    """Sizes of all files, hidden ones too, and all folders."""
+    sizes = []
+    for where, folders, files in os.walk(folder):
+        sizes += [(os.path.join(where, name), -1) for name in folders]
+        for path in (os.path.join(where, name) for name in files):
+            with contextlib.suppress(FileNotFoundError):
+                sizes.append((path, os.stat(path).st_size))
+    return sorted(sizes)
+
+
+def _undisturbed(name: str, root: Path) -> Whole:
+    """Run twice: the first run compiles, and the second has to end with the same bytes."""
+    runs = []
+    for _ in range(2):
+        trial, begin = Trial(name, root), time.perf_counter()
+        process = trial.start()
+        changes = sum(1 for _ in trial.changes(process))
+        assert status_of(process) == 0, f"{name}: {trial.error()}"
+        runs.append(Whole(trial.files(), time.perf_counter() - begin, changes))
+    assert runs[1].files and not trial.count_differing(runs[0].files, "differs between two runs")
+    return runs[1]
+
+
+def _disturb(commands: Sequence[str], rows_of: Callable[[str, Path, Whole], Iterator[dict[str, Any]]]) -> None:
+    """Make the inputs, and print a table of disturbed commands."""
+    table = None
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = Path(folder) / INPUTS
+        inputs.mkdir()
+        for line in INPUT_LINES:
+            command, *arguments = line.split()
+            assert status_of(start(command, arguments, inputs)) == 0, (inputs / ERRORS).read_text()
+        (inputs / ERRORS).unlink()
+        for name in commands:
+            for row in rows_of(name, Path(folder), _undisturbed(name, Path(folder))):
+                table = table or Table("command", *row)
+                table.add(name, *row.values())
+    print("\n".join(about().values()))
 
 
 def kills(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 20, seed: int = 0) -> None:
@@ -43,159 +242,94 @@ def kills(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 20, seed: 
     bytes.
 
     Args:
-        commands: names in `writers.WRITERS`.
+        commands: names in `WRITERS`.
         times: how often each is killed.
         seed: seed of the moments.
     """
-    _run("killed", commands, functools.partial(_killed, times=times, seed=seed))
+    _disturb(commands, functools.partial(_killed, times=times, seed=seed))
+
+
+def _killed(name: str, root: Path, whole: Whole, *, times: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Kill a command this many times, each time in an empty folder, and run it again."""
+    draw = random.Random(f"{seed} {name}")
+    counts = dict.fromkeys(("kills", "in the middle", "half-written", "next run fails", "other bytes"), 0)
+    for attempt in range(3 * times):
+        if counts["kills"] == times:
+            break
+        trial = Trial(name, root)
+        process = trial.start()
+        if attempt % 2:
+            for _ in itertools.islice(trial.changes(process), draw.randint(1, whole.changes)):
+                pass
+            time.sleep(draw.uniform(0, 5e-3))
+        else:
+            time.sleep(draw.uniform(0, whole.seconds))
+        process.kill()
+        if status_of(process) >= 0:
+            continue  # it was faster
+        counts["kills"] += 1
+        counts["in the middle"] += bool(half_written(trial.out)) or 0 < len(trial.files()) < len(whole.files)
+        counts["half-written"] += trial.count_differing(whole.files, "is not whole")
+        status, refuses = trial.run(), trial.writer.refuses
+        if status == 0 or (refuses and refuses in trial.error()):
+            counts["other bytes"] += trial.count_differing(whole.files, "differs after the next run", complete=True)
+        else:
+            counts["next run fails"] += 1
+            print(f"{name}: the next run ended with {status}: {trial.error()[-2000:]}", file=sys.stderr)
+    yield {"seconds": f"{whole.seconds:.1f}", "files": len(whole.files), **counts}
 
 
 def together(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 5) -> None:
     """Start each command twice at once on one folder: both end well, or one is refused in one line.
 
     Args:
-        commands: names in `writers.WRITERS`.
+        commands: names in `WRITERS`.
         times: how often each is started twice.
     """
-    _run("two at once", commands, functools.partial(_together, times=times))
+    _disturb(commands, functools.partial(_doubled, times=times))
+
+
+def _doubled(name: str, root: Path, whole: Whole, *, times: int) -> Iterator[dict[str, Any]]:
+    """Start a command twice at once, this many times."""
+    counts = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
+    for _ in range(times):
+        trial, errors = Trial(name, root), (f"{ERRORS}-0", f"{ERRORS}-1")
+        statuses = [status_of(process) for process in [trial.start(errors=one) for one in errors]]
+        failures = [trial.error(one) for one, status in zip(errors, statuses, strict=True) if status]
+        refused = len(failures) == 1 and _is_one_line(failures[0])
+        counts["both end well" if not failures else "one is refused" if refused else "fail"] += 1
+        for error in failures:
+            print(f"{name}: one of two ended with: {error[-2000:]}", file=sys.stderr)
+        counts["other bytes"] += trial.count_differing(whole.files, "differs after two at once", complete=True)
+    yield counts
 
 
 def disk(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 4, seed: int = 0) -> None:
     """No room, no right to write, files that are read vanish or are half there: one line, and nothing half-written.
 
     Args:
-        commands: names in `writers.WRITERS`.
+        commands: names in `WRITERS`.
         times: how often each trouble is made.
         seed: seed of sizes and moments.
     """
-    _run("troubles", commands, functools.partial(_troubled, times=times, seed=seed))
+    _disturb(commands, functools.partial(_troubled, times=times, seed=seed))
 
 
-def _run(title: str, commands: Sequence[str], rows_of: Callable[[Writer, Path], Iterator[Row]]) -> None:
-    """Disturb commands. Prints a row as soon as it is known, and a table."""
-    rows: list[Row] = []
-    with tempfile.TemporaryDirectory() as folder:
-        make_inputs(Path(folder))
-        for name in commands:
-            for row in rows_of(WRITERS[name], Path(folder)):
-                rows.append({"command": name, **row})
-                print(rows[-1], flush=True)
-    table = Table(*rows[0], title=title)
-    for row in rows:
-        table.add_row(*(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row.values()))
-    Console(width=140).print(table)
-    print("\n".join(about().values()))
-
-
-class Whole(NamedTuple):
-    """An undisturbed run."""
-
-    files: dict[str, bytes]
-    seconds: float
-    changes: int
-    """How often something changed in its folder."""
-
-
-def _undisturbed(writer: Writer, folder: Path) -> Whole:
-    """Run twice: the first run compiles, and the second has to end with the same bytes."""
-    runs = []
-    for _ in range(2):
-        place, start = _fresh(folder, writer), time.perf_counter()
-        process = writer.begin(place)
-        changes = sum(1 for _ in _changing(process, place))
-        assert ended(process) == 0, f"{writer.name}: {said(place)}"
-        runs.append(Whole(written(place), time.perf_counter() - start, changes))
-    unlike = writer.differing(runs[1].files, runs[0].files)
-    assert not unlike and runs[1].files, f"{writer.name}: two runs differ in {', '.join(unlike)}"
-    return runs[1]
-
-
-def _changing(process: Process, folder: Path) -> Iterator[None]:
-    """Yield each time that something has changed in what a process writes, until it ends; looks 1000 times a second."""
-    before: list[tuple[str, int]] = []
-    while process.is_alive():
-        if (now := _seen(folder / OUT)) != before:
-            before = now
-            yield
-        time.sleep(1e-3)
-
-
-def _seen(folder: Path) -> list[tuple[str, int]]:
-    """Files, those with hidden names too, and their sizes; folders."""
-    found = []
-    for where, folders, files in os.walk(folder):
-        found += [(os.path.join(where, name), -1) for name in folders]
-        for path in (os.path.join(where, name) for name in files):
-            with contextlib.suppress(FileNotFoundError):
-                found.append((path, os.stat(path).st_size))
-    return sorted(found)
-
-
-def _killed(writer: Writer, folder: Path, *, times: int, seed: int) -> Iterator[Row]:
-    """Kill a command so often, each time in a fresh folder, and let it run again."""
-    draw, whole = random.Random(f"{seed} {writer.name}"), _undisturbed(writer, folder)
-    counts = dict.fromkeys(("kills", "in the middle", "half-written", "next run fails", "other bytes"), 0)
-    for attempt in range(3 * times):
-        if counts["kills"] == times:
-            break
-        place = _fresh(folder, writer)
-        process = writer.begin(place)
-        if attempt % 2:
-            for _ in itertools.islice(_changing(process, place), draw.randint(1, whole.changes)):
-                pass
-            time.sleep(draw.uniform(0, 5e-3))
-        else:
-            time.sleep(draw.uniform(0, whole.seconds))
-        process.kill()
-        if ended(process) >= 0:
-            continue  # it was faster
-        found = written(place)
-        counts["kills"] += 1
-        counts["in the middle"] += bool(half_written(place / OUT)) or 0 < len(found) < len(whole.files)
-        counts["half-written"] += _told(writer, "is not whole", writer.differing(found, whole.files))
-        if not _finishes(writer, place):
-            counts["next run fails"] += 1
-        else:
-            unlike = writer.differing(written(place), whole.files, complete=True)
-            counts["other bytes"] += _told(writer, "is another one after the next run", unlike)
-    yield {"seconds": whole.seconds, "files": len(whole.files), **counts}
-
-
-def _together(writer: Writer, folder: Path, *, times: int) -> Iterator[Row]:
-    """Start a command twice at once, so often."""
-    whole = _undisturbed(writer, folder)
-    counts = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
-    for _ in range(times):
-        place = _fresh(folder, writer)
-        errors = (f"{ERRORS}-0", f"{ERRORS}-1")
-        processes = [writer.begin(place, errors=name) for name in errors]
-        statuses = [ended(process) for process in processes]
-        bad = [said(place, name) for name, status in zip(errors, statuses, strict=True) if status]
-        refused = len(bad) == 1 and _is_one_line(bad[0])
-        counts["both end well" if not bad else "one is refused" if refused else "fail"] += 1
-        for error in bad:
-            print(f"{writer.name}: one of two ended with: {error[-2000:]}", file=sys.stderr)
-        unlike = writer.differing(written(place), whole.files, complete=True)
-        counts["other bytes"] += _told(writer, "is another one after two at once", unlike)
-    yield dict(counts)
-
-
-def _troubled(writer: Writer, folder: Path, *, times: int, seed: int) -> Iterator[Row]:
-    """Let a command run with each of `TROUBLES`, so often."""
-    draw, whole = random.Random(f"{seed} {writer.name}"), _undisturbed(writer, folder)
-    for name, trouble in TROUBLES.items():
+def _troubled(name: str, root: Path, whole: Whole, *, times: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Run a command with each of `TROUBLES`, this many times."""
+    draw = random.Random(f"{seed} {name}")
+    for trouble, run in TROUBLES.items():
         counts = dict.fromkeys(("refused in one line", "ends well", "anything else", "half-written"), 0)
         for _ in range(times):
-            place = _fresh(folder, writer)
-            status = trouble(writer, place, whole, draw)
-            refused = status == 1 and _is_one_line(said(place))
+            trial = Trial(name, root)
+            status = run(trial, whole, draw)
+            refused = status == 1 and _is_one_line(trial.error())
             kind = "ends well" if status == 0 else "refused in one line" if refused else "anything else"
             if kind == "anything else":
-                print(f"{writer.name}, {name}: status {status}: {said(place)[-2000:]}", file=sys.stderr)
+                print(f"{name}, {trouble}: status {status}: {trial.error()[-2000:]}", file=sys.stderr)
             counts[kind] += 1
-            unlike = writer.differing(written(place), whole.files)
-            counts["half-written"] += _told(writer, f"is not whole: {name}", unlike)
-        yield {"trouble": name, **counts}
+            counts["half-written"] += trial.count_differing(whole.files, f"is not whole: {trouble}")
+        yield {"trouble": trouble, **counts}
 
 
 def _is_one_line(error: str) -> bool:
@@ -203,69 +337,44 @@ def _is_one_line(error: str) -> bool:
     return "Traceback" not in error and error.rstrip("\n").split("\n")[-1].startswith("error: ")
 
 
-def _full(writer: Writer, place: Path, whole: Whole, draw: random.Random) -> int:
+def _without_room(trial: Trial, whole: Whole, draw: random.Random) -> int:
     """No file may grow beyond a part of the largest one: to a program that is a full disk, and it takes no rights."""
-    largest = max(len(content) for content in whole.files.values())
-    return ended(writer.begin(place, file_bytes=draw.randrange(largest)))
+    return trial.run(file_bytes=draw.randrange(max(map(len, whole.files.values()))))
 
 
-def _read_only(writer: Writer, place: Path, whole: Whole, draw: random.Random) -> int:
+def _without_rights(trial: Trial, whole: Whole, draw: random.Random) -> int:
     """Nobody may write into the folder."""
-    (place / OUT).mkdir(parents=True)
-    (place / OUT).chmod(0o555)
-    status = ended(writer.begin(place, humble=True))
-    (place / OUT).chmod(0o755)
+    trial.out.chmod(0o555)
+    status = trial.run(humble=True)
+    trial.out.chmod(0o755)
     return status
 
 
-def _meanwhile(writer: Writer, place: Path, whole: Whole, draw: random.Random, change: Callable[[Path], None]) -> int:
+def _meanwhile(trial: Trial, whole: Whole, draw: random.Random, change: Callable[[Path], None]) -> int:
     """Change a file that the command names, or a scan of the drive that it names, at any time of its run."""
-    inputs, before = place.parent / INPUTS, place.parent / "inputs-before"
+    root = trial.folder.parent
+    inputs, before = root / INPUTS, root / "inputs-before"
     shutil.copytree(inputs, before)
     try:
-        scans = sorted((inputs / "town/sequences/08/velodyne").iterdir())
-        named = [place / word for word in writer.line.split() if word.startswith(f"../{INPUTS}/")]
-        process = writer.begin(place)
+        scans = sorted((trial.folder / SCANS).iterdir())
+        named = [trial.folder / word for word in trial.writer.line.split() if word.startswith(f"../{INPUTS}/")]
+        process = trial.start()
         time.sleep(draw.uniform(0, whole.seconds))
         change(draw.choice([*scans[-len(named) :], *(one for one in named if one.is_file())]))
-        return ended(process)
+        return status_of(process)
     finally:
         shutil.rmtree(inputs)
         before.rename(inputs)
 
 
-def _half(path: Path) -> None:
+def _cut(path: Path) -> None:
     """Cut a file in the middle of a number."""
     os.truncate(path, path.stat().st_size // 2 | 1)
 
 
-TROUBLES: dict[str, Callable[[Writer, Path, Whole, random.Random], int]] = {
-    "full disk": _full,
-    "read-only folder": _read_only,
+TROUBLES: dict[str, Callable[[Trial, Whole, random.Random], int]] = {
+    "full disk": _without_room,
+    "read-only folder": _without_rights,
     "a file vanishes": functools.partial(_meanwhile, change=Path.unlink),
-    "a file is half there": functools.partial(_meanwhile, change=_half),
+    "a file is half there": functools.partial(_meanwhile, change=_cut),
 }
-
-
-def _fresh(folder: Path, writer: Writer) -> Path:
-    """An empty folder for one run; always the same, for some commands write down where they are."""
-    place = folder / writer.name.replace(" ", "-")
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    return place
-
-
-def _finishes(writer: Writer, place: Path) -> bool:
-    """Run to the end; whether that went well, or the work had been done before."""
-    status = ended(writer.begin(place))
-    good = status == 0 or bool(writer.refuses and writer.refuses in said(place))
-    if not good:
-        print(f"{writer.name}: the next run ended with {status}: {said(place)[-2000:]}", file=sys.stderr)
-    return good
-
-
-def _told(writer: Writer, what: str, files: list[str]) -> int:
-    """How many files these are, after each was named."""
-    for name in files:
-        print(f"{writer.name}: {name} {what}", file=sys.stderr)
-    return len(files)

@@ -8,8 +8,6 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.console import Console
-
 
 class Mutation(NamedTuple):
     """One line made wrong, and the tests that should notice it."""
@@ -51,45 +49,35 @@ MUTATIONS = (
 def mutations(*, tree: Path = Path()) -> None:
     """Make twenty lines wrong, one at a time, and run the tests of their modules until the first failure.
 
-    A mutation that no test notices is printed with the tests that ran.
-
     Args:
         tree: Checkout whose package and tests are used. An earlier version can be compared.
     """
-    console, noticed = Console(), 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "tree"
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=tree, check=True, capture_output=True, text=True).stdout
         for name in filter(None, listed.split("\0")):
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(tree / name, copy / name)
-        for one in MUTATIONS:
-            noticed += _noticed(one, copy, console)
-    console.print(f"noticed: {noticed} of {len(MUTATIONS)}")
+        noticed = sum(_is_noticed(mutation, copy) for mutation in MUTATIONS)
+    print(f"noticed: {noticed} of {len(MUTATIONS)}")
 
 
-def _noticed(one: Mutation, tree: Path, console: Console) -> bool:
-    """Whether a test of the tree fails with the mutation, and not without it."""
-    files = [path for path in sorted((tree / "sglpr_jax").rglob("*.py")) if one.line in path.read_text()]
-    tests = [str(path) for pattern in one.tests for path in sorted((tree / "tests").glob(pattern))]
-    tests = [name for name in tests if Path(name).name.startswith("test_")]
+def _is_noticed(mutation: Mutation, tree: Path) -> bool:
+    """Whether a test of the tree fails with the mutation. Raises RuntimeError if the tests cannot run."""
+    files = [path for path in sorted((tree / "sglpr_jax").rglob("*.py")) if mutation.line in path.read_text()]
+    tests = [path for pattern in mutation.tests for path in sorted((tree / "tests").glob(pattern))]
+    tests = [path for path in tests if path.name.startswith("test_")]
     if len(files) != 1 or not tests:
-        raise SystemExit(f"error: expected {one.line!r} in one file and tests of it, found {len(files)}, {len(tests)}")
+        counts = f"{len(files)}, {len(tests)}"
+        raise SystemExit(f"error: expected {mutation.line!r} in one file and tests of it, found {counts}")
     text = files[0].read_text()
-    files[0].write_text(text.replace(one.line, one.wrong))
-    try:
-        failed = _failed(tree, tests)
-    finally:
-        files[0].write_text(text)
-    console.print(f"{'noticed' if failed else 'MISSED'}: {one.wrong.strip()} ({files[0].relative_to(tree)})")
-    return failed
-
-
-def _failed(tree: Path, tests: list[str]) -> bool:
-    """Whether one of the tests fails. Raises RuntimeError if they cannot run."""
+    files[0].write_text(text.replace(mutation.line, mutation.wrong))
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     ended = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)
+    files[0].write_text(text)
     if ended.returncode not in (0, 1):
         raise RuntimeError(ended.stdout + ended.stderr)
-    return ended.returncode == 1
+    state = "noticed" if ended.returncode else "MISSED"
+    print(f"{state}: {mutation.wrong.strip()} ({files[0].relative_to(tree)})", flush=True)
+    return bool(ended.returncode)

@@ -9,6 +9,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+from benchmarks.table import Table
+
 ROOT = Path(__file__).resolve().parents[2]
 PLATFORMS = {
     "Linux x86_64": "x86_64-manylinux_2_28",
@@ -26,40 +28,37 @@ MACOS = "14.0"
 """Version of macOS. By default uv takes 13.0, for which small-gicp has no wheel."""
 
 
-def platforms(
-    *,
-    pythons: tuple[str, ...] = PYTHONS,
-    platforms: tuple[str, ...] = tuple(PLATFORMS),
-    extras: tuple[str, ...] = (),
-) -> None:
-    """Print a Markdown table of platforms with wheels of every dependency, and what is missing.
+def platforms(*, extras: tuple[str, ...] = ()) -> None:
+    """Print a table of platforms with wheels of every dependency, and what is missing.
 
     Each extra of pyproject.toml is resolved with all that it needs, from wheels only. Nothing is installed. The program
     is `uv pip compile` (pip install uv): unlike pip, it applies the conditions of the other platform.
 
     Args:
-        pythons: versions of Python.
-        platforms: names in `PLATFORMS`.
         extras: extras of pyproject.toml; without them all, and what is required.
     """
     if shutil.which("uv") is None:
         sys.exit("expected the program uv, found none; pip install uv")
     project, reasons = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"], set[str]()
-    wanted = {"required": project["dependencies"], **project["optional-dependencies"]}
-    print(f"{datetime.date.today()}, Python {', '.join(pythons)}\n\n| | {' | '.join(platforms)} |")
-    print("|---" * (len(platforms) + 1) + "|")
-    for extra, needs in wanted.items():
+    requirements = {"required": project["dependencies"], **project["optional-dependencies"]}
+    print(f"{datetime.date.today()}, Python {', '.join(PYTHONS)}\n")
+    table = Table("", *PLATFORMS)
+    for extra, needs in requirements.items():
         if extra in NOT_OF_USERS or (extras and extra not in extras):
             continue
         cells = []
-        for platform in platforms:
-            missing = {python: _missing(needs, platform, python) for python in pythons}
-            names = dict.fromkeys(name for found in missing.values() for name in found)
-            lacking = {name: [python for python in pythons if name in missing[python]] for name in names}
-            texts = (name if len(of) == len(pythons) else f"{name} ({', '.join(of)})" for name, of in lacking.items())
-            cells.append(f"no {', '.join(texts)}" if names else "yes")
-            reasons |= {f"{platform}, {name}: {why}" for found in missing.values() for name, why in found.items()}
-        print(f"| `{extra}` | {' | '.join(cells)} |", flush=True)
+        for platform in PLATFORMS:
+            pythons_without: dict[str, list[str]] = {}
+            for python in PYTHONS:
+                for name, why in _missing(needs, platform, python).items():
+                    pythons_without.setdefault(name, []).append(python)
+                    reasons.add(f"{platform}, {name}: {why}")
+            texts = [
+                name if len(pythons) == len(PYTHONS) else f"{name} ({', '.join(pythons)})"
+                for name, pythons in pythons_without.items()
+            ]
+            cells.append(f"no {', '.join(texts)}" if texts else "yes")
+        table.add(f"`{extra}`", *cells)
     print("", *sorted(reasons), sep="\n")
 
 
@@ -67,9 +66,9 @@ def _missing(needs: list[str], platform: str, python: str) -> dict[str, str]:
     """Requirements without a wheel, and why. All are tried together first, and singly if that fails."""
     if not _reason_against(needs, platform, python):
         return {}
-    each = {re.split(r"[\[<>=!; ]", need)[0]: _reason_against([need], platform, python) for need in needs}
-    found = {name: reason for name, reason in each.items() if reason}
-    return found or {" with ".join(needs): "their needs contradict each other"}
+    singly = {re.split(r"[\[<>=!; ]", need)[0]: _reason_against([need], platform, python) for need in needs}
+    missing = {name: reason for name, reason in singly.items() if reason}
+    return missing or {" with ".join(needs): "their needs contradict each other"}
 
 
 def _reason_against(needs: list[str], platform: str, python: str) -> str:
@@ -82,5 +81,5 @@ def _reason_against(needs: list[str], platform: str, python: str) -> str:
         return ""
     if "No solution found" not in done.stderr:
         sys.exit(f"{', '.join(needs)} for {platform}: {done.stderr}")
-    found = UNAVAILABLE.search(" ".join(done.stderr.split()))
-    return f"no wheel of {found[1]}" if found else " ".join(done.stderr.split())
+    unavailable = UNAVAILABLE.search(" ".join(done.stderr.split()))
+    return f"no wheel of {unavailable[1]}" if unavailable else " ".join(done.stderr.split())

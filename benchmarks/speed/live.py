@@ -4,6 +4,7 @@ A process publishes a simulated drive at a fixed rate, there and back. bin/live 
 a scan is the time from before it is published to the line of bin/live that reports it or its loop.
 """
 
+import functools
 import json
 import multiprocessing
 import os
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.table import Table
 from benchmarks.timing import resident_mb
 from sglpr_jax.live.messages import Reports
 from sglpr_jax.live.ros import Transport, domain_of
@@ -54,25 +56,26 @@ class RosPublisher:
 
     flags = ("--topic", "/points", "--odometry-topic", "/odometry")
 
-    def __init__(self, connect: Callable[[], Transport]):
-        """`connect` opens the connection with the first scan. Scans before the subscription finds it are lost."""
-        self._connect = connect
-        self._wire: Transport | None = None
+    def __init__(self, connect: Callable[[str], Transport], where: str):
+        """The connection opens with the first scan. Scans before the subscription finds it are lost."""
+        self._connect = functools.partial(connect, where)
 
     def put(self, points: np.ndarray, world_from_lidar: np.ndarray, stamp: float) -> None:
         """Publish a scan with its odometry at a time in seconds since 1970."""
-        if self._wire is None:
-            self._wire = self._connect()
-            self._clouds = self._wire.advertise("/points", CLOUD, depth=1, latched=False)
-            self._poses = self._wire.advertise("/odometry", TRANSFORMS, depth=100, latched=False)
-        self._poses(transform_message(world_from_lidar, time=stamp, frame="odom", child="lidar"))
-        self._clouds(_cloud(points, stamp))
+        clouds, poses = self._topics
+        poses(transform_message(world_from_lidar, time=stamp, frame="odom", child="lidar"))
+        clouds(_cloud(points, stamp))
+
+    @functools.cached_property
+    def _topics(self) -> tuple[Callable[[bytes], None], Callable[[bytes], None]]:
+        wire = self._connect()
+        clouds = wire.advertise("/points", CLOUD, depth=1, latched=False)
+        return clouds, wire.advertise("/odometry", TRANSFORMS, depth=100, latched=False)
 
 
 def _cloud(points: np.ndarray, stamp: float) -> bytes:
     """PointCloud2 with the fields x, y and z."""
-    padded = np.zeros((len(points), 4), np.float32)
-    padded[:, :3] = points
+    padded = np.pad(points.astype(np.float32), ((0, 0), (0, 1)))
     fields = {
         "header": header(stamp, "lidar"),
         "height": 1,
@@ -107,8 +110,8 @@ def _zenoh(endpoint: str) -> Transport:
 
 PUBLISHERS: dict[str, Callable[[str], Any]] = {
     "folder": FolderPublisher,
-    "dds": lambda where: RosPublisher(lambda: _dds(where)),
-    "zenoh": lambda where: RosPublisher(lambda: _zenoh(where)),
+    "dds": functools.partial(RosPublisher, _dds),
+    "zenoh": functools.partial(RosPublisher, _zenoh),
 }
 """By the name of the source."""
 
@@ -132,12 +135,11 @@ def live(
         scans: scans of the simulated drive.
         weights: weights of bin/live.
     """
-    for at, rate in enumerate(rates):
-        count = int(rate * (seconds + warm_s))
-        row = _measured(source, rate, count, warm_s, scans, weights)
-        if not at:
-            print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
-        print("| " + " | ".join(f"{value:.4g}" for value in row.values()) + " |", flush=True)
+    table = None
+    for rate in rates:
+        row = _measured(source, rate, int(rate * (seconds + warm_s)), warm_s, scans, weights)
+        table = table or Table(*row)
+        table.add(*(f"{value:.4g}" for value in row.values()))
 
 
 def _measured(source: str, rate: float, count: int, warm_s: float, scans: int, weights: str) -> dict[str, float]:
@@ -146,15 +148,14 @@ def _measured(source: str, rate: float, count: int, warm_s: float, scans: int, w
         folder = Path(place)
         name, _, where = source.partition(":")
         where = str(folder / "scans") if name == "folder" else where
-        text = f"{name}:{where}" if where else name
-        publisher = PUBLISHERS[name](where)
-        command = ["-m", "sglpr_jax.cli", "live", text, "--out", str(folder / "map"), "--weights", weights]
-        with (folder / "errors.txt").open("w") as errors:
-            node = subprocess.Popen(
-                [sys.executable, *command, *publisher.flags], stdout=subprocess.PIPE, stderr=errors, text=True
-            )
-        results = Results(node)
-        ready = _wait_for(folder / "errors.txt", "ready:", node)
+        flags = [f"{name}:{where}" if where else name, "--out", folder / "map", "--weights", weights]
+        command = [sys.executable, "-m", "sglpr_jax.cli", "live", *flags, *PUBLISHERS[name](where).flags]
+        log = folder / "errors.txt"
+        with log.open("w") as errors:
+            node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        begin, results = time.monotonic(), Results(node)
+        _wait_until(lambda: "ready:" in log.read_text(), node)
+        start_s = time.monotonic() - begin
         context = multiprocessing.get_context("spawn")
         process = context.Process(target=_publish, args=(name, where, rate, count, scans))
         process.start()
@@ -167,7 +168,7 @@ def _measured(source: str, rate: float, count: int, warm_s: float, scans: int, w
         node.send_signal(signal.SIGTERM)
         results.close()
         memory = {"resident [MB]": after[0], "grown [MB]": after[0] - before[0], "map grown [MB]": after[1] - before[1]}
-        return {"Hz": rate, "start [s]": ready, **results.row(count), **memory}
+        return {"Hz": rate, "start [s]": start_s, **results.row(count), **memory}
 
 
 def _publish(name: str, where: str, rate: float, count: int, scans: int) -> None:
@@ -189,9 +190,8 @@ class Results:
 
     def __init__(self, node: subprocess.Popen):
         self.frames: list[dict] = []
-        self.of_frames: list[float] = []
-        self.of_loops: list[float] = []
-        """Latencies in seconds: of each scan, and of each scan with loops, to its last loop."""
+        self.latencies_s: dict[str, list[float]] = {"frame": [], "edge": []}
+        """Latency of each scan, and of each scan with loops, to its last loop."""
         self._node = node
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -210,10 +210,10 @@ class Results:
     def row(self, published: int) -> dict[str, float]:
         """Numbers of the table."""
         row = {"published": published, "taken": len(self.frames), "dropped": self.frames[-1]["dropped"]}
-        for what, values in (("frame", self.of_frames), ("edge", self.of_loops)):
+        for what, values in self.latencies_s.items():
             for share in (50, 99):
                 row[f"{what} {share} % [ms]"] = 1000 * float(np.percentile(values, share)) if values else np.nan
-        return {**row, "loops": len(self.of_loops)}
+        return {**row, "loops": len(self.latencies_s["edge"])}
 
     def _read(self) -> None:
         """The loops of a scan come before its own line."""
@@ -225,17 +225,10 @@ class Results:
                 looped = now
                 continue
             self.frames.append(value)
-            self.of_frames.append(now - value["time"])
+            self.latencies_s["frame"].append(now - value["time"])
             if looped is not None:
-                self.of_loops.append(looped - value["time"])
+                self.latencies_s["edge"].append(looped - value["time"])
             looped = None
-
-
-def _wait_for(path: Path, text: str, node: subprocess.Popen) -> float:
-    """Seconds until a file contains a text."""
-    begin = time.monotonic()
-    _wait_until(lambda: text in path.read_text(), node)
-    return time.monotonic() - begin
 
 
 def _wait_until(condition, node: subprocess.Popen) -> None:

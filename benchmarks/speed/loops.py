@@ -8,13 +8,11 @@ from collections.abc import Callable, Sequence
 from types import FunctionType, ModuleType
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 import sglpr_jax
+from benchmarks.table import Table
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
@@ -46,48 +44,45 @@ def loops(
     detector, rng = LoopDetector(sglpr_jax.load(weights)), np.random.default_rng(0)
     finder, sensor = detector.finder, dataclasses.replace(HDL64E, azimuth_steps=azimuth_steps)
     drive = simulate_recording("08", scans=60, sensor=sensor, seed=101)
-    records = [drive.scan(i, labels=False) for i in range(SCANS)]
-    keyframe = [finder.keyframe(scan) for scan in records]
+    scans = [drive.scan(i, labels=False) for i in range(SCANS)]
+    keyframes = [finder.keyframe(scan) for scan in scans]
     table = Table("frames", "MB", "bytes a frame", "ms to describe a scan", "ms a scan")
     before = held_bytes(detector)
     for end in frames:
         while len(detector) < end:
             frame = len(detector)
             drawn = rng.normal(size=finder.index.width).astype(np.float32)
-            own = Keyframe(drawn / np.linalg.norm(drawn), keyframe[frame % SCANS].image.copy(), keyframe[0].mounting)
+            keyframe = keyframes[frame % SCANS]._replace(descriptor=drawn / np.linalg.norm(drawn))
+            keyframe = keyframe._replace(image=keyframe.image.copy())
             spread = np.diag([0.1, 0.1, 0.0]) ** 2
-            link = (
-                BevRegistration(*map(np.asarray, (STEP_M, 0.0, 2 * np.pi / LAP, spread, 0.9, 0.3))) if frame else None
-            )
-            detector.add_keyframe(own, time=STEP_S * frame, compared=NO_FITS._replace(link=link))
+            motion = map(np.asarray, (STEP_M, 0.0, 2 * np.pi / LAP, spread, 0.9, 0.3))
+            link = BevRegistration(*motion) if frame else None
+            detector.add_keyframe(keyframe, time=STEP_S * frame, compared=NO_FITS._replace(link=link))
         held = held_bytes(detector) - before
-        describing = _mean_s(lambda scan: finder.keyframe(scan), records, repeats)
-        adding = _mean_s(lambda scan: detector.add(scan, time=STEP_S * len(detector)), records, repeats)
+        describing = _mean_s(lambda scan: finder.keyframe(scan), scans, repeats)
+        adding = _mean_s(lambda scan: detector.add(scan, time=STEP_S * len(detector)), scans, repeats)
         milliseconds = (f"{1e3 * one:.1f}" for one in (describing, adding))
-        values = (f"{end:,}", f"{held / 1e6:.0f}", f"{held / end:,.0f}", *milliseconds)
-        table.add_row(*values)
-        print(*values, flush=True)
-    Console(width=100).print(table)
+        table.add(f"{end:,}", f"{held / 1e6:.0f}", f"{held / end:,.0f}", *milliseconds)
 
 
-def _mean_s(job: Callable[[sglpr_jax.Scan], object], records: list[sglpr_jax.Scan], repeats: int) -> float:
+def _mean_s(job: Callable[[sglpr_jax.Scan], object], scans: list[sglpr_jax.Scan], repeats: int) -> float:
     """Mean processor seconds of a job. The first runs, which compile, do not count."""
     for i in range(2 * repeats):
         if i == repeats:
             start = time.process_time()
-        job(records[i % SCANS])
+        job(scans[i % SCANS])
     return (time.process_time() - start) / repeats
 
 
 def held_bytes(root: object) -> int:
     """Bytes of an object and of all that it refers to, without functions, modules and classes."""
-    keyframe, left, total = {id(root)}, [root], 0
+    known, left, total = {id(root)}, [root], 0
     while left:
-        one = left.pop()
-        total += sys.getsizeof(one)
-        others = [one.base] if isinstance(one, np.ndarray) else gc.get_referents(one)
+        current = left.pop()
+        total += sys.getsizeof(current)
+        others = [current.base] if isinstance(current, np.ndarray) else gc.get_referents(current)
         for other in others:
-            if id(other) not in keyframe and not isinstance(other, type | ModuleType | FunctionType):
-                keyframe.add(id(other))
+            if id(other) not in known and not isinstance(other, type | ModuleType | FunctionType):
+                known.add(id(other))
                 left.append(other)
     return total

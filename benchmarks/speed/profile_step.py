@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from rich.console import Console
-from rich.table import Table
 
 from benchmarks.speed.inputs import random_batch
 from benchmarks.speed.training import product_job, step_flops
+from benchmarks.table import Table
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.image_network import ImageNetwork
@@ -51,12 +50,11 @@ def profile(*, preset: tuple[str, ...] = ("circular", "sglpr"), steps: int = 3) 
         batch = jax.device_put(random_batch(config, config.max_points))
         milliseconds, wall = _profiled(config, batch, steps)
         total, floor = sum(milliseconds.values()), 1e3 * step_flops(config, batch) / peak
-        table = Table("part", "forward ms", "backward ms", "share", title=name)
+        table = Table(name, "forward ms", "backward ms", "share")
         parts = {part for part, _ in milliseconds}
         for part in sorted(parts, key=lambda part: -milliseconds[part, False] - milliseconds[part, True]):
             times = [milliseconds[part, backward] for backward in (False, True)]
-            table.add_row(part, *(f"{time:.1f}" for time in times), f"{sum(times) / total:.1%}")
-        Console(width=120, highlight=False).print(table)
+            table.add(part, *(f"{time:.1f}" for time in times), f"{sum(times) / total:.1%}")
         print(f"all operations {total:.0f} ms a step, in {wall:.0f} ms: {floor / wall:.0%} of {peak / 1e9:.0f} GFLOP/s")
 
 

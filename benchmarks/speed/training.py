@@ -1,4 +1,4 @@
-"""Training steps: tuples a second, their operations, and their share of the device's peak."""
+"""Training steps and descriptors: rates, operations, and their share of the device's peak."""
 
 import dataclasses
 import math
@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jax.interpreters.partial_eval import dce_jaxpr
-from rich.console import Console
-from rich.table import Table
 
 from benchmarks.speed.inputs import random_batch, random_images
+from benchmarks.table import Table
 from benchmarks.timing import SPREAD, Job, about, clocked, in_turn, peak_mb
 from sglpr_jax.files import in_short
 from sglpr_jax.models.sglpr import describe, init
@@ -24,10 +23,8 @@ from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.step import train_step
 
-PRODUCTS = 4
-"""Matrix products in one timing."""
 NOMINAL_TYPE = "bfloat16"
-"""The type that nominal peaks are given for here."""
+"""Type of the nominal peak."""
 
 
 def count_flops(program: ClosedJaxpr) -> int:
@@ -37,45 +34,29 @@ def count_flops(program: ClosedJaxpr) -> int:
     loop once. Raises ValueError for a product in a loop whose turns depend on values.
     """
     needed, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars))
-    return _count(needed)
+    return sum(map(_flops_of, needed.eqns))
 
 
-def _count(program: Jaxpr) -> int:
-    return sum(map(_of_equation, program.eqns))
-
-
-def _of_equation(equation: Any) -> int:
-    name = equation.primitive.name
+def _flops_of(equation: Any) -> int:
+    """Operations of an equation. Zeros between the inputs of a convolution (`lhs_dilation`) are no work; padding is."""
+    name, parameters = equation.primitive.name, equation.params
     if name == "dot_general":
-        return _of_product(equation)
+        (summed, _), _ = parameters["dimension_numbers"]
+        left, out = equation.invars[0].aval.shape, equation.outvars[0].aval.shape
+        return 2 * math.prod(out) * math.prod(left[axis] for axis in summed)
     if name == "conv_general_dilated":
-        return _of_convolution(equation)
-    values = [each for one in equation.params.values() for each in (one if isinstance(one, tuple) else (one,))]
-    opened = [each.jaxpr if isinstance(each, ClosedJaxpr) else each for each in values]
-    inner = [_count(each) for each in opened if isinstance(each, Jaxpr)]
+        _, inputs, *spatial = parameters["dimension_numbers"].rhs_spec
+        kernel, out = equation.invars[1].aval.shape, equation.outvars[0].aval.shape
+        taps = math.prod(kernel[axis] for axis in spatial)
+        return 2 * math.prod(out) * kernel[inputs] * taps // math.prod(parameters["lhs_dilation"])
+    programs = [inner for value in parameters.values() for inner in (value if isinstance(value, tuple) else (value,))]
+    programs = [inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner for inner in programs]
+    flops = [sum(map(_flops_of, inner.eqns)) for inner in programs if isinstance(inner, Jaxpr)]
     if name == "cond":
-        return max(inner)
-    if name == "while" and any(inner):
+        return max(flops)
+    if name == "while" and any(flops):
         raise ValueError("a matrix product in a loop whose number of turns is not known cannot be counted")
-    return (equation.params["length"] if name == "scan" else 1) * sum(inner)
-
-
-def _of_product(equation: Any) -> int:
-    (summed, _), _ = equation.params["dimension_numbers"]
-    left, out = equation.invars[0].aval.shape, equation.outvars[0].aval.shape
-    return 2 * math.prod(out) * math.prod(left[axis] for axis in summed)
-
-
-def _of_convolution(equation: Any) -> int:
-    """Every output adds up a kernel's worth of products; zeros between the inputs (`lhs_dilation`) are no work.
-
-    Such zeros are in the gradient of a convolution with strides. Padding counts, as it does everywhere.
-    """
-    _, _, *spatial = equation.params["dimension_numbers"].rhs_spec
-    kernel, out = equation.invars[1].aval.shape, equation.outvars[0].aval.shape
-    inputs = kernel[equation.params["dimension_numbers"].rhs_spec[1]]
-    taps = math.prod(kernel[axis] for axis in spatial)
-    return 2 * math.prod(out) * inputs * taps // math.prod(equation.params["lhs_dilation"])
+    return (parameters["length"] if name == "scan" else 1) * sum(flops)
 
 
 def step_flops(config: TrainConfig, batch: Batch) -> int:
@@ -93,8 +74,8 @@ class Timing:
     """Steps, or calls of `describe`, in one timing."""
     size: int | None
     """Rows and columns of the matrices whose product is the measured peak. None: 2048 on a CPU, 8192 elsewhere."""
-    products: int
-    """Of them in one timing."""
+    products: int = 4
+    """Matrix products in one timing."""
     peak_tflops: float | None = None
     """The nominal peak of products in bfloat16, 10^12 operations a second."""
 
@@ -130,7 +111,7 @@ def step_work(config: TrainConfig, calls: int, *, labels: bool = True) -> Work:
 
 
 def describe_work(config: TrainConfig, batch: int, calls: int) -> Work:
-    """Descriptors of so many random images that are on the device; each call waits for its own."""
+    """Descriptors of this number of random images that are on the device; each call waits for its own."""
     params = jax.jit(init, static_argnames="config")(jax.random.key(0), config=config.model)
     images = jax.device_put(random_images(batch, config.model.grid, image="points")[0])
     described = jax.jit(describe)
@@ -170,7 +151,7 @@ def measured(make: Callable[[], Work], compute: str, timing: Timing) -> dict[str
         size = timing.size or (2048 if jax.devices()[0].platform == "cpu" else 8192)
         jobs = [clocked(work.job), clocked(product_job(compute, size, timing.products))]
         seconds = in_turn(jobs, repeats=timing.repeats)
-        needed = _program_bytes(work.program())
+        needs = work.program().memory_analysis()
     except (jax.errors.JaxRuntimeError, FloatingPointError) as error:
         return {"error": in_short(error)}
     rates, peaks = (np.array([timing.calls * work.flops, timing.products * 2.0 * size**3]) / seconds).T
@@ -187,23 +168,19 @@ def measured(make: Callable[[], Work], compute: str, timing: Timing) -> dict[str
         "share_of_peak_spread": (low, high),
         "nominal_tflops": nominal,
         "share_of_nominal": None if nominal is None else rate / (nominal * 1e12),
-        "program_bytes": needed,
+        "program_bytes": None
+        if needs is None
+        else needs.argument_size_in_bytes
+        + needs.output_size_in_bytes
+        + needs.temp_size_in_bytes
+        - needs.alias_size_in_bytes,
         "peak_bytes": None if peak_after == peak_before else peak_after,
     }
 
 
 def _peak_bytes() -> int | None:
-    """The most of the device's memory that this process has used so far; None if the device does not tell."""
+    """Maximum memory of the device that this process has used, in bytes. None if the device does not tell."""
     return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
-
-
-def _program_bytes(program: jax.stages.Compiled) -> int | None:
-    """Bytes of inputs, outputs and intermediate values; None if the compiler does not tell."""
-    needs = program.memory_analysis()
-    if needs is None:
-        return None
-    buffers = needs.argument_size_in_bytes + needs.output_size_in_bytes + needs.temp_size_in_bytes
-    return buffers - needs.alias_size_in_bytes
 
 
 def about_device() -> dict[str, str]:
@@ -240,14 +217,13 @@ def training(
     for name in preset:
         for type_ in types:
             config = configured(load_preset(name), type_)
-            timing = Timing(repeats, steps, size, PRODUCTS)
+            timing = Timing(repeats, steps, size)
             row = measured(lambda config=config: step_work(config, steps, labels=labels), type_, timing)
-            tuples_per_second = config.tuples / row["seconds"]
-            giga = (f"{row[key] / 1e9:.4g}" for key in ("flop", "flop_per_second", "peak_flop_per_second"))
+            giga = (row[key] / 1e9 for key in ("flop", "flop_per_second", "peak_flop_per_second"))
+            numbers = (config.tuples / row["seconds"], row["images_per_second"], *giga)
             spread = " to ".join(f"{share:.3f}" for share in row["share_of_peak_spread"])
-            numbers = (f"{tuples_per_second:.4g}", f"{row['images_per_second']:.4g}", *giga)
-            table.add_row(name, type_, str(config.tuples), *numbers, f"{row['share_of_peak']:.3f}", spread)
-    Console(width=140, highlight=False).print(table)
+            cells = (f"{number:.4g}" for number in numbers)
+            table.add(name, type_, config.tuples, *cells, f"{row['share_of_peak']:.3f}", spread)
     print("Share: of the peak, medians of what was measured in turn. Spread: its 10 % and 90 % quantiles.")
     print("\n".join(f"{name}: {value}" for name, value in about_device().items()))
     print(f"peak of memory: {peak_mb():.0f} MB, with GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")

@@ -187,5 +187,8 @@ def _compare(
     for other in theirs:
         both = ((one.name, seconds[one]) for one in (ours, other))
         report(title, *both, packages=("jax", "torch", "optax"), threads=threads)
-    used = "; ".join(f"{one.name} {one.processor_s() / calls:.3g} s, {one.peak_mb():.0f} MB" for one in everyone)
+    usages = {contender.name: contender.usage() for contender in everyone}
+    used = "; ".join(
+        f"{name} {seconds / calls:.3g} s, {megabytes:.0f} MB" for name, (seconds, megabytes) in usages.items()
+    )
     print(f"Processor time of a {'call' if calls > 1 else 'run'}, and peak of resident memory: {used}")

@@ -12,12 +12,18 @@ from sglpr_jax.files import read_json, replacing
 from sglpr_jax.sim import RATE_HZ, SCANS
 from sglpr_jax.sim.drive import CARRIERS, check_drawing, name_of_path, read_path, scan_rows
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
-from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, numbered, simulate_recording, with_submaps
-from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.recording import (
+    PlannedRecording,
+    SimulatedRecording,
+    numbered,
+    plan_sessions,
+    simulate_recording,
+    simulate_repeating,
+    with_submaps,
+)
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import SENSORS, Sensor
-from sglpr_jax.sim.sessions import plan_sessions
 from sglpr_jax.sim.styles import SCENERIES, TOWN
 
 SETTINGS_FILE = "simulation.json"
@@ -113,7 +119,7 @@ def simulate(
       print(sglpr_jax.simulate("towns", routes=["08"], scans=400))
     """
     lidar = _lidar(sensor or ("hdl32e-nclt" if sessions else "hdl64e"), azimuth_steps)
-    _check_names(routes, along, sessions, scenery, carrier, submap_m=submap_m, images=images, vary=vary)
+    _check_arguments(routes, along, sessions, scenery, carrier, submap_m=submap_m, images=images, vary=vary)
     repeats = scenery in REPEATING
     if routes is None:
         routes = () if along or sessions else REVISITED if repeats else ROUTES
@@ -121,21 +127,22 @@ def simulate(
         rate_hz = CARRIERS[carrier].rate_hz or REPEATING[scenery].rate_hz if repeats else RATE_HZ
     layout = "nclt" if sessions else "varied" if vary else "images" if images else "scans"
     options = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
-    surroundings = {"repeating": scenery} if repeats else dataclasses.asdict(SCENERIES[scenery])
-    sensed = {"sensor": dataclasses.asdict(lidar), "carrier": dataclasses.asdict(CARRIERS[carrier])}
-    settings = {"version": VERSION, "layout": layout, "scenery": surroundings, **sensed, **options}
+    settings = {
+        "version": VERSION,
+        "layout": layout,
+        "scenery": {"repeating": scenery} if repeats else dataclasses.asdict(SCENERIES[scenery]),
+        "sensor": dataclasses.asdict(lidar),
+        "carrier": dataclasses.asdict(CARRIERS[carrier]),
+        **options,
+    }
     if sessions:
-        route = next(iter(routes), "00")
+        route, drives = next(iter(routes), "00"), {}
         plans = plan_sessions(sessions, route=route, sensor=lidar, scenery=SCENERIES[scenery], **options)
         settings |= {"sessions": sessions, "route": route}
-        drives = {}
     else:
         check_drawing(rate_hz, seed)
-        drives = _drives(routes, along, scans)
-        plans = [
-            _plan(name, file, scenery, submap_m, **options, sensor=lidar, carrier=CARRIERS[carrier])
-            for name, file in drives.items()
-        ]
+        drives, options = _drives(routes, along, scans), {**options, "sensor": lidar, "carrier": CARRIERS[carrier]}
+        plans = [_plan(name, file, scenery, submap_m, **options) for name, file in drives.items()]
         settings |= {"submap_m": submap_m} if submap_m else {}
     out = Path(out)
     _claim(out, settings, {f"drive {name}": _fingerprint(file) for name, file in drives.items()})
@@ -162,7 +169,7 @@ def _lidar(sensor: str | Sensor, azimuth_steps: int | None) -> Sensor:
     return sensor if azimuth_steps is None else dataclasses.replace(sensor, azimuth_steps=azimuth_steps)
 
 
-def _check_names(
+def _check_arguments(
     routes: Sequence[str] | None,
     along: Sequence[Path],
     sessions: Sequence[str],
@@ -174,28 +181,30 @@ def _check_names(
     vary: bool,
 ) -> None:
     """Raises ValueError if a name is unknown, or if arguments contradict each other."""
-    if sessions and (along or images or len(routes or ()) > 1):
-        found = f"{len(routes or ())} routes, {len(along)} pose files, images {images}"
-        raise ValueError(f"with sessions, expected at most one route, no pose files and no images, found {found}")
-    known = SCENERIES if sessions else {**SCENERIES, **REPEATING}
-    if scenery not in known:
-        raise ValueError(f"expected a scenery among {', '.join(known)}, found {scenery!r}")
-    if carrier not in CARRIERS:
-        raise ValueError(f"expected a carrier among {', '.join(CARRIERS)}, found {carrier!r}")
-    if sessions and carrier != "vehicle":
-        raise ValueError(f"with sessions, expected the carrier vehicle, found {carrier!r}")
-    if sessions and submap_m:
-        raise ValueError(f"with sessions, expected no submaps, found submaps of {submap_m:g} m")
-    if not 0 <= submap_m < math.inf:
-        raise ValueError(f"submap_m: expected metres, at least 0, found {submap_m}")
-    if vary and not images:
-        raise ValueError("vary: expected images, found scans; vary changes scans before they are converted to images")
-    revisits = [ROLES[name].revisit for name in routes or () if name in ROLES]
-    if scenery in REPEATING and (along or len(set(revisits)) < len(revisits)):
-        expected = "no pose files and routes with different revisits, such as 01 06 08"
-        raise ValueError(
-            f"scenery {scenery}: expected {expected}, found {' '.join([*(routes or ()), *map(str, along)])}"
-        )
+    names, sceneries = list(routes or ()), SCENERIES if sessions else {**SCENERIES, **REPEATING}
+    revisits = [ROLES[name].revisit for name in names if name in ROLES]
+    repeated = scenery in REPEATING and (along or len(set(revisits)) < len(revisits))
+    rules = (
+        (
+            not sessions or (not along and not images and len(names) <= 1),
+            "with sessions, expected at most one route, no pose files and no images",
+            f"{len(names)} routes, {len(along)} pose files, images {images}",
+        ),
+        (scenery in sceneries, f"expected a scenery among {', '.join(sceneries)}", repr(scenery)),
+        (carrier in CARRIERS, f"expected a carrier among {', '.join(CARRIERS)}", repr(carrier)),
+        (not sessions or carrier == "vehicle", "with sessions, expected the carrier vehicle", repr(carrier)),
+        (not sessions or not submap_m, "with sessions, expected no submaps", f"submaps of {submap_m:g} m"),
+        (0 <= submap_m < math.inf, "submap_m: expected metres, at least 0", f"{submap_m}"),
+        (images or not vary, "vary: expected images", "scans; vary changes scans before they are converted to images"),
+        (
+            not repeated,
+            f"scenery {scenery}: expected no pose files and routes with different revisits, such as 01 06 08",
+            " ".join([*names, *map(str, along)]),
+        ),
+    )
+    for holds, expected, found in rules:
+        if not holds:
+            raise ValueError(f"{expected}, found {found}")
 
 
 def _drives(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[str, Path | None]:
@@ -217,7 +226,7 @@ def _plan(name: str, file: Path | None, scenery: str, submap_m: float, *, scans:
             recording = simulate_repeating(scenery, revisit=ROLES[name].revisit, scans=scans, **options)
         else:
             recording = simulate_recording(name, along=file, scenery=SCENERIES[scenery], scans=scans, **options)
-        return with_submaps(recording, submap_m)
+        return with_submaps(recording, submap_m) if submap_m else recording
 
     return PlannedRecording(name, numbered(scans if file is None else len(scan_rows(read_path(file), scans))), simulate)
 
@@ -229,23 +238,20 @@ def _fingerprint(file: Path | None) -> str:
     return hashlib.sha256(b"".join(values.tobytes() for values in read_path(file))).hexdigest()[:16]
 
 
-def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
+def _claim(root: Path, settings: dict, drives: dict[str, str]) -> None:
     """Stores settings and drives in `root`, or checks that they match the stored ones. New drives are added."""
     path = root / SETTINGS_FILE
-    if path.exists():
-        found = _read_settings(path)
-    elif root.is_dir() and any(not file.name.startswith(".") for file in root.iterdir()):
+    if not path.exists() and root.is_dir() and any(not file.name.startswith(".") for file in root.iterdir()):
         raise ValueError(f"{root} holds files that were not simulated (no {SETTINGS_FILE}); choose another folder")
-    else:
-        found = {}
-    expected = json.loads(json.dumps({**settings, **ways}))  # as read from JSON: tuples become lists
-    claimed = {**(found or expected), **{way: ways[way] for way in ways if way not in found}}
-    different = [key for key, value in expected.items() if claimed.get(key) != value]
+    stored = _read_settings(path) if path.exists() else {}
+    expected = json.loads(json.dumps({**settings, **drives}))  # as read from JSON: tuples become lists
+    merged = {**drives, **(stored or expected)}
+    different = [key for key, value in expected.items() if merged.get(key) != value]
     if different:
-        described = ", ".join(f"{key} {expected[key]} (found {found.get(key)})" for key in different)
+        described = ", ".join(f"{key} {expected[key]} (found {stored.get(key)})" for key in different)
         raise ValueError(f"{path} belongs to another simulated dataset; expected {described}; choose another folder")
-    if claimed != found:
-        _write(path, json.dumps(claimed, indent=1, sort_keys=True).encode())
+    if merged != stored:
+        _write(path, json.dumps(merged, indent=1, sort_keys=True).encode())
 
 
 def _read_settings(path: Path) -> dict:

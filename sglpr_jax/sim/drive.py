@@ -256,18 +256,18 @@ class Carrier:
             clock.append(clock[-1] + seconds)
             progress.append(to)
 
-        reverses, there = rng.random() < 0.5, rng.uniform(*self.halt_every_s)
-        while there < path.times[-1]:
-            go(there - progress[-1], there)
+        reverses, halt_s = rng.random() < 0.5, rng.uniform(*self.halt_every_s)
+        while halt_s < path.times[-1]:
+            go(halt_s - progress[-1], halt_s)
             if reverses:
-                metres = np.interp(there, path.times, length) - rng.uniform(*self.reverse_m)
-                back = float(np.interp(metres, length, path.times))
-                go(SHIFT_S, there)
-                go((there - back) / REVERSE_SPEED, back)
-                go(SHIFT_S, back)
+                metres = np.interp(halt_s, path.times, length) - rng.uniform(*self.reverse_m)
+                reversed_s = float(np.interp(metres, length, path.times))
+                go(SHIFT_S, halt_s)
+                go((halt_s - reversed_s) / REVERSE_SPEED, reversed_s)
+                go(SHIFT_S, reversed_s)
             else:
-                go(rng.uniform(*self.stand_s), there)
-            reverses, there = not reverses, there + rng.uniform(*self.halt_every_s)
+                go(rng.uniform(*self.stand_s), halt_s)
+            reverses, halt_s = not reverses, halt_s + rng.uniform(*self.halt_every_s)
         go(float(path.times[-1]) - progress[-1], float(path.times[-1]))
         return clock, progress
 

@@ -65,12 +65,12 @@ def _poisson(rng: np.random.Generator, per_metre: float, start: float, stop: flo
 def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float = STAY_S) -> Iterator[Clock]:
     """Yields the stays at a place that is occupied for the fraction `occupied`. The first may begin at -inf."""
     time = clock[0]
-    taken = rng.random() < occupied
+    is_occupied = rng.random() < occupied
     while time < clock[1]:
-        lasts = rng.exponential(stay_s if taken else stay_s * (1 - occupied) / occupied)
-        if taken:
-            yield (-np.inf if time == clock[0] else time, time + lasts)
-        time, taken = time + lasts, not taken
+        duration = rng.exponential(stay_s if is_occupied else stay_s * (1 - occupied) / occupied)
+        if is_occupied:
+            yield (-np.inf if time == clock[0] else time, time + duration)
+        time, is_occupied = time + duration, not is_occupied
 
 
 def _changing(
@@ -205,8 +205,8 @@ def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, cloc
         plan = side.row or draw_house(rng, style)
         width, gap = min(plan.width, stop - s), rng.uniform(*style.gap)
         if rng.random() < style.houses:
-            near = rng.random() < (1.0 if side.row else 0.75)
-            set_back = side.set_back if near else rng.uniform(*style.set_back)
+            on_building_line = rng.random() < (1.0 if side.row else 0.75)
+            set_back = side.set_back if on_building_line else rng.uniform(*style.set_back)
             plan = objects.House(width, plan.depth, plan.height, plan.glass)
             thing = objects.house(rng, plan, porch=set_back > 2)
             yield Spot(thing, s + width / 2, side.verge + 0.1 + set_back, rng.normal(0, 0.008))
@@ -216,16 +216,16 @@ def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, cloc
 
 
 def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock) -> Iterator[Spot]:
-    what = rng.choice(["cars", "garage", "hedge", "wall", "nothing"], p=[0.4, 0.2, 0.15, 0.1, 0.15])
+    content = rng.choice(["cars", "garage", "hedge", "wall", "nothing"], p=[0.4, 0.2, 0.15, 0.1, 0.15])
     middle, d = s + gap / 2, side.verge
-    if what == "cars":
+    if content == "cars":
         for at in np.arange(s + 1.4, s + min(gap, 14) - 1.2, 2.6).tolist():
             yield from _changing(rng, objects.parked, Spot((), at, d + 4.5, np.pi / 2), clock, 0.6)
-    elif what == "garage":
+    elif content == "garage":
         yield Spot(objects.garage(rng, min(gap, rng.uniform(3, 7))), middle, d + rng.uniform(3, 9))
-    elif what == "hedge":
+    elif content == "hedge":
         yield Spot(objects.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
-    elif what == "wall":
+    elif content == "wall":
         yield Spot(_wall(rng, 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
 
 

@@ -35,45 +35,45 @@ ObjectModel = tuple[Primitive, ...]
 
 
 def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
-    """Box with its centre at x and y. `more` holds fields of Part."""
+    """Box with its centre at x and y. `more` holds fields of `Primitive`."""
     return Primitive("box", label, (length, width, height), x, y, **more)
 
 
-def post(label: int, thick: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
-    """Cylinder with its axis at x and y. `more` holds fields of Part."""
-    return Primitive("cylinder", label, (thick, thick, height), x, y, **more)
+def post(label: int, thickness: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
+    """Cylinder with its axis at x and y. `more` holds fields of `Primitive`."""
+    return Primitive("cylinder", label, (thickness, thickness, height), x, y, **more)
 
 
-def ball(label: int, wide: float, high: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
-    """Round ellipsoid with its axis at x and y, such as a crown of leaves. `more` holds fields of Part."""
-    return Primitive("ellipsoid", label, (wide, wide, high), x, y, **more)
+def ball(label: int, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
+    """Round ellipsoid with its axis at x and y, such as a crown of leaves. `more` holds fields of `Primitive`."""
+    return Primitive("ellipsoid", label, (width, width, height), x, y, **more)
 
 
 def tree(rng: np.random.Generator, spread: Range) -> ObjectModel:
     """Tree whose crown has a diameter in the range `spread`, in metres. A large crown has several ellipsoids."""
     crown, below = rng.uniform(*spread), rng.uniform(0.9, 2.6)
-    thick = 0.12 + 0.05 * crown * rng.uniform(0.6, 1.4)
-    parts = [post(labels.TRUNK, thick, below + 0.35 * crown)]
+    thickness = 0.12 + 0.05 * crown * rng.uniform(0.6, 1.4)
+    parts = [post(labels.TRUNK, thickness, below + 0.35 * crown)]
     lobes = 1 if crown < 3.5 else int(rng.integers(2, 5))
     for _ in range(lobes):
         size = crown * (1.0 if lobes == 1 else rng.uniform(0.6, 0.85))
         x, y = (rng.uniform(-0.5, 0.5, 2) * (crown - size)).tolist()
         low = below + rng.uniform(0, 0.25) * crown * (lobes > 1)
-        high = size * rng.uniform(0.8, 1.3)
+        height = size * rng.uniform(0.8, 1.3)
         porosity = rng.uniform(0.45, 0.75)
-        parts.append(ball(labels.VEGETATION, size, high, x, y, bottom=low, roughness=0.7, porosity=porosity))
+        parts.append(ball(labels.VEGETATION, size, height, x, y, bottom=low, roughness=0.7, porosity=porosity))
     return tuple(parts)
 
 
 def limbed_tree(rng: np.random.Generator, spread: Range) -> ObjectModel:
     """Old street tree: a thick trunk and bare limbs under a crown that begins above most lasers."""
     crown, fork = rng.uniform(*spread), rng.uniform(1.2, 2.2)
-    thick = rng.uniform(0.25, 0.7)
-    parts = [post(labels.TRUNK, thick, fork + 1.5, roughness=0.05)]
+    thickness = rng.uniform(0.25, 0.7)
+    parts = [post(labels.TRUNK, thickness, fork + 1.5, roughness=0.05)]
     for _ in range(int(rng.integers(1, 4))):
-        wide, high = rng.uniform((0.6, 0.7), (2.2, 1.8)).tolist()
+        width, height = rng.uniform((0.6, 0.7), (2.2, 1.8)).tolist()
         x, y = rng.uniform(-0.4, 0.4, 2).tolist()
-        parts.append(ball(labels.TRUNK, wide, high, x, y, bottom=fork - 0.2, roughness=0.4, porosity=0.8))
+        parts.append(ball(labels.TRUNK, width, height, x, y, bottom=fork - 0.2, roughness=0.4, porosity=0.8))
     low, porosity = fork + rng.uniform(-0.3, 1.6), rng.uniform(0.55, 0.85)
     parts.append(ball(labels.VEGETATION, crown, crown, bottom=low, roughness=0.9, porosity=porosity))
     return tuple(parts)
@@ -125,8 +125,8 @@ def thicket(rng: np.random.Generator) -> ObjectModel:
     parts = [*bush(rng, rng.uniform(1.2, 2.4))]
     for _ in range(int(rng.integers(1, 4))):
         x, y = rng.uniform(-2.5, 2.5, 2).tolist()
-        thick = rng.uniform(0.15, 0.45)
-        parts.append(post(labels.TRUNK, thick, rng.uniform(4, 8), x, y))
+        thickness = rng.uniform(0.15, 0.45)
+        parts.append(post(labels.TRUNK, thickness, rng.uniform(4, 8), x, y))
         size = rng.uniform(2.5, 5)
         low = rng.uniform(1.0, 3.5)
         porosity = rng.uniform(0.5, 0.75)
@@ -196,9 +196,9 @@ def people(rng: np.random.Generator) -> ObjectModel:
     """One to three people side by side, including their arms and bags."""
     parts = []
     for place in range(int(rng.integers(1, 4))):
-        deep, wide, height = rng.uniform((0.35, 0.5, 1.5), (0.6, 0.8, 1.9)).tolist()
+        depth, width, height = rng.uniform((0.35, 0.5, 1.5), (0.6, 0.8, 1.9)).tolist()
         x, y = rng.uniform(-0.15, 0.15, 2).tolist()
-        parts.append(Primitive("cylinder", labels.PERSON, (deep, wide, height), x, y + 0.75 * place, roughness=0.12))
+        parts.append(Primitive("cylinder", labels.PERSON, (depth, width, height), x, y + 0.75 * place, roughness=0.12))
     return tuple(parts)
 
 

@@ -20,6 +20,7 @@ SLOTS = 64, 48, 128  # maximum numbers of boxes, cylinders and ellipsoids in a s
 UNROLL = 2  # shapes tested between two checks of the stop condition; it divides all numbers of slots
 _MARGIN = 1e-3
 _PORE_FACTORS = np.random.default_rng(0).integers(2**32, size=sum(SLOTS), dtype=np.uint32) | np.uint32(1)
+PerRay = Float[Array, "lasers azimuths"]
 Nearest = tuple[Array, Array]
 """Distance and slot of the nearest hit of each ray. The slot is -1 without a hit."""
 STOREY_M, BAY_M = 3.0, 2.5  # height and width of a piece of facade with one window, in metres
@@ -74,13 +75,13 @@ def find_candidates(
     step = (last - first) / azimuth_steps
     middle = first + (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
     half_width = (COLUMNS - 1) / 2 * step + _MARGIN
-    found = []
+    candidates = []
     for shapes, count in zip(scene, slots, strict=True):
-        near = at_time(shapes, time, world_from_lidar[:3, 3], reach_m=reach_m)
-        bearing, half_extent = _bearings(near, world_from_lidar)
-        apart = np.abs(_wrapped(bearing[:, None] - middle))
-        found.append(_listed(near, world_from_lidar[:3, 3], apart <= half_extent[:, None] + half_width, count))
-    return tuple(found)
+        present = at_time(shapes, time, world_from_lidar[:3, 3], reach_m=reach_m)
+        bearing, half_extent = _bearings(present, world_from_lidar)
+        angle = np.abs(_wrapped(bearing[:, None] - middle))
+        candidates.append(_listed(present, world_from_lidar[:3, 3], angle <= half_extent[:, None] + half_width, count))
+    return tuple(candidates)
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
@@ -147,8 +148,8 @@ def into_unit_frame(vectors: Vectors, shape: Candidates) -> Vectors:
 
 
 def nearest_hit(
-    rays: Vectors, candidates: Sequence[Candidates], limit: Float[Array, "lasers azimuths"], chance: Chance
-) -> tuple[Float[Array, "lasers azimuths"], Int[Array, "lasers azimuths"]]:
+    rays: Vectors, candidates: Sequence[Candidates], limit: PerRay, chance: Chance
+) -> tuple[PerRay, Int[Array, "lasers azimuths"]]:
     """Returns the distance to the first shape that each ray from the sensor hits, and its slot.
 
     Slots count boxes, then cylinders, then ellipsoids. Without a hit nearer than `limit`, they are `limit` and -1.
@@ -220,10 +221,7 @@ class Surface(NamedTuple):
 
 
 def surface_of_shapes(
-    rays: Vectors,
-    distance: Float[Array, "lasers azimuths"],
-    slot: Int[Array, "lasers azimuths"],
-    candidates: Sequence[Candidates],
+    rays: Vectors, distance: PerRay, slot: Int[Array, "lasers azimuths"], candidates: Sequence[Candidates]
 ) -> Surface:
     """Surface that each ray hits at `distance` on the shape in `slot`. If `slot` is -1, the values are arbitrary."""
     first_cylinder, first_ellipsoid = np.cumsum([len(kind.nearest) for kind in candidates])[:2]
@@ -260,13 +258,13 @@ def _in_window(along: Array, up: Array, glass: Array) -> Bool[Array, "lasers azi
     return (beside < half_side) & (above < half_side)
 
 
-def reflectivity(label: Int[Array, "lasers azimuths"]) -> Float[Array, "lasers azimuths"]:
+def reflectivity(label: Int[Array, "lasers azimuths"]) -> PerRay:
     """Fraction of the light that a surface with this label reflects, from 0 to 1."""
     return jnp.asarray(_REFLECTIVITY)[label]
 
 
 def echo_returns(
-    chance: Float[Array, "lasers azimuths"], surface: Surface, *, faintest_echo: float, dropout: float
+    chance: PerRay, surface: Surface, *, faintest_echo: float, dropout: float
 ) -> Bool[Array, "lasers azimuths"]:
     """Whether the echo of each ray is detected. `chance` is uniform in [0, 1).
 
@@ -274,17 +272,11 @@ def echo_returns(
     1 - exp(-(e / faintest_echo)^2), reduced by `dropout` and by windows. A flat road vanishes between 35 and 55 m.
     """
     echo = reflectivity(surface.label) * surface.facing / jnp.maximum(surface.distance, 1) ** 2
-    seen = (1 - dropout) * -jnp.expm1(-((echo / faintest_echo) ** 2))
-    return chance < jnp.where(surface.window, 1 - WINDOW_LOSS, 1) * seen
+    detected = (1 - dropout) * -jnp.expm1(-((echo / faintest_echo) ** 2))
+    return chance < jnp.where(surface.window, 1 - WINDOW_LOSS, 1) * detected
 
 
-def mix_edges(
-    chance: Float[Array, "lasers azimuths"],
-    reach: Float[Array, "lasers azimuths"],
-    returned: Bool[Array, "lasers azimuths"],
-    *,
-    share: float,
-) -> Float[Array, "lasers azimuths"]:
+def mix_edges(chance: PerRay, reach: PerRay, returned: Bool[Array, "lasers azimuths"], *, share: float) -> PerRay:
     """Replaces the fraction `share` of the ranges by random values between them and the range of the next azimuth.
 
     Both rays must return, with ranges that differ by less than EDGE_JUMP_M. `chance` is uniform in [0, 1).

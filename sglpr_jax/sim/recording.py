@@ -1,8 +1,10 @@
-"""Simulated drive as a recording. Its scans are rendered on demand and not stored on disk."""
+"""Simulated drives as recordings, whose scans are rendered on demand: through towns, also on several days, and through
+surroundings where places repeat."""
 
 import dataclasses
+import datetime
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,12 +31,21 @@ from sglpr_jax.sim.drive import (
     read_path,
     scan_rows,
     speeds,
+    timed,
 )
-from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
+from sglpr_jax.sim.layouts import to_utime
+from sglpr_jax.sim.routes import REVISITS, Revisit
+from sglpr_jax.sim.sceneries import REPEATING, Repeating
+from sglpr_jax.sim.sceneries.site import LAPS, build, driven_line
+from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor, scan
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import World, build_world
 
 KEPT_SCANS = 8  # number of cached scans, so that reading points and labels of a scan renders it once
+SHORTEST_S = 75.0  # minimum duration of a drive where places repeat, in seconds, over which few scans are spread
+LEAST_RANGE_M = 0.5  # highest minimum range of the sensor of a small robot, in metres
+PAUSE_S = 1800.0  # pause between two days, in seconds: three times the mean stay of a parked car
+START_H = 12  # hour (UTC) at which each session starts
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +108,124 @@ def simulate_recording(
     return drive_through(world, path, rows, name=name, sensor=sensor, carrier=carrier, **random_of(seeds))
 
 
+def simulate_repeating(
+    name: str,
+    *,
+    scans: int = 300,
+    seed: int = 0,
+    sensor: Sensor = HDL64E,
+    revisit: Revisit = "none",
+    rate_hz: float | None = None,
+    carrier: Carrier = VEHICLE,
+) -> SimulatedRecording:
+    """Returns the recording of a drive through surroundings where places repeat.
+
+    Arguments:
+      name: Scenery, from `REPEATING`.
+      scans: Number of scans, evenly spaced over the drive.
+      seed: Seed of the scenery and the drive, at least 0.
+      sensor: LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of at most 0.5 m.
+      revisit: "none": frames 30 s apart are more than `other_m` apart. "opposite": returns on the same way.
+        "same": drives one and a half laps along a closed path.
+      rate_hz: Scans per second. None uses the rate of the carrier or of the scenery.
+      carrier: Carrier of the sensor, such as one of `CARRIERS`. Slow ones and halts bring frames 30 s apart closer.
+
+    Raises:
+      ValueError: The name or `revisit` is unknown, `rate_hz` is not positive, or `seed` is negative.
+
+    Example:
+      drive = simulate_repeating("yard", seed=1, revisit="same", carrier=CARRIERS["backpack"])
+    """
+    if name not in REPEATING:
+        raise ValueError(f"expected a scenery among {', '.join(REPEATING)}, found {name!r}")
+    if revisit not in REVISITS:
+        raise ValueError(f"revisit: expected one of {', '.join(REVISITS)}, found {revisit!r}")
+    scenery = REPEATING[name]
+    rate_hz = carrier.rate_hz or scenery.rate_hz if rate_hz is None else rate_hz
+    check_drawing(rate_hz, seed)
+    seeds = drive_seed(seed, f"{name} {revisit}")
+    world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
+    height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
+    if height_m is not None:
+        sensor = dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))
+    options = {"name": f"{name}-{revisit}", "sensor": sensor, "carrier": carrier}
+    return drive_through(world, path, scan_rows(path, scans), **options, **random_of(seeds))
+
+
+def plan_drive(
+    scenery: Repeating,
+    seeds: tuple[int, ...],
+    *,
+    scans: int,
+    revisit: Revisit,
+    rate_hz: float,
+    carrier: Carrier = VEHICLE,
+) -> tuple[World, PlanarPath]:
+    """Draws a scenery and the drive through it. The number of poses is a multiple of `scans`."""
+    rng = np.random.default_rng((*seeds, 1))
+    speed = rng.uniform(*(carrier.speed_mps or scenery.speed_mps))
+    length = max(scans / rate_hz, SHORTEST_S) * speed / {"none": 1, "opposite": 2, "same": LAPS}[revisit]
+    if revisit == "same":  # a lap has room for the scenery even if the carrier is slow
+        length = max(length, SHORTEST_S * scenery.speed_mps[0] / LAPS)
+    site = scenery.site(rng, length, scenery.is_closed(revisit))
+    line = driven_line(rng, site, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
+    path = carrier.halted(rng, timed(rng, line, free_mps=speed, poses=scans), poses=scans)
+    return build(site, line, clearance_m=scenery.clearance_m), path
+
+
+def plan_sessions(
+    dates: Sequence[str],
+    *,
+    route: str = "00",
+    scans: int = 300,
+    sensor: Sensor = SENSORS["hdl32e-nclt"],
+    seed: int = 0,
+    rate_hz: float = RATE_HZ,
+    scenery: Scenery = TOWN,
+) -> tuple[PlannedRecording, ...]:
+    """Plans one session for each date. The town is built when the first session is simulated.
+
+    The first session drives `route`, the others the same streets in another order, partly in the opposite direction. As
+    in NCLT, times are seconds since 1970, and ids are these times in microseconds. Other arguments and errors are as in
+    `simulate_recording`.
+
+    Raises:
+      ValueError: A date is invalid or repeated, or there are no dates. Or `scans` is below 2.
+    """
+    check_drawing(rate_hz, seed)
+    starts = [_start_of(date) for date in dates]
+    if len(set(dates)) < max(len(dates), 1) or scans < 2:
+        raise ValueError(f"expected different dates and 2 scans or more, found {', '.join(dates) or 'none'}; {scans}")
+    seeds, days = drive_seed(seed, f"sessions {route}"), len(dates)
+    path = plan_path(np.random.default_rng((*seeds, 1)), route, scans=scans, rate_hz=rate_hz, days=days)
+    path = path._replace(times=path.times + PAUSE_S * (np.arange(len(path.times)) * days // len(path.times)))
+    town = functools.cache(lambda: build_world(seeds, path.xy, path.times, scenery=scenery))
+
+    def plan(day: int, rows: np.ndarray) -> PlannedRecording:
+        times = starts[day] + path.times[rows] - path.times[rows[0]]
+        ids = tuple(str(to_utime(time)) for time in times.tolist())
+
+        def simulate() -> SimulatedRecording:
+            options = {"name": dates[day], "ids": ids, "times": times, "sensor": sensor}
+            return drive_through(town(), path, rows, **options, **random_of((*seeds, day)))
+
+        return PlannedRecording(dates[day], ids, simulate)
+
+    rows = np.arange(0, len(path.times), len(path.times) // (scans * days))
+    return tuple(plan(day, rows_of_day) for day, rows_of_day in enumerate(np.split(rows, days)))
+
+
+def _start_of(date: str) -> float:
+    """Start of a session, in seconds since 1970. Raises ValueError if the date is invalid."""
+    try:
+        day = datetime.datetime.strptime(date, "%Y-%m-%d")
+    except ValueError as error:
+        raise ValueError(f"expected dates such as 2012-01-15, found {date!r}") from error
+    return day.replace(hour=START_H, tzinfo=datetime.UTC).timestamp()
+
+
 def with_submaps(recording: SimulatedRecording, length_m: float) -> SimulatedRecording:
-    """Returns the recording with submaps of `length_m` metres by the true poses, or unchanged with 0 metres."""
-    if not length_m:
-        return recording
+    """Returns the recording with submaps of `length_m` metres by the true poses."""
     view = submaps(recording, recording.poses.world_from_lidar, length_m=length_m)
 
     def render(i: int) -> tuple[np.ndarray, np.ndarray]:
@@ -135,19 +260,10 @@ def drive_through(
     rng: np.random.Generator,
     carrier: Carrier = VEHICLE,
 ) -> SimulatedRecording:
-    """Returns the recording of a drive through a town.
+    """Returns the recording of a drive along `path` through a town, with scans at some of its rows.
 
-    Arguments:
-      world: Town.
-      path: Path of the vehicle, with the times of the town.
-      rows: Rows of `path` at which scans are taken.
-      name: Name of the recording.
-      ids: Names of the scans. None numbers them.
-      times: Times of the scans in the recording, in seconds. None: the times of the town.
-      sensor: LiDAR.
-      key: Random key of the measurements.
-      rng: Random generator of the sway of the carrier.
-      carrier: Carrier of the sensor. Its height and sway are used.
+    By default, `ids` numbers the scans, and `times` (seconds) are those of the town. `key` draws the measurements, and
+    `rng` the sway. The carrier determines height and sway, not the speed.
     """
     clock = path.times[rows]
     ids, times = ids or numbered(len(rows)), clock if times is None else times
@@ -156,8 +272,8 @@ def drive_through(
     aside = np.reshape(left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
     of_lidar = in_world = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
     if world.levels is not None:  # storeys above one another
-        there, ground, slope = (values[rows] for values in world.levels.along(path.xy))
-        in_world = poses_on(world.ground.relief, there + aside, yaw, height_m=height, tilt=tilt)
+        xy, ground, slope = (values[rows] for values in world.levels.along(path.xy))
+        in_world = poses_on(world.ground.relief, xy + aside, yaw, height_m=height, tilt=tilt)
         of_lidar = poses_on((ground, slope), path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
     speed = speeds(path)[rows]
     height_m = sensor.height_m if carrier.height_m is None else carrier.height_m

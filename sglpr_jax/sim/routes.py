@@ -125,11 +125,13 @@ def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -
         ahead[b].add(a)
     driven = Counter(pairwise(walk))
     for step in range(blocks * (days - 1)):
-        here, before = walk[-1], walk[-2]
-        ways = sorted(ahead[here] - {before}) if step % blocks else []
-        taken = [driven[here, way] + rng.random() for way in ways]  # random among streets driven equally often
-        walk.append(ways[np.argmin(taken)] if ways else before)
-        driven[here, walk[-1]] += 1
+        crossing, before = walk[-1], walk[-2]
+        choices = sorted(ahead[crossing] - {before}) if step % blocks else []
+        counts = [
+            driven[crossing, node] + rng.random() for node in choices
+        ]  # random among streets driven equally often
+        walk.append(choices[np.argmin(counts)] if choices else before)
+        driven[crossing, walk[-1]] += 1
     return walk
 
 
@@ -150,17 +152,17 @@ def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: 
     wandering = int(rng.integers(new // 2, max(new - 1, 1) + 1))
     walk = _wandered(rng, role, nodes, wandering)
     left = new - wandering
-    ways = _ways_back(walk, left + 1) if walk else {}
+    paths = _paths_back(walk, left + 1) if walk else {}
     shortest = max(SHORTEST_LOOP[role.opposite], new // 2)
     driven = Counter(_streets(walk))
     closings = []
     for k, node in enumerate(walk):
-        way = ways.get(node, [])
-        if len(way) < max(left - 1, 1) or len(walk) - 1 + len(way) - k < shortest:
+        path = paths.get(node, [])
+        if len(path) < max(left - 1, 1) or len(walk) - 1 + len(path) - k < shortest:
             continue
         second = walk[max(k - again, 0) : k + 1][::-1] if role.opposite else walk[k : k + again + 1]
         if len(second) == again + 1 and all(driven[street] == 1 for street in _streets(second)):
-            closings.append(walk + way + second[1:])
+            closings.append(walk + path + second[1:])
     return closings[rng.integers(len(closings))] if closings else []
 
 
@@ -178,22 +180,22 @@ def _wandered(rng: np.random.Generator, role: Role, nodes: list[Node], steps: in
     return walk
 
 
-def _ways_back(walk: list[Node], longest: int) -> dict[Node, list[Node]]:
+def _paths_back(walk: list[Node], longest: int) -> dict[Node, list[Node]]:
     """Shortest paths of up to `longest` streets from the end of `walk`, over unvisited crossings to visited ones."""
     visited, reached = set(walk), set(walk)
     frontier: dict[Node, list[Node]] = {walk[-1]: []}
-    found: dict[Node, list[Node]] = {}
+    paths: dict[Node, list[Node]] = {}
     for _ in range(longest):
-        further = {}
-        for end, way in frontier.items():
+        next_frontier = {}
+        for end, path in frontier.items():
             for node in (_moved(end, step) for step in STEPS):
                 if node in visited:
-                    found.setdefault(node, [*way, node])
+                    paths.setdefault(node, [*path, node])
                 elif node not in reached:
-                    further[node] = [*way, node]
+                    next_frontier[node] = [*path, node]
                     reached.add(node)
-        frontier = further
-    return found
+        frontier = next_frontier
+    return paths
 
 
 def _streets(walk: list[Node]) -> list[tuple[Node, Node]]:

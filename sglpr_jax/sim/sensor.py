@@ -153,15 +153,9 @@ def scan(
     time: float = 0.0,
     velocity: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
-    """Simulates one scan of a world: points laser by laser, each counter-clockwise from the first azimuth, as in KITTI.
+    """Simulates one scan of a world at `time` (seconds): points laser by laser, each counter-clockwise, as in KITTI.
 
-    Arguments:
-      key: Random key of the measurements.
-      world: World to scan.
-      world_from_lidar: Pose of the LiDAR.
-      sensor: LiDAR.
-      time: Time in the world, in seconds.
-      velocity: Velocity of the sensor in its own frame, in m/s, for sensors with `motion_distortion`.
+    A sensor with `motion_distortion` needs its `velocity` in its own frame, in m/s.
 
     Returns:
       Points (x, y, z in metres in the LiDAR frame, intensity from 0 to 1) and their raw labels.

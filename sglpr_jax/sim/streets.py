@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
+from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
 MIDDLE_M = 1.2  # distance from the first pass to the middle of the street on its left, in metres
@@ -66,7 +67,7 @@ class Island(NamedTuple):
     radius: float  # metres
 
 
-def resample(trajectory: Float[np.ndarray, "n 2"], times: Float[np.ndarray, " n"]) -> Path:
+def resample(trajectory: Line, times: Float[np.ndarray, " n"]) -> Path:
     """Resamples `trajectory` to one point per metre. A standstill becomes one point.
 
     Raises:
@@ -92,11 +93,11 @@ def revisits(path: Path) -> Bool[np.ndarray, " n"]:
     pairs = KDTree(path.xy).query_pairs(SAME_STREET_M, output_type="ndarray")
     parallel = np.abs(np.cos(path.heading[pairs[:, 0]] - path.heading[pairs[:, 1]])) > 0.75
     pairs = pairs[parallel & (pairs[:, 1] - pairs[:, 0] > _LOOK_BACK_M)]
-    again = np.zeros(len(path.xy), bool)
+    is_revisit = np.zeros(len(path.xy), bool)
     # Sorted by the later point, so that a pass is compared only with first passes.
     for older, later in pairs[np.lexsort(pairs.T)].tolist():
-        again[later] |= not again[older]
-    return again
+        is_revisit[later] |= not is_revisit[older]
+    return is_revisit
 
 
 def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
@@ -145,20 +146,18 @@ def _draw_stretches(
         stop = min(start + int(rng.uniform(*(_LOOK_ALIKE_M if look_alike else _STRETCH_M))), len(fast))
         stop = min([stop, *changes[changes > start].tolist()])
         name = name if rng.random() < 0.7 else _new_style(rng, scenery)
-        here = STYLES["highway" if fast[start] else name]
-        half_width = sum(here.road) / 2 + town_width
-        median = rng.random() < here.median
+        left_style = STYLES["highway" if fast[start] else name]
+        half_width = sum(left_style.road) / 2 + town_width
+        median = rng.random() < left_style.median
         # One stretch in four has another style on its right side.
-        other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
-        left = draw_side(rng, here, median=median, look_alike=look_alike)
-        right = draw_side(rng, other, median=False, look_alike=look_alike)
+        right_style = left_style if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
+        left = draw_side(rng, left_style, median=median, look_alike=look_alike)
+        right = draw_side(rng, right_style, median=False, look_alike=look_alike)
         yield Stretch(start, stop, half_width, (left, right))
         start = stop
 
 
-def _branch_starts(
-    rng: np.random.Generator, street: Street, scenery: Scenery
-) -> list[tuple[Float[np.ndarray, "2"], float]]:
+def _branch_starts(rng: np.random.Generator, street: Street, scenery: Scenery) -> list[tuple[np.ndarray, float]]:
     """Start points and headings of possible side streets: ahead at sharp bends, and sideways at random points."""
     starts = []
     for turn in _sharp_turns(street.heading):
@@ -188,9 +187,7 @@ def _sharp_turns(heading: Float[np.ndarray, " n"]) -> Iterator[int]:
             yield peak + 10
 
 
-def _free_line(
-    start: Float[np.ndarray, "2"], heading: float, length: float, bend: float, others: KDTree
-) -> Float[np.ndarray, "m 2"]:
+def _free_line(start: Float[np.ndarray, "2"], heading: float, length: float, bend: float, others: KDTree) -> Line:
     """Gentle curve from `start` to the next street that it meets. Where it runs along a street, it is cut or empty."""
     along = np.arange(int(length))
     bearing = heading + bend * along
@@ -245,9 +242,7 @@ class Network:
         return np.copysign(np.hypot(left, np.maximum(ahead - 1, 0)), left)
 
 
-def paint_ground(
-    network: Network, islands: tuple[Island, ...], relief: Relief, path: Float[np.ndarray, "n 2"]
-) -> Ground:
+def paint_ground(network: Network, islands: tuple[Island, ...], relief: Relief, path: Line) -> Ground:
     """Paints the ground around the streets. Ground within 1.5 m of `path` is road."""
     block_m = BLOCK_CELLS * CELL_M
     low = np.floor(network.middle.min(axis=0) - REACH_M - 20)
@@ -263,7 +258,7 @@ def paint_ground(
     for island in islands:
         _paint_disc(label, (island.centre - low) / CELL_M, island.radius / CELL_M, OTHER_GROUND)
         _paint_disc(label, (island.centre - low) / CELL_M, (island.radius - 1) / CELL_M, TERRAIN)
-    _paint_way(label, (path - low) / CELL_M)
+    _paint_path(label, (path - low) / CELL_M)
     return Ground(label, low, relief)
 
 
@@ -278,10 +273,7 @@ def _near_streets(points: Float[np.ndarray, "n 2"], size: tuple[int, int], reach
 
 
 def _labels(
-    network: Network,
-    profiles: tuple[np.ndarray, np.ndarray],
-    xy: Float[np.ndarray, "m 2"],
-    nearest: Int[np.ndarray, " m"],
+    network: Network, profiles: tuple[np.ndarray, np.ndarray], xy: Line, nearest: Int[np.ndarray, " m"]
 ) -> UInt8[np.ndarray, " m"]:
     """Label at each position, from the nearest point of a street."""
     bounds, names = profiles
@@ -315,10 +307,10 @@ def _paint_disc(label: UInt8[np.ndarray, "r c"], centre: Float[np.ndarray, "2"],
     window[np.hypot(columns + 0.5 - centre[0], rows + 0.5 - centre[1]) < radius] = name
 
 
-def _paint_way(label: UInt8[np.ndarray, "r c"], path: Float[np.ndarray, "n 2"]) -> None:
+def _paint_path(label: UInt8[np.ndarray, "r c"], path: Float[np.ndarray, "n 2"]) -> None:
     """Paints road under the vehicle, but keeps lane markings. `path` has one point per metre, in units of cells."""
-    around = np.stack(np.meshgrid(*2 * [np.arange(-6, 7)]), axis=-1).reshape(-1, 2)
-    around = around[np.hypot(*around.T) < 6.5]
-    cells = np.unique((np.floor(path)[:, None] + around).astype(int).reshape(-1, 2), axis=0)
+    offsets = np.stack(np.meshgrid(*2 * [np.arange(-6, 7)]), axis=-1).reshape(-1, 2)
+    offsets = offsets[np.hypot(*offsets.T) < 6.5]
+    cells = np.unique((np.floor(path)[:, None] + offsets).astype(int).reshape(-1, 2), axis=0)
     cells = cells[label[cells[:, 1], cells[:, 0]] != LANE_MARKING]
     label[cells[:, 1], cells[:, 0]] = ROAD

@@ -53,24 +53,31 @@ Lane = tuple[np.ndarray, np.ndarray]
 def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
     """Lanes of the traffic relative to the vehicle: the oncoming lane, its own lane, and the sidewalks."""
     nearest = network.nearest(path.xy)
-    same_way = np.cos(path.heading - network.heading[nearest])
-    to_middle = -network.offset(path.xy, nearest) * np.sign(same_way)
-    to_middle = np.where(np.abs(same_way) > 0.9, to_middle.clip(-3, 4), MIDDLE_M)
-    pairs = [part.sides for part in network.stretches]
     half_width, stretch = network.half_width[nearest], network.stretch[nearest]
-    away = {}
-    for name, turned in (("left walk", same_way < 0), ("right walk", same_way > 0)):
-        sides = [(sum(s.strips[-1].width for s in [side] if s.strips), side.verge) for pair in pairs for side in pair]
-        last, verge = np.array(sides)[2 * stretch + turned].T
-        sign = 1 if name == "left walk" else -1
-        away[name] = to_middle + sign * (half_width + verge - np.where(last > 0, last / 2, -0.8)), last > 0.9
-    medians = np.array([[side.median for side in pair] for pair in pairs])[stretch, (same_way < 0).astype(int)]
-    beyond = np.where(medians > 0, half_width + medians + 3.5, half_width - 1.55)
-    away["oncoming"] = to_middle + beyond, np.ones(len(stretch), bool)
-    away["own"] = np.zeros(len(stretch)), np.ones(len(stretch), bool)
+    forward = np.cos(path.heading - network.heading[nearest])  # -1 against the direction of the street
+    to_middle = -network.offset(path.xy, nearest) * np.sign(forward)
+    to_middle = np.where(np.abs(forward) > 0.9, to_middle.clip(-3, 4), MIDDLE_M)
+    sizes = np.array(
+        [
+            [(side.strips[-1].width if side.strips else 0.0, side.verge, side.median) for side in part.sides]
+            for part in network.stretches
+        ]
+    )  # (stretches, 2, 3): width of the last strip, of all strips and of the median
+    left, right = sizes[stretch, (forward < 0).astype(int)], sizes[stretch, (forward > 0).astype(int)]
+    median, everywhere = left[:, 2], np.ones(len(stretch), bool)
+    beyond = np.where(median > 0, half_width + median + 3.5, half_width - 1.55)
+    offsets: dict[LaneName, Lane] = {
+        "own": (np.zeros(len(stretch)), everywhere),
+        "oncoming": (to_middle + beyond, everywhere),
+    }
+    walks: tuple[tuple[LaneName, int, np.ndarray], ...] = ("left walk", 1, left), ("right walk", -1, right)
+    for name, sign, side in walks:
+        sidewalk, verge, _ = side.T
+        offset = half_width + verge - np.where(sidewalk > 0, sidewalk / 2, -0.8)
+        offsets[name] = to_middle + sign * offset, sidewalk > 0.9
     return {
-        name: (path.xy + gaussian_filter1d(left, 5.0, mode="nearest")[:, None] * path.left, usable)
-        for name, (left, usable) in away.items()
+        name: (path.xy + gaussian_filter1d(offset, 5.0, mode="nearest")[:, None] * path.left, usable)
+        for name, (offset, usable) in offsets.items()
     }
 
 
@@ -83,24 +90,24 @@ def traffic(rng: np.random.Generator, network: Network, path: Path) -> list[Spot
 def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], path: Path) -> Iterator[Spot]:
     """Yields the pieces of all movers of one flow. The vehicle meets each mover at another point of the path."""
     for block in np.arange(rng.uniform(-0.5, 0) * flow.every_m, len(path.xy), flow.every_m):
-        met, name = block + rng.uniform(0, flow.every_m), flow.lanes[rng.integers(len(flow.lanes))]
+        meeting_m, name = block + rng.uniform(0, flow.every_m), flow.lanes[rng.integers(len(flow.lanes))]
         thing, speed = objects.moving(flow.make(rng)), rng.uniform(*flow.speed)
-        direction, follows = int(rng.choice((-1, 1))), rng.choice((-1, 1)) * rng.uniform(14, 35)
-        if not 0 <= met < len(path.xy) or not lines[name][1][int(met)]:
+        direction, gap_m = int(rng.choice((-1, 1))), rng.choice((-1, 1)) * rng.uniform(14, 35)
+        if not 0 <= meeting_m < len(path.xy) or not lines[name][1][int(meeting_m)]:
             continue
-        ego = path.speed[int(met)]
+        ego = path.speed[int(meeting_m)]
         if name == "own":
-            lasts = rng.uniform(10, 30)
-            times = path.times[int(met)] + np.arange(0, lasts, 1.0)
-            along = np.interp(times, path.times, np.arange(len(path.xy))) + follows
+            duration = rng.uniform(10, 30)
+            times = path.times[int(meeting_m)] + np.arange(0, duration, 1.0)
+            along = np.interp(times, path.times, np.arange(len(path.xy))) + gap_m
             direction = 1
         else:
             if name == "oncoming":
                 direction, speed = -1, max(speed, 0.9 * ego)
-            lasts = _VIEW_M / max(speed + ego, 5.0)
+            duration = _VIEW_M / max(speed + ego, 5.0)
             step = float(np.clip(_PIECE_M / speed, *_PIECE_S))
-            offsets = np.arange(-lasts, lasts, step)
-            times, along = path.times[int(met)] + offsets, met + direction * speed * offsets
+            offsets = np.arange(-duration, duration, step)
+            times, along = path.times[int(meeting_m)] + offsets, meeting_m + direction * speed * offsets
         yield from _pieces(thing, lines[name][0], path, times, along, direction)
 
 

@@ -41,15 +41,15 @@ class Levels:
         Returns:
           Positions in the world, and true height (metres) and slope along x and y of the ground there.
         """
-        on, beyond = path[:, 1] > self.ramp_y_m, path[:, 0] < (self.top_m + self.foot_m) / 2
-        storey = np.concatenate([[0], np.cumsum(np.diff(beyond.astype(int)) * on[1:])])
+        on_ramp, is_beyond = path[:, 1] > self.ramp_y_m, path[:, 0] < (self.top_m + self.foot_m) / 2
+        storey = np.concatenate([[0], np.cumsum(np.diff(is_beyond.astype(int)) * on_ramp[1:])])
         run = self.foot_m - self.top_m
         share = ((self.foot_m - path[:, 0]) / run).clip(0, 1)
-        climbed = np.where(on, share**2 * (3 - 2 * share) - beyond, 0)
-        steepness = np.where(on, 6 * share * (1 - share), 0) * self.rise_m / run
+        climbed = np.where(on_ramp, share**2 * (3 - 2 * share) - is_beyond, 0)
+        steepness = np.where(on_ramp, 6 * share * (1 - share), 0) * self.rise_m / run
         slope = np.stack([-steepness, np.zeros(len(path))], axis=1)
-        there = path + self.pitch_m * np.stack([np.zeros(len(path)), storey], axis=1)
-        return there, self.rise_m * (storey + climbed), slope
+        xy = path + self.pitch_m * np.stack([np.zeros(len(path)), storey], axis=1)
+        return xy, self.rise_m * (storey + climbed), slope
 
 
 class World(NamedTuple):
@@ -61,19 +61,11 @@ class World(NamedTuple):
 
 
 def build_world(
-    seed: int | tuple[int, ...],
-    trajectory: Float[np.ndarray, "n 2"],
-    times: Float[np.ndarray, " n"],
-    *,
-    scenery: Scenery = TOWN,
+    seed: int | tuple[int, ...], trajectory: Line, times: Float[np.ndarray, " n"], *, scenery: Scenery = TOWN
 ) -> World:
-    """Builds a town along a drive. Nothing is closer to the trajectory than 1.6 m.
+    """Builds a town along a drive: x and y of the LiDAR in metres, 0.2 to 3 m apart, with times in seconds.
 
-    Arguments:
-      seed: Seed of the town.
-      trajectory: x and y of the LiDAR, in metres. Points may be 0.2 to 3 m apart, and the vehicle may stand still.
-      times: Times of these positions, in seconds.
-      scenery: Scenery of the town.
+    The vehicle may stand still. Nothing is closer to the trajectory than 1.6 m.
 
     Raises:
       ValueError: The trajectory is shorter than 2 m or not finite, or `times` do not increase.
@@ -96,20 +88,15 @@ def build_world(
 
 
 def _furnish(
-    rng: np.random.Generator,
-    network: Network,
-    islands: tuple[Island, ...],
-    ground: Ground,
-    path: Float[np.ndarray, "n 2"],
-    clock: Clock,
+    rng: np.random.Generator, network: Network, islands: tuple[Island, ...], ground: Ground, path: Line, clock: Clock
 ) -> list[Spot]:
     """Things along the streets of `network`, clear of the streets and of `path`."""
-    spots, makers, free, first = [], bystanders(rng), _free(network), 0
+    spots, next_bystander, free, first = [], bystanders(rng), _free(network), 0
     for street in network.streets:
         for stretch, k in itertools.product(street.stretches, (0, 1)):
             for low, high in runs(free[first + stretch.start : first + stretch.stop, k], gap=1):
                 bounds = float(stretch.start + low), float(stretch.start + high)
-                for spot in frontage(rng, stretch.sides[k], *bounds, clock, makers) if high - low > 3 else ():
+                for spot in frontage(rng, stretch.sides[k], *bounds, clock, next_bystander) if high - low > 3 else ():
                     along, side = first + min(max(spot.x, 0), stretch.stop - 0.01), 1 - 2 * k
                     spots.append(spot._replace(x=along, y=side * (stretch.half_width + spot.y), side=side))
         first += len(street.middle)
@@ -117,14 +104,14 @@ def _furnish(
     spots = _bent(network, point, spots)
     placed = place(spots, ground)
     street, zone = network.street[point], np.array([spot.zone for spot in spots])
-    bad = _on_a_street(network, placed, street[placed.owner], zone[placed.owner])
-    dense = np.concatenate([path, (path[1:] + path[:-1]) / 2])
-    bad |= distances(placed.shapes, dense, reach_m=CLEARANCE_M) < CLEARANCE_M + 0.05
+    is_blocked = _on_a_street(network, placed, street[placed.owner], zone[placed.owner])
+    path_points = np.concatenate([path, (path[1:] + path[:-1]) / 2])
+    is_blocked |= distances(placed.shapes, path_points, reach_m=CLEARANCE_M) < CLEARANCE_M + 0.05
     for island in islands:
-        away = np.linalg.norm(placed.shapes.centre[:, :2] - island.centre, axis=1)
-        bad |= away < island.radius + 2 + np.hypot(placed.shapes.half[:, 0], placed.shapes.half[:, 1])
-    gone = set(placed.owner[bad].tolist())
-    return [spot for i, spot in enumerate(spots) if i not in gone]
+        distance = np.linalg.norm(placed.shapes.centre[:, :2] - island.centre, axis=1)
+        is_blocked |= distance < island.radius + 2 + np.hypot(placed.shapes.half[:, 0], placed.shapes.half[:, 1])
+    removed = set(placed.owner[is_blocked].tolist())
+    return [spot for i, spot in enumerate(spots) if i not in removed]
 
 
 def _free(network: Network) -> Bool[np.ndarray, "n 2"]:
@@ -160,12 +147,12 @@ def _on_a_street(
     network: Network, placed: PlacedObjects, street: np.ndarray, zone: np.ndarray
 ) -> Bool[np.ndarray, " n"]:
     """Whether each shape touches a road, or strips that it belongs behind. Cars must park on their own street."""
-    shapes, bad = placed.shapes, np.zeros(len(zone), bool)
+    shapes, is_on_street = placed.shapes, np.zeros(len(zone), bool)
     cos, sin = np.cos(shapes.yaw), np.sin(shapes.yaw)
     for u in np.linspace(-1, 1, 7):
         for v in np.linspace(-1, 1, 5):
             x, y = u * shapes.half[:, 0], v * shapes.half[:, 1]
             xy = np.asarray(shapes.centre)[:, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
-            bad |= _margin(network, xy, zone == "plot") < -_TOLERANCE_M
-            bad |= (zone == "bay") & (network.street[network.nearest(xy)] != street)
-    return bad & np.array([part.bottom < HEAD_ROOM_M for part in placed.parts], bool)
+            is_on_street |= _margin(network, xy, zone == "plot") < -_TOLERANCE_M
+            is_on_street |= (zone == "bay") & (network.street[network.nearest(xy)] != street)
+    return is_on_street & np.array([part.bottom < HEAD_ROOM_M for part in placed.parts], bool)

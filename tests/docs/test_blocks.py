@@ -52,8 +52,10 @@ def test_command_lines_of_benchmarks_are_parsed(line, monkeypatch):
     if module == "benchmarks.gpu":
         importlib.import_module("benchmarks.gpu.__main__").parser().parse_args(words)
         return
-    program = importlib.import_module("benchmarks.__main__").PROGRAMS[" ".join(words[:2])].load()
-    tyro.cli(functools.wraps(program)(lambda *values, **flags: flags), args=words[2:])
+    benchmarks = importlib.import_module("benchmarks.__main__")
+    name = benchmarks.name_of(words)
+    program = benchmarks.PROGRAMS[name].load()
+    tyro.cli(functools.wraps(program)(lambda *values, **flags: flags), args=words[len(name.split()) :])
 
 
 def test_nothing_else_is_unknown():

@@ -6,18 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.se3 import distances
-from sglpr_jax.sim.drive import (
-    CARRIERS,
-    PlanarPath,
-    plan_path,
-    poses_on,
-    read_path,
-    scan_rows,
-    speeds,
-)
+from sglpr_jax.sim.drive import CARRIERS, PlanarPath, plan_path, poses_on, read_path, scan_rows, speeds
 from sglpr_jax.sim.ground import draw_relief, relief_height
-from sglpr_jax.sim.recording import SimulatedRecording
-from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.recording import simulate_repeating
 from sglpr_jax.sim.routes import ROLES, plan_walk
 from sglpr_jax.sim.sensor import Sensor
 
@@ -133,27 +124,16 @@ NARROW = Sensor(elevations_deg=(10.0, -10.0, -20.0), azimuth_steps=64, azimuths_
 straight = PlanarPath(np.stack([np.arange(0, 800, 0.5), np.zeros(1600)], axis=1), np.zeros(1600), np.arange(1600) / 10)
 
 
-def carried(name: str, scans: int = 40, **more):
-    return simulate_repeating("garage", scans=scans, seed=2, sensor=NARROW, carrier=CARRIERS[name], **more)
-
-
-def xyz(recording: SimulatedRecording) -> np.ndarray:
-    return recording.poses.world_from_lidar[:, :3, 3]
-
-
-def tilts_deg(recording) -> np.ndarray:
-    """Angle between the z axis of the sensor and the vertical, in degrees."""
-    return np.degrees(np.arccos(recording.poses.world_from_lidar[:, 2, 2].clip(-1, 1)))
-
-
 @pytest.mark.parametrize(
     ("name", "height_m", "bob_m", "tilt_deg"),
     [("backpack", 1.8, 0.03, (3.0, 7.1)), ("handheld", 1.4, 0.04, (9.0, 21.3)), ("cart", 0.6, 0.0, (0.0, 0.0))],
 )
 def test_a_carrier_has_its_height_and_tilt(name, height_m, bob_m, tilt_deg):
-    recording = carried(name)
-    assert np.abs(xyz(recording)[:, 2] - height_m).max() <= bob_m + 1e-9
-    assert tilt_deg[0] <= tilts_deg(recording).max() <= tilt_deg[1] + 1e-6
+    recording = simulate_repeating("garage", scans=40, seed=2, sensor=NARROW, carrier=CARRIERS[name])
+    poses = recording.poses.world_from_lidar
+    assert np.abs(poses[:, 2, 3] - height_m).max() <= bob_m + 1e-9
+    tilts_deg = np.degrees(np.arccos(poses[:, 2, 2].clip(-1, 1)))  # between the z axis and the vertical
+    assert tilt_deg[0] <= tilts_deg.max() <= tilt_deg[1] + 1e-6
     assert recording.mounting is not None and recording.mounting.height_m == height_m
 
 

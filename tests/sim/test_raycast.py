@@ -129,9 +129,8 @@ def test_rough_shapes_return_from_within_and_let_long_shots_through():
     scene, rays = Scene(hedge, NOTHING, NOTHING), directions(pose())
     plain, slot, _ = cast(scene, pose())
     deep, _, _ = cast(scene, pose(), no_chance(rays)._replace(depth=np.full(rays.shape[:2], 2.0, np.float32)))
-    through, through_slot, _ = cast(
-        scene, pose(), no_chance(rays)._replace(depth=np.full(rays.shape[:2], 9.0, np.float32))
-    )
+    far = no_chance(rays)._replace(depth=np.full(rays.shape[:2], 9.0, np.float32))
+    through, through_slot, _ = cast(scene, pose(), far)
     ahead = (slot >= 0) & (rays[..., 0] > 0.9)
     np.testing.assert_allclose((deep - plain)[ahead], 0.5, atol=1e-4)
     assert np.all(through_slot[ahead] == -1) and np.all(through[ahead] == REACH_M)
@@ -199,13 +198,7 @@ def test_windows_cover_the_share_of_glass_in_a_lattice():
 
 
 def flat_surface(distance: float, facing: float, label: int, window: bool = False) -> Surface:
-    shape = (50, 400)
-    return Surface(
-        *(
-            jnp.full(shape, value, dtype)
-            for value, dtype in ((distance, float), (label, int), (facing, float), (window, bool))
-        )
-    )
+    return Surface(*(jnp.full((50, 400), value) for value in (float(distance), label, float(facing), window)))
 
 
 def share(surface: Surface, **options) -> float:
@@ -213,14 +206,11 @@ def share(surface: Surface, **options) -> float:
     return float(jnp.mean(echo_returns(chance, surface, **{"faintest_echo": 6e-6, "dropout": 0.0} | options)))
 
 
-def test_road_thins_out_with_distance_and_walls_do_not():
+def test_road_thins_out_with_distance_and_dropout_and_windows_take_their_shares():
     road = [share(flat_surface(d, 1.73 / d, ROAD)) for d in (5, 15, 25, 35, 45, 55, 75)]
     assert min(road[:3]) > 0.99 and road[3] > 0.85 and 0.3 < road[4] < 0.7 and road[5] < 0.3 and road[6] < 0.05
     assert share(flat_surface(75, 0.7, BUILDING)) > 0.99
     assert share(flat_surface(45, 1.73 / 45, TERRAIN)) > road[4]
-
-
-def test_dropout_and_windows_take_their_shares():
     assert abs(share(flat_surface(10, 0.9, BUILDING), dropout=0.2) - 0.8) < 0.02
     assert abs(share(flat_surface(10, 0.9, BUILDING, window=True)) - 0.1) < 0.02
 

@@ -7,9 +7,9 @@ from sglpr_jax.sim.drive import drive_seed
 from sglpr_jax.sim.ground import relief_height
 from sglpr_jax.sim.labels import BUILDING, FENCE, POLE
 from sglpr_jax.sim.placement import HEAD_ROOM_M, distances, footprint_distance
-from sglpr_jax.sim.repeating import driven_line, plan_drive, simulate_repeating
+from sglpr_jax.sim.recording import plan_drive, simulate_repeating
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.sceneries.site import STEP_M, build, painted_ground
+from sglpr_jax.sim.sceneries.site import STEP_M, build, driven_line, painted_ground
 from sglpr_jax.sim.sceneries.site import Strip as GroundStrip
 from sglpr_jax.sim.sensor import Sensor
 from sglpr_jax.sim.shapes import Shapes
@@ -59,7 +59,7 @@ def test_a_drive_shows_the_scenery_stays_clear_and_returns_as_asked(name, revisi
 def test_no_wall_is_left_out(name):
     scenery, rng, revisit = REPEATING[name], np.random.default_rng(8), "opposite"
     site = scenery.site(rng, 75 * scenery.speed_mps[0] / 1.5, scenery.is_closed(revisit))
-    line = driven_line(rng, site, scenery, revisit)
+    line = driven_line(rng, site, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
     counts = [
         np.isin(build(site, line, clearance_m=clearance).scene.boxes.label, (BUILDING, FENCE)).sum()
         for clearance in (0.0, scenery.clearance_m)

@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import NOTHING, shapes
@@ -38,20 +37,11 @@ def test_rays_are_inside_their_interval_and_outside_elsewhere(seed, kind):
     assert np.all(np.stack([level(np.full(200, t)) for t in steps])[:, missed] > 1)
 
 
-def test_a_mover_is_where_it_has_come_to():
+def test_shapes_are_where_and_while_they_are_present():
     car = shapes((0, 0, 1, 2, 1, 1, 0, 252), velocity=(10.0, -5.0), since=0.0, until=3.0)
-    there = at_time(car, 2.0, np.array([20.0, -10, 1]), reach_m=1.0)
-    np.testing.assert_allclose(there.centre, [[20, -10, 1]])
-    assert len(at_time(car, 2.0, np.zeros(3), reach_m=15.0).label) == 0
-
-
-@pytest.mark.parametrize(("time", "count"), [(4.9, 0), (5.0, 1), (7.9, 1), (8.0, 0)])
-def test_a_shape_is_there_from_since_to_just_before_until(time, count):
-    parked = shapes((3, 0, 0, 1, 1, 1, 0, 10), since=5.0, until=8.0)
-    assert len(at_time(parked, time, np.zeros(3), reach_m=50.0).label) == count
-
-
-def test_reach_counts_to_the_shape_not_to_its_centre():
+    np.testing.assert_allclose(at_time(car, 2.0, np.array([20.0, -10, 1]), reach_m=1.0).centre, [[20, -10, 1]])
+    for time, near, count in ((2.0, 0.0, 0), (0.0, 0.0, 1), (3.0, 30.0, 0), (2.9, 29.0, 1)):  # `until` is excluded
+        assert len(at_time(car, time, np.array([near, -near / 2, 1]), reach_m=15.0).label) == count
     wall = shapes((0, 100, 0, 50, 45, 2, 0, 50), (0, 100, 0, 1, 1, 2, 0, 80))
-    np.testing.assert_array_equal(at_time(wall, 0.0, np.zeros(3), reach_m=60.0).label, [50])
+    np.testing.assert_array_equal(at_time(wall, 0.0, np.zeros(3), reach_m=60.0).label, [50])  # reach to the shape
     assert len(at_time(NOTHING, 0.0, np.zeros(3), reach_m=60.0).label) == 0

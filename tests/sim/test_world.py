@@ -1,5 +1,7 @@
 """The town: nothing is in the way, everything stands on the ground, all classes occur, and parked cars change."""
 
+import functools
+
 import numpy as np
 import pytest
 from town import LOOP, THERE_AND_BACK, drive
@@ -7,17 +9,15 @@ from town import LOOP, THERE_AND_BACK, drive
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim.ground import label_at, surface_height
 from sglpr_jax.sim.labels import BUILDING, LANE_MARKING, MOVING, POLE, ROAD, TRUNK
+from sglpr_jax.sim.placement import footprint_distance
 from sglpr_jax.sim.shapes import Shapes
 from sglpr_jax.sim.styles import SCENERIES
 from sglpr_jax.sim.world import World, build_world
 
-_worlds: dict[tuple, World] = {}
 
-
+@functools.cache
 def world_of(corners, seed: int, scenery: str = "town") -> World:
-    if (corners, seed, scenery) not in _worlds:
-        _worlds[corners, seed, scenery] = build_world(seed, *drive(corners), scenery=SCENERIES[scenery])
-    return _worlds[corners, seed, scenery]
+    return build_world(seed, *drive(corners), scenery=SCENERIES[scenery])
 
 
 def clearance(shapes: Shapes, vehicle: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -25,12 +25,9 @@ def clearance(shapes: Shapes, vehicle: np.ndarray, times: np.ndarray) -> np.ndar
     nearest = np.full(len(shapes.label), np.inf)
     for (x, y), time in zip(vehicle, times, strict=True):
         away = np.array([x, y]) - shapes.centre[:, :2] - shapes.velocity * time
-        cos, sin = np.cos(shapes.yaw), np.sin(shapes.yaw)
-        along = np.abs(cos * away[:, 0] + sin * away[:, 1]) - shapes.half[:, 0]
-        across = np.abs(cos * away[:, 1] - sin * away[:, 0]) - shapes.half[:, 1]
-        distance = np.hypot(np.maximum(along, 0), np.maximum(across, 0))
-        there = (shapes.since <= time) & (time < shapes.until)
-        nearest = np.where(there, np.minimum(nearest, distance), nearest)
+        is_present = (shapes.since <= time) & (time < shapes.until)
+        distance = footprint_distance(away, shapes.yaw, shapes.half)
+        nearest = np.where(is_present, np.minimum(nearest, distance), nearest)
     return nearest
 
 

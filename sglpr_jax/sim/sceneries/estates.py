@@ -36,33 +36,33 @@ def _street(line: Line, walk_m: float, relief: Relief) -> Ground:
 
 def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Streets of one house that repeats, 46 to 56 m apart. Different cars are parked in front of the houses."""
-    pitch, wide = rng.uniform(46, 56), rng.uniform(5.5, 9)
+    pitch, width = rng.uniform(46, 56), rng.uniform(5.5, 9)
     plan = rows(length_m, run_m=rng.uniform(110, 160), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
     streets = pitch * np.arange(-1, plan.count + 1)
-    module, xs = _module(rng, wide), np.arange(12.0 + wide / 2, plan.run_m - 12.0, wide)
+    module, xs = _module(rng, width), np.arange(12.0 + width / 2, plan.run_m - 12.0, width)
     houses = on_both_sides(xs, streets, 0.0, lambda: module)
     bays = on_both_sides(xs, streets, ROAD_M - 0.9, lambda: parked(rng))
-    lamps = grid(xs[:: max(1, round(30 / wide))] + wide / 2, streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 6.0),))
+    lamps = grid(xs[:: max(1, round(30 / width))] + width / 2, streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 6.0),))
     ground = _street(plan.line, HOUSES_WALK_M, rolling(rng))
     return Site(plan.line, [*houses, *jittered(rng, bays, 0.2, keep=rng.uniform(0.2, 0.5)), *lamps], ground)
 
 
-def _module(rng: np.random.Generator, wide: float) -> ObjectModel:
+def _module(rng: np.random.Generator, width: float) -> ObjectModel:
     """House with its front garden. The y axis points from the middle of the street to the house."""
-    garden, deep, high, recess = rng.uniform((3, 8, 5.5, 0.5), (7, 11, 9, 2.5)).tolist()
-    front, main = HOUSES_WALK_M + garden, rng.choice((1.0, 0.7)) * wide
-    body = block(BUILDING, main, deep, high + 1, 0.0, front + deep / 2, bottom=-1.0, roughness=0.06, glass=0.2)
-    wing = block(BUILDING, wide, deep - recess, 3.5, 0.0, front + recess + (deep - recess) / 2, bottom=-0.5)
-    porch = block(BUILDING, 1.4, 1.2, 2.6, rng.uniform(-0.25, 0.25) * wide, front - 0.6)
-    shed = block(BUILDING, 2.4, 2.0, 2.3, 0.3 * wide, front + deep + rng.uniform(3, 5))
+    garden, depth, height, recess = rng.uniform((3, 8, 5.5, 0.5), (7, 11, 9, 2.5)).tolist()
+    front, main = HOUSES_WALK_M + garden, rng.choice((1.0, 0.7)) * width
+    body = block(BUILDING, main, depth, height + 1, 0.0, front + depth / 2, bottom=-1.0, roughness=0.06, glass=0.2)
+    wing = block(BUILDING, width, depth - recess, 3.5, 0.0, front + recess + (depth - recess) / 2, bottom=-0.5)
+    porch = block(BUILDING, 1.4, 1.2, 2.6, rng.uniform(-0.25, 0.25) * width, front - 0.6)
+    shed = block(BUILDING, 2.4, 2.0, 2.3, 0.3 * width, front + depth + rng.uniform(3, 5))
     gate = rng.uniform(1.0, 2.5)
     if rng.random() < 0.5:
-        (border,) = hedge(wide - gate, rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.6))
+        (border,) = hedge(width - gate, rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.6))
     else:
-        border = block(FENCE, wide - gate, 0.1, rng.uniform(0.8, 1.2), porosity=0.4)
+        border = block(FENCE, width - gate, 0.1, rng.uniform(0.8, 1.2), porosity=0.4)
     border = border._replace(x=-gate / 2, y=HOUSES_WALK_M + 0.4)
-    between = block(FENCE, 0.1, garden - 0.6, 1.0, wide / 2, HOUSES_WALK_M + garden / 2, porosity=0.3)
-    x, y = rng.uniform(-0.3, 0.3) * wide, front - garden / 2
+    between = block(FENCE, 0.1, garden - 0.6, 1.0, width / 2, HOUSES_WALK_M + garden / 2, porosity=0.3)
+    x, y = rng.uniform(-0.3, 0.3) * width, front - garden / 2
     crown = rng.uniform(1.5, 2.5)
     leaves = ball(VEGETATION, crown, crown, x, y, bottom=1.3, roughness=0.6, porosity=0.5)
     return body, wing, porch, shed, border, between, post(TRUNK, 0.15, 2.0, x, y), leaves
@@ -70,19 +70,19 @@ def _module(rng: np.random.Generator, wide: float) -> ObjectModel:
 
 def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Streets 44 to 56 m apart with random trees and cars. Between each two of them, equal slabs stand in a row."""
-    pitch, long, deep, high, gap = rng.uniform((44, 40, 11, 14, 12), (56, 60, 13, 26, 22)).tolist()
-    plan = rows(length_m, run_m=2 * (long + gap), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
+    pitch, length, depth, high, gap = rng.uniform((44, 40, 11, 14, 12), (56, 60, 13, 26, 22)).tolist()
+    plan = rows(length_m, run_m=2 * (length + gap), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
     streets = pitch * np.arange(-1, plan.count + 1)
-    slab, middles = _slab(long, deep, high), np.arange(gap / 2 + long / 2, plan.run_m, long + gap)
+    slab, middles = _slab(length, depth, high), np.arange(gap / 2 + length / 2, plan.run_m, length + gap)
     buildings = grid(middles, streets + pitch / 2, lambda: slab)
-    xs, aside = np.arange(10.0, plan.run_m - 10.0, 6.0), ROAD_M - 0.9
-    bays = grid(xs, np.concatenate([streets - aside, streets + aside]), lambda: parked(rng))
+    xs, parking_offset = np.arange(10.0, plan.run_m - 10.0, 6.0), ROAD_M - 0.9
+    bays = grid(xs, np.concatenate([streets - parking_offset, streets + parking_offset]), lambda: parked(rng))
     lamps = grid(xs[::5], streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 7.0),))
     spots = [*buildings, *jittered(rng, bays, 0.2, keep=rng.uniform(0.3, 0.6)), *lamps]
-    low, high = (0, SLABS_WALK_M + 1.0), (plan.run_m, (pitch - deep) / 2 - 2.0)  # between sidewalks and slabs
+    low, high = (0, SLABS_WALK_M + 1.0), (plan.run_m, (pitch - depth) / 2 - 2.0)  # between sidewalks and slabs
     for street, side, _ in itertools.product(streets.tolist(), (-1, 1), range(round(plan.run_m / 14.0))):
-        x, away = rng.uniform(low, high).tolist()
-        spots.append(Spot(_plant(rng, 5.0), x, street + side * away, rng.uniform(0, 2 * np.pi)))
+        x, offset = rng.uniform(low, high).tolist()
+        spots.append(Spot(_plant(rng, 5.0), x, street + side * offset, rng.uniform(0, 2 * np.pi)))
     return Site(plan.line, spots, _street(plan.line, SLABS_WALK_M, rolling(rng)))
 
 
@@ -91,12 +91,12 @@ def _plant(rng: np.random.Generator, widest: float) -> ObjectModel:
     return tree(rng, (2.5, widest)) if rng.random() < 0.7 else bush(rng)
 
 
-def _slab(long: float, deep: float, high: float) -> ObjectModel:
+def _slab(length: float, depth: float, height: float) -> ObjectModel:
     """Building along x with windows, and porches and balconies at equal distances."""
-    body = block(BUILDING, long, deep, high + 1, bottom=-1.0, roughness=0.05, glass=0.25)
-    entrances = np.arange(-long / 2 + 5, long / 2 - 4, 10.0).tolist()
-    porches = [block(BUILDING, 3.0, 1.4, 2.8, x, -(deep + 1.4) / 2) for x in entrances]
-    balconies = [block(BUILDING, 3.5, 1.2, high - 3.0, x, (deep + 1.2) / 2, bottom=2.5) for x in entrances]
+    body = block(BUILDING, length, depth, height + 1, bottom=-1.0, roughness=0.05, glass=0.25)
+    entrances = np.arange(-length / 2 + 5, length / 2 - 4, 10.0).tolist()
+    porches = [block(BUILDING, 3.0, 1.4, 2.8, x, -(depth + 1.4) / 2) for x in entrances]
+    balconies = [block(BUILDING, 3.5, 1.2, height - 3.0, x, (depth + 1.2) / 2, bottom=2.5) for x in entrances]
     return body, *porches, *balconies
 
 
@@ -115,13 +115,13 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     lines = np.arange(-2, count + 1)
     twin, spots = _building(rng, pitch), []
     for column, row in itertools.product(columns.tolist(), lines.tolist()):
-        building = twin if row == 0 and column in (0, 1) else _building(rng, pitch)  # beside the first path
+        building = twin if row == 0 and column in (0, 1) else _building(rng, pitch)  # shift the first path
         x, y = (column + 0.5) * pitch, (row + 0.5) * pitch
         spots.append(Spot(building, x, y))
         for _ in range(int(rng.integers(4, 11))):
-            beside = rng.uniform(-0.5, 0.5) * pitch
-            away = rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
-            dx, dy = ((beside, away), (away, beside))[rng.integers(2)]
+            shift = rng.uniform(-0.5, 0.5) * pitch
+            offset = rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
+            dx, dy = ((shift, offset), (offset, shift))[rng.integers(2)]
             spots.append(Spot(_plant(rng, 6.0), x + dx, y + dy, rng.uniform(0, 2 * np.pi)))
     spots += along(shifted(line, 2.5), ((post(POLE, 0.15, 4.5),), rng.uniform(18, 26)))
     spots += along(shifted(line, -2.6), ((block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40)))
@@ -136,13 +136,15 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 def _building(rng: np.random.Generator, pitch: float) -> ObjectModel:
     """Building around the origin, six of ten with a wing at the back, and a bicycle stand in front of it."""
     room = pitch - 2 * LAWN_M
-    wide, deep, high, glass = (rng.uniform((0.55, 0.3, 7, 0.2), (0.95, 0.55, 18, 0.5)) * (room, room, 1, 1)).tolist()
+    width, depth, height, glass = (
+        rng.uniform((0.55, 0.3, 7, 0.2), (0.95, 0.55, 18, 0.5)) * (room, room, 1, 1)
+    ).tolist()
     front = room * rng.uniform(-0.5, -0.35)
-    parts = [part._replace(y=part.y + front) for part in house(rng, House(wide, deep, high, glass), porch=True)]
+    parts = [part._replace(y=part.y + front) for part in house(rng, House(width, depth, height, glass), porch=True)]
     if rng.random() < 0.6:
-        long, thick = rng.uniform(0.6, 0.95) * (room / 2 - front - deep), rng.uniform(0.2, 0.35) * room
-        x, y = rng.choice((-1, 1)) * (wide - thick) / 2, front + deep + long / 2
-        parts.append(block(BUILDING, thick, long, high, float(x), y, roughness=0.06, glass=glass))
-    x, count, every = rng.uniform(-0.3, 0.3) * wide, int(rng.integers(6, 17)), rng.uniform(0.5, 0.8)
+        length, thickness = rng.uniform(0.6, 0.95) * (room / 2 - front - depth), rng.uniform(0.2, 0.35) * room
+        x, y = rng.choice((-1, 1)) * (width - thickness) / 2, front + depth + length / 2
+        parts.append(block(BUILDING, thickness, length, height, float(x), y, roughness=0.06, glass=glass))
+    x, count, every = rng.uniform(-0.3, 0.3) * width, int(rng.integers(6, 17)), rng.uniform(0.5, 0.8)
     stand = (x + every * (np.arange(count) - count / 2)).tolist()
     return *parts, *(bicycle(rng)[0]._replace(x=place, y=front - 2.6, yaw=np.pi / 2) for place in stand)

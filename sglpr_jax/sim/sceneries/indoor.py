@@ -26,9 +26,9 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """One straight corridor, or four corridors at right angles around a core, with a door every 5 to 7 m."""
     half, height, pitch, recess = rng.uniform(1.0, 1.4), rng.uniform(2.4, 3.0), rng.uniform(5, 7), rng.uniform(0.1, 0.3)
     if closed:
-        long = (0.5 + rng.uniform(0, 0.15)) * length_m / 2
-        wide = length_m / 2 - long
-        corners = np.array([(0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide)])
+        length = (0.5 + rng.uniform(0, 0.15)) * length_m / 2
+        width = length_m / 2 - length
+        corners = np.array([(0.0, 0.0), (length, 0.0), (length, width), (0.0, width)])
         line = rounded(corners, corner_m=0.5, closed=True)
     else:
         corners = np.array([(-40.0, 0.0), (length_m + 40.0, 0.0)])
@@ -39,8 +39,8 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     for start, stop in zip(starts, np.roll(corners, -1, axis=0), strict=False):
         spots += _corridor_walls(start, stop, half, height, pitch, recess, closed)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    (long, wide), (x, y) = (high - low + 4).tolist(), ((low + high) / 2).tolist()
-    ceiling = Spot((block(BUILDING, long, wide, 0.3, bottom=height),), x, y)
+    (length, width), (x, y) = (high - low + 4).tolist(), ((low + high) / 2).tolist()
+    ceiling = Spot((block(BUILDING, length, width, 0.3, bottom=height),), x, y)
     return Site(line, [*spots, ceiling], painted_ground(OTHER_GROUND))
 
 
@@ -50,19 +50,19 @@ def _corridor_walls(
     """Walls along one straight corridor. If `closed`, the left wall belongs to the core and is shorter."""
     length, ahead = float(np.linalg.norm(stop - start)), (stop - start) / np.linalg.norm(stop - start)
     heading = float(np.arctan2(ahead[1], ahead[0]))
-    spots, thick, door = [], 0.6, 1.0
+    spots, thickness, door = [], 0.6, 1.0
     for side in (1, -1):
         first = (half if side > 0 else -half) if closed else 0.0
         pieces = max(1, round((length - 2 * first) / pitch))
-        each = (length - 2 * first) / pieces
-        away, part = half + thick / 2, (each - door) / 2
+        piece_length = (length - 2 * first) / pieces
+        offset, part = half + thickness / 2, (piece_length - door) / 2
         thing = (
-            block(BUILDING, part, thick, height, part / 2, side * away),
-            block(BUILDING, door, thick, height, each / 2, side * (away + recess)),  # door in the middle
-            block(BUILDING, part, thick, height, each - part / 2, side * away),
+            block(BUILDING, part, thickness, height, part / 2, side * offset),
+            block(BUILDING, door, thickness, height, piece_length / 2, side * (offset + recess)),  # door in the middle
+            block(BUILDING, part, thickness, height, piece_length - part / 2, side * offset),
         )
         for k in range(pieces):
-            x, y = (start + (first + k * each) * ahead).tolist()
+            x, y = (start + (first + k * piece_length) * ahead).tolist()
             spots.append(Spot(thing, x, y, heading))
     return spots
 
@@ -74,10 +74,10 @@ def _visit(x: float, side_m: float, deep_m: float, ahead: int = 1) -> list[tuple
 
 def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: bool) -> Site:
     """Rooms of one size along a corridor, with `equal` or with different furniture."""
-    pitch, size, deep, height = rng.uniform(7.5, 8.5), *rng.uniform(4.7, 5.3, 2), rng.uniform(2.4, 3.0)
-    into = ROOMS_HALF_M + 0.6 * deep
-    each = pitch + 2 * into + (pitch if closed else 0.0)  # a closed path returns through the corridor
-    count = max(2, round(length_m / each) if closed else int(np.ceil(length_m / each)))
+    pitch, size, depth, height = rng.uniform(7.5, 8.5), *rng.uniform(4.7, 5.3, 2), rng.uniform(2.4, 3.0)
+    into = ROOMS_HALF_M + 0.6 * depth
+    visit_length = pitch + 2 * into + (pitch if closed else 0.0)  # a closed path returns through the corridor
+    count = max(2, round(length_m / visit_length) if closed else int(np.ceil(length_m / visit_length)))
     corners = [(-pitch / 2, 0.0)]
     for k in range(count):
         corners += _visit(k * pitch, ROOMS_SIDE_M, into)
@@ -85,39 +85,41 @@ def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: boo
         corners += [(corners[-1][0] + 1.0, 0.0), (corners[-1][0] + 1.0, -0.4), (-pitch / 2, -0.4)]
     line = rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
     middles = pitch * np.arange(-2, count + 2)
-    same = _room_furniture(rng, size, deep)
-    inside = grid(middles, (ROOMS_HALF_M + WALL_M,), lambda: same if equal else _room_furniture(rng, size, deep))
-    shell = grid(middles, (0.0,), lambda: _room_walls(pitch, size, deep, height))
+    standard = _room_furniture(rng, size, depth)
+    equipment = grid(
+        middles, (ROOMS_HALF_M + WALL_M,), lambda: standard if equal else _room_furniture(rng, size, depth)
+    )
+    shell = grid(middles, (0.0,), lambda: _room_walls(pitch, size, depth, height))
     middle, length = float(middles.mean()), pitch * len(middles)
     ends = tuple(block(BUILDING, 0.3, 2 * ROOMS_HALF_M, height, x) for x in (-length / 2, length / 2))
     wall = block(BUILDING, length, 0.3, height, y=-ROOMS_HALF_M - 0.15)
-    ceiling = block(BUILDING, length, 2 * ROOMS_HALF_M + 2 * deep + 2, 0.3, bottom=height)
-    spots = [*inside, *shell, Spot((*ends, wall, ceiling), middle, 0.0)]
+    ceiling = block(BUILDING, length, 2 * ROOMS_HALF_M + 2 * depth + 2, 0.3, bottom=height)
+    spots = [*equipment, *shell, Spot((*ends, wall, ceiling), middle, 0.0)]
     return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
-def _room_walls(pitch: float, size: float, deep: float, height: float) -> ObjectModel:
+def _room_walls(pitch: float, size: float, depth: float, height: float) -> ObjectModel:
     """Walls of a room with its door at x = 0, and the block between it and the next room."""
     front, between, jamb = ROOMS_HALF_M + WALL_M / 2, pitch - size, (size - ROOMS_DOOR_M) / 2
     outer = (ROOMS_DOOR_M + jamb) / 2
     return (
         *(block(BUILDING, jamb, WALL_M, height, x, front) for x in (-outer, outer)),
-        block(BUILDING, between, deep + WALL_M, height, pitch / 2, ROOMS_HALF_M + (deep + WALL_M) / 2),
-        block(BUILDING, pitch, 0.3, height, y=ROOMS_HALF_M + WALL_M + deep + 0.15),
+        block(BUILDING, between, depth + WALL_M, height, pitch / 2, ROOMS_HALF_M + (depth + WALL_M) / 2),
+        block(BUILDING, pitch, 0.3, height, y=ROOMS_HALF_M + WALL_M + depth + 0.15),
     )
 
 
-def _room_furniture(rng: np.random.Generator, size: float, deep: float) -> ObjectModel:
+def _room_furniture(rng: np.random.Generator, size: float, depth: float) -> ObjectModel:
     """Cupboards, desks and shelves along the walls of a room: two on each side and two at the back."""
     parts = []
     for low in (0.1, 0.5):
         for side in (-1, 1):
-            wide, thick, high = rng.uniform((0.5, 0.35, 0.6), (1.8, 0.8, 2.1)).tolist()
-            y = low * deep + wide / 2 + rng.uniform(0, 0.1) * deep
-            parts.append(block(OTHER_OBJECT, thick, wide, high, side * (size - thick) / 2, y))
-        wide, thick, high = rng.uniform((0.5, 0.35, 0.6), (1.6, 0.7, 2.1)).tolist()
+            width, thickness, height = rng.uniform((0.5, 0.35, 0.6), (1.8, 0.8, 2.1)).tolist()
+            y = low * depth + width / 2 + rng.uniform(0, 0.1) * depth
+            parts.append(block(OTHER_OBJECT, thickness, width, height, side * (size - thickness) / 2, y))
+        width, thickness, height = rng.uniform((0.5, 0.35, 0.6), (1.6, 0.7, 2.1)).tolist()
         x = (low - 0.3) * 2 * (size / 2 - 0.9) + rng.uniform(-0.4, 0.4)
-        parts.append(block(OTHER_OBJECT, wide, thick, high, x, deep - thick / 2))
+        parts.append(block(OTHER_OBJECT, width, thickness, height, x, depth - thickness / 2))
     return tuple(parts)
 
 
@@ -177,27 +179,29 @@ def _wing(rng: np.random.Generator, floor: Floor) -> list[Room]:
             length = floor.run_m / 2 - 2 * floor.half_m
             widths = rng.uniform(1, 2.2, int(rng.integers(2, 1 + max(2, round(length / 4)))))
             widths *= length / widths.sum()
-            for x, wide in zip(start + np.cumsum(widths) - widths / 2, widths.tolist(), strict=True):
+            for x, width in zip(start + np.cumsum(widths) - widths / 2, widths.tolist(), strict=True):
                 front = list(FRONTS)[rng.choice(len(FRONTS), p=list(FRONTS.values()))]
-                wing.append(Room(float(x), wide, side, front, _furniture(rng, wide, floor.deep_m)))
+                wing.append(Room(float(x), width, side, front, _furniture(rng, width, floor.deep_m)))
     wing[0] = wing[0]._replace(front="open")
     return wing
 
 
-def _furniture(rng: np.random.Generator, wide: float, deep: float) -> list[Primitive]:
+def _furniture(rng: np.random.Generator, width: float, depth: float) -> list[Primitive]:
     """Furniture along the walls, and a desk, in a room that begins at y = 0 with its door at x = 0."""
     parts = []
     for side in (-1, 1):
-        for low in np.arange(0.2, deep - 1.8, rng.uniform(1.6, 2.4)):
-            long, thick, high = rng.uniform((0.6, 0.35, 0.7), (1.5, 0.7, 2.1)).tolist()
+        for low in np.arange(0.2, depth - 1.8, rng.uniform(1.6, 2.4)):
+            length, thickness, height = rng.uniform((0.6, 0.35, 0.7), (1.5, 0.7, 2.1)).tolist()
             if rng.random() < 0.8:
-                y = float(low) + long / 2
-                parts.append(block(OTHER_OBJECT, thick, long, high, side * (wide - thick - 0.2) / 2, y))
-    long, thick, high = rng.uniform((0.8, 0.35, 0.7), (2.0, 0.7, 2.1)).tolist()
-    parts.append(block(OTHER_OBJECT, long, thick, high, rng.uniform(-0.3, 0.3) * (wide - long), deep - thick / 2))
-    if wide > 4.5:
-        x = float(rng.choice((-1, 1))) * wide / 4
-        parts.append(block(OTHER_OBJECT, 0.8, 1.6, 0.75, x, rng.uniform(0.4, 0.6) * deep))
+                y = float(low) + length / 2
+                parts.append(block(OTHER_OBJECT, thickness, length, height, side * (width - thickness - 0.2) / 2, y))
+    length, thickness, height = rng.uniform((0.8, 0.35, 0.7), (2.0, 0.7, 2.1)).tolist()
+    parts.append(
+        block(OTHER_OBJECT, length, thickness, height, rng.uniform(-0.3, 0.3) * (width - length), depth - thickness / 2)
+    )
+    if width > 4.5:
+        x = float(rng.choice((-1, 1))) * width / 4
+        parts.append(block(OTHER_OBJECT, 0.8, 1.6, 0.75, x, rng.uniform(0.4, 0.6) * depth))
     return parts
 
 
@@ -207,35 +211,35 @@ def _tour(floor: Floor, visited: list[Room], length_m: float, closed: bool) -> L
     for k, room in enumerate(visited):
         ahead = (1, -1)[k % 2]
         ends = [(0.0, 0.0), (floor.run_m, 0.0)][::ahead]
-        way = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + 2.5, ahead)
-        corners += [(x, y + k * floor.pitch_m) for x, y in (ends[0], *way, ends[1])]
+        visit = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + 2.5, ahead)
+        corners += [(x, y + k * floor.pitch_m) for x, y in (ends[0], *visit, ends[1])]
     return rounded(corners, corner_m=0.15, closed=closed, length_m=length_m)
 
 
 def _walls(floor: Floor, room: Room) -> ObjectModel:
     """Front, back and side walls of a room."""
-    wide, high, front, begin = room.wide_m, floor.height_m, floor.half_m + WALL_M / 2, floor.half_m + WALL_M
-    middle, aside = begin + floor.deep_m / 2, wide / 2 - WALL_M / 4
-    walls = [block(BUILDING, WALL_M / 2, floor.deep_m, high, side * aside, middle) for side in (-1, 1)]
-    walls.append(block(BUILDING, wide, WALL_M, high, y=begin + floor.deep_m + WALL_M / 2))
+    width, height, front, begin = room.wide_m, floor.height_m, floor.half_m + WALL_M / 2, floor.half_m + WALL_M
+    middle, aside = begin + floor.deep_m / 2, width / 2 - WALL_M / 4
+    walls = [block(BUILDING, WALL_M / 2, floor.deep_m, height, side * aside, middle) for side in (-1, 1)]
+    walls.append(block(BUILDING, width, WALL_M, height, y=begin + floor.deep_m + WALL_M / 2))
     if room.front == "hall":
-        return *walls, *(block(BUILDING, 0.4, 0.4, high, side * wide / 3, front + 0.2) for side in (-1, 1))
-    jamb, glass = (wide - FLOOR_DOOR_M) / 2, 0.7 if room.front == "glass" else 0.0
-    walls += [block(BUILDING, jamb, WALL_M, high, side * (wide - jamb) / 2, front, glass=glass) for side in (-1, 1)]
+        return *walls, *(block(BUILDING, 0.4, 0.4, height, side * width / 3, front + 0.2) for side in (-1, 1))
+    jamb, glass = (width - FLOOR_DOOR_M) / 2, 0.7 if room.front == "glass" else 0.0
+    walls += [block(BUILDING, jamb, WALL_M, height, side * (width - jamb) / 2, front, glass=glass) for side in (-1, 1)]
     if room.front == "closed":
-        walls.append(block(BUILDING, FLOOR_DOOR_M, 0.05, high, y=front + 0.08))
+        walls.append(block(BUILDING, FLOOR_DOOR_M, 0.05, height, y=front + 0.08))
     return tuple(walls)
 
 
 def _shell(floor: Floor, count: int) -> list[Spot]:
     """Outer walls and ceiling of the floor. The wall at x = 0 is partly glass."""
     low, high = -1.5 * floor.pitch_m, (count + 0.5) * floor.pitch_m
-    x, y, wide, half = floor.run_m / 2, (low + high) / 2, high - low, floor.half_m
-    long, away = floor.run_m + 2 * half, floor.run_m / 2 + half + WALL_M / 2
+    x, y, width, half = floor.run_m / 2, (low + high) / 2, high - low, floor.half_m
+    length, offset = floor.run_m + 2 * half, floor.run_m / 2 + half + WALL_M / 2
     walls = [
-        block(BUILDING, WALL_M, wide, floor.height_m, -away, glass=0.6),
-        block(BUILDING, WALL_M, wide, floor.height_m, away),
-        *(block(BUILDING, long, WALL_M, floor.height_m, y=side * wide / 2) for side in (-1, 1)),
+        block(BUILDING, WALL_M, width, floor.height_m, -offset, glass=0.6),
+        block(BUILDING, WALL_M, width, floor.height_m, offset),
+        *(block(BUILDING, length, WALL_M, floor.height_m, y=side * width / 2) for side in (-1, 1)),
     ]
-    ceiling = block(BUILDING, long, wide, 0.3, bottom=floor.height_m)
+    ceiling = block(BUILDING, length, width, 0.3, bottom=floor.height_m)
     return [Spot((part,), x, y) for part in (*walls, ceiling)]

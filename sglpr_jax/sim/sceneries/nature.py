@@ -19,18 +19,21 @@ BEND_M = 25.0  # distance between two bends of the path through the forest, in m
 
 
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Track through fields, with posts or poles along it, some bushes, and single trees and sheds far away."""
-    whole, driven = road(rng, length_m, closed)
-    (every, thick, high), beside = ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)], rng.choice((-1, 1)) * 5.0
-    posts = along(shifted(whole, beside), ((post(POLE, thick, high),), every))
-    bushes = _beside(rng, whole, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
+    """Track through fields, with posts or poles along it, some bushes, and single trees and sheds distant away."""
+    road_line, path = road(rng, length_m, closed)
+    (every, thickness, height), offset = (
+        ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)],
+        rng.choice((-1, 1)) * 5.0,
+    )
+    posts = along(shifted(road_line, offset), ((post(POLE, thickness, height),), every))
+    bushes = _beside(rng, road_line, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
 
     def tree_or_shed() -> ObjectModel:
         return garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
 
-    far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), tree_or_shed)
-    ground = track(whole, 1.5, rolling(rng))
-    return Site(driven, [*posts, *bushes, *far], ground)
+    distant = _beside(rng, road_line, rng.uniform(30, 80), (30.0, 75.0), tree_or_shed)
+    ground = track(road_line, 1.5, rolling(rng))
+    return Site(path, [*posts, *bushes, *distant], ground)
 
 
 def _beside(
@@ -38,18 +41,18 @@ def _beside(
 ) -> Iterator[Spot]:
     """Yields things at random positions beside a line, on average one per `every_m` metres."""
     for _ in range(round(len(line) * STEP_M / every_m)):
-        away = np.array([rng.uniform(*away_m) * rng.choice((-1, 1))])
+        offset = np.array([rng.uniform(*away_m) * rng.choice((-1, 1))])
         row = int(rng.integers(1, len(line) - 1))
-        x, y = shifted(line[row - 1 : row + 2], away)[1].tolist()
+        x, y = shifted(line[row - 1 : row + 2], offset)[1].tolist()
         yield Spot(make(), x, y, rng.uniform(0, 2 * np.pi))
 
 
 def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Trees of one stand on slopes, 250 to 900 a hectare, with a bush for every 3 to 30 trunks."""
     line = _path(rng, length_m, closed)
-    density, thick = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
+    density, thickness = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
     branches, shrubs = rng.uniform(3.0, 7.0), 1 / rng.uniform(3, 30)
-    spots = [Spot(_tree(rng, thick, branches), x, y) for x, y in _scattered(rng, line, density)]
+    spots = [Spot(_tree(rng, thickness, branches), x, y) for x, y in _scattered(rng, line, density)]
     for x, y in _scattered(rng, line, shrubs * density):
         spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
     relief = draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))
@@ -74,14 +77,14 @@ def _scattered(rng: np.random.Generator, line: Line, density: float) -> list[tup
     low, high = line.min(axis=0) - WIDE_M, line.max(axis=0) + WIDE_M
     points = rng.uniform(low, high, (round(density * np.prod(high - low)), 2))
     coarse = line[:: round(1 / STEP_M)]
-    near = [np.linalg.norm(coarse - point, axis=1).min() < WIDE_M for point in points]
-    return [(float(x), float(y)) for x, y in points[near]]
+    is_near = [np.linalg.norm(coarse - point, axis=1).min() < WIDE_M for point in points]
+    return [(float(x), float(y)) for x, y in points[is_near]]
 
 
-def _tree(rng: np.random.Generator, thick: float, branches: float) -> ObjectModel:
+def _tree(rng: np.random.Generator, thickness: float, branches: float) -> ObjectModel:
     """Trunk, and a crown that begins at about `branches` metres. The thickness has a log-normal distribution."""
-    thick = float(thick * np.exp(rng.normal(scale=0.35)))
-    wide, bottom = 10 * thick * rng.uniform(0.7, 1.3), branches * rng.uniform(0.7, 1.3)
-    high = wide * rng.uniform(1.2, 2.0)
-    leaves = ball(VEGETATION, wide, high, bottom=bottom, roughness=0.8, porosity=0.6)
-    return post(TRUNK, thick, bottom + 0.4 * high), leaves
+    thickness = float(thickness * np.exp(rng.normal(scale=0.35)))
+    width, bottom = 10 * thickness * rng.uniform(0.7, 1.3), branches * rng.uniform(0.7, 1.3)
+    height = width * rng.uniform(1.2, 2.0)
+    leaves = ball(VEGETATION, width, height, bottom=bottom, roughness=0.8, porosity=0.6)
+    return post(TRUNK, thickness, bottom + 0.4 * height), leaves

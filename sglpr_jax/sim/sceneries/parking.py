@@ -28,32 +28,38 @@ WIDE_M, RAMP_M = 17.5, 12.0  # distance between a storey's aisles, and from the 
 
 def car_park(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Equal aisles, 22 to 28 m apart, with parked cars on both sides and lamps between the aisles."""
-    pitch, stall, full = rng.uniform(22, 28), rng.uniform(2.5, 2.8), rng.uniform(0.8, 0.92)
+    pitch, stall, occupancy = rng.uniform(22, 28), rng.uniform(2.5, 2.8), rng.uniform(0.8, 0.92)
     plan = rows(length_m, run_m=rng.uniform(60, 100), pitch_m=pitch, closed=closed, back_m=7.0, corner_m=2.5)
     aisles = pitch * np.arange(-2, plan.count + 2)  # two more than driven on each side
-    stalls, away = np.arange(6.0, plan.run_m - 6.0, stall), rng.uniform(5.8, 6.5)
-    cars = on_both_sides(stalls, aisles, away, lambda: parked(rng), np.pi / 2)
+    stalls, stall_offset = np.arange(6.0, plan.run_m - 6.0, stall), rng.uniform(5.8, 6.5)
+    cars = on_both_sides(stalls, aisles, stall_offset, lambda: parked(rng), np.pi / 2)
     xs = np.arange(6.0, plan.run_m, rng.uniform(20, 30))
     lamps = grid(xs, aisles + pitch / 2, lambda: (post(POLE, 0.25, 7.0),))
-    return Site(plan.line, [*jittered(rng, cars, 0.15, keep=full), *lamps], painted_ground(PARKING))
+    return Site(plan.line, [*jittered(rng, cars, 0.15, keep=occupancy), *lamps], painted_ground(PARKING))
 
 
 def garage(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Floors side by side, hidden from each other by walls. Rows 0, 2, 4, ... are floors, the others ramps."""
-    run, height, full = rng.uniform(30, 40), rng.uniform(2.4, 3.0), rng.uniform(0.75, 0.92)
+    run, height, occupancy = rng.uniform(30, 40), rng.uniform(2.4, 3.0), rng.uniform(0.75, 0.92)
     plan = rows(length_m, run_m=run, pitch_m=PITCH_M, closed=closed, back_m=9.0, corner_m=1.5)
     aisles = PITCH_M * np.arange(0, plan.count, 2)
-    spots = _floor(rng, plan.run_m, aisles, stall=rng.uniform(2.5, 2.7), height=height, full=full)
+    spots = _floor(rng, plan.run_m, aisles, stall=rng.uniform(2.5, 2.7), height=height, occupancy=occupancy)
     spots.append(Spot(_shell(plan.count, plan.run_m, height, closed), 0.0, 0.0))
     return Site(plan.line, spots, painted_ground(PARKING))
 
 
 def _floor(
-    rng: np.random.Generator, run_m: float, aisles: Float[np.ndarray, " _"], *, stall: float, height: float, full: float
+    rng: np.random.Generator,
+    run_m: float,
+    aisles: Float[np.ndarray, " _"],
+    *,
+    stall: float,
+    height: float,
+    occupancy: float,
 ) -> list[Spot]:
     """Parked cars and pillars along the aisles of one floor."""
     xs, pillar = np.arange(TURN_M, run_m - TURN_M, stall), (block(BUILDING, 0.4, 0.6, height),)
-    cars = jittered(rng, on_both_sides(xs, aisles, CAR_M, lambda: car(rng), np.pi / 2), 0.12, keep=full)
+    cars = jittered(rng, on_both_sides(xs, aisles, CAR_M, lambda: car(rng), np.pi / 2), 0.12, keep=occupancy)
     return cars + grid(xs[::3] - stall / 2, np.concatenate([aisles - PILLAR_M, aisles + PILLAR_M]), lambda: pillar)
 
 
@@ -77,9 +83,9 @@ def storeys(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
     The path laps each storey once on its way up, a closed one the lowest twice, for up to twice `length_m`.
     """
-    run, rise, stall, full = rng.uniform((34, 3.0, 2.5, 0.7), (44, 3.6, 2.7, 0.9)).tolist()
+    run, rise, stall, occupancy = rng.uniform((34, 3.0, 2.5, 0.7), (44, 3.6, 2.7, 0.9)).tolist()
     lap_m = 2 * (run + WIDE_M + RAMP_M)
-    fewest, most = (int(np.clip(np.ceil(far / lap_m), 3, 6)) for far in (length_m, 2 * length_m))
+    fewest, most = (int(np.clip(np.ceil(metres / lap_m), 3, 6)) for metres in (length_m, 2 * length_m))
     count, height = int(rng.integers(fewest, most + 1)), rise - 0.3
     inner = WIDE_M + HALF_M
     between = wall((TURN_M, inner), (run - TURN_M, inner), height)  # storey and ramp, open at both ends
@@ -87,7 +93,7 @@ def storeys(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     shell = *outer, between, ceiling
     spots, pitch = [], 45.0
     for y in pitch * np.arange(count):
-        spots += _floor(rng, run, np.array([y, y + WIDE_M]), stall=stall, height=height, full=full)
+        spots += _floor(rng, run, np.array([y, y + WIDE_M]), stall=stall, height=height, occupancy=occupancy)
         spots.append(Spot(shell, 0.0, float(y)))
     lap = [(0.0, WIDE_M), (0.0, 0.0), (run, 0.0), (run, WIDE_M)]
     ramp = [(run, WIDE_M + RAMP_M), (0.0, WIDE_M + RAMP_M)]

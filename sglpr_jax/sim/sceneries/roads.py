@@ -28,32 +28,32 @@ THICK_M = 2.0
 
 def walls(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Road between two walls without features."""
-    whole, driven = road(rng, length_m, closed)
+    road_line, path = road(rng, length_m, closed)
     left, right, height = rng.uniform(3.5, 8), rng.uniform(3, 7), rng.uniform(1.8, 4)
     pair = tuple(block(FENCE, OVERLAP * 4.0, 0.4, height, y=y, roughness=0.02) for y in (left + 0.2, -right - 0.2))
-    return Site(driven, along(whole, (pair, 4.0)), painted_ground(ROAD))
+    return Site(path, along(road_line, (pair, 4.0)), painted_ground(ROAD))
 
 
 def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Tunnel of equal pieces of length TUNNEL_M with lamps. Every n-th piece has an emergency niche on the right."""
-    whole, driven = road(rng, length_m, closed)
+    road_line, path = road(rng, length_m, closed)
     half, height, every = rng.uniform(3.8, 5.5), rng.uniform(4.8, 6.5), int(rng.integers(7, 16))
-    pieces = along(whole, (_tube(half, height, 0.0), TUNNEL_M))
-    pieces[::every] = along(whole, (_tube(half, height, NICHE_M), every * TUNNEL_M))
+    pieces = along(road_line, (_tube(half, height, 0.0), TUNNEL_M))
+    pieces[::every] = along(road_line, (_tube(half, height, NICHE_M), every * TUNNEL_M))
     lamp = (block(OTHER_OBJECT, 1.2, 0.4, 0.25, y=rng.choice((0.0, half - 1)), bottom=height - 0.3),)
-    return Site(driven, [*pieces, *along(whole, (lamp, rng.uniform(8, 14)))], painted_ground(ROAD))
+    return Site(path, [*pieces, *along(road_line, (lamp, rng.uniform(8, 14)))], painted_ground(ROAD))
 
 
 def _tube(half: float, height: float, niche: float) -> ObjectModel:
-    long, away = OVERLAP * TUNNEL_M, half + THICK_M / 2
-    wall = block(BUILDING, long, THICK_M, height + 0.5, y=away, roughness=0.02)
-    ceiling = block(BUILDING, long, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
-    return wall, wall._replace(y=-away - niche), ceiling
+    length, offset = OVERLAP * TUNNEL_M, half + THICK_M / 2
+    wall = block(BUILDING, length, THICK_M, height + 0.5, y=offset, roughness=0.02)
+    ceiling = block(BUILDING, length, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
+    return wall, wall._replace(y=-offset - niche), ceiling
 
 
 def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Deck that rays beyond it do not hit, with railings, lamps and pylons, half of the time with hangers."""
-    whole, driven = road(rng, length_m, closed)
+    road_line, path = road(rng, length_m, closed)
     half, rail, hang, lit, span = rng.uniform((5, 0.9, 8, 25, 120), (8, 1.3, 15, 45, 260)).tolist()
     bars = [block(FENCE, OVERLAP * 2.0, 0.06, 0.08, y=half, bottom=z * rail) for z in (0.5, 0.95)]
     kerb = block(FENCE, OVERLAP * 2.0, 0.3, 0.25, y=half)
@@ -64,14 +64,17 @@ def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     things.append((mirrored(lamp) if rng.random() < 0.5 else (lamp,), lit))
     legs = mirrored(block(BUILDING, 2.5, 2.0, 30.0, y=half + 1.8))
     things.append(((*legs, block(BUILDING, 1.5, 2 * half + 2, 2.0, bottom=6.5)), span))
-    lines = [Strip(whole, 0.0, 0.2, LANE_MARKING, 4.0), *(Strip(whole, y, y + 0.2, LANE_MARKING) for y in (-3.6, 3.4))]
-    deck = Strip(whole, -half - 0.3, half + 0.3, ROAD)
-    return Site(driven, along(whole, *things), painted_ground(NO_RETURN, [deck, *lines]))
+    lines = [
+        Strip(road_line, 0.0, 0.2, LANE_MARKING, 4.0),
+        *(Strip(road_line, y, y + 0.2, LANE_MARKING) for y in (-3.6, 3.4)),
+    ]
+    deck = Strip(road_line, -half - 0.3, half + 0.3, ROAD)
+    return Site(path, along(road_line, *things), painted_ground(NO_RETURN, [deck, *lines]))
 
 
 def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Four lanes between rails with posts, walls of equal panels, lamps and gantries. Slopes are at most 1.5 %."""
-    whole, driven = road(rng, length_m, closed)
+    road_line, path = road(rng, length_m, closed)
     rail, wall, panel = rng.uniform(8, 9.5), rng.uniform(11, 17), rng.uniform(4, 5)
     fence = mirrored(
         block(FENCE, OVERLAP * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1)
@@ -81,11 +84,11 @@ def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     lamps = mirrored(post(POLE, 0.2, 9.0, y=rail + 1))
     gantry = (*mirrored(post(POLE, 0.4, 6.5, y=rail + 0.8)), block(TRAFFIC_SIGN, 0.4, 2 * rail + 2, 1.5, bottom=5.5))
     lamps_m, gantries_m = rng.uniform(30, 60), rng.uniform(120, 250)
-    spots = along(whole, (fence, panel), (rails, 4.0), (lamps, lamps_m), (gantry, gantries_m))
-    lines = [Strip(whole, y, y + 0.2, LANE_MARKING, 4.0) for y in (-LANE_M, 0.0, LANE_M)]
-    edges = [Strip(whole, y, y + 0.2, LANE_MARKING) for y in (-2 * LANE_M, 2 * LANE_M)]
-    ground = painted_ground(TERRAIN, [Strip(whole, -rail, rail, ROAD), *lines, *edges], rolling(rng))
-    return Site(driven, [*spots, *_traffic(rng, whole, 1), *_traffic(rng, whole, -1)], ground)
+    spots = along(road_line, (fence, panel), (rails, 4.0), (lamps, lamps_m), (gantry, gantries_m))
+    lines = [Strip(road_line, y, y + 0.2, LANE_MARKING, 4.0) for y in (-LANE_M, 0.0, LANE_M)]
+    edges = [Strip(road_line, y, y + 0.2, LANE_MARKING) for y in (-2 * LANE_M, 2 * LANE_M)]
+    ground = painted_ground(TERRAIN, [Strip(road_line, -rail, rail, ROAD), *lines, *edges], rolling(rng))
+    return Site(path, [*spots, *_traffic(rng, road_line, 1), *_traffic(rng, road_line, -1)], ground)
 
 
 def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]:

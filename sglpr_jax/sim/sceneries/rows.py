@@ -29,8 +29,8 @@ def orchard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
 
     def fruit_tree() -> ObjectModel:
-        wide, high = crown * rng.uniform(0.9, 1.1), crown * rng.uniform(1.0, 1.3)
-        leaves = ball(VEGETATION, wide, high, bottom=0.8, roughness=0.5, porosity=0.5)
+        width, height = crown * rng.uniform(0.9, 1.1), crown * rng.uniform(1.0, 1.3)
+        leaves = ball(VEGETATION, width, height, bottom=0.8, roughness=0.5, porosity=0.5)
         return post(TRUNK, rng.uniform(0.12, 0.2), 1.8), leaves
 
     trees = grid(np.arange(FREE_M, plan.run_m - FREE_M, spacing), across, fruit_tree)
@@ -40,13 +40,13 @@ def orchard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 def vineyard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Rows of vines 2.8 to 3.4 m apart, with a post every 4 to 6 m."""
-    pitch, every, high, thick = rng.uniform((2.8, 4, 1.6, 0.35), (3.4, 6, 2.2, 0.6)).tolist()
+    pitch, every, height, thickness = rng.uniform((2.8, 4, 1.6, 0.35), (3.4, 6, 2.2, 0.6)).tolist()
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
 
     def vines() -> ObjectModel:  # leaves between two posts, and the first post
-        top, wide = high * rng.uniform(0.9, 1.05), thick * rng.uniform(0.8, 1.2)
-        leaves = block(VEGETATION, every, wide, top - 0.6, bottom=0.6, roughness=0.2, porosity=rng.uniform(0.3, 0.6))
-        return leaves, post(POLE, 0.1, high + 0.15, -every / 2)
+        top, width = height * rng.uniform(0.9, 1.05), thickness * rng.uniform(0.8, 1.2)
+        leaves = block(VEGETATION, every, width, top - 0.6, bottom=0.6, roughness=0.2, porosity=rng.uniform(0.3, 0.6))
+        return leaves, post(POLE, 0.1, height + 0.15, -every / 2)
 
     middles = np.arange(FREE_M, plan.run_m - FREE_M - every, every) + every / 2
     return Site(plan.line, grid(middles, across, vines), track(plan.line, 1.2, rolling(rng)))
@@ -54,56 +54,63 @@ def vineyard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 def solar(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Rows of equal panels 7 to 10 m apart. The panels are 8 to 16 m long and tilted by 15 to 30 degrees."""
-    pitch, long, deep, tilt, low = rng.uniform((7, 8, 2.2, 15, 0.6), (10, 16, 3.8, 30, 1.0)).tolist()
+    pitch, length, depth, tilt, low = rng.uniform((7, 8, 2.2, 15, 0.6), (10, 16, 3.8, 30, 1.0)).tolist()
     plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(80, 130))
-    wide, step = (of(np.radians(tilt)) * deep / 8 for of in (np.cos, np.sin))
-    places = ((np.arange(8) - 3.5) * wide).tolist()  # of eight level slats, because shapes have no tilt
-    slats = [block(OTHER_OBJECT, long, wide, step + 0.02, y=y, bottom=low + k * step) for k, y in enumerate(places)]
-    xs = np.linspace(-long / 2 + 1, long / 2 - 1, 4).tolist()
+    width, step = (of(np.radians(tilt)) * depth / 8 for of in (np.cos, np.sin))
+    places = ((np.arange(8) - 3.5) * width).tolist()  # of eight level slats, because shapes have no tilt
+    slats = [block(OTHER_OBJECT, length, width, step + 0.02, y=y, bottom=low + k * step) for k, y in enumerate(places)]
+    xs = np.linspace(-length / 2 + 1, length / 2 - 1, 4).tolist()
     panel = *slats, *(post(POLE, 0.12, low + k * step, x, places[k]) for k in (1, 6) for x in xs)
-    panels = grid(np.arange(FREE_M + long / 2, plan.run_m - FREE_M - long / 2, long + 0.4), across, lambda: panel)
+    panels = grid(np.arange(FREE_M + length / 2, plan.run_m - FREE_M - length / 2, length + 0.4), across, lambda: panel)
     return Site(plan.line, panels, track(plan.line, 1.5, rolling(rng)))
 
 
 def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Aisles 5 to 6 m apart, between shelves with three levels that are 85 to 95 % full."""
-    pitch, aisle, bay, full = rng.uniform(5, 6), rng.uniform(2.6, 3.0), rng.uniform(2.4, 3.0), rng.uniform(0.85, 0.95)
+    pitch, aisle, bay, occupancy = (
+        rng.uniform(5, 6),
+        rng.uniform(2.6, 3.0),
+        rng.uniform(2.4, 3.0),
+        rng.uniform(0.85, 0.95),
+    )
     plan = rows(length_m, run_m=rng.uniform(25, 40), pitch_m=pitch, closed=closed, back_m=2.5, corner_m=0.6)
     lanes = pitch * np.arange(-1, plan.count + 2)
     bays = np.arange(2.5, plan.run_m - 2.5 - bay, bay) + bay / 2
-    spots = grid(bays, lanes - pitch / 2, lambda: _shelf(rng, bay, pitch - aisle, full))
+    spots = grid(bays, lanes - pitch / 2, lambda: _shelf(rng, bay, pitch - aisle, occupancy))
     low, high, height = lanes[0] - pitch / 2, lanes[-1] - pitch / 2, rng.uniform(6, 9)
-    x, y, long, wide = plan.run_m / 2, (low + high) / 2, plan.run_m + 14.0, high - low + 6.0
-    walls = [block(BUILDING, long, 0.4, height, y=side * wide / 2) for side in (-1, 1)]
-    walls += [block(BUILDING, 0.4, wide, height, x=side * long / 2) for side in (-1, 1)]
-    ceiling = block(BUILDING, long, wide, 0.4, bottom=height)
+    x, y, length, width = plan.run_m / 2, (low + high) / 2, plan.run_m + 14.0, high - low + 6.0
+    walls = [block(BUILDING, length, 0.4, height, y=side * width / 2) for side in (-1, 1)]
+    walls += [block(BUILDING, 0.4, width, height, x=side * length / 2) for side in (-1, 1)]
+    ceiling = block(BUILDING, length, width, 0.4, bottom=height)
     return Site(plan.line, [*spots, Spot((*walls, ceiling), x, y)], painted_ground(OTHER_GROUND))
 
 
-def _shelf(rng: np.random.Generator, bay: float, deep: float, full: float) -> ObjectModel:
+def _shelf(rng: np.random.Generator, bay: float, depth: float, occupancy: float) -> ObjectModel:
     """One bay of a double shelf: a frame, two boards, and pallets on three levels on both sides."""
-    parts = [block(POLE, 0.12, 0.12, 3.4 * LEVEL_M, -bay / 2, side * (deep / 2 - 0.06)) for side in (-1, 1)]
-    parts += [block(OTHER_OBJECT, bay, deep, 0.14, bottom=level * LEVEL_M) for level in (1, 2)]
+    parts = [block(POLE, 0.12, 0.12, 3.4 * LEVEL_M, -bay / 2, side * (depth / 2 - 0.06)) for side in (-1, 1)]
+    parts += [block(OTHER_OBJECT, bay, depth, 0.14, bottom=level * LEVEL_M) for level in (1, 2)]
     for level in range(3):
         for side in (-1, 1):
-            wide, thick, high = rng.uniform((0.75 * bay, 0.38 * deep, 0.8), (0.92 * bay, 0.46 * deep, 1.45)).tolist()
-            if rng.random() < full:
-                y = side * (deep / 2 - thick / 2 - rng.uniform(0, 0.1))
-                parts.append(block(OTHER_OBJECT, wide, thick, high, y=y, bottom=level * LEVEL_M + 0.14))
+            width, thickness, height = rng.uniform(
+                (0.75 * bay, 0.38 * depth, 0.8), (0.92 * bay, 0.46 * depth, 1.45)
+            ).tolist()
+            if rng.random() < occupancy:
+                y = side * (depth / 2 - thickness / 2 - rng.uniform(0, 0.1))
+                parts.append(block(OTHER_OBJECT, width, thickness, height, y=y, bottom=level * LEVEL_M + 0.14))
     return tuple(parts)
 
 
 def terminal(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Blocks five or six containers wide, with stacks of one to five containers, between lanes along x and along y."""
-    wide, long, run = int(rng.integers(5, 7)), float(rng.choice((6.06, 12.19))), rng.uniform(95, 125)
-    across, high, gap = 2.44, 2.59, 0.35  # of a container, in metres
-    pitch, bay = wide * (across + gap) + LANE_M, long + gap
+    width, length, run = int(rng.integers(5, 7)), float(rng.choice((6.06, 12.19))), rng.uniform(95, 125)
+    across, height, gap = 2.44, 2.59, 0.35  # of a container, in metres
+    pitch, bay = width * (across + gap) + LANE_M, length + gap
     plan = rows(length_m, run_m=run, pitch_m=pitch, closed=closed, back_m=LANE_M / 2, corner_m=2.5)
     lanes = pitch * np.arange(-2, plan.count + 1)
-    first, each = np.linspace(0, plan.run_m, 1 + max(1, round(plan.run_m / 55.0)), retstep=True)
-    middles = (np.arange((each - LANE_M) // bay) + 0.5) * bay
+    first, block_pitch = np.linspace(0, plan.run_m, 1 + max(1, round(plan.run_m / 55.0)), retstep=True)
+    middles = (np.arange((block_pitch - LANE_M) // bay) + 0.5) * bay
     xs = (first[:-1, None] + LANE_M / 2 + middles).ravel()
-    ys = (lanes[:, None] + LANE_M / 2 + (np.arange(wide) + 0.5) * (across + gap)).ravel()
-    stacks = grid(xs, ys, lambda: (block(OTHER_OBJECT, long, across, high * int(rng.integers(1, 6))),))
+    ys = (lanes[:, None] + LANE_M / 2 + (np.arange(width) + 0.5) * (across + gap)).ravel()
+    stacks = grid(xs, ys, lambda: (block(OTHER_OBJECT, length, across, height * int(rng.integers(1, 6))),))
     masts = grid(first[:-1] + LANE_M / 2 - 1.0, lanes + LANE_M / 2 + 0.5, lambda: (post(POLE, 0.5, 20.0),))
     return Site(plan.line, [*jittered(rng, stacks, 0.04), *masts], painted_ground(PARKING))

@@ -85,12 +85,12 @@ def mirrored(*parts: Primitive) -> ObjectModel:
 
 def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep: float = 1.0) -> list[Spot]:
     """Keeps the fraction `keep` of the spots, shifts them by about `metres`, and turns them by up to 3 degrees."""
-    kept = [spot for spot in spots if rng.random() < keep]
-    moves = rng.normal(scale=metres, size=(len(kept), 2)).tolist()
-    turns = np.radians(rng.uniform(-3, 3, len(kept))).tolist()
+    spots = [spot for spot in spots if rng.random() < keep]
+    moves = rng.normal(scale=metres, size=(len(spots), 2)).tolist()
+    turns = np.radians(rng.uniform(-3, 3, len(spots))).tolist()
     return [
         spot._replace(x=spot.x + dx, y=spot.y + dy, heading=spot.heading + turn)
-        for spot, (dx, dy), turn in zip(kept, moves, turns, strict=True)
+        for spot, (dx, dy), turn in zip(spots, moves, turns, strict=True)
     ]
 
 
@@ -123,8 +123,8 @@ def track(line: Line, half_m: float, relief: Relief) -> Ground:
 
 def wall(start: tuple[float, float], stop: tuple[float, float], height_m: float) -> Primitive:
     """Wall of a building along x or y."""
-    long, wide = (abs(b - a) + WALL_M for a, b in zip(start, stop, strict=True))
-    return block(BUILDING, long, wide, height_m, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)
+    length, width = (abs(b - a) + WALL_M for a, b in zip(start, stop, strict=True))
+    return block(BUILDING, length, width, height_m, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)
 
 
 def closed_box(left: float, right: float, low: float, high: float, height_m: float) -> ObjectModel:
@@ -139,9 +139,9 @@ def build(site: Site, driven: Line, *, clearance_m: float) -> World:
     """Builds the world of a site without standing things closer than `clearance_m` to the driven line."""
     placed = place(site.spots, site.ground)
     driven = driven if site.levels is None else site.levels.along(driven)[0]
-    low = np.array([part.bottom < HEAD_ROOM_M for part in placed.parts]) & ~placed.shapes.velocity.any(axis=1)
-    bad = low & (distances(placed.shapes, driven, reach_m=clearance_m) < clearance_m)
-    scene = to_scene(placed, ~np.isin(placed.owner, placed.owner[bad]))
+    is_low = np.array([part.bottom < HEAD_ROOM_M for part in placed.parts]) & ~placed.shapes.velocity.any(axis=1)
+    is_close = is_low & (distances(placed.shapes, driven, reach_m=clearance_m) < clearance_m)
+    scene = to_scene(placed, ~np.isin(placed.owner, placed.owner[is_close]))
     return World(scene, site.ground, site.levels)
 
 
@@ -188,22 +188,23 @@ def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m:
     else:
         count = int(np.ceil(length_m / (run_m + pitch_m))) + 1
     ends = [(x, k * pitch_m) for k in range(count) for x in ((0.0, run_m), (run_m, 0.0))[k % 2]]
-    back = [(-back_m, ends[-1][1]), (-back_m, 0.0)] * closed
-    return Rows(rounded([*ends, *back], corner_m=corner_m, closed=closed, length_m=length_m), count, run_m)
+    return_path = [(-back_m, ends[-1][1]), (-back_m, 0.0)] * closed
+    return Rows(rounded([*ends, *return_path], corner_m=corner_m, closed=closed, length_m=length_m), count, run_m)
 
 
-def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
-    """Path of a vehicle `right_m` metres to the right of `line`, with a sway of up to `sway_m` metres.
+def driven_line(rng: np.random.Generator, site: Site, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
+    """Path of a vehicle `right_m` metres to the right of a site's line, with a sway of up to `sway_m` metres.
 
     Revisits are on the way back ("opposite"), or in LAPS laps of a closed line ("same").
     """
-    if revisit == "same":
+    line = site.line
+    if revisit == "same" and not site.returns:
         line = np.concatenate([line, line[: round((LAPS - 1) * len(line))]])
-    out = shifted(line, -right_m)
+    path = shifted(line, -right_m)
     if revisit == "opposite":  # a half circle to the left around the end of the line, and back
         ahead = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
         angle = np.linspace(-np.pi / 2, np.pi / 2, 2 + round(np.pi * right_m / STEP_M))[1:-1, None]
         turn = line[-1] + right_m * (np.cos(angle) * ahead + np.sin(angle) * np.array([-ahead[1], ahead[0]]))
-        out = np.concatenate([out, turn, shifted(line[::-1], -right_m)])
-    out = resampled(out, STEP_M)
-    return resampled(shifted(out, sway_m * waves(rng, travelled(out), (15.0, 60.0))), STEP_M)
+        path = np.concatenate([path, turn, shifted(line[::-1], -right_m)])
+    path = resampled(path, STEP_M)
+    return resampled(shifted(path, sway_m * waves(rng, travelled(path), (15.0, 60.0))), STEP_M)

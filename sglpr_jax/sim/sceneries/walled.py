@@ -32,8 +32,8 @@ def _places(
     walls = [wall((0.0, side * half), (ends, side * half), height_m) for side in (-1, 1)]
     walls += [wall((x, -half), (x, half), height_m) for x in (0.0, ends)]
     for k, y in enumerate(gates, 1):
-        beside = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
-        walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in beside]
+        wall_parts = (-half, y - GATE_M / 2), (y + GATE_M / 2, half)
+        walls += [wall((k * long_m, low), (k * long_m, high), height_m) for low, high in wall_parts]
     return line, tuple(walls), len(gates) + 1
 
 
@@ -59,28 +59,28 @@ def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_
 
 def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Yards of 15 to 24 m with equal walls and different things, joined by gates. A closed path stays in one yard."""
-    long, wide, height = rng.uniform((15, 15, 3), (24, 24, 8)).tolist()
-    line, walls, count = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
+    long, width, height = rng.uniform((15, 15, 3), (24, 24, 8)).tolist()
+    line, walls, count = _places(rng, length_m, closed, long_m=long, wide_m=width, height_m=height)
     spots = [Spot(walls, 0.0, 0.0)]
     for k in range(count):
         spots += [
-            Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in _anywhere(rng, long, wide, 22.0, 1.0)
+            Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in _anywhere(rng, long, width, 22.0, 1.0)
         ]
         for side in (-1, 1):  # sheds, stairs and ducts at the two walls along x
             for place in rng.uniform(2.0, long - 2.0, int(rng.integers(1, 4))).tolist():
-                length, deep, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
-                annex = (block(OTHER_OBJECT, length, deep, high),)
-                spots.append(Spot(annex, k * long + place, side * (wide - deep - 0.3) / 2))
+                length, depth, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
+                annex = (block(OTHER_OBJECT, length, depth, high),)
+                spots.append(Spot(annex, k * long + place, side * (width - depth - 0.3) / 2))
     return Site(line, spots, painted_ground(PARKING))
 
 
 def _lumber(rng: np.random.Generator) -> ObjectModel:
     """Crate, bin, barrel, pole, plant or vehicle."""
-    long, wide, high = rng.uniform((0.4, 0.4, 0.6), (1.8, 1.4, 2.6)).tolist()
+    length, width, height = rng.uniform((0.4, 0.4, 0.6), (1.8, 1.4, 2.6)).tolist()
     kinds = (
-        lambda: (block(OTHER_OBJECT, long, wide, high),),
-        lambda: (post(OTHER_OBJECT, wide, 0.6 * high),),
-        lambda: (post(POLE, 0.12, 2 * high),),
+        lambda: (block(OTHER_OBJECT, length, width, height),),
+        lambda: (post(OTHER_OBJECT, width, 0.6 * height),),
+        lambda: (post(POLE, 0.12, 2 * height),),
         lambda: tree(rng, (1.5, 3.5)) if rng.random() < 0.4 else bush(rng, 0.7),
         lambda: car(rng),
         lambda: bicycle(rng),
@@ -90,16 +90,16 @@ def _lumber(rng: np.random.Generator) -> ObjectModel:
 
 def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Halls of 30 to 60 m with equal walls and columns and different things. A closed path stays in one."""
-    long, wide, height, span = rng.uniform((30, 30, 5, 6), (60, 45, 9, 10)).tolist()
-    line, walls, count = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
-    column, along = (block(POLE, 0.4, 0.4, height),), count * long
-    columns = grid(np.arange(span / 2, along, span), np.arange((span - wide) / 2, wide / 2, span), lambda: column)
-    ceiling = block(BUILDING, along, wide, 0.3, along / 2, bottom=height, roughness=0.02)
+    length, width, height, span = rng.uniform((30, 30, 5, 6), (60, 45, 9, 10)).tolist()
+    line, walls, count = _places(rng, length_m, closed, long_m=length, wide_m=width, height_m=height)
+    column, along = (block(POLE, 0.4, 0.4, height),), count * length
+    columns = grid(np.arange(span / 2, along, span), np.arange((span - width) / 2, width / 2, span), lambda: column)
+    ceiling = block(BUILDING, along, width, 0.3, along / 2, bottom=height, roughness=0.02)
     spots = [Spot((*walls, ceiling), 0.0, 0.0), *columns]
     for k in range(count):
-        for x, y, heading in _anywhere(rng, long, wide, 40.0, 2.5):
+        for x, y, heading in _anywhere(rng, length, width, 40.0, 2.5):
             turned = heading if rng.random() < 0.3 else round(2 * heading / np.pi) * np.pi / 2
-            spots.append(Spot(_machine(rng), x + k * long, y, turned))
+            spots.append(Spot(_machine(rng), x + k * length, y, turned))
     return Site(line, spots, painted_ground(OTHER_GROUND))
 
 
@@ -107,13 +107,13 @@ def _machine(rng: np.random.Generator) -> ObjectModel:
     """Machine, shelf or stack of crates."""
     match rng.integers(3):
         case 0:
-            long, wide, high = rng.uniform((1.5, 1.0, 1.0), (5.0, 2.5, 2.2)).tolist()
-            x, tower = rng.uniform(-0.3, 0.3) * long, rng.uniform(0.3, 1.5)
-            body = block(OTHER_OBJECT, long, wide, high)
-            return body, block(OTHER_OBJECT, 0.35 * long, 0.7 * wide, tower, x, bottom=high)
+            length, width, height = rng.uniform((1.5, 1.0, 1.0), (5.0, 2.5, 2.2)).tolist()
+            x, tower = rng.uniform(-0.3, 0.3) * length, rng.uniform(0.3, 1.5)
+            body = block(OTHER_OBJECT, length, width, height)
+            return body, block(OTHER_OBJECT, 0.35 * length, 0.7 * width, tower, x, bottom=height)
         case 1:
-            long, wide, high = rng.uniform((2.0, 0.5, 1.8), (6.0, 1.1, 4.0)).tolist()
-            return (block(OTHER_OBJECT, long, wide, high, roughness=0.15, porosity=0.25),)
+            length, width, height = rng.uniform((2.0, 0.5, 1.8), (6.0, 1.1, 4.0)).tolist()
+            return (block(OTHER_OBJECT, length, width, height, roughness=0.15, porosity=0.25),)
         case _:
             size = rng.uniform(0.6, 1.3, 3)
             return tuple(

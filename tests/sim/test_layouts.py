@@ -1,17 +1,10 @@
-"""Varied scans: what is left of each, with its labels, levelled and turned; and the images that are made of them."""
-
-import dataclasses
+"""Varied scans: what is left of each, with its labels, levelled and turned."""
 
 import numpy as np
 import pytest
 
-from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.readers import open_recording
-from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.layouts import vary
-from sglpr_jax.sim.recording import simulate_recording
-from sglpr_jax.sim.sensor import HDL64E
 
 SCANS = 300
 
@@ -56,16 +49,3 @@ def test_the_scan_alone_decides_and_it_is_levelled_before_it_is_turned(varied):
     np.testing.assert_array_equal(same, labels)
     lifted, _ = vary(points, np.arange(len(points)), Mounting(height_m=0.73))
     np.testing.assert_allclose(lifted[:, 2], turned[:, 2] - 1.0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_images_are_those_of_varied_scans(tmp_path):
-    options = {"scans": 4, "sensor": dataclasses.replace(HDL64E, azimuth_steps=60), "seed": 1}
-    root = simulate(tmp_path / "varied", routes=["08"], images=True, vary=True, **options).root
-    drive, images = simulate_recording("08", **options), open_recording(root, "08")
-    for i in range(4):
-        points, labels = vary(drive.points(i), drive.labels(i), None)
-        expected = np.rot90(density_image(points), -1) * np.float32(10 / 255)
-        np.testing.assert_array_equal(images.image(i), expected)
-        shown = np.rot90(density_label_image(points, labels), -1)
-        np.testing.assert_array_equal(images.labels(i), np.where(expected > 0, shown, 0))
