@@ -70,7 +70,7 @@ def baselines(
 def _score(name: str, recording: Recording, seed: int | None) -> Score:
     """Describe the sequence, and score."""
     start = time.perf_counter()
-    file = embed(method_named(name, None, recording), recording, rotation_seed=seed)
+    file = embed(method_named(name, ready_made=recording.has_images), recording, rotation_seed=seed)
     seconds = time.perf_counter() - start
     result = TOP1_F1MAX(file)
     return Score(file, result.score, result.recalls[1], seconds / len(file))

@@ -7,7 +7,6 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 
 Takes = Literal["images", "points", "labelled points", "labelled images"]
@@ -60,25 +59,6 @@ class Method:
     def name(self) -> str:
         """Name on the command line."""
         return self.about["method"]
-
-
-def require_content(name: str, takes: Takes, recording: Recording, *, every_label: bool = False) -> None:
-    """Raise ValueError, in one line, if a recording lacks the points or labels of the method called `name`.
-
-    With `every_label` every scan must have labels. Otherwise one label file suffices.
-    """
-    if takes.endswith("points") and recording.has_images:
-        raise ValueError(f"{name} needs points, found only images in sequence {recording.name}; use polar-fft")
-    if takes not in LABELLED:
-        return
-    if not recording.has_labels:
-        raise ValueError(f"{name} needs labels beside the scans, found none in sequence {recording.name}")
-    missing = [name for name, labelled in zip(recording.ids, recording.labelled, strict=True) if not labelled]
-    if every_label and missing:
-        raise ValueError(
-            f"{name} needs labels of every scan, found none for {len(missing)} scans of sequence {recording.name}, "
-            f"the first is {missing[0]}"
-        )
 
 
 def check_descriptors(method: str, descriptors: np.ndarray, names: Sequence[str]) -> None:

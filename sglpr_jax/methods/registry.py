@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.grid import Grid, ImageKind
@@ -31,24 +30,27 @@ from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
 
 
-def method_named(name: str, params: Params | None, recording: Recording) -> Method:
-    """Return the network with these weights (None: `DEFAULT_WEIGHTS`), or a handcrafted method."""
+def method_named(name: str, params: Params | None = None, *, ready_made: bool = False) -> Method:
+    """Return the network with these weights (None: `DEFAULT_WEIGHTS`), or a handcrafted method.
+
+    `ready_made` is for recordings of images (`Recording.has_images`), which a handcrafted method describes as a whole.
+    """
     if name != NETWORK:
-        return handcrafted(name, recording, model_preset("sglpr").grid)
+        return handcrafted(name, None if ready_made else model_preset("sglpr").grid)
     return network(load(DEFAULT_WEIGHTS) if params is None else params)
 
 
-def method_beside(trained: Params, name: str, recording: Recording, *, seed: int = 0) -> Method:
+def method_beside(trained: Params, name: str, *, ready_made: bool, seed: int = 0) -> Method:
     """Return the method called `name`, one of `BesideName`, for comparison with a newly trained network.
 
     `untrained` is the same network with random weights from `seed`, `shipped` has the `DEFAULT_WEIGHTS`. A handcrafted
-    method on images has the window of the network.
+    method has the window of the network, or `ready_made` images as a whole.
     """
     if name == UNTRAINED:
         return network(init(jax.random.key(seed + 1), config=trained.config))
     if name == SHIPPED:
         return network(load(DEFAULT_WEIGHTS))
-    return handcrafted(name, recording, trained.config.grid)
+    return handcrafted(name, None if ready_made else trained.config.grid)
 
 
 def method_with_weights(weights: str) -> Method:
@@ -99,8 +101,8 @@ def network(params: Params) -> Method:
     )
 
 
-def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
-    """Return a handcrafted method for the scans of `recording`. It takes points, whole images, or images of `grid`.
+def handcrafted(name: str, grid: Grid | None) -> Method:
+    """Return a handcrafted method. Its images are made from scans on `grid`, or are ready-made ones (None).
 
     Raises ValueError if the name is not in `HANDCRAFTED`.
     """
@@ -110,12 +112,11 @@ def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
     if method.takes != "images":
         prepare = functools.partial(_describe_points, method)
         return Method({"method": name}, method.takes, prepare, lambda rows: rows, method.distance_name)
-    ready_made = recording.has_images
-    describe_images = (ready_made and method.describe_ready_made) or method.describe
+    describe_images = (grid is None and method.describe_ready_made) or method.describe
     return Method(
-        {"method": name, **({} if ready_made else {"grid": dataclasses.asdict(grid)})},
+        {"method": name} | ({} if grid is None else {"grid": dataclasses.asdict(grid)}),
         method.takes,
-        functools.partial(checked_view, grid=None if ready_made else grid),
+        functools.partial(checked_view, grid=grid),
         lambda views: describe_images(views.image),
         method.distance_name,
     )

@@ -9,29 +9,48 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.backbone_config import BackboneConfig, CircularConfig, SglprConfig, SwinConfig
-from sglpr_jax.models.circular import CircularBackbone
+from sglpr_jax.models.circular import CircularDecoder, CircularNet
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
-from sglpr_jax.models.layers import BackboneFeatures
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import PlaceHead, raw_input
 from sglpr_jax.models.segmentation_head import segmentation_head
-from sglpr_jax.models.swin_unet import SglprBackbone, SwinBackbone
+from sglpr_jax.models.swin import PatchExpand
+from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
 
 
-def _backbone(config: BackboneConfig, *, circular: bool) -> SwinBackbone | CircularBackbone | SglprBackbone:
-    """Return the layers of a backbone, which belong to the calling Flax module.
+class BackboneFeatures(NamedTuple):
+    """Output of a backbone for a batch of images."""
 
-    They have two calls: from images to `BackboneFeatures`, and from these to pixels (`decode`, at most once).
-    """
-    match config:
-        case SwinConfig():
-            return SwinBackbone(config, circular)
-        case CircularConfig():
-            return CircularBackbone(config)
-        case SglprConfig():
-            return SglprBackbone(config)
+    features: Float[Array, "b p q c"]
+    """Input of the place head and of the decoder."""
+    finer: list[Array]
+    """Intermediate maps that the decoder uses again, finest first."""
+    named: dict[str, Array]
+    """All maps by name, for pictures and tests."""
+
+
+def _encode(config: BackboneConfig, image: Array, *, circular: bool, train: bool) -> BackboneFeatures:
+    """Compute the features of images (b, p, q, c). The layers belong to the calling Flax module."""
+    if isinstance(config, SwinConfig):
+        tokens, named = SwinUnet(config, config.patch, circular, name="backbone")(image, train=train)
+        return BackboneFeatures(tokens, [], named)
+    if isinstance(config, CircularConfig):
+        circular_maps = CircularNet(config, name="rings")(image)  # the name in weight files
+        features, named = circular_maps[-1], {}
+    else:
+        features, circular_maps, named = CircularSwin(config, name="backbone")(image, train=train)
+    blocks = {f"circular_block{i}": block for i, block in enumerate(circular_maps[1:])}
+    return BackboneFeatures(features, circular_maps[:-1], blocks | named)
+
+
+def _decode(config: BackboneConfig, output: BackboneFeatures) -> Float[Array, "b _ _ _"]:
+    """Compute pixels from the output of `_encode`. The layers belong to the calling Flax module."""
+    if isinstance(config, SwinConfig):
+        return PatchExpand(config.patch, output.features.shape[-1], name="expand")(output.features)
+    widths = config.stem.widths if isinstance(config, SglprConfig) else config.widths
+    return CircularDecoder(widths, name="decoder")([*output.finer, output.features])
 
 
 class Outputs(NamedTuple):
@@ -59,28 +78,22 @@ class SGLPR(nn.Module):
         segment: int = 1,
         train: bool = False,
     ) -> Outputs:
-        """Compute descriptors and semantic logits.
-
-        Logits are computed for every `segment`-th image, or for no image if it is 0 or if there is no segmentation
-        head. `labels` are for a place head that reads labels. This head has no backbone (table 6).
-        """
+        """Compute descriptors, and logits for every `segment`-th image (0: for none)."""
         config = self.config
         place_head = PlaceHead(config.head, circular=config.polar is not None, name="place_head")
-        if not config.head.reads_features:
+        if not config.head.reads_features:  # such a model has no backbone (table 6)
             features = raw_input(image, labels, config)
             descriptor, maps = place_head(features)
             return Outputs(descriptor, None, {"raw_input": features, **maps})
-        backbone = _backbone(config.backbone, circular=config.polar is not None)
-        seen = backbone(backbone_view(image, config), train=train)
-        pixels = backbone.decode(seen) if config.head.tap == "pixels" else None
-        descriptor, maps = place_head(seen.features if pixels is None else pixels)
-        maps = {**seen.named, **maps}
+        output = _encode(config.backbone, backbone_view(image, config), circular=config.polar is not None, train=train)
+        pixels = _decode(config.backbone, output) if config.head.tap == "pixels" else None
+        descriptor, maps = place_head(output.features if pixels is None else pixels)
+        maps = {**output.named, **maps}
         if not (segment and config.segments):
             return Outputs(descriptor, None, maps)
-        if pixels is None:
-            pixels = backbone.decode(
-                BackboneFeatures(seen.features[::segment], [one[::segment] for one in seen.finer], {})
-            )
+        if pixels is None:  # the head did not need all of them
+            chosen = BackboneFeatures(output.features[::segment], [x[::segment] for x in output.finer], {})
+            pixels = _decode(config.backbone, chosen)
         else:
             pixels = pixels[::segment]
         logits = segmentation_head(pixels, image[::segment], config)
@@ -93,7 +106,7 @@ def describe(
     bev: Num[Array, "*b h w"],
     labels: Int[Array, "... h w"] | None = None,
 ) -> Float[Array, "*b d"]:
-    """Compute the descriptor of each bird's-eye-view image. It works under jit, vmap and grad.
+    """Compute the descriptor of each bird's-eye-view image, also under jit, vmap and grad.
 
     The distance between two descriptors is the dissimilarity of their places (equation 2). An empty image has a
     descriptor, too: see `is_describable`.
@@ -122,11 +135,10 @@ def describe(
 def is_describable(params: Params, bev: Num[Array, "*b h w"]) -> Bool[Array, "*b"]:
     """Whether each image shows a place: all counts are finite, and at least 2 cells in the field of view hold points.
 
-    `describe` gives every empty image the same descriptor. The function works under jit and vmap.
+    `describe` gives every empty image the same descriptor.
     """
-    seen = jnp.where(field_of_view(params.config)[0], bev > 0, False)
-    enough = seen.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS
-    return enough & jnp.isfinite(bev).all((-2, -1))
+    occupied = jnp.where(field_of_view(params.config)[0], bev > 0, False)
+    return (occupied.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS) & jnp.isfinite(bev).all((-2, -1))
 
 
 def segment(params: Params, bev: Num[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
@@ -148,17 +160,14 @@ def forward(
     key: Array | None = None,
     segment: int = 1,
 ) -> Outputs:
-    """Compute descriptors, logits and named maps in one pass, for training and pictures.
-
-    The leading axes of the images are merged into one.
+    """Compute descriptors, logits and named maps in one pass. The leading axes of the images are merged into one.
 
     Arguments:
       params: Model.
       bev: Images, as in `describe`.
       labels: Class maps, as in `describe`.
       key: Random key. With a key this is the training pass, in which stochastic depth drops residual branches.
-      segment: Interval between images with logits: n for every n-th image, 0 for no logits. A model without a
-        segmentation head gives no logits.
+      segment: Interval between images with logits: n for every n-th image, 0 for no logits.
 
     Raises:
       ValueError: In the same cases as `describe`, or if there are no images.
@@ -193,14 +202,13 @@ def _check_array(bev: Any) -> None:
 
 def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelConfig) -> None:
     """Raise ValueError if the head reads labels and they are missing, or if it reads no labels and they are given."""
-    found = "none" if labels is None else f"shape {labels.shape}"
-    if config.head.reads_labels and (labels is None or labels.shape != shape):
+    reads, found = config.head.reads_labels, None if labels is None else labels.shape
+    if found != (shape if reads else None):
+        expected = f"class maps of shape {shape}, one for each image" if reads else "no labels"
         raise ValueError(
-            f"the place head of this model reads {config.head.input}: expected class maps of shape {shape}, "
-            f"one for each image, found {found}"
+            f"the place head of this model reads {config.head.input}: expected {expected}, found "
+            f"{'none' if labels is None else f'shape {found}'}"
         )
-    if labels is not None and not config.head.reads_labels:
-        raise ValueError(f"the place head of this model reads {config.head.input}: expected no labels, found {found}")
 
 
 def init(key: Array, *, preset: str = "sglpr", config: ModelConfig | None = None) -> Params:

@@ -45,10 +45,10 @@ def sinogram(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "60 120"
     place = np.cos(turn) * x[None] + np.sin(turn) * y[None] + (SIDE - 1) / 2
     low = np.floor(place).astype(np.int64)
     flat, share = low + SIDE * np.arange(ANGLES)[:, None], place - low
-    found = np.zeros(ANGLES * SIDE)
+    lines = np.zeros(ANGLES * SIDE)
     for offset, part in ((0, 1 - share), (1, share)):
-        found += np.bincount((flat + offset).ravel(), part.ravel(), minlength=ANGLES * SIDE)
-    return found.reshape(ANGLES, SIDE)
+        lines += np.bincount((flat + offset).ravel(), part.ravel(), minlength=ANGLES * SIDE)
+    return lines.reshape(ANGLES, SIDE)
 
 
 def ring_distance(
@@ -64,10 +64,10 @@ def ring_distance(
     def compare(queries, database):
         return 1 - correlate(queries, database).max(axis=-1)
 
-    return in_blocks(compare, queries, database, block=BLOCK, prepare=_standardised)
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=_standardise)
 
 
-def _standardised(rows: Float32[np.ndarray, "n 3660"]) -> Float32[np.ndarray, "n 61 60"]:
+def _standardise(rows: Float32[np.ndarray, "n 3660"]) -> Float32[np.ndarray, "n 61 60"]:
     """Return the magnitudes with mean 0 and length 1 over all 120 frequencies. 59 of them occur twice."""
     times = np.full(FREQUENCIES, 2.0)
     times[[0, -1]] = 1

@@ -1,4 +1,4 @@
-"""Interface of a learned method: network, input, loss and recipe. Points, rotations and losses that several share."""
+"""Interface of a learned method: network, input, loss and recipe. Rotations and losses that several methods share."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -52,8 +52,8 @@ class LearnedMethod:
     network: nn.Module
     prepare: Callable[[Scan], Shaped[np.ndarray, "..."]]
     """Makes the input of the network from a record. All inputs have one shape and type."""
-    turned: Callable[[Array, Shaped[Array, "b ..."]], Shaped[Array, "b ..."]]
-    """`turned(key, inputs)` rotates each input about the vertical axis by its own random angle, for the training."""
+    rotate_inputs: Callable[[Array, Shaped[Array, "b ..."]], Shaped[Array, "b ..."]]
+    """Rotates each input about the vertical axis by its own random angle, given a random key, for the training."""
     loss: Callable[[Variables, Tuples], Float[Array, ""]]
     recipe: Recipe
     compare: Callable[[Variables, Float[Array, "q d"], Float[Array, "n d"]], Float[Array, "q n"]] | None = None
@@ -69,13 +69,13 @@ def finite_points(scan: Scan) -> Float32[np.ndarray, "n 3"]:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def rolled(key: Array, inputs: Shaped[Array, "b r s *_"]) -> Shaped[Array, "b r s *_"]:
+def roll_azimuths(key: Array, inputs: Shaped[Array, "b r s *_"]) -> Shaped[Array, "b r s *_"]:
     """Roll each input along the axis after the first one, the azimuths, by its own random number of columns."""
     shifts = jax.random.randint(key, (len(inputs),), 0, inputs.shape[2])
     return jax.vmap(lambda one, shift: jnp.roll(one, shift, axis=1))(inputs, shifts)
 
 
-def rotated_points(key: Array, points: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
+def rotate_clouds(key: Array, points: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
     """Rotate the first three coordinates of the points of each input about z by its own random angle."""
     angles = jax.random.uniform(key, (len(points),), maxval=2 * jnp.pi)
     return points.at[..., :3].set(rotate_points(points[..., :3], angles))
