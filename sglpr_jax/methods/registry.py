@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -68,34 +67,25 @@ def trained_method(method: LearnedMethod, weights: str) -> Method:
     Raises the errors of `load_variables`.
     """
     variables = load_variables(weights, method)
-    hashed = variables_hash(variables)
-
-    def prepare(scan: Scan, angle: float | None) -> Any:
-        return method.prepare(scan if angle is None else rotated_scan(scan, angle))
-
+    sha256 = variables_hash(variables)
     return Method(
         {"method": method.name, "weights": weights},
         method.takes,
-        prepare,
+        lambda scan, angle: method.prepare(scan if angle is None else rotated_scan(scan, angle)),
         functools.partial(apply_network, variables, method=method),
-        distance="l2" if method.compare is None else stated_distance(method.name, weights, hashed),
-        weights_hash=hashed,
+        distance="l2" if method.compare is None else stated_distance(method.name, weights, sha256),
+        weights_hash=sha256,
     )
 
 
 def network(params: Params) -> Method:
     """Return the method that describes images with `params`."""
     config = params.config
+    options = {"image": config.image, "categories": config.categories_read, "field": field_of_view(config)[0]}
     return Method(
         {"method": NETWORK, "model": dataclasses.asdict(config)},
         "labelled images" if config.categories_read else "images",
-        functools.partial(
-            checked_view,
-            grid=config.grid,
-            image=config.image,
-            categories=config.categories_read,
-            field=field_of_view(config)[0],
-        ),
+        functools.partial(checked_view, grid=config.grid, **options),
         lambda views: describe(params, *views),
         weights_hash=weights_hash(params),
     )
@@ -123,7 +113,7 @@ def handcrafted(name: str, grid: Grid | None) -> Method:
 
 
 def _describe_points(method: HandcraftedMethod, scan: Scan, angle: float | None) -> np.ndarray:
-    """Return the descriptor of the finite points of a scan, and of their classes if the method needs them."""
+    """Return the descriptor of the finite points of a scan, and of their classes if the method takes labels."""
     assert scan.points is not None
     finite = np.isfinite(scan.points).all(axis=1)
     points = scan.upright_points[finite]
@@ -140,21 +130,24 @@ def checked_view(
     categories: int = 0,
     field: Bool[np.ndarray, "h w"] | None = None,
 ) -> View:
-    """Return the `view` of a record. Raises ValueError if too few cells within `field` (None: all) are occupied."""
-    turn = None if angle is None else jnp.float32(angle)
-    found = view(scan, grid, image=image, categories=categories, angle=turn)
-    seen = np.asarray(found.image)
-    cells = np.count_nonzero(seen if field is None else seen * field)
-    if cells < FEWEST_CELLS:
+    """Return the `view` of a scan, rotated by `angle` in radians.
+
+    Raises ValueError if too few cells within `field` (None: all) are occupied.
+    """
+    result = view(scan, grid, image=image, categories=categories, angle=None if angle is None else jnp.float32(angle))
+    counts = np.asarray(result.image)
+    occupied = np.count_nonzero(counts if field is None else counts * field)
+    if occupied < FEWEST_CELLS:
+        rows, columns = counts.shape
         raise ValueError(
-            f"{scan.name}: expected points in at least {FEWEST_CELLS} cells of the window of {seen.shape[0]} x"
-            f" {seen.shape[1]} cells, found points in {cells}"
+            f"{scan.name}: expected points in at least {FEWEST_CELLS} cells of the window of {rows} x {columns} cells, "
+            f"found points in {occupied}"
         )
-    return found
+    return result
 
 
 def rotated_scan(scan: Scan, angle: float) -> Scan:
-    """Return a record whose scan or image is rotated by an angle in radians, counter-clockwise."""
+    """Return a scan whose points or image are rotated by an angle in radians, counter-clockwise."""
     if scan.points is not None:
         return dataclasses.replace(scan, points=rotated(scan.upright_points, angle), mounting=None)
     assert scan.image is not None

@@ -55,14 +55,6 @@ def test_clusters_start_at_those_of_the_features():
     assert apart[0] > 1.5 * apart[1]
 
 
-def test_netvlad():
-    x = jax.random.normal(jax.random.key(0), (2, 30, 5))
-    variables = NetVLAD(7).init(jax.random.key(0), x)
-    params = jax.tree.map(np.asarray, variables["params"])
-    expected = np.stack([reference.netvlad(one, params) for one in np.asarray(x)])
-    np.testing.assert_allclose(NetVLAD(7).apply(variables, x), expected, atol=1e-5)
-
-
 def test_the_encoder_is_resnet_34():
     variables = reference.moved(random_variables(LEARNED["resnet34-netvlad"], seed=0))
     grey = jax.random.uniform(jax.random.key(0), (2, 25, 25))

@@ -167,9 +167,7 @@ def test_labels_must_be_there_exactly_where_they_are_read(views, call):
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(
-        ValueError, match=r"expected categories of labels .* reads counts\+labels, found 0"
-    ):
+    with pytest.raises(ValueError, match=r"expected categories of labels .* reads counts\+labels, found 0"):
         with_head(CONFIG, categories=0, input="counts+labels")
     with pytest.raises(ValueError, match="expected a model with a segmentation head, found one without"):
         segment(Params({}, with_head(CONFIG, categories=0)), jnp.zeros((SIZE, SIZE)))

@@ -34,8 +34,7 @@ def apply_network(variables: Variables, inputs: Shaped[Any, "b ..."], *, method:
 def describe_inputs(
     method: LearnedMethod, variables: Variables, inputs: Shaped[np.ndarray, "n ..."]
 ) -> Float32[np.ndarray, "n d"]:
-    """Return the descriptors of all inputs, which may be a memory-mapped file. Raises the error of
-    `check_descriptors`."""
+    """Return the descriptors of all inputs, which may be a memory-mapped file. Raises as `check_descriptors`."""
     batches = []
     for start in range(0, len(inputs), BATCH):
         rows = np.asarray(inputs[start : start + BATCH])
@@ -67,7 +66,7 @@ def stated_distance(method: str, weights: str, weights_hash: str) -> str:
 
 @functools.lru_cache(maxsize=4)
 def distance_of_weights(method: LearnedMethod, name: str) -> DistanceFn:
-    """Return the distance called `name`, of `stated_distance`.
+    """Return the distance that `stated_distance` has named.
 
     Raises:
       FileNotFoundError: If the folder of the weights does not exist any more.

@@ -52,9 +52,8 @@ class OverlapTransformer(nn.Module):
     """Convolutions along the rows, one transformer layer between the columns, and NetVLAD: 256 numbers of unit length.
 
     No layer knows the position of a column, so a rotation by whole columns (0.4 degrees) does not change the
-    descriptor. The paper gives the order of the layers, the sizes of the transformer and of NetVLAD. Chosen here: the
-    heights of the kernels, no normalisation of the convolutions, the layer norms, unit length of the local features,
-    and the context gating.
+    descriptor. The paper gives the order of the layers and the sizes of the transformer and of NetVLAD. The heights of
+    the kernels, the normalisations and the context gating are choices of this project.
     """
 
     @nn.compact

@@ -75,9 +75,9 @@ class Vlad(nn.Module):
         b, n, d = features.shape
         init = nn.initializers.normal(d**-0.5)
         logits = nn.Dense(CLUSTERS, use_bias=False, kernel_init=init, name="clusters")(features.reshape(b * n, d))
-        share = nn.softmax(batch_norm(train, epsilon=EPSILON)(logits)).reshape(b, n, CLUSTERS)
+        assignment = nn.softmax(batch_norm(train, epsilon=EPSILON)(logits)).reshape(b, n, CLUSTERS)
         centres = self.param("centres", init, (d, CLUSTERS))
-        vlad = l2_normalize(residual_sums(features, share, centres).reshape(b, -1))
+        vlad = l2_normalize(residual_sums(features, assignment, centres).reshape(b, -1))
         hidden = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(CLUSTERS**-0.5), name="hidden")
         y = batch_norm(train, epsilon=EPSILON)(hidden(vlad))
         gate = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(NUMBERS**-0.5), name="gate")
@@ -90,19 +90,19 @@ class PointNetVlad(nn.Module):
     @nn.compact
     def __call__(self, points: Float[Array, "b n 3"], *, train: bool = False) -> Float[Array, "b 256"]:
         b, n, _ = points.shape
-        moved = TNet()(points, train=train)
-        features = Mlp((64, 64))(moved.reshape(b * n, 3), train=train)
-        moved = TNet()(features.reshape(b, n, -1), train=train)
-        features = Mlp((64, 128, 1024))(moved.reshape(b * n, -1), train=train)
+        transformed = TNet()(points, train=train)
+        features = Mlp((64, 64))(transformed.reshape(b * n, 3), train=train)
+        transformed = TNet()(features.reshape(b, n, -1), train=train)
+        features = Mlp((64, 128, 1024))(transformed.reshape(b * n, -1), train=train)
         return l2_normalize(Vlad()(l2_normalize(features).reshape(b, n, -1), train=train))
 
 
 def scaled_points(scan: Scan) -> Float32[np.ndarray, "4096 3"]:
-    """Return 4096 points above the ground, with coordinates between -1 and 1.
+    """Return 4096 points above the ground, divided by 40 m, so that coordinates are between -1 and 1.
 
-    The points are the means of the voxels of 0.4 m. They are drawn without replacement with the same seed for every
-    scan. If a scan has fewer voxels, all are used, and some of them are drawn again. Raises ValueError if the scan
-    shows no place, or has no points above the ground within 40 m.
+    They are drawn without replacement from the means of the voxels of 0.4 m, with the same seed for every scan. If a
+    scan has fewer voxels, some are drawn again. Raises ValueError if the scan shows no place, or has no points above
+    the ground within 40 m.
     """
     points = finite_points(scan)
     near = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]

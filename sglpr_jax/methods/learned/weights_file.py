@@ -1,4 +1,4 @@
-"""Weights of learned methods: random ones, and those in the same files as the weights of the models."""
+"""Weights of learned methods: random ones, and those in files, which are the same as for models."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,7 +26,7 @@ RANDOM = "random:"
 
 
 def example_inputs(method: LearnedMethod) -> np.ndarray:
-    """Return the input (1, ...) of an artificial scan. It defines the shapes of the weights."""
+    """Return the input (1, ...) of an artificial scan, which defines the shapes of the weights."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-40, -40, -1.5), (40, 40, 5), (5000, 3)).astype(np.float32)
     labels = np.full(len(points), 50, np.int32)  # buildings
@@ -40,7 +40,7 @@ def random_variables(method: LearnedMethod, *, seed: int) -> Variables:
 
 
 def save_variables(folder: Path, method: LearnedMethod, variables: Variables, about: Mapping[str, Any]) -> None:
-    """Write the variables of a trained network, and `about`: the settings of its training, as JSON values.
+    """Write the variables of a trained network, and the settings of its training (`about`) as JSON values.
 
     Raises OSError if the folder cannot be written or holds other files than earlier weights.
     """
