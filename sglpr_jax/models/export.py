@@ -12,7 +12,6 @@ from typing import Literal, get_args
 import jax
 import jax.export
 import numpy as np
-from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
 
 from sglpr_jax.data.density_image import CEILING_M, EDGE_STEP_M, FIRST_EDGE_M, FLOOR_M, MAX_VOXELS, REACH_M
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
@@ -90,8 +89,10 @@ def stablehlo(params: Params) -> bytes:
 
 
 def onnx(params: Params) -> bytes:
-    """Return `describe` with these weights as an ONNX model. The conversion needs a process of its own, because it
-    changes JAX."""
+    """Return `describe` with these weights as an ONNX model.
+
+    The conversion changes JAX, so it needs a process of its own, which runs this file (`convert`).
+    """
     with tempfile.TemporaryDirectory() as temporary:
         weights, program = Path(temporary, "weights"), Path(temporary, "describe.onnx")
         save(params, weights)
@@ -99,9 +100,9 @@ def onnx(params: Params) -> bytes:
         environment = os.environ | {"JAX_PLATFORMS": "cpu"}
         process = subprocess.run(command, capture_output=True, text=True, env=environment)
         if process.returncode:
-            last = (process.stderr.strip().splitlines() or ["no message"])[-1]
-            error = ImportError if "ModuleNotFoundError" in last else RuntimeError
-            raise error(f"the conversion to ONNX failed ({last}); it requires: {NEEDS_ONNX}")
+            last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
+            error = ImportError if "ModuleNotFoundError" in last_line else RuntimeError
+            raise error(f"the conversion to ONNX failed ({last_line}); it requires: {NEEDS_ONNX}")
         return program.read_bytes()
 
 
@@ -144,6 +145,8 @@ def _counts_of_voxels(grid: Grid) -> dict[str, str]:
 
 def convert(weights: Path, file: Path) -> None:
     """Write `describe` as an ONNX model, with the description of its input in the metadata."""
+    from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]  (an optional package)
+
     params = load(weights)
     grid = params.config.grid
     model = to_onnx(
