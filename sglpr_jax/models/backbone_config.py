@@ -30,7 +30,6 @@ class _Stages:
     embed_dim: int
     depths: tuple[int, ...]
     heads: tuple[int, ...]
-    token: tuple[int, int]
 
     def __post_init__(self):
         check_fields(self)
@@ -42,6 +41,10 @@ class _Stages:
         for i, heads in enumerate(self.heads):
             if (channels := self.embed_dim * 2**i) % heads:
                 raise ValueError(f"heads: expected a divisor of the {channels} channels of stage {i}, found {heads}")
+
+    @property
+    def token(self) -> tuple[int, int]:
+        raise NotImplementedError
 
     @property
     def width(self) -> int:

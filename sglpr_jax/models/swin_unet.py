@@ -48,8 +48,11 @@ class SwinUnet(nn.Module):
         """Return the tokens, and the intermediate maps by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
         config, maps = self.config, {}
         options = (config.window, config.mlp_ratio, self.circular, self.shift_each_way)
-        rates = drop_path_rates(config.depths, config.drop_path)
-        stages = [functools.partial(SwinStage, *of, *options) for of in zip(config.heads, rates, strict=True)]
+        stage_rates = drop_path_rates(config.depths, config.drop_path)
+        stages = [
+            functools.partial(SwinStage, heads, rates, *options)
+            for heads, rates in zip(config.heads, stage_rates, strict=True)
+        ]
 
         def run_stage(x: Array, level: int, name: str, label: str) -> Array:
             """Run the blocks of a stage with the widths of encoder stage `level`, and store their maps."""

@@ -39,30 +39,30 @@ def weight_shapes(config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
     return by_name(jax.eval_shape(lambda: init(jax.random.key(0), config=config)).weights)
 
 
-def graft(given: Params, fresh: Params) -> Params:
-    """Replace the weights of `fresh` by those of `given` that exist (partial restore), to continue a training.
+def graft(source: Params, target: Params) -> Params:
+    """Replace the weights of `target` by those of `source` that exist (partial restore), to continue a training.
 
-    A kernel of `fresh` may have more input channels than that of `given`. The additional channels come last and start
-    at 0, so a larger network initially computes the same as the smaller one. The segmentation head of `given` is
-    dropped if `fresh` has none.
+    A kernel of `target` may have more input channels than that of `source`. The additional channels come last and start
+    at 0, so a larger network initially computes the same as the smaller one. The segmentation head of `source` is
+    dropped if `target` has none.
 
     Raises:
-      ValueError: If `given` has another weight that `fresh` lacks, or one of another shape.
+      ValueError: If `source` has another weight that `target` lacks, or one of another shape.
     """
-    given = given if fresh.config.segments else for_places(given)
-    weights = by_name(fresh.weights)
-    for name, value in by_name(given.weights).items():
+    source = source if target.config.segments else for_places(source)
+    weights = by_name(target.weights)
+    for name, value in by_name(source.weights).items():
         expected = weights[name].shape if name in weights else "no such weight"
         if value.shape != expected:
             is_kernel = name in weights and value.ndim == len(expected) and value.ndim in (2, 4)
             added = np.subtract(expected, value.shape) if is_kernel else np.array([-1])
-            if added.min() < 0 or added[-2] != added.sum():  # only the last axis but one, the inputs, may be longer
+            if added.min() < 0 or added[-2] != added.sum():  # only the inputs (last axis but one) may be longer
                 raise ValueError(
                     f"cannot start from these weights: {name} has shape {value.shape}, expected {expected}"
                 )
             value = np.pad(np.asarray(value), [(0, length) for length in added])
         weights[name] = value
-    return dataclasses.replace(fresh, weights=as_tree(weights))
+    return dataclasses.replace(target, weights=as_tree(weights))
 
 
 def descriptor_layers(params: Params) -> Any:

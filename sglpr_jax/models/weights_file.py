@@ -93,11 +93,12 @@ def load(weights: Path | str) -> Params:
     folder = last_weights(weights_folder(weights))
     stored = read_json(folder / CONFIG_FILE)
     config = config_from_dict(stored, source=folder / CONFIG_FILE)
-    known = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}  # fields added later are not in older files
+    # The hash of the stored values counts, too, because older files lack fields that were added later.
+    config_hashes = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}
     path = folder / WEIGHTS_FILE
     values, header = read_tensors(path)
     values = {name: leaf.astype(np.float32) if leaf.dtype == np.float16 else leaf for name, leaf in values.items()}
-    if header.get(CHECKED_FOR) not in known:
+    if header.get(CHECKED_FOR) not in config_hashes:
         check_leaves(values, weight_shapes(config), source=path)
         if CHECKED_FOR in header:  # files of earlier versions have none
             raise ValueError(f"{path}: expected the {CONFIG_FILE} that it was saved with, found a changed one")

@@ -148,11 +148,11 @@ def spectra(images: Float[Array, "n 80 360"]) -> Spectra:
     radius = LOG_BASE ** np.arange(COLUMNS)[None, :]
     pixels = np.stack([RINGS // 2 + radius * np.cos(angle), COLUMNS // 2 + radius * np.sin(angle)]).astype(np.float32)
 
-    def of_image(image):
+    def image_spectra(image):
         amplitudes = jnp.fft.fftshift(jnp.abs(jnp.fft.fft2(image))) / image.size * gain
         return Spectra(image, jnp.fft.rfft2(image), jnp.fft.rfft2(map_coordinates(amplitudes, list(pixels), order=1)))
 
-    return jax.lax.map(of_image, images)
+    return jax.lax.map(image_spectra, images)
 
 
 @jax.jit

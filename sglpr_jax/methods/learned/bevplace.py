@@ -103,8 +103,10 @@ class REIN(nn.Module):
 
 
 def bordered(images: Float[Array, "b h h"]) -> Float[Array, "b _ _"]:
-    """Add zeros on all sides, so that all resolutions of the encoder have a pixel at the centre. Raises ValueError if
-    the number of rows is even."""
+    """Add zeros on all sides, so that all resolutions of the encoder have a pixel at the centre.
+
+    Raises ValueError if the number of rows is even.
+    """
     size = images.shape[1]
     if size % 2 == 0:
         raise ValueError(f"expected images with an odd number of rows, found {size}")
@@ -164,8 +166,10 @@ def resized(maps: Float[Array, "b h h c"], size: int) -> Float[Array, "b {size} 
 
 
 def grey_image(scan: Scan) -> UInt8[np.ndarray, "151 151"]:
-    """Return the ready-made density image of a record, or the density image of a scan, as grey values. Raises
-    ValueError for another image, or for a scan that shows no place."""
+    """Return the ready-made density image, or the density image of the points of a scan, as grey values.
+
+    Raises ValueError for another image, or for a scan that shows no place.
+    """
     if scan.points is not None:
         check_cloud(scan.points, name=scan.name)
     check_ready_made(scan, "density")
