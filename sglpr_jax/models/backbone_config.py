@@ -6,7 +6,7 @@ Besides its fields, each has the following properties:
     width        channels of the features
     multiple     the image's rows and columns must be a multiple of this: the size of one feature of the coarsest map
     needs_polar  whether the backbone requires a polar image, because its layers wrap around
-    pictures     maps to draw as heat maps: from the title of each picture to a name in `BackboneFeatures.named`
+    pictures     maps to draw as heat maps: from the title of each picture to a name in `Outputs.intermediates`
 """
 
 import dataclasses

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.models.backbone_config import BackboneConfig, CircularConfig, SglprConfig, SwinConfig
+from sglpr_jax.models.backbone_config import BackboneConfig, SglprConfig, SwinConfig
 from sglpr_jax.models.circular import CircularDecoder, CircularNet
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
@@ -20,37 +20,28 @@ from sglpr_jax.models.swin import PatchExpand
 from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
 
 
-class BackboneFeatures(NamedTuple):
-    """Output of a backbone for a batch of images."""
+def _encode(
+    config: BackboneConfig, image: Float[Array, "b p q c"], *, circular: bool, train: bool
+) -> tuple[list[Array], dict[str, Array]]:
+    """Return the maps that the decoder uses, the last of which are the features, and all maps by name.
 
-    features: Float[Array, "b p q c"]
-    """Input of the place head and of the decoder."""
-    finer: list[Array]
-    """Intermediate maps that the decoder uses again, finest first."""
-    named: dict[str, Array]
-    """All maps by name, for pictures and tests."""
-
-
-def _encode(config: BackboneConfig, image: Array, *, circular: bool, train: bool) -> BackboneFeatures:
-    """Compute the features of images (b, p, q, c). The layers belong to the calling Flax module."""
+    The layers belong to the calling Flax module.
+    """
     if isinstance(config, SwinConfig):
         tokens, named = SwinUnet(config, config.patch, circular, name="backbone")(image, train=train)
-        return BackboneFeatures(tokens, [], named)
-    if isinstance(config, CircularConfig):
-        circular_maps = CircularNet(config, name="rings")(image)  # the name in weight files
-        features, named = circular_maps[-1], {}
-    else:
-        features, circular_maps, named = CircularSwin(config, name="backbone")(image, train=train)
-    blocks = {f"circular_block{i}": block for i, block in enumerate(circular_maps[1:])}
-    return BackboneFeatures(features, circular_maps[:-1], blocks | named)
+        return [tokens], named
+    if isinstance(config, SglprConfig):
+        return CircularSwin(config, name="backbone")(image, train=train)
+    maps = CircularNet(config, name="rings")(image)  # the name in weight files
+    return maps, {f"circular_block{i}": block for i, block in enumerate(maps[1:])}
 
 
-def _decode(config: BackboneConfig, output: BackboneFeatures) -> Float[Array, "b _ _ _"]:
-    """Compute pixels from the output of `_encode`. The layers belong to the calling Flax module."""
+def _decode(config: BackboneConfig, maps: list[Array]) -> Float[Array, "b _ _ _"]:
+    """Compute pixels from the maps of `_encode`. The layers belong to the calling Flax module."""
     if isinstance(config, SwinConfig):
-        return PatchExpand(config.patch, output.features.shape[-1], name="expand")(output.features)
+        return PatchExpand(config.patch, maps[-1].shape[-1], name="expand")(maps[-1])
     widths = config.stem.widths if isinstance(config, SglprConfig) else config.widths
-    return CircularDecoder(widths, name="decoder")([*output.finer, output.features])
+    return CircularDecoder(widths, name="decoder")(maps)
 
 
 class Outputs(NamedTuple):
@@ -85,19 +76,17 @@ class SGLPR(nn.Module):
             features = raw_input(image, labels, config)
             descriptor, maps = place_head(features)
             return Outputs(descriptor, None, {"raw_input": features, **maps})
-        output = _encode(config.backbone, backbone_view(image, config), circular=config.polar is not None, train=train)
-        pixels = _decode(config.backbone, output) if config.head.tap == "pixels" else None
-        descriptor, maps = place_head(output.features if pixels is None else pixels)
-        maps = {**output.named, **maps}
+        circular = config.polar is not None
+        maps, named = _encode(config.backbone, backbone_view(image, config), circular=circular, train=train)
+        pixels = _decode(config.backbone, maps) if config.head.tap == "pixels" else None
+        descriptor, head_maps = place_head(maps[-1] if pixels is None else pixels)
+        named = {**named, **head_maps}
         if not (segment and config.segments):
-            return Outputs(descriptor, None, maps)
-        if pixels is None:  # the head did not need all of them
-            chosen = BackboneFeatures(output.features[::segment], [x[::segment] for x in output.finer], {})
-            pixels = _decode(config.backbone, chosen)
-        else:
-            pixels = pixels[::segment]
+            return Outputs(descriptor, None, named)
+        # If the place head did not need the pixels, only those of the images with logits are computed.
+        pixels = _decode(config.backbone, [x[::segment] for x in maps]) if pixels is None else pixels[::segment]
         logits = segmentation_head(pixels, image[::segment], config)
-        return Outputs(descriptor, logits, {**maps, "pixels": pixels})
+        return Outputs(descriptor, logits, {**named, "pixels": pixels})
 
 
 @jax.jit

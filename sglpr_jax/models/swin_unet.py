@@ -88,9 +88,9 @@ class CircularSwin(nn.Module):
     @nn.compact
     def __call__(
         self, polar: Float[Array, "b p q c"], *, train: bool = False
-    ) -> tuple[Float[Array, "b _ _ _"], list[Float[Array, "b _ _ _"]], dict[str, Float[Array, "b _ _ _"]]]:
-        """Return the tokens, the maps of the stem from the finest to the coarsest, and the Swin-Unet's maps by name."""
-        stem_maps = CircularNet(self.config.stem, name="stem")(polar)
+    ) -> tuple[list[Float[Array, "b _ _ _"]], dict[str, Float[Array, "b _ _ _"]]]:
+        """Return the maps of the stem, of which the tokens replace the last one, and all maps by name."""
+        maps = CircularNet(self.config.stem, name="stem")(polar)
         swin_unet = SwinUnet(self.config, patch=1, circular=True, shift_each_way=True, name="swin_unet")
-        tokens, named = swin_unet(stem_maps[-1], train=train)
-        return tokens, stem_maps, named
+        tokens, named = swin_unet(maps[-1], train=train)
+        return [*maps[:-1], tokens], {f"circular_block{i}": block for i, block in enumerate(maps[1:])} | named
