@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 from sglpr_jax.models import initial
 from sglpr_jax.models.initial import Initial, Initializer
 
+EPSILON = 1e-5
+"""PyTorch's epsilon of a layer norm."""
 NORM_FLOOR = 1e-12
 ROUNDING = 1e-6
 """Relative difference from the maximum below which an entry counts as equal to it."""
@@ -73,8 +75,8 @@ def product(x: Float[Array, "n c"], matrix: Float[Array, "c f"]) -> Float[Array,
 def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]):
     (x, matrix), (x_tangent, matrix_tangent) = primals, tangents
     if len(x) > len(matrix) > matrix.shape[1]:
-        turned = jax.lax.optimization_barrier(matrix_tangent.T)
-        by_matrix = jax.lax.dot_general(x, turned, (((1,), (1,)), ((), ())))
+        transposed = jax.lax.optimization_barrier(matrix_tangent.T)
+        by_matrix = jax.lax.dot_general(x, transposed, (((1,), (1,)), ((), ())))
     else:
         by_matrix = x @ matrix_tangent
     return product(x, matrix), x_tangent @ matrix + by_matrix
@@ -86,45 +88,38 @@ def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
 
 
 class LayerNorm(nn.Module):
-    """Layer norm over channels with PyTorch's epsilon, computed in float32.
-
-    The arithmetic is that of Flax, whose layer would trace the initial values in every call (see `weight`).
-    """
-
-    epsilon: float = 1e-5
+    """Layer norm over channels with the arithmetic of Flax, computed in float32."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
         scale = jnp.asarray(weight(self, "scale", initial.ones, x.shape[-1:]))
         bias = jnp.asarray(weight(self, "bias", initial.zeros, x.shape[-1:]))
         rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])
-        return layer_norm(rows, scale, bias, self.epsilon).astype(x.dtype).reshape(x.shape)
+        return layer_norm(rows, scale, bias).astype(x.dtype).reshape(x.shape)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def layer_norm(
-    x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"], epsilon: float
-) -> Float[Array, "n c"]:
+@jax.custom_jvp
+def layer_norm(x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"]) -> Float[Array, "n c"]:
     """Normalise every row. XLA passes over the rows more often for the derivative of JAX than for this one."""
-    mean, per_deviation = _statistics(x, epsilon)
+    mean, per_deviation = _statistics(x)
     return (x - mean) * (per_deviation * scale[None]) + bias[None]
 
 
 @layer_norm.defjvp
-def _(epsilon: float, primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]):
+def _(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]):
     (x, scale, bias), (x_tangent, scale_tangent, bias_tangent) = primals, tangents
-    mean, per_deviation = _statistics(x, epsilon)
+    mean, per_deviation = _statistics(x)
     normed = (x - mean) * per_deviation
     along = x_tangent - x_tangent.mean(-1, keepdims=True) - normed * (normed * x_tangent).mean(-1, keepdims=True)
     tangent = along * (per_deviation * scale[None]) + normed * scale_tangent[None] + bias_tangent[None]
-    return layer_norm(x, scale, bias, epsilon), tangent
+    return layer_norm(x, scale, bias), tangent
 
 
-def _statistics(x: Float[Array, "n c"], epsilon: float) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
+def _statistics(x: Float[Array, "n c"]) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
     """Mean and reciprocal standard deviation of each row."""
     mean = x.mean(-1, keepdims=True)
     variance = jnp.maximum((x * x).mean(-1, keepdims=True) - mean * mean, 0.0)
-    return mean, jax.lax.rsqrt(variance + epsilon)
+    return mean, jax.lax.rsqrt(variance + EPSILON)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
