@@ -75,32 +75,25 @@ def import_swin_t(params: Params, path: Path | str) -> tuple[Params, tuple[str, 
       ValueError: If the file is not a safetensors file, or if no weight fits.
     """
     with naming(path):
-        state = read_checkpoint(Path(path))
-        expected = _expected_shapes(params.config)
-        weights, copied, used, misshapen = by_name(params.weights), [], set(), set()
+        state, shapes = read_checkpoint(Path(path)), _expected_shapes(params.config)
         backbone = params.config.backbone
         assert isinstance(backbone, SwinConfig)  # checked by `_expected_shapes`
-        last_stage = len(backbone.depths) - 1
-        for name, shape in expected.items():
-            source = re.sub(
-                r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last_stage - int(m[1])}.blocks", torch_name(name)
-            )
-            if source not in state:
-                continue
-            weight = _flax_layout(name, state[source])
-            if weight.shape == shape:
-                weights[name] = weight
-                copied.append(name)
-                used.add(source)
-            else:
-                misshapen.add(source)
-        unused = sorted(set(state) - used)
-        unknown = [name for name in unused if name not in misshapen and not _SWIN_T_ONLY.fullmatch(name)]
+        last = len(backbone.depths) - 1
+
+        def encoder_name(name: str) -> str:
+            return re.sub(r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last - int(m[1])}.blocks", torch_name(name))
+
+        sources = {name: source for name in shapes if (source := encoder_name(name)) in state}
+        converted = {name: _flax_layout(name, state[source]) for name, source in sources.items()}
+        fitting = {name: weight for name, weight in converted.items() if weight.shape == shapes[name]}
+        unused = sorted(set(state) - {sources[name] for name in fitting})
+        unknown = [name for name in unused if name not in sources.values() and not _SWIN_T_ONLY.fullmatch(name)]
         if unknown:
             raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
-        if not copied:
+        if not fitting:
             raise ValueError("expected weights that fit the model, found none; Swin-T fits 96 channels and window 7")
-    return dataclasses.replace(params, weights=as_tree(weights)), tuple(copied), tuple(unused)
+    weights = as_tree({**by_name(params.weights), **fitting})
+    return dataclasses.replace(params, weights=weights), tuple(fitting), tuple(unused)
 
 
 def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
