@@ -73,7 +73,9 @@ class Entry(NamedTuple):
 def entry(name: str, runs: Path) -> Entry:
     """The contender called `name`. Raises FileNotFoundError if there is no method, weights or run of that name."""
     if name in HANDCRAFTED:
-        return Entry(name, HANDCRAFTED[name].takes, lambda recording: handcrafted(name, recording, GRID))
+        return Entry(
+            name, HANDCRAFTED[name].takes, lambda recording: handcrafted(name, None if recording.has_images else GRID)
+        )
     method, _, weights = name.rpartition("@")
     if name in sglpr_jax.shipped_weights():
         params = sglpr_jax.load(name)

@@ -43,9 +43,9 @@ def baselines(
     table = Table("method", "numbers", "distance", *columns)
     for name in methods:
         start = time.perf_counter()
-        files = [embed(method_named(name, None, recording), recording)]
+        files = [embed(method_named(name, ready_made=recording.has_images), recording)]
         per_scan_s = (time.perf_counter() - start) / len(recording)
-        files.append(embed(method_named(name, None, recording), recording, rotation_seed=ROTATION_SEED))
+        files.append(embed(method_named(name, ready_made=recording.has_images), recording, rotation_seed=ROTATION_SEED))
         results = [TOP1_F1MAX(file) for file in files]
         scores = (*(result.score for result in results), *(result.recalls[1] for result in results))
         distance, numbers = files[0].distance, files[0].descriptors.shape[1]

@@ -128,7 +128,7 @@ def _method(command: EmbedCommand) -> "Callable[[Recording], Method]":
         trained = trained_method(LEARNED[command.method], command.weights)
         return lambda recording: trained
     params = None if command.weights is None else load(command.weights)
-    return lambda recording: method_named(command.method, params, recording)
+    return lambda recording: method_named(command.method, params, ready_made=recording.has_images)
 
 
 def _check_file(command: EmbedCommand) -> None:

@@ -67,6 +67,25 @@ def check_readable(recording: Recording, readable: int) -> None:
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
 
 
+def require_content(method: str, takes: str, recording: Recording, *, every_label: bool = False) -> None:
+    """Raise ValueError, in one line, if a recording lacks the points or labels that a method takes (`Method.takes`).
+
+    With `every_label` every scan must have labels. Otherwise one label file suffices.
+    """
+    if takes.endswith("points") and recording.has_images:
+        raise ValueError(f"{method} needs points, found only images in sequence {recording.name}; use polar-fft")
+    if not takes.startswith("labelled"):
+        return
+    if not recording.has_labels:
+        raise ValueError(f"{method} needs labels beside the scans, found none in sequence {recording.name}")
+    missing = [scan_id for scan_id, labelled in zip(recording.ids, recording.labelled, strict=True) if not labelled]
+    if every_label and missing:
+        raise ValueError(
+            f"{method} needs labels of every scan, found none for {len(missing)} scans of sequence {recording.name}, "
+            f"the first is {missing[0]}"
+        )
+
+
 def _results(
     recording: Recording, look: Look[T], rows: Iterable[int], *, labels: bool, ahead: int
 ) -> Iterator[tuple[int, Callable[[], T]]]:

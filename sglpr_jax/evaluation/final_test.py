@@ -74,7 +74,8 @@ def final_test(
       ValueError: If a method does not fit the recording.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    beside = {name: method_beside(params, name, recording, seed=seed) for name in methods}
+    ready_made = recording.has_images
+    beside = {name: method_beside(params, name, ready_made=ready_made, seed=seed) for name in methods}
     results: dict[str, dict[str, list[Result]]] = {}
     for title, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
         results[title] = {}

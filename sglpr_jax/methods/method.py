@@ -7,11 +7,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 
 Takes = Literal["images", "points", "labelled points", "labelled images"]
-"""Content of a record that a method needs. Methods on images accept ready-made images and scans."""
+"""Content of a scan that a method needs. Methods on images accept ready-made images and point clouds."""
 LABELLED: tuple[Takes, ...] = ("labelled points", "labelled images")
 DistanceFn = Callable[[Float32[np.ndarray, "q d"], Float32[np.ndarray, "n d"]], Float32[np.ndarray, "q n"]]
 """Maps the descriptors of queries and of a database to distances. Smaller distances mean more similar places."""
@@ -42,13 +41,13 @@ class HandcraftedMethod:
 
 @dataclass(frozen=True)
 class Method:
-    """A method as `retrieval.embed` runs it: it prepares the input of each record and describes inputs in batches."""
+    """A method as `retrieval.embed` runs it: it prepares the input of each scan and describes inputs in batches."""
 
     about: dict[str, Any]
     """Name of the method (`method`) and its configuration, as JSON values."""
     takes: Takes
     prepare: Callable[[Scan, float | None], Any]
-    """Returns the input of a record that is first rotated about z by an angle in radians, if there is one. Called in
+    """Returns the input of a scan that is first rotated about z by an angle in radians (None: not rotated). Called in
     several threads."""
     describe: Callable[[Any], Float[Any, "b d"]]
     """Maps a batch of inputs, stacked along a new first axis, to descriptors."""
@@ -62,31 +61,11 @@ class Method:
         return self.about["method"]
 
 
-def require_content(name: str, takes: Takes, recording: Recording, *, every_label: bool = False) -> None:
-    """Raise ValueError, in one line, if a recording lacks the points or labels of the method called `name`.
-
-    With `every_label` every scan must have labels. Otherwise one label file suffices.
-    """
-    if takes.endswith("points") and recording.has_images:
-        raise ValueError(f"{name} needs points, found only images in sequence {recording.name}; use polar-fft")
-    if takes not in LABELLED:
-        return
-    if not recording.has_labels:
-        raise ValueError(f"{name} needs labels beside the scans, found none in sequence {recording.name}")
-    missing = [name for name, labelled in zip(recording.ids, recording.labelled, strict=True) if not labelled]
-    if every_label and missing:
-        raise ValueError(
-            f"{name} needs labels of every scan, found none for {len(missing)} scans of sequence {recording.name}, "
-            f"the first is {missing[0]}"
-        )
-
-
 def check_descriptors(method: str, descriptors: np.ndarray, names: Sequence[str]) -> None:
-    """Raise ValueError, with the method and the scan, unless each of the scans called `names` has a descriptor (d,)
-    that is finite and not zero."""
+    """Raise ValueError unless each of the scans called `names` has a descriptor (d,) that is finite and not zero."""
     if descriptors.ndim != 2 or len(descriptors) != len(names):
         raise ValueError(f"{method}: expected {len(names)} descriptors ({len(names)}, d), found {descriptors.shape}")
-    broken, empty = ~np.isfinite(descriptors).all(axis=1), ~descriptors.any(axis=1)
-    for bad, what in ((broken, "values that are not finite"), (empty, "only zeros")):
-        if bad.any():
-            raise ValueError(f"{method}: expected a descriptor of {names[int(bad.argmax())]}, found {what}")
+    infinite, empty = ~np.isfinite(descriptors).all(axis=1), ~descriptors.any(axis=1)
+    for is_bad, found in ((infinite, "values that are not finite"), (empty, "only zeros")):
+        if is_bad.any():
+            raise ValueError(f"{method}: expected a descriptor of {names[int(is_bad.argmax())]}, found {found}")

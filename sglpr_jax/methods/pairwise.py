@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 Rows = Float32[np.ndarray, "rows d"]
+BLOCK = 1024
+"""Number of descriptors on each side of a block of L2 and cosine distances."""
 
 
 def in_blocks(
@@ -31,12 +33,31 @@ def in_blocks(
     def fill(column: int) -> None:
         prepared = (prepare_database or prepare)(database[column : column + block])
         for row in range(0, len(queries), block):
-            found = compare(prepare(queries[row : row + block]), prepared)
-            out[row : row + block, column : column + block] = found
+            out[row : row + block, column : column + block] = compare(prepare(queries[row : row + block]), prepared)
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         list(pool.map(fill, range(0, len(database), block)))  # raises the errors of the blocks
     return out
+
+
+def l2(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
+    """Return the Euclidean distances |q - d|. Sums are in float64, because the squares cancel near zero."""
+
+    def compare(queries, database):
+        squares = np.sum(queries**2, axis=1)[:, None] + np.sum(database**2, axis=1)[None, :]
+        return np.sqrt(np.maximum(squares - 2 * queries @ database.T, 0))
+
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=lambda rows: rows.astype(np.float64))
+
+
+def cosine(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
+    """Return 1 - q . d / (|q| |d|), from 0 to 2. The result is 1 if either vector is zero."""
+
+    def unit(rows):
+        lengths = np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True)
+        return np.divide(rows, lengths, out=np.zeros(rows.shape), where=lengths > 0)
+
+    return in_blocks(lambda q, d: 1 - q @ d.T, queries, database, block=BLOCK, prepare=unit)
 
 
 def correlate(

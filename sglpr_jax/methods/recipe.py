@@ -56,10 +56,8 @@ class TupleConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Training of a learned method, beside its loss."""
+    """Training of a learned method, besides its loss."""
 
-    published: str
-    """Training of the authors, in words: optimiser, loss, tuples, duration."""
     sampling: TupleConfig
     tuples: int
     """Number of tuples in a step."""

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.grid import Grid, ImageKind
@@ -31,24 +29,27 @@ from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
 
 
-def method_named(name: str, params: Params | None, recording: Recording) -> Method:
-    """Return the network with these weights (None: `DEFAULT_WEIGHTS`), or a handcrafted method."""
+def method_named(name: str, params: Params | None = None, *, ready_made: bool = False) -> Method:
+    """Return the network with these weights (None: `DEFAULT_WEIGHTS`), or a handcrafted method.
+
+    `ready_made` is for recordings of images (`Recording.has_images`), which a handcrafted method describes as a whole.
+    """
     if name != NETWORK:
-        return handcrafted(name, recording, model_preset("sglpr").grid)
+        return handcrafted(name, None if ready_made else model_preset("sglpr").grid)
     return network(load(DEFAULT_WEIGHTS) if params is None else params)
 
 
-def method_beside(trained: Params, name: str, recording: Recording, *, seed: int = 0) -> Method:
+def method_beside(trained: Params, name: str, *, ready_made: bool, seed: int = 0) -> Method:
     """Return the method called `name`, one of `BesideName`, for comparison with a newly trained network.
 
     `untrained` is the same network with random weights from `seed`, `shipped` has the `DEFAULT_WEIGHTS`. A handcrafted
-    method on images has the window of the network.
+    method has the window of the network, or `ready_made` images as a whole.
     """
     if name == UNTRAINED:
         return network(init(jax.random.key(seed + 1), config=trained.config))
     if name == SHIPPED:
         return network(load(DEFAULT_WEIGHTS))
-    return handcrafted(name, recording, trained.config.grid)
+    return handcrafted(name, None if ready_made else trained.config.grid)
 
 
 def method_with_weights(weights: str) -> Method:
@@ -66,41 +67,32 @@ def trained_method(method: LearnedMethod, weights: str) -> Method:
     Raises the errors of `load_variables`.
     """
     variables = load_variables(weights, method)
-    hashed = variables_hash(variables)
-
-    def prepare(scan: Scan, angle: float | None) -> Any:
-        return method.prepare(scan if angle is None else rotated_scan(scan, angle))
-
+    sha256 = variables_hash(variables)
     return Method(
         {"method": method.name, "weights": weights},
         method.takes,
-        prepare,
+        lambda scan, angle: method.prepare(scan if angle is None else rotated_scan(scan, angle)),
         functools.partial(apply_network, variables, method=method),
-        distance="l2" if method.compare is None else stated_distance(method.name, weights, hashed),
-        weights_hash=hashed,
+        distance="l2" if method.compare is None else stated_distance(method.name, weights, sha256),
+        weights_hash=sha256,
     )
 
 
 def network(params: Params) -> Method:
     """Return the method that describes images with `params`."""
     config = params.config
+    options = {"image": config.image, "categories": config.categories_read, "field": field_of_view(config)[0]}
     return Method(
         {"method": NETWORK, "model": dataclasses.asdict(config)},
         "labelled images" if config.categories_read else "images",
-        functools.partial(
-            checked_view,
-            grid=config.grid,
-            image=config.image,
-            categories=config.categories_read,
-            field=field_of_view(config)[0],
-        ),
+        functools.partial(checked_view, grid=config.grid, **options),
         lambda views: describe(params, *views),
         weights_hash=weights_hash(params),
     )
 
 
-def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
-    """Return a handcrafted method for the scans of `recording`. It takes points, whole images, or images of `grid`.
+def handcrafted(name: str, grid: Grid | None) -> Method:
+    """Return a handcrafted method. Its images are made from scans on `grid`, or are ready-made ones (None).
 
     Raises ValueError if the name is not in `HANDCRAFTED`.
     """
@@ -110,19 +102,18 @@ def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
     if method.takes != "images":
         prepare = functools.partial(_describe_points, method)
         return Method({"method": name}, method.takes, prepare, lambda rows: rows, method.distance_name)
-    ready_made = recording.has_images
-    describe_images = (ready_made and method.describe_ready_made) or method.describe
+    describe_images = (grid is None and method.describe_ready_made) or method.describe
     return Method(
-        {"method": name, **({} if ready_made else {"grid": dataclasses.asdict(grid)})},
+        {"method": name} | ({} if grid is None else {"grid": dataclasses.asdict(grid)}),
         method.takes,
-        functools.partial(checked_view, grid=None if ready_made else grid),
+        functools.partial(checked_view, grid=grid),
         lambda views: describe_images(views.image),
         method.distance_name,
     )
 
 
 def _describe_points(method: HandcraftedMethod, scan: Scan, angle: float | None) -> np.ndarray:
-    """Return the descriptor of the finite points of a scan, and of their classes if the method needs them."""
+    """Return the descriptor of the finite points of a scan, and of their classes if the method takes labels."""
     assert scan.points is not None
     finite = np.isfinite(scan.points).all(axis=1)
     points = scan.upright_points[finite]
@@ -139,21 +130,24 @@ def checked_view(
     categories: int = 0,
     field: Bool[np.ndarray, "h w"] | None = None,
 ) -> View:
-    """Return the `view` of a record. Raises ValueError if too few cells within `field` (None: all) are occupied."""
-    turn = None if angle is None else jnp.float32(angle)
-    found = view(scan, grid, image=image, categories=categories, angle=turn)
-    seen = np.asarray(found.image)
-    cells = np.count_nonzero(seen if field is None else seen * field)
-    if cells < FEWEST_CELLS:
+    """Return the `view` of a scan, rotated by `angle` in radians.
+
+    Raises ValueError if too few cells within `field` (None: all) are occupied.
+    """
+    result = view(scan, grid, image=image, categories=categories, angle=None if angle is None else jnp.float32(angle))
+    counts = np.asarray(result.image)
+    occupied = np.count_nonzero(counts if field is None else counts * field)
+    if occupied < FEWEST_CELLS:
+        rows, columns = counts.shape
         raise ValueError(
-            f"{scan.name}: expected points in at least {FEWEST_CELLS} cells of the window of {seen.shape[0]} x"
-            f" {seen.shape[1]} cells, found points in {cells}"
+            f"{scan.name}: expected points in at least {FEWEST_CELLS} cells of the window of {rows} x {columns} cells, "
+            f"found points in {occupied}"
         )
-    return found
+    return result
 
 
 def rotated_scan(scan: Scan, angle: float) -> Scan:
-    """Return a record whose scan or image is rotated by an angle in radians, counter-clockwise."""
+    """Return a scan whose points or image are rotated by an angle in radians, counter-clockwise."""
     if scan.points is not None:
         return dataclasses.replace(scan, points=rotated(scan.upright_points, angle), mounting=None)
     assert scan.image is not None

@@ -1,6 +1,14 @@
-"""Configurations of the backbones: Swin-Unet, circular CNN, and a Swin-Unet on the tokens of the circular CNN."""
+"""Configurations of the backbones: Swin-Unet, circular CNN, and a Swin-Unet on the tokens of the circular CNN.
 
-import abc
+Besides its fields, each has the following properties:
+
+    token        rows and columns of the image that one feature represents
+    width        channels of the features
+    multiple     the image's rows and columns must be a multiple of this: the size of one feature of the coarsest map
+    needs_polar  whether the backbone requires a polar image, because its layers wrap around
+    pictures     maps to draw as heat maps: from the title of each picture to a name in `Outputs.intermediates`
+"""
+
 import dataclasses
 import math
 from typing import Literal
@@ -16,36 +24,7 @@ def check_lengths(owner: str, **lists: tuple[int, ...]) -> None:
         raise ValueError(f"expected equal numbers of {', '.join(names)} and {last} of {owner}, found {found}")
 
 
-class BackboneSizes(abc.ABC):
-    """What every configuration of a backbone says about it. Sizes are rows and columns of the image that it sees."""
-
-    @property
-    @abc.abstractmethod
-    def token(self) -> tuple[int, int]:
-        """Rows and columns of the image that one feature represents."""
-
-    @property
-    @abc.abstractmethod
-    def width(self) -> int:
-        """Channels of the features."""
-
-    @property
-    def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this: the size of one feature of the coarsest map."""
-        return self.token
-
-    @property
-    @abc.abstractmethod
-    def needs_polar(self) -> bool:
-        """Whether the backbone requires a polar image, because its layers wrap around."""
-
-    @property
-    @abc.abstractmethod
-    def pictures(self) -> dict[str, str]:
-        """Maps to draw as heat maps: from the title of each picture to a name in `BackboneFeatures.named`."""
-
-
-class _Stages(BackboneSizes):
+class _Stages:
     """Backbone of Swin stages. Stage i has `embed_dim` * 2**i channels."""
 
     embed_dim: int
@@ -59,9 +38,13 @@ class _Stages(BackboneSizes):
                 "expected at least one stage, and a number of heads for each, found "
                 f"depths {self.depths}, heads {self.heads}"
             )
-        for i, number in enumerate(self.heads):
-            if (channels := self.embed_dim * 2**i) % number:
-                raise ValueError(f"heads: expected a divisor of the {channels} channels of stage {i}, found {number}")
+        for i, heads in enumerate(self.heads):
+            if (channels := self.embed_dim * 2**i) % heads:
+                raise ValueError(f"heads: expected a divisor of the {channels} channels of stage {i}, found {heads}")
+
+    @property
+    def token(self) -> tuple[int, int]:
+        raise NotImplementedError
 
     @property
     def width(self) -> int:
@@ -69,14 +52,12 @@ class _Stages(BackboneSizes):
 
     @property
     def multiple(self) -> tuple[int, int]:
-        rows, columns = self.token
         coarsest = 2 ** (len(self.depths) - 1)
-        return rows * coarsest, columns * coarsest
+        return self.token[0] * coarsest, self.token[1] * coarsest
 
     @property
     def pictures(self) -> dict[str, str]:
-        # Normalised maps have the same strength everywhere.
-        last = len(self.depths) - 1
+        last = len(self.depths) - 1  # of the maps before normalisation, which makes all positions equally strong
         return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
 
 
@@ -98,17 +79,16 @@ class SwinConfig(_Stages):
     """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
     block."""
 
+    mlp_ratio = 4
+    needs_polar = False
+
     @property
     def token(self) -> tuple[int, int]:
         return self.patch, self.patch
 
-    @property
-    def needs_polar(self) -> bool:
-        return False
-
 
 @dataclasses.dataclass(frozen=True)
-class CircularConfig(BackboneSizes):
+class CircularConfig:
     """Circular convolutions on the polar image, with one block for each width."""
 
     kind: Literal["circular"] = "circular"
@@ -125,6 +105,8 @@ class CircularConfig(BackboneSizes):
     means: Sizes = (1, 1, 2, 1, 2, 1, 1)
     """Number of neighbouring sectors that are averaged into one after each block."""
 
+    needs_polar = True
+
     def __post_init__(self):
         check_fields(self)
         if not self.widths:
@@ -139,13 +121,11 @@ class CircularConfig(BackboneSizes):
     def token(self) -> tuple[int, int]:
         return self.average * math.prod(self.strides), self.average * math.prod(self.means)
 
+    multiple = token
+
     @property
     def width(self) -> int:
         return self.widths[-1]
-
-    @property
-    def needs_polar(self) -> bool:
-        return True
 
     @property
     def pictures(self) -> dict[str, str]:
@@ -173,13 +153,11 @@ class SglprConfig(_Stages):
     """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
     block."""
 
+    needs_polar = True
+
     @property
     def token(self) -> tuple[int, int]:
         return self.stem.token
-
-    @property
-    def needs_polar(self) -> bool:
-        return True
 
     @property
     def pictures(self) -> dict[str, str]:

@@ -5,7 +5,6 @@ average pooling reduces it, because pooling skips no sector. A rotation by a who
 therefore a shift of that map. It is exact up to the resampling of the image.
 """
 
-import dataclasses
 import functools
 import itertools
 
@@ -15,21 +14,7 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models.backbone_config import CircularConfig
 from sglpr_jax.models.convolution import Convolution
-from sglpr_jax.models.layers import BackboneFeatures, LayerNorm, Linear
-
-
-@dataclasses.dataclass(frozen=True)
-class CircularBackbone:
-    """Circular CNN and its decoder: layers `rings` and `decoder`."""
-
-    config: CircularConfig
-
-    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> BackboneFeatures:
-        maps = CircularNet(self.config, name="rings")(image)  # the name in weight files
-        return BackboneFeatures(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
-
-    def decode(self, seen: BackboneFeatures) -> Float[Array, "b _ _ _"]:
-        return CircularDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
+from sglpr_jax.models.layers import LayerNorm, Linear
 
 
 class CircularBlock(nn.Module):
@@ -64,8 +49,8 @@ class CircularNet(nn.Module):
             if i < len(config.fine):
                 stride_of_fine = config.strides[i - 1] if i else config.average
                 fine = CircularBlock(config.fine[i], stride_of_fine, name=f"fine_{i}")(fine)
-                joining = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
-                maps[-1] = jnp.concatenate([maps[-1], joining], axis=-1)
+                averaged = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
+                maps[-1] = jnp.concatenate([maps[-1], averaged], axis=-1)
             maps.append(block_means(CircularBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
         return maps
 
@@ -82,27 +67,26 @@ class CircularDecoder(nn.Module):
     @nn.compact
     def __call__(self, maps: list[Array]) -> Float[Array, "b p q _"]:
         """Returns pixels with the channels of the first block."""
-        finer = [i for i, (fine, coarse) in enumerate(itertools.pairwise(maps)) if fine.shape[:3] != coarse.shape[:3]]
+        skips = [i for i, (fine, coarse) in enumerate(itertools.pairwise(maps)) if fine.shape[:3] != coarse.shape[:3]]
         x = maps[-1]
-        for i, of_map in enumerate(reversed(finer)):
-            seen, width = maps[of_map], self.widths[max(of_map - 1, 0)]
+        for i, row in enumerate(reversed(skips)):
+            skip, width = maps[row], self.widths[max(row - 1, 0)]
             x = Linear(width, name=f"narrow_{i}")(x)
-            x = x.repeat(seen.shape[1] // x.shape[1], axis=1).repeat(seen.shape[2] // x.shape[2], axis=2)
-            x = jnp.concatenate([x, seen], axis=-1)
-            x = CircularBlock(width, name=f"block_{i}")(x)
+            x = x.repeat(skip.shape[1] // x.shape[1], axis=1).repeat(skip.shape[2] // x.shape[2], axis=2)
+            x = CircularBlock(width, name=f"block_{i}")(jnp.concatenate([x, skip], axis=-1))
         return x
 
 
 def block_means(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
     """Average blocks of `radii` x `sectors` pixels, one direction after the other, so that no array has six axes."""
     b, r, s, c = x.shape
-    rows = _means_of_parts(x.reshape(b, r // radii, radii * s * c), radii)
-    blocks = _means_of_parts(rows.reshape(b, r // radii * (s // sectors), sectors * c), sectors)
+    rows = _mean_of_parts(x.reshape(b, r // radii, radii * s * c), radii)
+    blocks = _mean_of_parts(rows.reshape(b, r // radii * (s // sectors), sectors * c), sectors)
     return blocks.reshape(b, r // radii, s // sectors, c)
 
 
-def _means_of_parts(x: Float[Array, "b n k"], parts: int) -> Float[Array, "b n _"]:
-    """Averages equal parts of each row. It adds them, because XLA's CPU backend reduces a few numbers slowly."""
+def _mean_of_parts(x: Float[Array, "b n k"], parts: int) -> Float[Array, "b n _"]:
+    """Average equal parts of each row. They are added, because XLA's CPU backend reduces a few numbers slowly."""
     if parts == 1:
         return x
     return functools.reduce(jnp.add, jnp.split(x, parts, axis=-1)) * (1 / parts)

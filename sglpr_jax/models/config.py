@@ -55,16 +55,14 @@ class HeadConfig:
     """Whether CBAM first weights the map by channel and by position."""
     cbam_reduction: Size = 16
     """Channels per hidden unit of CBAM's channel gate."""
-    pooling: Literal["netvlad", "mean", "spectrum"] = "netvlad"
-    """Pooling of the map into one vector. `mean`: average pooling and a linear layer replace NetVLAD (table 4).
-    `spectrum`: amplitudes of the map's Fourier transform along the sectors of a polar image
-    (models/place_head.py)."""
+    pooling: Literal["netvlad", "mean"] = "netvlad"
+    """Pooling of the map into one vector. `mean`: average pooling and a linear layer replace NetVLAD (table 4)."""
     clusters: Size = 64
     """Number of NetVLAD clusters."""
     descriptor_size: Size = 256
     whiten: bool = False
     """Whether a last linear layer equalises the spread of the descriptors over their directions
-    (models/whitening.py)."""
+    (`bin/export --whiten`)."""
 
     def __post_init__(self):
         check_fields(self)
@@ -81,14 +79,9 @@ class HeadConfig:
         return self.input == "features"
 
     @property
-    def reads_counts(self) -> bool:
-        """Whether the head reads the image itself."""
-        return self.input in ("counts", "counts+labels")
-
-    @property
     def reads_labels(self) -> bool:
         """Whether a descriptor requires the ground-truth semantic map."""
-        return self.input in ("labels", "counts+labels")
+        return "labels" in self.input
 
     @property
     def pictures(self) -> dict[str, str]:
@@ -211,31 +204,30 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 
 
 def _read(annotation: Any, value: Any, field: str) -> Any:
-    """Converts a value to a field's type, and dictionaries to dataclasses, of a union by their `kind`."""
-    members = [annotation] if is_config(annotation) else list(filter(is_config, typing.get_args(annotation)))
-    if not members:
+    """Convert a value to a field's type, and dictionaries to dataclasses, of a union by their `kind`."""
+    configs = [member for member in (annotation, *typing.get_args(annotation)) if is_config(member)]
+    if not configs:
         return read_value(value, annotation, field)
-    require(value, isinstance(value, dict), f"the fields of a {' or '.join(one.__name__ for one in members)}", field)
-    prefix, kind = f"{field}." if field else "", value.get("kind")
-    value = {name: one for name, one in value.items() if (prefix + name, one) not in REMOVED}
-    if isinstance(kind, str) and kind in RENAMED:
-        value["kind"] = kind = RENAMED[kind]
-    expected: Any = members[0]
-    if len(members) > 1:
-        configs: dict[str, Any] = {member.kind: member for member in members}
-        require(kind, isinstance(kind, str) and kind in configs, f"a kind, {' or '.join(configs)}", field)
-        expected = configs[kind]
-    annotations, begin = field_types(expected), f"{field}: " if field else ""
-    value = {name: ADDED_LATER[prefix + name] for name in annotations if prefix + name in ADDED_LATER} | value
-    unknown = min(map(str, set(value) - set(annotations)), default=None)
-    missing = min(set(annotations) - set(value), default=None)
-    every = f"the fields of a {expected.__name__} ({', '.join(annotations)})"
-    require(unknown, unknown is None, every, field)
+    require(value, isinstance(value, dict), f"the fields of a {' or '.join(c.__name__ for c in configs)}", field)
+    prefix, config = f"{field}." if field else "", configs[0]
+    values = {name: entry for name, entry in value.items() if (prefix + name, entry) not in REMOVED}
+    if isinstance(kind := values.get("kind"), str):
+        values["kind"] = kind = RENAMED.get(kind, kind)
+    if len(configs) > 1:
+        by_kind: dict[Any, Any] = {config.kind: config for config in configs}
+        require(kind, isinstance(kind, str) and kind in by_kind, f"a kind, {' or '.join(by_kind)}", field)
+        config = by_kind[kind]
+    types = field_types(config)
+    values = {name: ADDED_LATER[prefix + name] for name in types if prefix + name in ADDED_LATER} | values
+    unknown = min(map(str, set(values) - set(types)), default=None)
+    missing = min(set(types) - set(values), default=None)
+    expected = f"the fields of a {config.__name__} ({', '.join(types)})"
+    require(unknown, unknown is None, expected, field)
     if missing is not None:
-        raise ValueError(f"{begin}expected {every}, found no {missing!r}")
-    read = {name: _read(annotations[name], one, prefix + name) for name, one in value.items()}
+        raise ValueError(f"{f'{field}: ' if field else ''}expected {expected}, found no {missing!r}")
+    read = {name: _read(types[name], entry, prefix + name) for name, entry in values.items()}
     with naming(field) if field else contextlib.nullcontext():  # the fields may be inconsistent
-        return expected(**read)
+        return config(**read)
 
 
 _PAPER = ModelConfig()

@@ -1,9 +1,7 @@
 """Convolution of the backbones and heads: XLA's in the forward pass, matrix products in the backward pass.
 
-Convolutions with few input channels use one matrix product in the forward pass, too.
-
-On a CPU, XLA computes the gradient of a kernel by a slow general loop if the step runs in chunks. The loop takes 27 to
-70 times as long as the products. Otherwise XLA takes up to 1.8 times as long as the products.
+On a CPU, XLA's gradient of a kernel takes up to 1.8 times as long as the products, and 27 to 70 times as long if the
+step runs in chunks. Convolutions with few input channels are one matrix product in the forward pass, too.
 """
 
 import functools
@@ -19,7 +17,7 @@ from sglpr_jax.models.layers import product, weight
 
 FEW_INPUTS = 16
 """Maximum kernel height times channels for which a matrix product takes half the time of XLA's convolution."""
-AT_ONCE = 4
+RESULTS_PER_PATCH = 4
 """Number of output columns in one row of the matrix product for few channels."""
 
 
@@ -62,7 +60,7 @@ def convolve(
         return as_product(x, kernel, strides, circular)
     border = _border(kernel, strides)
     padding, axes = ((border, border), (0, 0)), ("NHWC", "HWIO", "NHWC")
-    x = _columns_around(x, border, circular)
+    x = _pad_columns(x, border, circular)
     return jax.lax.conv_general_dilated(x, kernel, strides, padding, dimension_numbers=axes)
 
 
@@ -79,27 +77,28 @@ def as_product(
     """Compute the same convolution as one matrix product.
 
     With column stride 1 and an odd kernel, the product gives the contributions of each column, of k pixels above each
-    other, to itself and to its neighbours. Otherwise it multiplies whole patches, which copies k times the data.
-    For few channels, the patches are wide enough for several results side by side, and the kernel is mostly zeros. The
-    time of this small product is limited by memory access.
+    other, to itself and to its neighbours. Otherwise it multiplies whole patches, which copies k times the data. For
+    few channels, the patches are wide enough for several results side by side, and the kernel is mostly zeros: memory
+    access limits this small product.
     """
     size, border, f = len(kernel), _border(kernel, strides), kernel.shape[-1]
     x = jnp.pad(x, ((0, 0), (border, border), (0, 0), (0, 0)))
     columns = _side_by_side(x, 1, size, strides[0])
     few = _few_inputs(kernel)
     if strides[1] == 1 and size % 2 and not few:
-        added = jnp.split(_product(columns, kernel.swapaxes(1, 2).reshape(-1, size * f)), size, axis=-1)
-        return functools.reduce(jnp.add, [_moved(of_one, border - j, circular) for j, of_one in enumerate(added)])
-    columns, at_once = _columns_around(columns, border, circular), AT_ONCE if few else 1
-    stride = at_once * strides[1]
+        parts = jnp.split(_product(columns, kernel.swapaxes(1, 2).reshape(-1, size * f)), size, axis=-1)
+        return functools.reduce(jnp.add, [_shift(part, border - j, circular) for j, part in enumerate(parts)])
+    columns, results_per_patch = _pad_columns(columns, border, circular), RESULTS_PER_PATCH if few else 1
+    stride = results_per_patch * strides[1]
     beyond = stride - strides[1]
-    parts = [jnp.pad(kernel, ((0, 0), (j, beyond - j), (0, 0), (0, 0))) for j in range(0, beyond + 1, strides[1])]
-    wide = jnp.concatenate(parts, axis=-1)  # of at_once results, each from its own part of a wider patch
+    kernels = [jnp.pad(kernel, ((0, 0), (j, beyond - j), (0, 0), (0, 0))) for j in range(0, beyond + 1, strides[1])]
+    wide_kernel = jnp.concatenate(kernels, axis=-1)
     results = (columns.shape[2] - size) // strides[1] + 1
-    lacking = -results % at_once * strides[1]
-    patches = _side_by_side(jnp.pad(columns, ((0, 0), (0, 0), (0, lacking), (0, 0))), 2, wide.shape[1], stride)
-    found = _product(patches, wide.swapaxes(0, 1).reshape(-1, at_once * f))
-    return found.reshape(*found.shape[:2], -1, f)[:, :, :results]
+    missing = -results % results_per_patch * strides[1]
+    columns = jnp.pad(columns, ((0, 0), (0, 0), (0, missing), (0, 0)))
+    patches = _side_by_side(columns, 2, wide_kernel.shape[1], stride)
+    y = _product(patches, wide_kernel.swapaxes(0, 1).reshape(-1, results_per_patch * f))
+    return y.reshape(*y.shape[:2], -1, f)[:, :, :results]
 
 
 def _few_inputs(kernel: Float[Array, "k k c f"]) -> bool:
@@ -112,7 +111,7 @@ def _border(kernel: Float[Array, "k k c f"], strides: tuple[int, int]) -> int:
     return 0 if strides == (size, size) else size // 2
 
 
-def _columns_around(x: Float[Array, "b h w c"], border: int, circular: bool) -> Float[Array, "b h _ c"]:
+def _pad_columns(x: Float[Array, "b h w c"], border: int, circular: bool) -> Float[Array, "b h _ c"]:
     """Add columns on the left and on the right: those of the opposite side, or zeros."""
     sides = ((0, 0), (0, 0), (border, border), (0, 0))
     return jnp.pad(x, sides, mode="wrap") if circular else jnp.pad(x, sides)
@@ -120,16 +119,15 @@ def _columns_around(x: Float[Array, "b h w c"], border: int, circular: bool) -> 
 
 def _side_by_side(x: Float[Array, "b h w c"], axis: int, size: int, stride: int) -> Float[Array, "b _ _ _"]:
     """Stack the pixels along the axis that the kernel covers at each position, as channels."""
-    met = (x.shape[axis] - size) // stride * stride + 1
-    return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + met, stride, axis) for i in range(size)], axis=-1)
+    end = (x.shape[axis] - size) // stride * stride + 1
+    return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + end, stride, axis) for i in range(size)], axis=-1)
 
 
-def _moved(x: Float[Array, "b h w c"], by: int, circular: bool) -> Float[Array, "b h w c"]:
-    """Shift the columns to the right. Columns that leave the image enter on the other side, or zeros enter."""
+def _shift(x: Float[Array, "b h w c"], columns: int, circular: bool) -> Float[Array, "b h w c"]:
+    """Shift an image to the right. Columns that leave the image enter on the other side, or zeros enter."""
     if circular:
-        return jnp.roll(x, by, axis=2)
-    as_it_is = (0, 0, 0)
-    return jax.lax.pad(x, x.dtype.type(0), (as_it_is, as_it_is, (by, -by, 0), as_it_is))
+        return jnp.roll(x, columns, axis=2)
+    return jax.lax.pad(x, x.dtype.type(0), ((0, 0, 0), (0, 0, 0), (columns, -columns, 0), (0, 0, 0)))
 
 
 def _product(x: Float[Array, "b h w c"], matrix: Float[Array, "c f"]) -> Float[Array, "b h w f"]:

@@ -12,7 +12,6 @@ from typing import Literal, get_args
 import jax
 import jax.export
 import numpy as np
-from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
 
 from sglpr_jax.data.density_image import CEILING_M, EDGE_STEP_M, FIRST_EDGE_M, FLOOR_M, MAX_VOXELS, REACH_M
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
@@ -28,6 +27,7 @@ from sglpr_jax.models.weights_file import CONFIG_FILE, load, save
 ProgramFormat = Literal["stablehlo", "onnx"]
 PLATFORMS = ("cpu", "cuda", "tpu")
 INPUT_FILE = "input.json"
+OPSET = 21
 NEEDS = "pip install 'sglpr-jax[export]'"
 NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
 """jax2onnx is installed without its dependencies. They include an Orbax that is older than Flax's and that the
@@ -35,11 +35,10 @@ conversion does not use."""
 
 
 def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -> Path:
-    """Export `describe` with its weights as a program.
+    """Export `describe` with its weights as a program from images (b, h, w) in float32 to descriptors (b, d).
 
     The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`. The latter
-    describes how a scan becomes the program's input, and holds the SHA-256 of the program. Both formats take any number
-    of images (b, h, w) in float32 and return descriptors (b, d).
+    describes how a scan becomes the program's input, and holds the SHA-256 of the program.
 
     Arguments:
       params: Model that reads images only.
@@ -57,7 +56,8 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
     folder = Path(folder)
     if params.config.head.reads_labels:
         raise ValueError(f"expected a model that reads images only, found one that reads {params.config.head.input}")
-    check_holds_only(folder, (*(f"describe.{one}" for one in get_args(ProgramFormat)), CONFIG_FILE, INPUT_FILE))
+    programs = [f"describe.{program_format}" for program_format in get_args(ProgramFormat)]
+    check_holds_only(folder, (*programs, CONFIG_FILE, INPUT_FILE))
     params = for_places(params)
     program = stablehlo(params) if format == "stablehlo" else onnx(params)
     with replacing(folder) as new:
@@ -89,17 +89,20 @@ def stablehlo(params: Params) -> bytes:
 
 
 def onnx(params: Params) -> bytes:
-    """Return `describe` with these weights as an ONNX model, converted in a process of its own, which it spoils."""
+    """Return `describe` with these weights as an ONNX model.
+
+    The conversion changes JAX, so it needs a process of its own, which runs this file (`convert`).
+    """
     with tempfile.TemporaryDirectory() as temporary:
         weights, program = Path(temporary, "weights"), Path(temporary, "describe.onnx")
         save(params, weights)
         command = [sys.executable, "-m", "sglpr_jax.models.export", str(weights), str(program)]
-        on_the_cpu = os.environ | {"JAX_PLATFORMS": "cpu"}
-        ended = subprocess.run(command, capture_output=True, text=True, env=on_the_cpu)
-        if ended.returncode:
-            last = (ended.stderr.strip().splitlines() or ["no message"])[-1]
-            error = ImportError if "ModuleNotFoundError" in last else RuntimeError
-            raise error(f"the conversion to ONNX failed ({last}); it requires: {NEEDS_ONNX}")
+        environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+        process = subprocess.run(command, capture_output=True, text=True, env=environment)
+        if process.returncode:
+            last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
+            error = ImportError if "ModuleNotFoundError" in last_line else RuntimeError
+            raise error(f"the conversion to ONNX failed ({last_line}); it requires: {NEEDS_ONNX}")
         return program.read_bytes()
 
 
@@ -125,7 +128,7 @@ def _counts_of_points(grid: Grid) -> dict[str, str]:
 
 
 def _counts_of_voxels(grid: Grid) -> dict[str, str]:
-    """Steps of `density_bev`, `even_cells` and `centre_crop`."""
+    """Describe the steps of `density_bev`, `even_cells` and `centre_crop`."""
     u, v = grid.width // 2, grid.height // 2
     return {
         "voxels": f"points with |x| < {REACH_M}, |y| < {REACH_M}, {FLOOR_M} < z < {CEILING_M} are sorted into voxels, "
@@ -140,11 +143,10 @@ def _counts_of_voxels(grid: Grid) -> dict[str, str]:
     }
 
 
-OPSET = 21
-
-
 def convert(weights: Path, file: Path) -> None:
     """Write `describe` as an ONNX model, with the description of its input in the metadata."""
+    from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]  (an optional package)
+
     params = load(weights)
     grid = params.config.grid
     model = to_onnx(

@@ -24,43 +24,39 @@ FEWEST_CELLS = 2
 def prepare(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w {config.channels}"]:
     """Convert point counts to network input.
 
-    Counts are scaled as in `config.counts`, and cells outside the field of view are blank.
+    Counts are scaled as in `config.counts`, and cells outside the field of view are blank. A density image has floats,
+    or uint8 grey values. Other integers are an error, because the fractions of the counts are lost.
     """
-    image = _counts(bev, config)
-    if config.counts == "log1p":
-        image = jnp.log1p(image)
-    elif config.counts == "clipped":
-        image = jnp.minimum(image, CLIP_COUNT) / CLIP_COUNT
-    image = jnp.where(field_of_view(config), image, 0.0)[..., None]
-    if config.range_channel:
-        distance = cell_distance(config.grid) / cell_distance(config.grid).max()
-        image = jnp.concatenate([image, jnp.broadcast_to(distance[None, ..., None], image.shape)], axis=-1)
-    return image
-
-
-def _counts(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w"]:
-    """Counts of an image as float32. A density image has floats or uint8 grey values; other integers are invalid."""
+    counts = jnp.asarray(bev, jnp.float32)
     if config.image == "density" and not jnp.issubdtype(bev.dtype, jnp.floating):
         if bev.dtype != jnp.uint8:
             raise ValueError(
                 "this model describes density images: expected counts 0 to 10 as floats, or grey values 0 to 255 as "
                 f"uint8, found {bev.dtype}, which has lost the fractions of the counts"
             )
-        return bev.astype(jnp.float32) * np.float32(DENSITY_MAX_COUNT / 255)
-    return jnp.asarray(bev, jnp.float32)
+        counts = counts * np.float32(DENSITY_MAX_COUNT / 255)
+    if config.counts == "log1p":
+        counts = jnp.log1p(counts)
+    elif config.counts == "clipped":
+        counts = jnp.minimum(counts, CLIP_COUNT) / CLIP_COUNT
+    image = jnp.where(field_of_view(config), counts, 0.0)[..., None]
+    if config.range_channel:
+        distance = cell_distance(config.grid) / cell_distance(config.grid).max()
+        image = jnp.concatenate([image, jnp.broadcast_to(distance[None, ..., None], image.shape)], axis=-1)
+    return image
 
 
 def backbone_view(image: Float[Array, "b h w c"], config: ModelConfig) -> Float[Array, "b p q c"]:
     """Convert an image to the input of the backbone: polar if configured, and in the data type of the computation."""
-    seen = to_polar(image, config.grid, *config.polar) if config.polar else image
-    return seen.astype(config.compute)
+    polar = to_polar(image, config.grid, *config.polar) if config.polar else image
+    return polar.astype(config.compute)
 
 
 def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
     """Return the mask of cells that the network sees: within the field and at least `blind_m` from the sensor."""
     grid, distance = config.grid, cell_distance(config.grid)
-    seen = (distance < grid.resolution_m * min(grid.height, grid.width) / 2) | (config.field == "square")
-    return (seen & (distance >= config.blind_m))[None]
+    within = (distance < grid.resolution_m * min(grid.height, grid.width) / 2) | (config.field == "square")
+    return (within & (distance >= config.blind_m))[None]
 
 
 def cell_distance(grid: Grid) -> Float[np.ndarray, "h w"]:
@@ -87,14 +83,14 @@ def to_polar(
     row = (grid.height - 1) / 2 - np.outer(radius, np.sin(angle))
     column = (grid.width - 1) / 2 + np.outer(radius, np.cos(angle))
     taps = _bilinear(row.clip(0, grid.height - 1), column.clip(0, grid.width - 1), grid.height, grid.width)
-    return _read(_flat(image), taps).reshape(image.shape[0], radii, sectors, -1)
+    return resample(_flat(image), taps).reshape(image.shape[0], radii, sectors, -1)
 
 
 def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {grid.height} {grid.width} c"]:
     """Sample the polar image at every cell of the grid. Cells outside the circle are zero.
 
-    The function is differentiable in reverse mode only. Its gradient is written as a gather, too. With the scatter of
-    JAX's own gradient, the forward and backward passes took six times as long on a CPU.
+    The function is differentiable in reverse mode only. Its gradient is a gather, too, because the scatter of JAX's own
+    gradient is six times slower on a CPU.
     """
     radii, sectors = polar.shape[1:3]
     down, right = np.mgrid[: grid.height, : grid.width]
@@ -106,12 +102,8 @@ def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {g
     inside = (np.hypot(up, right) < radius_cells).reshape(-1)
     taps = Taps(taps.pixel, taps.weight * inside)
     back = _transposed(taps, radii * sectors)
-
-    @jax.custom_vjp
-    def read(flat: Array) -> Array:
-        return _read(flat, taps)
-
-    read.defvjp(lambda flat: (read(flat), None), lambda _, cotangent: (_read(cotangent, back),))
+    read = jax.custom_vjp(lambda flat: resample(flat, taps))
+    read.defvjp(lambda flat: (resample(flat, taps), None), lambda _, cotangent: (resample(cotangent, back),))
     return read(_flat(polar)).reshape(polar.shape[0], grid.height, grid.width, -1)
 
 
@@ -143,7 +135,7 @@ def _transposed(taps: Taps, pixels: int) -> Taps:
     return back
 
 
-def _read(flat: Float[Array, "b p c"], taps: Taps) -> Float[Array, "b n c"]:
-    """Weighted sums of the pixels in `taps`."""
-    read = (flat[:, pixel] * weight[None, :, None] for pixel, weight in zip(*taps, strict=True))
-    return functools.reduce(jnp.add, read)
+def resample(flat: Float[Array, "b p c"], taps: Taps) -> Float[Array, "b n c"]:
+    """Return the weighted sums of the pixels in `taps`."""
+    parts = (flat[:, pixel] * weight[None, :, None] for pixel, weight in zip(*taps, strict=True))
+    return functools.reduce(jnp.add, parts)

@@ -1,4 +1,4 @@
-"""Linear layer, layer norm and initial values of all modules, configured as in the PyTorch reference.
+"""Layers that all networks share: linear layer, layer norm, maximum, NetVLAD's residuals and unit length.
 
 Weights are float32. Layers multiply in the data type of their input. A network therefore computes in the type of its
 image (`ModelConfig.compute`), except where a module requests float32.
@@ -6,7 +6,7 @@ image (`ModelConfig.compute`), except where a module requests float32.
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -16,18 +16,11 @@ from jaxtyping import Array, Float
 from sglpr_jax.models import initial
 from sglpr_jax.models.initial import Initial, Initializer
 
+EPSILON = 1e-5
+"""PyTorch's epsilon of a layer norm."""
 NORM_FLOOR = 1e-12
-
-
-class BackboneFeatures(NamedTuple):
-    """Output of a backbone for a batch of images."""
-
-    features: Float[Array, "b p q c"]
-    """Input of the place head and of the decoder."""
-    finer: list[Array]
-    """Intermediate maps that the decoder uses again, finest first."""
-    named: dict[str, Array]
-    """All maps by name, for pictures and tests."""
+ROUNDING = 1e-6
+"""Relative difference from the maximum below which an entry counts as equal to it."""
 
 
 def weight(module: nn.Module, name: str, init: Initializer, shape: tuple[int, ...]) -> Any:
@@ -72,9 +65,8 @@ class Linear(nn.Module):
 def product(x: Float[Array, "n c"], matrix: Float[Array, "c f"]) -> Float[Array, "n f"]:
     """Multiply many rows by a matrix.
 
-    The gradient of the matrix is a sum over the rows. XLA's CPU backend rearranges the first factor of this sum, which
-    takes up to half of the time if the first factor is the wider one. For a matrix with more rows than columns, the
-    derivative therefore exchanges the factors. The barrier keeps XLA from exchanging them again.
+    For a matrix with more rows than columns, the derivative exchanges the factors of its sum over the rows, because
+    XLA's CPU backend rearranges the first one. The barrier keeps XLA from exchanging them again.
     """
     return x @ matrix
 
@@ -83,8 +75,8 @@ def product(x: Float[Array, "n c"], matrix: Float[Array, "c f"]) -> Float[Array,
 def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]):
     (x, matrix), (x_tangent, matrix_tangent) = primals, tangents
     if len(x) > len(matrix) > matrix.shape[1]:
-        turned = jax.lax.optimization_barrier(matrix_tangent.T)
-        by_matrix = jax.lax.dot_general(x, turned, (((1,), (1,)), ((), ())))
+        transposed = jax.lax.optimization_barrier(matrix_tangent.T)
+        by_matrix = jax.lax.dot_general(x, transposed, (((1,), (1,)), ((), ())))
     else:
         by_matrix = x @ matrix_tangent
     return product(x, matrix), x_tangent @ matrix + by_matrix
@@ -96,49 +88,68 @@ def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
 
 
 class LayerNorm(nn.Module):
-    """Layer norm over channels with PyTorch's epsilon, computed in float32.
-
-    The arithmetic is that of Flax, whose layer would trace the initial values in every call (see `weight`).
-    """
-
-    epsilon: float = 1e-5
+    """Layer norm over channels with the arithmetic of Flax, computed in float32."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
         scale = jnp.asarray(weight(self, "scale", initial.ones, x.shape[-1:]))
         bias = jnp.asarray(weight(self, "bias", initial.zeros, x.shape[-1:]))
         rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])
-        return layer_norm(rows, scale, bias, self.epsilon).astype(x.dtype).reshape(x.shape)
+        return layer_norm(rows, scale, bias).astype(x.dtype).reshape(x.shape)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def layer_norm(
-    x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"], epsilon: float
-) -> Float[Array, "n c"]:
+@jax.custom_jvp
+def layer_norm(x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"]) -> Float[Array, "n c"]:
     """Normalise every row. XLA passes over the rows more often for the derivative of JAX than for this one."""
-    mean, per_deviation = _statistics(x, epsilon)
+    mean, per_deviation = _statistics(x)
     return (x - mean) * (per_deviation * scale[None]) + bias[None]
 
 
 @layer_norm.defjvp
-def _(epsilon: float, primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]):
+def _(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]):
     (x, scale, bias), (x_tangent, scale_tangent, bias_tangent) = primals, tangents
-    mean, per_deviation = _statistics(x, epsilon)
+    mean, per_deviation = _statistics(x)
     normed = (x - mean) * per_deviation
-    along = x_tangent - _mean(x_tangent) - normed * _mean(normed * x_tangent)
+    along = x_tangent - x_tangent.mean(-1, keepdims=True) - normed * (normed * x_tangent).mean(-1, keepdims=True)
     tangent = along * (per_deviation * scale[None]) + normed * scale_tangent[None] + bias_tangent[None]
-    return layer_norm(x, scale, bias, epsilon), tangent
+    return layer_norm(x, scale, bias), tangent
 
 
-def _statistics(x: Float[Array, "n c"], epsilon: float) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
+def _statistics(x: Float[Array, "n c"]) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
     """Mean and reciprocal standard deviation of each row."""
-    mean = _mean(x)
-    variance = jnp.maximum(_mean(x * x) - mean * mean, 0.0)
-    return mean, jax.lax.rsqrt(variance + epsilon)
+    mean = x.mean(-1, keepdims=True)
+    variance = jnp.maximum((x * x).mean(-1, keepdims=True) - mean * mean, 0.0)
+    return mean, jax.lax.rsqrt(variance + EPSILON)
 
 
-def _mean(x: Float[Array, "n c"]) -> Float[Array, "n 1"]:
-    return x.mean(-1, keepdims=True)
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def maximum(x: Float[Array, "*dims"], axes: tuple[int, ...]) -> Float[Array, "*rest"]:
+    """Maximum over some axes. All entries within rounding of the maximum share its gradient.
+
+    The gradient of `jnp.max` goes to the entries equal to the maximum. XLA may compute `x` again for the gradient and
+    round it differently. Then no entry is equal, and the gradient is 0 / 0.
+    """
+    return x.max(axes)
+
+
+@maximum.defjvp
+def _(axes: tuple[int, ...], primals: tuple[Array], tangents: tuple[Array]):
+    (x,), (x_tangent,) = primals, tangents
+    y = x.max(axes, keepdims=True)
+    equal = x >= y - ROUNDING * (1 + jnp.abs(y))
+    return y.squeeze(axes), jnp.where(equal, x_tangent, 0).sum(axes) / jnp.maximum(equal.sum(axes), 1)
+
+
+def residual_sums(
+    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[Array, "d k"]
+) -> Float[Array, "b d k"]:
+    """Sum the residuals of local features per cluster, as in NetVLAD, each sum L2-normalised over d, in float32.
+
+    vlad[d, k] = sum over n of assignment[n, k] * (features[n, d] - centres[d, k])
+    """
+    weights = assignment.astype(features.dtype)
+    sums = jnp.einsum("bnd,bnk->bdk", features, weights, preferred_element_type=jnp.float32)
+    return l2_normalize(sums - assignment.sum(1)[:, None, :] * centres[None], axis=1)
 
 
 def l2_normalize(x: Float[Array, "*dims"], *, axis: int = -1) -> Float[Array, "*dims"]:

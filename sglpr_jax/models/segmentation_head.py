@@ -28,8 +28,7 @@ class Detail(nn.Module):
         image = image.astype(features.dtype)
         for i, (cells, channels) in enumerate(_LOCAL):
             image = nn.relu(Convolution(channels, cells, kernel_init=lecun_normal, name=f"local{i}")(image))
-        both = jnp.concatenate([features, image], axis=-1)
-        return gelu(Linear(self.width, name="mix")(both))
+        return gelu(Linear(self.width, name="mix")(jnp.concatenate([features, image], axis=-1)))
 
 
 def segmentation_head(
@@ -41,8 +40,8 @@ def segmentation_head(
     polar image to the grid. The resampling and the logits are float32.
     """
     to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
-    crossing = Linear(config.detail, name="narrow")(pixels) if config.detail else to_logits(pixels)
-    on_grid = crossing.astype(jnp.float32)
+    narrow = Linear(config.detail, name="narrow")(pixels) if config.detail else to_logits(pixels)
+    on_grid = narrow.astype(jnp.float32)
     on_grid = from_polar(on_grid, config.grid) if config.polar else on_grid
     if not config.detail:
         return on_grid

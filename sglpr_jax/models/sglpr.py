@@ -8,30 +8,40 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.models.backbone_config import BackboneConfig, CircularConfig, SglprConfig, SwinConfig
-from sglpr_jax.models.circular import CircularBackbone
+from sglpr_jax.models.backbone_config import BackboneConfig, SglprConfig, SwinConfig
+from sglpr_jax.models.circular import CircularDecoder, CircularNet
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
-from sglpr_jax.models.layers import BackboneFeatures
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import PlaceHead, raw_input
 from sglpr_jax.models.segmentation_head import segmentation_head
-from sglpr_jax.models.swin_unet import SglprBackbone, SwinBackbone
+from sglpr_jax.models.swin import PatchExpand
+from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
 
 
-def _backbone(config: BackboneConfig, *, circular: bool) -> SwinBackbone | CircularBackbone | SglprBackbone:
-    """Return the layers of a backbone, which belong to the calling Flax module.
+def _encode(
+    config: BackboneConfig, image: Float[Array, "b p q c"], *, circular: bool, train: bool
+) -> tuple[list[Array], dict[str, Array]]:
+    """Return the maps that the decoder uses, the last of which are the features, and all maps by name.
 
-    They have two calls: from images to `BackboneFeatures`, and from these to pixels (`decode`, at most once).
+    The layers belong to the calling Flax module.
     """
-    match config:
-        case SwinConfig():
-            return SwinBackbone(config, circular)
-        case CircularConfig():
-            return CircularBackbone(config)
-        case SglprConfig():
-            return SglprBackbone(config)
+    if isinstance(config, SwinConfig):
+        tokens, named = SwinUnet(config, config.patch, circular, name="backbone")(image, train=train)
+        return [tokens], named
+    if isinstance(config, SglprConfig):
+        return CircularSwin(config, name="backbone")(image, train=train)
+    maps = CircularNet(config, name="rings")(image)  # the name in weight files
+    return maps, {f"circular_block{i}": block for i, block in enumerate(maps[1:])}
+
+
+def _decode(config: BackboneConfig, maps: list[Array]) -> Float[Array, "b _ _ _"]:
+    """Compute pixels from the maps of `_encode`. The layers belong to the calling Flax module."""
+    if isinstance(config, SwinConfig):
+        return PatchExpand(config.patch, maps[-1].shape[-1], name="expand")(maps[-1])
+    widths = config.stem.widths if isinstance(config, SglprConfig) else config.widths
+    return CircularDecoder(widths, name="decoder")(maps)
 
 
 class Outputs(NamedTuple):
@@ -59,32 +69,24 @@ class SGLPR(nn.Module):
         segment: int = 1,
         train: bool = False,
     ) -> Outputs:
-        """Compute descriptors and semantic logits.
-
-        Logits are computed for every `segment`-th image, or for no image if it is 0 or if there is no segmentation
-        head. `labels` are for a place head that reads labels. This head has no backbone (table 6).
-        """
+        """Compute descriptors, and logits for every `segment`-th image (0: for none)."""
         config = self.config
         place_head = PlaceHead(config.head, circular=config.polar is not None, name="place_head")
-        if not config.head.reads_features:
+        if not config.head.reads_features:  # such a model has no backbone (table 6)
             features = raw_input(image, labels, config)
             descriptor, maps = place_head(features)
             return Outputs(descriptor, None, {"raw_input": features, **maps})
-        backbone = _backbone(config.backbone, circular=config.polar is not None)
-        seen = backbone(backbone_view(image, config), train=train)
-        pixels = backbone.decode(seen) if config.head.tap == "pixels" else None
-        descriptor, maps = place_head(seen.features if pixels is None else pixels)
-        maps = {**seen.named, **maps}
+        circular = config.polar is not None
+        maps, named = _encode(config.backbone, backbone_view(image, config), circular=circular, train=train)
+        pixels = _decode(config.backbone, maps) if config.head.tap == "pixels" else None
+        descriptor, head_maps = place_head(maps[-1] if pixels is None else pixels)
+        named = {**named, **head_maps}
         if not (segment and config.segments):
-            return Outputs(descriptor, None, maps)
-        if pixels is None:
-            pixels = backbone.decode(
-                BackboneFeatures(seen.features[::segment], [one[::segment] for one in seen.finer], {})
-            )
-        else:
-            pixels = pixels[::segment]
+            return Outputs(descriptor, None, named)
+        # If the place head did not need the pixels, only those of the images with logits are computed.
+        pixels = _decode(config.backbone, [x[::segment] for x in maps]) if pixels is None else pixels[::segment]
         logits = segmentation_head(pixels, image[::segment], config)
-        return Outputs(descriptor, logits, {**maps, "pixels": pixels})
+        return Outputs(descriptor, logits, {**named, "pixels": pixels})
 
 
 @jax.jit
@@ -93,7 +95,7 @@ def describe(
     bev: Num[Array, "*b h w"],
     labels: Int[Array, "... h w"] | None = None,
 ) -> Float[Array, "*b d"]:
-    """Compute the descriptor of each bird's-eye-view image. It works under jit, vmap and grad.
+    """Compute the descriptor of each bird's-eye-view image, also under jit, vmap and grad.
 
     The distance between two descriptors is the dissimilarity of their places (equation 2). An empty image has a
     descriptor, too: see `is_describable`.
@@ -122,11 +124,10 @@ def describe(
 def is_describable(params: Params, bev: Num[Array, "*b h w"]) -> Bool[Array, "*b"]:
     """Whether each image shows a place: all counts are finite, and at least 2 cells in the field of view hold points.
 
-    `describe` gives every empty image the same descriptor. The function works under jit and vmap.
+    `describe` gives every empty image the same descriptor.
     """
-    seen = jnp.where(field_of_view(params.config)[0], bev > 0, False)
-    enough = seen.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS
-    return enough & jnp.isfinite(bev).all((-2, -1))
+    occupied = jnp.where(field_of_view(params.config)[0], bev > 0, False)
+    return (occupied.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS) & jnp.isfinite(bev).all((-2, -1))
 
 
 def segment(params: Params, bev: Num[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
@@ -148,17 +149,14 @@ def forward(
     key: Array | None = None,
     segment: int = 1,
 ) -> Outputs:
-    """Compute descriptors, logits and named maps in one pass, for training and pictures.
-
-    The leading axes of the images are merged into one.
+    """Compute descriptors, logits and named maps in one pass. The leading axes of the images are merged into one.
 
     Arguments:
       params: Model.
       bev: Images, as in `describe`.
       labels: Class maps, as in `describe`.
       key: Random key. With a key this is the training pass, in which stochastic depth drops residual branches.
-      segment: Interval between images with logits: n for every n-th image, 0 for no logits. A model without a
-        segmentation head gives no logits.
+      segment: Interval between images with logits: n for every n-th image, 0 for no logits.
 
     Raises:
       ValueError: In the same cases as `describe`, or if there are no images.
@@ -193,14 +191,13 @@ def _check_array(bev: Any) -> None:
 
 def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelConfig) -> None:
     """Raise ValueError if the head reads labels and they are missing, or if it reads no labels and they are given."""
-    found = "none" if labels is None else f"shape {labels.shape}"
-    if config.head.reads_labels and (labels is None or labels.shape != shape):
+    reads, found = config.head.reads_labels, None if labels is None else labels.shape
+    if found != (shape if reads else None):
+        expected = f"class maps of shape {shape}, one for each image" if reads else "no labels"
         raise ValueError(
-            f"the place head of this model reads {config.head.input}: expected class maps of shape {shape}, "
-            f"one for each image, found {found}"
+            f"the place head of this model reads {config.head.input}: expected {expected}, found "
+            f"{'none' if labels is None else f'shape {found}'}"
         )
-    if labels is not None and not config.head.reads_labels:
-        raise ValueError(f"the place head of this model reads {config.head.input}: expected no labels, found {found}")
 
 
 def init(key: Array, *, preset: str = "sglpr", config: ModelConfig | None = None) -> Params:

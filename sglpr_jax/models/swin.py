@@ -18,8 +18,6 @@ from sglpr_jax.models.layers import LayerNorm, Linear, gelu, weight
 
 BLOCKED = -100.0
 """Value added to the score of two tokens that are neighbours only because the image was rolled."""
-MLP_RATIO = 4
-"""Hidden units of a block's MLP per channel, in the paper."""
 
 
 @cache
@@ -91,7 +89,7 @@ class WindowAttention(nn.Module):
         return Linear(c, name="projection")(mixed.reshape(n, t, c))
 
     def _position_bias(self, tokens: int) -> Float[Array, "heads t t"]:
-        """Reads the table by a product with one-hot rows, because the gradient of a lookup is a slow scatter."""
+        """Read the table by a product with one-hot rows, because the gradient of a lookup is a slow scatter."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
         table = weight(self, "position_bias", initial.normal(0.02), (rows, self.heads))
@@ -101,11 +99,10 @@ class WindowAttention(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """One token for each patch of the image: a convolution with stride equal to its kernel, then layer norm."""
+    """One token for each patch (rows, columns) of the image: a convolution with this stride, then layer norm."""
 
     channels: int
     patch: tuple[int, int]
-    """Rows and columns of a patch."""
 
     @nn.compact
     def __call__(
@@ -131,10 +128,8 @@ class PatchProjection(nn.Module):
 
 
 class DropPath(nn.Module):
-    """Stochastic depth: training drops a whole branch per sample and scales kept branches by 1 / (1 - rate).
-
-    It draws from the random stream `drop_path`.
-    """
+    """Stochastic depth: training drops the whole branch of some samples, by the random stream `drop_path`, and scales
+    the other branches by 1 / (1 - rate)."""
 
     rate: float
 
@@ -142,23 +137,23 @@ class DropPath(nn.Module):
     def __call__(self, branch: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w c"]:
         if not train or self.rate == 0:
             return branch
-        keep = 1 - self.rate
-        kept = jax.random.bernoulli(self.make_rng("drop_path"), keep, (len(branch), 1, 1, 1))
-        return jnp.where(kept, branch / keep, 0.0)
+        share = 1 - self.rate
+        is_kept = jax.random.bernoulli(self.make_rng("drop_path"), share, (len(branch), 1, 1, 1))
+        return jnp.where(is_kept, branch / share, 0.0)
 
 
 class SwinBlock(nn.Module):
-    """x + attention(norm(x)), then x + mlp(norm(x)). With `shifted`, the windows are shifted by half a window.
+    """x + attention(norm(x)), then x + mlp(norm(x)), with `mlp_ratio` hidden units per channel.
 
-    An image no larger than the window is one window of its own size and is not shifted. With `circular`, the first and
-    last columns of the image are neighbours. With `shift_each_way`, an image that a window spans in one direction only
-    is still shifted in the other direction. Swin does not shift it.
+    With `shifted`, the windows are shifted by half a window. An image no larger than the window is one window of its
+    own size and is not shifted. With `circular`, the first and last columns of the image are neighbours. With
+    `shift_each_way`, an image that a window spans in one direction is still shifted in the other, unlike in Swin.
     """
 
     heads: int
     window: int
     shifted: bool
-    mlp_ratio: int = MLP_RATIO
+    mlp_ratio: int = 4
     drop_path: float = 0.0
     circular: bool = False
     shift_each_way: bool = False
@@ -225,10 +220,8 @@ class PatchMerging(nn.Module):
 
 
 class PatchExpand(nn.Module):
-    """Expands each token to factor x factor tokens or pixels: a linear layer, then norm.
-
-    The outputs of the linear layer are in the order (row offset, column offset, channel).
-    """
+    """Expands each token to factor x factor tokens or pixels: a linear layer with outputs in the order (row offset,
+    column offset, channel), then norm."""
 
     factor: int
     channels: int

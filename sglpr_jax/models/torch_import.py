@@ -3,11 +3,9 @@
 import dataclasses
 import re
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 import safetensors
 import safetensors.numpy
@@ -16,8 +14,7 @@ from sglpr_jax.files import in_short, naming
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import SGLPR
-from sglpr_jax.models.weights import as_tree, by_name
+from sglpr_jax.models.weights import as_tree, by_name, weight_shapes
 
 _RULES = (
     (r"^backbone/", ""),
@@ -44,7 +41,6 @@ _RULES = (
 _BUFFERS = ("relative_position_index", "attn_mask")
 """Tables that PyTorch stores with the weights. Here they follow from the configuration."""
 
-
 PICKLES = (".pth", ".pt", ".bin", ".ckpt")
 """File name extensions of PyTorch's own checkpoints."""
 
@@ -52,41 +48,56 @@ _SWIN_T_ONLY = re.compile(r"head\.(weight|bias)|layers\.\d+\.(blocks\.\d+|downsa
 """Weights of ImageNet's Swin-T that a Swin-Unet may lack: the classifier, and a deeper third stage."""
 
 
-class SwinTImport(NamedTuple):
-    """Parameters after an import of Swin-T."""
-
-    params: Params
-    copied: tuple[str, ...]  # names of this project
-    unused: tuple[str, ...]  # names of the checkpoint
-
-
 def import_swin_unet(params: Params, path: Path | str) -> Params:
     """Load the backbone, the expansion and the segmentation head from a Swin-Unet checkpoint. The place head is kept.
+
+    A patch embedding of three channels is summed into one, because PyTorch's network repeats a grey image three times.
 
     Raises:
       FileNotFoundError: If the file does not exist.
       ValueError: If the file is not a safetensors file, or if names or shapes differ from the model.
     """
     with naming(path):
-        weights = from_torch_names(read_checkpoint(path), params.config)
+        weights = from_torch_names(read_checkpoint(Path(path)), params.config)
     return dataclasses.replace(params, weights={**params.weights, **weights})
 
 
-def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
+def import_swin_t(params: Params, path: Path | str) -> tuple[Params, tuple[str, ...], tuple[str, ...]]:
     """Load the encoder from an ImageNet Swin-T, and copy its blocks to the mirrored decoder stages.
 
     Swin-Unet's own code does the same. Weights of another shape, and weights without a counterpart in Swin-T, are kept.
+
+    Returns:
+      The new parameters, the names of their copied weights, and the names of the unused weights of the checkpoint.
 
     Raises:
       FileNotFoundError: If the file does not exist.
       ValueError: If the file is not a safetensors file, or if no weight fits.
     """
     with naming(path):
-        return from_swin_t(read_checkpoint(path), params)
+        state, shapes = read_checkpoint(Path(path)), _expected_shapes(params.config)
+        backbone = params.config.backbone
+        assert isinstance(backbone, SwinConfig)  # checked by `_expected_shapes`
+        last = len(backbone.depths) - 1
+
+        def encoder_name(name: str) -> str:
+            return re.sub(r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last - int(m[1])}.blocks", torch_name(name))
+
+        sources = {name: source for name in shapes if (source := encoder_name(name)) in state}
+        converted = {name: _flax_layout(name, state[source]) for name, source in sources.items()}
+        fitting = {name: weight for name, weight in converted.items() if weight.shape == shapes[name]}
+        unused = sorted(set(state) - {sources[name] for name in fitting})
+        unknown = [name for name in unused if name not in sources.values() and not _SWIN_T_ONLY.fullmatch(name)]
+        if unknown:
+            raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
+        if not fitting:
+            raise ValueError("expected weights that fit the model, found none; Swin-T fits 96 channels and window 7")
+    weights = as_tree({**by_name(params.weights), **fitting})
+    return dataclasses.replace(params, weights=weights), tuple(fitting), tuple(unused)
 
 
-def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
-    """Read the weights of a .safetensors file by name, as float32, without buffers and prefixes.
+def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
+    """Read the weights of a .safetensors file by PyTorch's names, as float32, without buffers and prefixes.
 
     A .pth file is a pickle, which can run code, so it is not opened.
 
@@ -94,7 +105,6 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
       FileNotFoundError: If the file does not exist.
       ValueError: If it is another kind of file.
     """
-    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a checkpoint, found no file")
     try:
@@ -112,17 +122,13 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
     }
 
 
-def from_torch_names(
-    state: Mapping[str, np.ndarray], config: ModelConfig, *, input_channels: int = 1
-) -> dict[str, Any]:
+def from_torch_names(state: dict[str, np.ndarray], config: ModelConfig) -> dict[str, Any]:
     """Convert a whole Swin-Unet with PyTorch's names to the tree of weights without the place head.
-
-    With `input_channels=1`, an embedding of 3 channels is summed into 1, because PyTorch repeats a grey image 3 times.
 
     Raises:
       ValueError: If a weight is missing, unknown or of the wrong shape. The message names the first one.
     """
-    expected = _expected_shapes(config, input_channels)
+    expected = _expected_shapes(config)
     unknown = set(state) - {torch_name(name) for name in expected}
     if unknown:
         raise ValueError(f"not a weight of Swin-Unet: {min(unknown)} ({len(unknown)} unknown names)")
@@ -131,36 +137,10 @@ def from_torch_names(
         source = torch_name(name)
         if source not in state:
             raise ValueError(f"expected a weight {source}, found none")
-        weights[name] = _flax_layout(name, state[source], input_channels)
+        weights[name] = _flax_layout(name, state[source])
         if weights[name].shape != shape:
             raise ValueError(f"{source}: expected shape {shape} (in Flax's axis order), found {weights[name].shape}")
     return as_tree(weights)
-
-
-def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
-    """Copy a Swin-T with PyTorch's names into `params`; see `import_swin_t`."""
-    expected = _expected_shapes(params.config, 1)
-    last = len(_swin(params.config).depths) - 1
-    weights = by_name(params.weights)
-    copied, used, misshapen = [], set(), set()
-    for name in expected:
-        source = re.sub(r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last - int(m[1])}.blocks", torch_name(name))
-        if source not in state:
-            continue
-        weight = _flax_layout(name, state[source], 1)
-        if weight.shape != weights[name].shape:
-            misshapen.add(source)
-            continue
-        weights[name] = weight
-        copied.append(name)
-        used.add(source)
-    unused = sorted(set(state) - used)
-    unknown = [name for name in unused if name not in misshapen and not _SWIN_T_ONLY.fullmatch(name)]
-    if unknown:
-        raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
-    if not copied:
-        raise ValueError("expected weights that fit the model, found none; Swin-T fits 96 channels and window 7")
-    return SwinTImport(dataclasses.replace(params, weights=as_tree(weights)), tuple(copied), tuple(unused))
 
 
 def torch_name(name: str) -> str:
@@ -173,26 +153,21 @@ def torch_name(name: str) -> str:
     return name
 
 
-def _expected_shapes(config: ModelConfig, input_channels: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of all weights that a Swin-Unet shares with the model: all except those of the place head."""
-    _swin(config)
-    image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, input_channels), np.float32)
-    shapes = jax.eval_shape(SGLPR(config).init, jax.random.key(0), image)["params"]
-    return {name: leaf.shape for name, leaf in by_name(shapes).items() if not name.startswith("place_head/")}
+def _expected_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of all weights but those of the place head, which a Swin-Unet has, too.
 
-
-def _swin(config: ModelConfig) -> SwinConfig:
-    """The configuration of a Swin-Unet backbone. Raises ValueError if the model has another backbone or none."""
+    Raises ValueError if the model has another backbone or none.
+    """
     if not config.head.reads_features:
         raise ValueError(f"expected a model with a backbone, found a place head that reads {config.head.input}")
     if not isinstance(config.backbone, SwinConfig):
         raise ValueError(f"expected a model with the backbone 'swin', found {config.backbone.kind!r}")
-    return config.backbone
+    return {name: leaf.shape for name, leaf in weight_shapes(config).items() if not name.startswith("place_head/")}
 
 
-def _flax_layout(name: str, weight: np.ndarray, input_channels: int) -> np.ndarray:
+def _flax_layout(name: str, weight: np.ndarray) -> np.ndarray:
     """Convert PyTorch's (out, in, ...) to Flax's (..., in, out). The bias tables are (rows, heads) in both."""
-    if name == "backbone/patch_embed/projection/kernel" and input_channels == 1:
+    if name == "backbone/patch_embed/projection/kernel":
         weight = weight.sum(1, keepdims=True)
     if name == "segmentation_head/kernel":
         weight = weight[..., 0, 0]

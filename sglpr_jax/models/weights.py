@@ -39,59 +39,53 @@ def weight_shapes(config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
     return by_name(jax.eval_shape(lambda: init(jax.random.key(0), config=config)).weights)
 
 
-def graft(given: Params, fresh: Params) -> Params:
-    """Replace the weights of `fresh` by those of `given` that exist (partial restore), to continue a training.
+def graft(source: Params, target: Params) -> Params:
+    """Replace the weights of `target` by those of `source` that exist (partial restore), to continue a training.
 
-    A kernel of `fresh` may have more input channels than that of `given`. The additional channels come last and start
-    at 0, so a larger network initially computes the same as the smaller one. The segmentation head of `given` is
-    dropped if `fresh` has none.
+    A kernel of `target` may have more input channels than that of `source`. The additional channels come last and start
+    at 0, so a larger network initially computes the same as the smaller one. The segmentation head of `source` is
+    dropped if `target` has none.
 
     Raises:
-      ValueError: If `given` has another weight that `fresh` lacks, or one of another shape.
+      ValueError: If `source` has another weight that `target` lacks, or one of another shape.
     """
-    given = given if fresh.config.segments else for_places(given)
-    weights = by_name(fresh.weights)
-    for name, value in by_name(given.weights).items():
-        wanted = weights[name].shape if name in weights else None
-        if wanted is None or not _may_become(wanted, value.shape):
-            expected = "no such weight" if wanted is None else wanted
-            raise ValueError(f"cannot start from these weights: {name} has shape {value.shape}, expected {expected}")
-        missing = np.subtract(wanted, value.shape)
-        weights[name] = np.pad(np.asarray(value), [(0, more) for more in missing]) if missing.any() else value
-    return dataclasses.replace(fresh, weights=as_tree(weights))
+    source = source if target.config.segments else for_places(source)
+    weights = by_name(target.weights)
+    for name, value in by_name(source.weights).items():
+        expected = weights[name].shape if name in weights else "no such weight"
+        if value.shape != expected:
+            is_kernel = name in weights and value.ndim == len(expected) and value.ndim in (2, 4)
+            added = np.subtract(expected, value.shape) if is_kernel else np.array([-1])
+            if added.min() < 0 or added[-2] != added.sum():  # only the inputs (last axis but one) may be longer
+                raise ValueError(
+                    f"cannot start from these weights: {name} has shape {value.shape}, expected {expected}"
+                )
+            value = np.pad(np.asarray(value), [(0, length) for length in added])
+        weights[name] = value
+    return dataclasses.replace(target, weights=as_tree(weights))
 
 
-def _may_become(wanted: tuple[int, ...], found: tuple[int, ...]) -> bool:
-    """Whether the shapes are equal, or of kernels where `wanted` has more input channels (last axis but one)."""
-    same = wanted[:-2] + wanted[-1:] == found[:-2] + found[-1:]
-    return wanted == found or (same and len(wanted) == len(found) in (2, 4) and wanted[-2] > found[-2])
-
-
-def describing(params: Params) -> Any:
+def descriptor_layers(params: Params) -> Any:
     """Return the layers that `describe` uses, without the segmentation head and layers that only serve it."""
-    left_out = SEGMENTATION_LAYERS if params.config.head.tap == "pixels" else SEGMENTATION_LAYERS + PIXEL_LAYERS
-    return {name: layer for name, layer in params.weights.items() if name not in left_out}
+    unused = SEGMENTATION_LAYERS if params.config.head.tap == "pixels" else SEGMENTATION_LAYERS + PIXEL_LAYERS
+    return {name: layer for name, layer in params.weights.items() if name not in unused}
 
 
 def for_places(params: Params) -> Params:
     """Return the part of a model that `describe` uses, for publication."""
     if not params.config.segments:
         return params
-    return Params(describing(params), dataclasses.replace(params.config, categories=0))
+    return Params(descriptor_layers(params), dataclasses.replace(params.config, categories=0))
 
 
-def learning_segmentation_alone(params: Params) -> Params:
+def freeze_descriptor_layers(params: Params) -> Params:
     """Return the same model with gradients only for the weights that `describe` does not use."""
-    return dataclasses.replace(params, weights=params.weights | jax.lax.stop_gradient(describing(params)))
+    return dataclasses.replace(params, weights=params.weights | jax.lax.stop_gradient(descriptor_layers(params)))
 
 
 def weights_hash(params: Params) -> str:
-    """Return the SHA-256 of names, shapes, types and values of the weights that `describe` uses.
-
-    It identifies the weights that made a descriptor. Models that differ only in the segmentation head make the same
-    descriptors and have the same hash.
-    """
-    return hash_of(by_name(describing(params)))
+    """Return the `hash_of` the weights that `describe` uses. It identifies the weights that made a descriptor."""
+    return hash_of(by_name(descriptor_layers(params)))
 
 
 def hash_of(named: Mapping[str, Any]) -> str:
@@ -104,9 +98,7 @@ def hash_of(named: Mapping[str, Any]) -> str:
 
 
 def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) -> Params:
-    """Average the weights of models with equal configurations, without their whitening layers.
-
-    The average is useful only if one training started from the weights of another.
+    """Average the weights of models whose trainings started from each other, without their whitening layers.
 
     Arguments:
       models: Models whose configurations are equal except for the whitening layer.
@@ -118,19 +110,18 @@ def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) 
     shares = [1.0] * len(models) if shares is None else list(shares)
     if len(shares) != len(models) or min(shares, default=0) < 0 or sum(shares) == 0:
         raise ValueError(f"expected {len(models)} shares of 0 or more, not all 0, found {shares}")
-    parts = [unwhitened(model) for model in models]
-    for part in parts[1:]:
-        a, b = (by_name(dataclasses.asdict(params.config)) for params in (parts[0], part))
-        if name := min((name for name in a.keys() | b.keys() if a.get(name) != b.get(name)), default=None):
-            found = f"{name.replace('/', '.')} {a.get(name)} and {b.get(name)}"
+    models = [without_whitening(model) for model in models]
+    first, *others = (by_name(dataclasses.asdict(model.config)) for model in models)
+    for other in others:
+        if names := sorted(name for name in first.keys() | other.keys() if first.get(name) != other.get(name)):
+            found = f"{names[0].replace('/', '.')} {first.get(names[0])} and {other.get(names[0])}"
             raise ValueError(f"expected models with equal configurations, found {found}")
-
     factors = [share / sum(shares) for share in shares]
 
     def mean(*values: Any) -> Any:
-        return sum(jnp.asarray(one, jnp.float32) * factor for one, factor in zip(values, factors, strict=True))
+        return sum(jnp.asarray(value, jnp.float32) * factor for value, factor in zip(values, factors, strict=True))
 
-    return Params(jax.tree.map(mean, *(part.weights for part in parts)), parts[0].config)
+    return Params(jax.tree.map(mean, *(model.weights for model in models)), models[0].config)
 
 
 def fit_whitening(descriptors: Float[np.ndarray, "n d"], *, power: float = WHITENING_POWER) -> Float[np.ndarray, "d d"]:
@@ -150,27 +141,23 @@ def fit_whitening(descriptors: Float[np.ndarray, "n d"], *, power: float = WHITE
     return (components / (spread / spread.max()) ** power).astype(np.float32)
 
 
-def whitened(params: Params, descriptors: Float[np.ndarray, "n d"], *, power: float = WHITENING_POWER) -> Params:
-    """Return `params`, which has no whitening layer, with one that is fitted to its descriptors.
-
-    Raises:
-      ValueError: If `params` already has a whitening layer.
-    """
+def with_whitening(params: Params, descriptors: Float[np.ndarray, "n d"], *, power: float = WHITENING_POWER) -> Params:
+    """Return `params` with a whitening layer fitted to its descriptors. Raises ValueError if it has one already."""
     if params.config.head.whiten:
         raise ValueError("expected weights without a whitening layer, found one")
     kernel = fit_whitening(descriptors, power=power)
     layer = {"kernel": jnp.asarray(kernel), "bias": jnp.zeros(len(kernel))}
-    head = {**params.weights["place_head"], "whiten": layer}
-    return Params({**params.weights, "place_head": head}, _with_layer(params.config, present=True))
+    return _with_head(params, {**params.weights["place_head"], "whiten": layer}, whiten=True)
 
 
-def unwhitened(params: Params) -> Params:
-    """Return `params` without the whitening layer, or unchanged if there is no whitening layer."""
+def without_whitening(params: Params) -> Params:
+    """Return `params` without the whitening layer, if it has one."""
     if not params.config.head.whiten:
         return params
     head = {name: value for name, value in params.weights["place_head"].items() if name != "whiten"}
-    return Params({**params.weights, "place_head": head}, _with_layer(params.config, present=False))
+    return _with_head(params, head, whiten=False)
 
 
-def _with_layer(config: ModelConfig, *, present: bool) -> ModelConfig:
-    return dataclasses.replace(config, head=dataclasses.replace(config.head, whiten=present))
+def _with_head(params: Params, place_head: dict[str, Any], *, whiten: bool) -> Params:
+    head_config = dataclasses.replace(params.config.head, whiten=whiten)
+    return Params({**params.weights, "place_head": place_head}, dataclasses.replace(params.config, head=head_config))

@@ -45,13 +45,12 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
       The folder.
 
     Raises:
-      OSError: If the folder cannot be written or holds other files. The message names the folder.
+      OSError: If the folder cannot be written or holds other files.
       ValueError: If a weight is not float32, is not finite, has another shape than the configuration requires, or is
-        too large for float16. The message names the weight.
+        too large for float16.
     """
     folder, config = Path(folder), dataclasses.asdict(params.config)
     values = {name: np.asarray(leaf) for name, leaf in by_name(params.weights).items()}
-    check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
     check_leaves(values, weight_shapes(params.config), source=folder)
     for name, leaf in values.items() if half else ():
         if np.abs(leaf).max(initial=0) > LARGEST:
@@ -68,10 +67,13 @@ def write_weights(
 
     Raises OSError if the folder cannot be written or holds other files.
     """
+    # safetensors writes memory in its physical order, so a transposed view would be read in the wrong order.
+    values = {name: np.asarray(leaf, order="C") for name, leaf in values.items()}
     check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
     with replacing(folder) as new:
         new.mkdir()
-        (new / WEIGHTS_FILE).write_bytes(checked_tensors(values, header))  # save_file hides the OSError of a full disk
+        content = tensors_as_bytes(values, {CHECKSUM: hash_of(values), **header})
+        (new / WEIGHTS_FILE).write_bytes(content)  # safetensors.save_file hides the OSError of a full disk
         (new / CONFIG_FILE).write_text(json_text(config))
 
 
@@ -91,75 +93,61 @@ def load(weights: Path | str) -> Params:
     folder = last_weights(weights_folder(weights))
     stored = read_json(folder / CONFIG_FILE)
     config = config_from_dict(stored, source=folder / CONFIG_FILE)
-    known = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}  # fields added later are not in older files
+    # The hash of the stored values counts, too, because older files lack fields that were added later.
+    config_hashes = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}
     path = folder / WEIGHTS_FILE
-    values, header = _read(path)
-    halved = {name: leaf.astype(np.float32) if leaf.dtype == np.float16 else leaf for name, leaf in values.items()}
-    if header.get(CHECKED_FOR) not in known:
-        check_leaves(halved, weight_shapes(config), source=path)
+    values, header = read_tensors(path)
+    values = {name: leaf.astype(np.float32) if leaf.dtype == np.float16 else leaf for name, leaf in values.items()}
+    if header.get(CHECKED_FOR) not in config_hashes:
+        check_leaves(values, weight_shapes(config), source=path)
         if CHECKED_FOR in header:  # files of earlier versions have none
             raise ValueError(f"{path}: expected the {CONFIG_FILE} that it was saved with, found a changed one")
-    if header:  # files of earlier versions have none
-        _check_checksum(values, header, source=path)
-    return Params(jax.device_put(as_tree(halved)), config)  # JAX would copy arrays of NumPy in every call
+    return Params(jax.device_put(as_tree(values)), config)  # JAX would copy arrays of NumPy in every call
 
 
 def last_weights(folder: Path) -> Path:
-    """Return a folder of weights, or that of the last weights of a training run. Raises FileNotFoundError if a file is
-    missing."""
+    """Return a folder of weights, or that of the last weights of a training run.
+
+    Raises FileNotFoundError if a file is missing.
+    """
     folder = folder / LAST if (folder / LAST).is_dir() else folder
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
-            raise FileNotFoundError(
-                f"{folder}: expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}, {name} is missing"
-            )
+            expected = f"expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}"
+            raise FileNotFoundError(f"{folder}: {expected}, {name} is missing")
     return folder
 
 
-def checked_tensors(values: Mapping[str, Any], header: Mapping[str, str] | None = None) -> bytes:
-    """Return the content of a safetensors file of arrays, with their checksum for `read_tensors` in the header."""
-    # safetensors writes memory in its physical order, so a transposed view would be read in the wrong order.
-    ordered = {name: np.asarray(leaf, order="C") for name, leaf in values.items()}
-    return tensors_as_bytes(ordered, {CHECKSUM: hash_of(ordered), **(header or {})})
+def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Read the arrays and the header of a safetensors file.
 
-
-def read_tensors(path: Path) -> dict[str, np.ndarray]:
-    """Read a safetensors file. Raises ValueError if it is damaged or its values do not have the stored checksum."""
-    values, header = _read(path)
-    _check_checksum(values, header, source=path)
-    return values
-
-
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    Raises ValueError if the file is damaged, or if its arrays do not have the checksum of the header. Files of earlier
+    versions have no header.
+    """
     try:
         with safetensors.safe_open(path, framework="np") as file:
             values = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-            return values, file.metadata() or {}
+            header = file.metadata() or {}
     except (safetensors.SafetensorError, UnicodeDecodeError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path}: expected a whole safetensors file, found a damaged one ({in_short(error)})"
         ) from error
-
-
-def _check_checksum(values: Mapping[str, np.ndarray], header: Mapping[str, str], *, source: Path) -> None:
-    said, found = header.get(CHECKSUM, "none"), hash_of(values)
-    if said != found:
-        raise ValueError(f"{source}: expected weights with the SHA-256 of the header, {said}, found {found}")
+    if header and (stored := header.get(CHECKSUM, "none")) != (found := hash_of(values)):
+        raise ValueError(f"{path}: expected weights with the SHA-256 of the header, {stored}, found {found}")
+    return values, header
 
 
 def check_leaves(values: Mapping[str, Any], expected: Mapping[str, Any], *, source: Path) -> None:
-    """Raise ValueError unless arrays, or descriptions of them, have the expected names, shapes and types.
+    """Raise ValueError unless arrays, or descriptions of them, have the expected names, shapes and types and are
+    finite."""
 
-    Arrays must be finite.
-    """
+    def described(array: Any) -> str:
+        return "no array" if array is None else f"{array.dtype} {tuple(array.shape)}"
+
     for name in sorted(values.keys() | expected.keys()):
-        wanted, found = (
-            f"{some[name].dtype} {tuple(some[name].shape)}" if name in some else "no array"
-            for some in (expected, values)
-        )
-        if wanted != found:
-            raise ValueError(f"{source}: expected {name} as {wanted}, found {found}")
-        array = values[name]
+        wanted, array = described(expected.get(name)), values.get(name)
+        if wanted != described(array):
+            raise ValueError(f"{source}: expected {name} as {wanted}, found {described(array)}")
         if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all():
             broken = array.size - np.isfinite(array).sum()
             raise ValueError(f"{source}: expected finite weights, found {broken} of {array.size} not finite in {name}")

@@ -155,7 +155,7 @@ class Reproduction:
         if method in VARIANTS:
             return network(self.params(method, seq))
         if method in HANDCRAFTED:
-            return handcrafted(method, recording, self.config.model.grid)
+            return handcrafted(method, None if recording.has_images else self.config.model.grid)
         return method_with_weights(method)
 
     def _settings(self, seq: str) -> dict[str, str]:

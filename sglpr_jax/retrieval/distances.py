@@ -8,34 +8,12 @@ method of the descriptors defines the meaning of their numbers.
 import difflib
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Int
 
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import DistanceFn
 from sglpr_jax.methods.names import LEARNED_NAMES
-from sglpr_jax.methods.pairwise import in_blocks
-
-BLOCK = 1024
-
-
-def l2(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
-    """Return the Euclidean distances |q - d|. Sums are in float64, because the squares cancel near zero."""
-
-    def compare(queries, database):
-        squares = np.sum(queries**2, axis=1)[:, None] + np.sum(database**2, axis=1)[None, :]
-        return np.sqrt(np.maximum(squares - 2 * queries @ database.T, 0))
-
-    return in_blocks(compare, queries, database, block=BLOCK, prepare=lambda rows: rows.astype(np.float64))
-
-
-def cosine(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
-    """Return 1 - q . d / (|q| |d|), from 0 to 2. The result is 1 if either vector is zero."""
-
-    def unit(rows):
-        lengths = np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True)
-        return np.divide(rows, lengths, out=np.zeros(rows.shape), where=lengths > 0)
-
-    return in_blocks(lambda q, d: 1 - q @ d.T, queries, database, block=BLOCK, prepare=unit)
+from sglpr_jax.methods.pairwise import cosine, l2
 
 
 def smallest(values: Float[np.ndarray, "q n"], k: int) -> Int[np.ndarray, "q {k}"]:

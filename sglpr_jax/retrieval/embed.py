@@ -13,16 +13,16 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import SCALE, scale_of
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
+from sglpr_jax.data.scan_stream import OnBadScan, check_readable, require_content, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import Size, check_value
-from sglpr_jax.methods.method import LABELLED, Method, check_descriptors, require_content
+from sglpr_jax.methods.method import LABELLED, Method, check_descriptors
 from sglpr_jax.methods.registry import checked_view, network
 from sglpr_jax.models.config import WHITENING_POWER, ModelConfig
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.weights import unwhitened, whitened
+from sglpr_jax.models.weights import with_whitening, without_whitening
 from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
 
 SCANS_AHEAD = 8
@@ -180,7 +180,7 @@ def whiten(
       power: Principal components are divided by their spread to this power. With 1, all have equal spread.
       on_progress: Called with the number of finished scans of a recording.
     """
-    params = unwhitened(params)
+    params = without_whitening(params)
     files = [embed(params, recording, on_progress=on_progress) for recording in recordings]
     descriptors = np.concatenate([file.descriptors for file in files])
     n, d = descriptors.shape
@@ -188,4 +188,4 @@ def whiten(
         warn(
             f"expected more than {d} scans for whitening (the length of a descriptor), better ten times that, found {n}"
         )
-    return whitened(params, descriptors, power=power)
+    return with_whitening(params, descriptors, power=power)

@@ -20,7 +20,7 @@ from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward, init
-from sglpr_jax.models.weights import learning_segmentation_alone
+from sglpr_jax.models.weights import freeze_descriptor_layers
 from sglpr_jax.training.batches import Batch, in_network_order, views
 from sglpr_jax.training.config import LossConfig, OcclusionConfig, OptimizerConfig, TrainConfig
 from sglpr_jax.training.devices import keep_placed, on_own_rows
@@ -120,7 +120,7 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
 
 def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
     """Run one chunk through the network. The segmentation head runs only if there are labels, on every n-th image."""
-    params = learning_segmentation_alone(params) if config.segmentation_alone else params
+    params = freeze_descriptor_layers(params) if config.segmentation_alone else params
     labels = chunk.maps if params.config.head.reads_labels else None
     if chunk.maps is None or not (params.config.segments and config.segments):
         return Summary(forward(params, chunk.images, labels, key=chunk.key, segment=0).descriptor, {})

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Int, Shaped
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan_stream import check_readable, scan_stream
+from sglpr_jax.data.scan_stream import check_readable, require_content, scan_stream
 from sglpr_jax.files import file_name, in_short, replacing
 from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.method import LABELLED, require_content
+from sglpr_jax.methods.method import LABELLED
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.training.tuples import TuplePool
 

@@ -105,7 +105,7 @@ class PeerNetwork:
 
     def gradient(self, state: TrainState, batch: PeerBatch, key: Array) -> Gradient:
         """Return the gradient of the loss of the rotated inputs, and the loss."""
-        inputs = self.method.turned(key, batch.inputs)
+        inputs = self.method.rotate_inputs(key, batch.inputs)
 
         def loss_of(params):
             variables, kept = {"params": params, **state.statistics}, [*state.statistics]

@@ -14,7 +14,7 @@ from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights import graft, unwhitened
+from sglpr_jax.models.weights import graft, without_whitening
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.batch_queue import BatchSource
 from sglpr_jax.training.batches import batches_of, positions_of, tuple_pool
@@ -283,5 +283,5 @@ def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:
             "loss.segmentation_alone trains no descriptors, found weights with a whitening layer: "
             "expected model.head.whiten True"
         )
-    given = given if config.model.head.whiten else unwhitened(given)
+    given = given if config.model.head.whiten else without_whitening(given)
     return graft(given, init(jax.random.key(config.seed), config=config.model))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.models.weights import weights_hash, whitened
+from sglpr_jax.models.weights import weights_hash, with_whitening
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.presets import load_preset
@@ -64,7 +64,9 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
     labelled = open_recording(labelled_images, "00")
     with pytest.raises(ValueError, match="expected weights to begin with, found none"):
         train(alone, [labelled], out=tmp_path / "run")
-    given = whitened(random_params(config.model), np.random.default_rng(0).normal(size=(600, 256)).astype(np.float32))
+    given = with_whitening(
+        random_params(config.model), np.random.default_rng(0).normal(size=(600, 256)).astype(np.float32)
+    )
     with pytest.raises(ValueError, match=r"found weights with a whitening layer: expected model\.head\.whiten True"):
         train(alone, [labelled], out=tmp_path / "run", weights=given)
     assert not list(tmp_path.iterdir())

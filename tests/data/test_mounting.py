@@ -136,7 +136,7 @@ def test_every_road_levels(low_robot):
     np.testing.assert_array_equal(batch.images[0], density_bev(lifted))
     batch = read_batch([recording], pool, frames, **options)
     np.testing.assert_array_equal(batch.points[0, : len(lifted)], lifted)
-    mean = handcrafted("m2dp", recording, config.grid)
+    mean = handcrafted("m2dp", config.grid)
     mean = dataclasses.replace(mean, prepare=lambda scan, angle: scan.upright_points.mean(axis=0))
     file = sglpr_jax.embed(mean, recording)
     np.testing.assert_allclose(file.descriptors[0], lifted.mean(axis=0), atol=1e-5)

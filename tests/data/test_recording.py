@@ -65,7 +65,7 @@ def test_a_batch_and_an_embedding_open_each_file_once_a_place(recording, opened)
         name: 3 for name in ("000000.bin", "000000.label", "000003.bin", "000003.label")
     }
     opened.clear()
-    embed(handcrafted("solid", recording, Grid()), recording)
+    embed(handcrafted("solid", Grid()), recording)
     assert sum(opened.values()) == 3
 
 

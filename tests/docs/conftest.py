@@ -28,7 +28,7 @@ def write_examples(folder: Path) -> None:
         shutil.copy(scan, folder / "my_scans")
     for name, root, seq in (("08", folder / "KITTI", "08"), ("mine", folder / "my_scans", None)):
         recording = sglpr_jax.open_recording(root, seq)
-        sglpr_jax.embed(method_named("polar-fft", None, recording), recording).save(folder / f"{name}.npz")
+        sglpr_jax.embed(method_named("polar-fft"), recording).save(folder / f"{name}.npz")
     recording = sglpr_jax.open_recording(folder / "KITTI", "08")
     poses = sglpr_jax.read_odometry(folder / "KITTI/sequences/08/poses.txt", format="kitti")
     write_tum(folder / "odometry.tum", poses, recording.times)

@@ -44,11 +44,11 @@ def rotate(points, degrees):
     return np.stack([turned.real, turned.imag])
 
 
-def move_of(query, turned, *, limit=100):
-    """The move of the turned outline (its sectors in the order of the query's), and the steps that it took."""
+def move_of(query, turned):
+    """The move of the turned outline, whose sectors are in the order of the query's."""
     fixed, landmarks = query.T.tolist(), turned.T.tolist()
     move, count, step = [0.0, 0.0], 0, [1.0, 1.0]
-    while count < limit and max(map(abs, step)) >= 1e-5:
+    while count < 100 and max(map(abs, step)) >= 1e-5:
         total, pairs = [0.0, 0.0], 1
         for j in range(360):
             partners = [landmarks[k % 360] for k in range(j - 10, j + 10) if any(landmarks[k % 360])]
@@ -60,13 +60,13 @@ def move_of(query, turned, *, limit=100):
                 total, pairs = [total[0] + x, total[1] + y], pairs + 1
         step = [value / pairs for value in total]
         move, count = [move[0] + step[0], move[1] + step[1]], count + 1
-    return np.array(move), count
+    return np.array(move)
 
 
 def alignment(query, other):
     """The shift, and the move after it: none where it would be beyond 5 m."""
     shift = shift_of(query, other)
-    move, _ = move_of(query, np.roll(rotate(other, -shift), -shift, axis=1))
+    move = move_of(query, np.roll(rotate(other, -shift), -shift, axis=1))
     return shift, move if np.all(np.abs(move) <= 5) else np.zeros(2)
 
 

@@ -1,4 +1,4 @@
-"""Layers of the learned methods: NetVLAD and its clusters at the start, the maximum, the encoder and its rotations."""
+"""Layers of the learned methods: NetVLAD and its clusters at the start, the encoder and its rotations."""
 
 import math
 
@@ -13,14 +13,13 @@ from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.bevplace import (
     REIN,
     Encoder,
-    eight_turns,
-    resampled,
+    eight_rotations,
     resampled_maps,
     resized,
-    turned_back,
-    turned_taps,
+    rotated_back,
+    rotation_taps,
 )
-from sglpr_jax.methods.learned.layers import FEATURES, LOCAL, NetVLAD, maximum, with_clusters
+from sglpr_jax.methods.learned.layers import FEATURES, LOCAL, NetVLAD, with_clusters
 from sglpr_jax.methods.learned.weights_file import random_variables
 from sglpr_jax.models.layers import l2_normalize
 
@@ -54,24 +53,6 @@ def test_clusters_start_at_those_of_the_features():
         for x in (found, Points().apply(before, inputs, train=False))
     ]
     assert apart[0] > 1.5 * apart[1]
-
-
-def test_netvlad():
-    x = jax.random.normal(jax.random.key(0), (2, 30, 5))
-    variables = NetVLAD(7).init(jax.random.key(0), x)
-    params = jax.tree.map(np.asarray, variables["params"])
-    expected = np.stack([reference.netvlad(one, params) for one in np.asarray(x)])
-    np.testing.assert_allclose(NetVLAD(7).apply(variables, x), expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("axis", [0, 2])
-def test_the_maximum_and_its_derivative_are_those_of_numpy(axis):
-    x = np.random.default_rng(0).normal(size=(3, 4, 5)).astype(np.float32)
-    np.testing.assert_array_equal(maximum(jnp.asarray(x), axis), x.max(axis))
-    slope = jax.grad(lambda x: jnp.square(maximum(x, axis)).sum())(jnp.asarray(x))
-    np.testing.assert_allclose(slope, 2 * x * (x == x.max(axis, keepdims=True)), rtol=1e-6)
-    equal = jax.grad(lambda x: maximum(x, 0).sum())(jnp.ones((4, 2)))
-    np.testing.assert_array_equal(np.sort(equal, axis=0), [[0, 0]] * 3 + [[1, 1]])
 
 
 def test_the_encoder_is_resnet_34():
@@ -114,8 +95,7 @@ def test_a_rotation_and_a_new_size_are_bicubic(degrees):
         turned[i, j] = sample(grey, 4 - (y * cos - x * sin), 4 + (x * cos + y * sin))
     for i, j in np.ndindex(17, 17):
         larger[i, j] = sample(grey, i / 2, j / 2)
-    taps = turned_taps(9, degrees)
-    np.testing.assert_allclose(resampled(image[None], taps)[0], turned, atol=1e-5)
+    taps = rotation_taps(9, degrees)
     maps = jnp.stack([image, 2 * image], axis=-1)[None]
     np.testing.assert_allclose(resampled_maps(maps, taps)[0, ..., 1], 2 * turned, atol=1e-5)
     np.testing.assert_allclose(resized(maps, 17)[0, ..., 1], 2 * larger, atol=1e-5)
@@ -124,9 +104,9 @@ def test_a_rotation_and_a_new_size_are_bicubic(degrees):
 def test_eight_rotations_and_back():
     down, right = np.mgrid[:33, :33] - 16
     smooth = jnp.asarray(np.exp(-((down - 5) ** 2 + (right + 3) ** 2) / 20), jnp.float32)[None]
-    turns = np.asarray(eight_turns(smooth))
+    turns = np.asarray(eight_rotations(smooth))
     for turn, degrees in zip(turns, (0, 90, 180, 270, 45, 135, 225, 315), strict=True):
         expected = rotate_image(smooth, jnp.float32([math.radians(degrees)]))[0]
         np.testing.assert_allclose(turn, expected, atol=0.04)
-    back = turned_back(jnp.asarray(turns)[..., None])[..., 0]
+    back = rotated_back(jnp.asarray(turns)[..., None])[..., 0]
     np.testing.assert_allclose(back, np.broadcast_to(smooth, back.shape), atol=0.04)

@@ -150,7 +150,7 @@ def test_the_descriptor_is_invariant(inputs, name):
 @pytest.mark.parametrize("name", NAMES)
 def test_each_input_is_rotated_by_its_own_angle(inputs, name):
     before = np.repeat(inputs(name)[:1], 4, axis=0)
-    found = np.asarray(LEARNED[name].turned(jax.random.key(1), jnp.asarray(before)))
+    found = np.asarray(LEARNED[name].rotate_inputs(jax.random.key(1), jnp.asarray(before)))
     assert found.dtype == before.dtype and len(np.unique(found.reshape(4, -1), axis=0)) == 4
     for one in found:
         for part, expected in zip(KEPT[name](one), KEPT[name](before[0]), strict=True):
@@ -159,7 +159,7 @@ def test_each_input_is_rotated_by_its_own_angle(inputs, name):
 
 def test_rinet_loses_neighbouring_columns():
     images = jnp.asarray(np.broadcast_to(np.arange(1, 361, dtype=np.float32), (64, 12, 360)))
-    found = np.asarray(LEARNED["rinet"].turned(jax.random.key(0), images))[:, 0]
+    found = np.asarray(LEARNED["rinet"].rotate_inputs(jax.random.key(0), images))[:, 0]
     lost = (found == 0).sum(axis=1)
     assert lost.max() <= 60 and 15 < (lost > 0).sum() < 50
     for row in found:

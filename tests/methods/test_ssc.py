@@ -8,7 +8,7 @@ import pytest
 
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import to_classes
-from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, align, best_move, ssc, ssc_distance
+from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, align, ssc, ssc_distance
 from tests.methods import published_ssc as published
 
 SETTINGS = {PAPER: {"rings": 50, "nearest": 0.0}, NEWEST: {"rings": 24, "nearest": 5.0}}
@@ -60,33 +60,21 @@ def chain(offsets):
 
 
 @pytest.mark.parametrize(
-    ("offsets", "moved"),
+    "offsets",
     [
-        ((2.0, 5.5), 2.0),  # beyond the gate of 3 m, and it stays there
-        ((2.0, 4.5), 3.25),  # beyond it at first
-        ((2.0, 4.999, 6.499), 4.499),  # joins so late that 20 steps do not end
+        (2.0, 5.5),  # one is beyond the gate of 3 m, and stays there
+        (2.0, 4.5),  # beyond it at first
+        (2.0, 4.999, 6.499),  # joins so late that 20 steps do not end
+        (2.9, 5.0, 6.9, 7.9),  # the move is larger than 5 m, and is given up
     ],
 )
-def test_partners_within_three_metres_move_the_scan_step_by_step(offsets, moved):
-    query, other = chain(offsets)
-    expected, steps = published.move_of(query, other)
-    assert expected[0] == pytest.approx(moved, abs=0.01)
-    found = best_move(jnp.asarray(query), jnp.asarray(other))
-    np.testing.assert_allclose(found, expected, atol=1e-4)
-    if len(offsets) == 3:
-        assert steps > 25 and abs(published.move_of(query, other, limit=20)[0][0] - moved) > 0.1
-
-
-def test_a_move_beyond_five_metres_is_given_up():
-    for offsets, given_up in (((2.0, 4.999, 6.499), False), ((2.9, 5.0, 6.9, 7.9), True)):
-        query, other = chain(offsets)
-        free, _ = published.move_of(query, other)
-        assert (free[0] > 5) == given_up
-        shift, move = align(jnp.asarray(query), jnp.asarray(other))
-        assert int(shift) == 0
-        np.testing.assert_allclose(move, [0, 0] if given_up else free, atol=1e-4)
-        _, backwards = align(jnp.asarray(-query), jnp.asarray(-other))
-        np.testing.assert_allclose(backwards, -move, atol=1e-4)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_partners_within_three_metres_move_the_scan_step_by_step(offsets, sign):
+    query, other = (np.float32(sign) * outline for outline in chain(offsets))
+    expected = published.alignment(query.astype(float), other.astype(float))
+    shift, move = align(jnp.asarray(query), jnp.asarray(other))
+    assert int(shift) == expected[0] == 0 and expected[1].any() == (len(offsets) < 4)
+    np.testing.assert_allclose(move, expected[1], atol=1e-4)
 
 
 def outline(seed):

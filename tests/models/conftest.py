@@ -48,9 +48,9 @@ def assert_parity():
 def model_config():
     """The model of a golden file: its own configuration in the words of ours."""
 
-    def read(golden: dict[str, np.ndarray]) -> tuple[ModelConfig, int]:
+    def read(golden: dict[str, np.ndarray]) -> ModelConfig:
         values = json.loads(str(golden["config"]))
-        config = ModelConfig(
+        return ModelConfig(
             grid=Grid(height=values["img_size"], width=values["img_size"]),
             backbone=SwinConfig(
                 embed_dim=values["embed_dim"],
@@ -61,7 +61,6 @@ def model_config():
             ),
             categories=values["num_classes"],
         )
-        return config, values["in_chans"]
 
     return read
 

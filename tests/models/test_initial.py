@@ -17,7 +17,6 @@ OF_FLAX = {
     "normal": (initial.normal(0.02), nn.initializers.normal(0.02)),
     "he_normal": (initial.he_normal, nn.initializers.he_normal()),
     "lecun_normal": (initial.lecun_normal, nn.initializers.lecun_normal()),
-    "scaled_normal": (initial.scaled_normal(1.0), nn.initializers.variance_scaling(1.0, "fan_in", "normal")),
     "torch_uniform": (initial.torch_uniform, nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")),
     "uniform": (initial.uniform(0.3), lambda key, shape: jax.random.uniform(key, shape, minval=-0.3, maxval=0.3)),
 }

@@ -1,4 +1,4 @@
-"""Layer norm and the product, whose derivatives are written out, against what JAX differentiates itself."""
+"""Layer norm, product, maximum and unit length, whose derivatives are written out, against those of JAX itself."""
 
 import functools
 
@@ -7,14 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.layers import layer_norm, product
+from sglpr_jax.models.layers import EPSILON, l2_normalize, layer_norm, maximum, product
 
-EPSILON = 1e-5
 RNG = np.random.default_rng(0)
 SCALE, BIAS = (jnp.asarray(RNG.normal(size=6), jnp.float32) for _ in range(2))
 ROWS = jnp.asarray(RNG.normal(size=(4, 5, 6)) * 3 + 1, jnp.float32)
 WEIGHTS = jnp.asarray(RNG.normal(size=(4, 5, 6)), jnp.float32)
-ours = functools.partial(layer_norm, epsilon=EPSILON)
 
 
 def plain(x, scale, bias):
@@ -31,8 +29,8 @@ def test_values_and_gradients_are_those_of_the_plain_formula(wrap):
     def loss(norm, x, scale, bias):
         return jnp.sum(norm(x, scale, bias) ** 3 * WEIGHTS[0])
 
-    assert_close(wrap(ours)(ROWS[0], SCALE, BIAS), plain(ROWS[0], SCALE, BIAS))
-    found, expected = (wrap(jax.grad(functools.partial(loss, norm), (0, 1, 2))) for norm in (ours, plain))
+    assert_close(wrap(layer_norm)(ROWS[0], SCALE, BIAS), plain(ROWS[0], SCALE, BIAS))
+    found, expected = (wrap(jax.grad(functools.partial(loss, norm), (0, 1, 2))) for norm in (layer_norm, plain))
     assert_close(found(ROWS[0], SCALE, BIAS), expected(ROWS[0], SCALE, BIAS))
 
 
@@ -55,3 +53,21 @@ def test_the_product_and_its_gradients_are_the_plain_ones(n, c, f):
     for matrices, wrap in ((matrix, jax.jit), (jnp.stack([matrix, 2 * matrix]), jax.vmap)):
         found, expected = (wrap(functools.partial(of, form))(matrices) for form in (product, jnp.matmul))
         assert_close(found, expected)
+
+
+@pytest.mark.parametrize("axes", [(0,), (1, 2)])
+def test_the_maximum_and_its_gradient_are_those_of_jax_and_survive_rounding(axes):
+    """An entry that rounding keeps from being equal to the maximum still has its gradient; ties share it."""
+    for derivative in (jax.grad, jax.jacfwd):
+        found = derivative(lambda x: jnp.square(maximum(x, axes)).sum())(ROWS)
+        np.testing.assert_allclose(found, derivative(lambda x: jnp.square(x.max(axes)).sum())(ROWS), rtol=1e-6)
+    tied = jnp.asarray([2.0, 1.0, np.nextafter(np.float32(2), np.float32(0)), 2.0], jnp.float32)
+    np.testing.assert_allclose(jax.grad(lambda x: maximum(x, (0,)))(tied), [1 / 3, 0, 1 / 3, 1 / 3], rtol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-8, 1e8])
+def test_l2_normalize_gives_unit_vectors_or_zero_and_finite_gradients(scale):
+    x = scale * jnp.asarray([[3.0, 4.0]])
+    expected = [[0.6, 0.8]] if scale > 1e-12 else [[0.0, 0.0]]
+    np.testing.assert_allclose(l2_normalize(x), expected, atol=1e-6)
+    assert np.isfinite(jax.grad(lambda x: l2_normalize(x)[0, 0])(x)).all()

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.layers import l2_normalize
-from sglpr_jax.models.place_head import CBAM, ChannelGate, NetVLAD, PlaceHead, largest
+from sglpr_jax.models.place_head import CBAM, ChannelGate, GatedNetVLAD, PlaceHead
 
 SPATIAL = "SpatialGate.spatial"
 LAYERS = {
@@ -44,7 +43,7 @@ def netvlad(state, image):
         elif weights in state:
             params[ours] = {"kernel": state[weights], "bias": state.get(biases)}
     features = image.transpose(0, 2, 3, 1).reshape(len(image), -1, image.shape[1])
-    return NetVLAD(clusters=8, output=16, gating="gate" in params).apply({"params": params}, features)
+    return GatedNetVLAD(clusters=8, output=16).apply({"params": params}, features)
 
 
 @pytest.mark.slow
@@ -54,7 +53,6 @@ def netvlad(state, image):
         ("cbam", "c32_r4", {"reduction": 4}),
         ("cbam", "c32_r4_nospatial", {"reduction": 4}),
         ("netvlad", "loupe_gating1_bn1", {}),
-        ("netvlad", "loupe_gating0_bn0", {}),
     ],
 )
 def test_output_and_gradients_are_those_of_pytorch(file, tag, options, golden, assert_parity):
@@ -77,25 +75,6 @@ def test_output_and_gradients_are_those_of_pytorch(file, tag, options, golden, a
     assert len(names) >= 4
     for name in names:
         assert_parity(jnp.linalg.norm(by_name[name]), expected[f"eval_gradnorm/{name}"], name)
-
-
-@pytest.mark.slow
-def test_the_gradient_of_the_maximum_survives_rounding():
-    """An entry that rounding keeps from being equal to the maximum still has its gradient; ties share it."""
-    x = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 5)), jnp.float32)
-    for derivative in (jax.grad, jax.jacfwd):
-        found = derivative(lambda x: jnp.square(largest(x, (1, 2))).sum())(x)
-        np.testing.assert_allclose(found, derivative(lambda x: jnp.square(x.max((1, 2))).sum())(x), rtol=1e-6)
-    tied = jnp.asarray([2.0, 1.0, np.nextafter(np.float32(2), np.float32(0)), 2.0], jnp.float32)
-    np.testing.assert_allclose(jax.grad(lambda x: largest(x, (0,)))(tied), [1 / 3, 0, 1 / 3, 1 / 3], rtol=1e-6)
-
-
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-8, 1e8])
-def test_l2_normalize_gives_unit_vectors_or_zero_and_finite_gradients(scale):
-    x = scale * jnp.asarray([[3.0, 4.0]])
-    expected = [[0.6, 0.8]] if scale > 1e-12 else [[0.0, 0.0]]
-    np.testing.assert_allclose(l2_normalize(x), expected, atol=1e-6)
-    assert np.isfinite(jax.grad(lambda x: l2_normalize(x)[0, 0])(x)).all()
 
 
 def head(kernels, strides):

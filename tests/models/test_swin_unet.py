@@ -1,7 +1,5 @@
 """What the Swin-Unet promises beyond its numbers: purity, stochastic depth, transformations, clear errors."""
 
-import dataclasses
-
 import flax.linen as nn
 import flax.traverse_util
 import jax
@@ -10,9 +8,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax import losses
-from sglpr_jax.models import sglpr
 from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig, SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
+from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.layers import LayerNorm
 from sglpr_jax.models.swin import PatchExpand, SwinBlock, WindowAttention
 from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
@@ -95,9 +92,9 @@ def run(weights: dict, image: jax.Array, labels: jax.Array, config: ModelConfig)
 @pytest.mark.slow
 def test_every_stage_loss_and_gradient_agrees(golden, assert_parity, model_config):
     expected = golden("swinunet_w4_img64_odd_depths")
-    config, channels = model_config(expected)
+    config = model_config(expected)
     state = {name.removeprefix("param/"): value for name, value in expected.items() if name.startswith("param/")}
-    weights = from_torch_names(state, config, input_channels=channels)
+    weights = from_torch_names(state, config)
     image = jnp.asarray(expected["input"].transpose(0, 2, 3, 1))
     labels = jnp.asarray(expected["labels"], jnp.int32)
     differentiate = jax.jit(jax.value_and_grad(run, (0, 1), has_aux=True), static_argnums=3)
@@ -157,19 +154,7 @@ def check_gradients(gradients, expected, assert_parity):
 
 STEM = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1))
 BACKBONE = SglprConfig(stem=STEM, embed_dim=8, depths=(2, 2), heads=(1, 2), window=2)
-AROUND = HeadConfig(
-    tap="tokens", channels=(8, 8), kernels=(3, 3), strides=(2, 1), means=(1, 2), cbam_reduction=4, clusters=4
-)
-CONFIG = dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=BACKBONE, head=AROUND)
-BEV = jax.random.poisson(jax.random.key(1), 0.7, (3, 32, 32)).astype(jnp.float32)
 POLAR = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
-
-describe, segment = jax.jit(sglpr.describe), jax.jit(sglpr.segment)
-
-
-@pytest.fixture(scope="module")
-def params(random_params):
-    return random_params(CONFIG)
 
 
 def test_a_turn_by_windows_of_the_coarsest_map_shifts_the_tokens(random_variables):
@@ -177,26 +162,17 @@ def test_a_turn_by_windows_of_the_coarsest_map_shifts_the_tokens(random_variable
     net = CircularSwin(BACKBONE)
     variables = random_variables(net, POLAR)
     apply = jax.jit(net.apply)
-    straight, turned = (apply(variables, image)[0] for image in (POLAR, jnp.roll(POLAR, 8, axis=2)))
+    straight, turned = (apply(variables, image)[0][-1] for image in (POLAR, jnp.roll(POLAR, 8, axis=2)))
     np.testing.assert_allclose(turned, jnp.roll(straight, 4, axis=2), atol=1e-4)
     assert jnp.abs(straight - jnp.roll(straight, 4, axis=2)).max() > 1e-2
 
 
-def test_quarter_turns_leave_the_descriptor(params):
-    straight = describe(params, BEV)
-    assert jnp.abs(straight[0] - straight[1]).max() > 1e-3
-    for quarters in (1, 2, 3):
-        np.testing.assert_allclose(describe(params, jnp.rot90(BEV, quarters, axes=(1, 2))), straight, atol=2e-5)
-
-
 def test_what_does_not_fit_is_an_error():
-    with pytest.raises(ValueError, match="polar"):
+    with pytest.raises(ValueError, match="'sglpr' requires a polar image"):
         ModelConfig(backbone=BACKBONE)
     with pytest.raises(ValueError, match=r"head\.means requires a polar image"):
         ModelConfig(head=HeadConfig(means=(1, 1, 1)))
     with pytest.raises(ValueError, match="a number of heads for each"):
         SglprConfig(depths=(2,))
-    with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):
-        dataclasses.replace(CONFIG, polar=(20, 32))
     with pytest.raises(ValueError, match="3 x 3 kernels"):
         HeadConfig(channels=(8,), kernels=(4,), strides=(1,), means=(1,))

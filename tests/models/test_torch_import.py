@@ -12,7 +12,7 @@ import safetensors.numpy
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.torch_import import from_swin_t, from_torch_names, import_swin_t, import_swin_unet, torch_name
+from sglpr_jax.models.torch_import import from_torch_names, import_swin_t, import_swin_unet, torch_name
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def state(golden):
 
 @pytest.fixture
 def params(golden, model_config) -> Params:
-    config, _ = model_config(golden("swinunet_w4_img64_odd_depths"))
+    config = model_config(golden("swinunet_w4_img64_odd_depths"))
     head = HeadConfig(channels=(8, 8, 8), kernels=(4, 3, 3), strides=(4, 2, 2), clusters=4)
     config = ModelConfig(**{**vars(config), "head": head})
     shapes = jax.eval_shape(lambda key: init(key, config=config), jax.random.key(0))
@@ -65,16 +65,16 @@ def test_swin_unet_checkpoint_with_prefix_buffers_and_three_channels(state, para
 
 
 @pytest.mark.slow
-def test_swin_t_fills_the_encoder_and_the_mirrored_decoder_where_shapes_match(state, params):
+def test_swin_t_fills_the_encoder_and_the_mirrored_decoder_where_shapes_match(state, params, checkpoint):
     """The small model plays Swin-T: encoder names only, plus what ImageNet's has more, and one other window size."""
     swin_t = {name: value for name, value in state.items() if name.startswith(("patch_embed.", "layers.", "norm."))}
     swin_t |= {"head.weight": np.zeros((1000, 64)), "layers.2.blocks.5.norm1.weight": np.ones(32)}
     table = "layers.0.blocks.0.attn.relative_position_bias_table"
     swin_t[table] = np.zeros((169, 1))
-    imported = from_swin_t(swin_t, params)
+    imported, copied, unused = import_swin_t(params, checkpoint(swin_t))
 
-    weights = leaves(imported.params.weights)
-    assert imported.unused == ("head.weight", table, "layers.2.blocks.5.norm1.weight")
+    weights = leaves(imported.weights)
+    assert unused == ("head.weight", table, "layers.2.blocks.5.norm1.weight")
     expected = state["layers.1.blocks.0.mlp.fc1.weight"].T
     for place in ("encoder_1", "decoder_2"):
         np.testing.assert_array_equal(weights[f"backbone/{place}/block_0/mlp_in/kernel"], expected)
@@ -83,7 +83,7 @@ def test_swin_t_fills_the_encoder_and_the_mirrored_decoder_where_shapes_match(st
         "decoder_1_expand/expand/kernel",
         "encoder_0/block_0/attention/position_bias",
     ):
-        assert f"backbone/{name}" not in imported.copied and (weights[f"backbone/{name}"] == 0.5).all()
+        assert f"backbone/{name}" not in copied and (weights[f"backbone/{name}"] == 0.5).all()
 
 
 @pytest.mark.parametrize(

@@ -18,14 +18,14 @@ from sglpr_jax.models.weights import (
     as_tree,
     average,
     by_name,
-    describing,
+    descriptor_layers,
     fit_whitening,
     for_places,
     graft,
-    unwhitened,
     weight_shapes,
     weights_hash,
-    whitened,
+    with_whitening,
+    without_whitening,
 )
 from sglpr_jax.models.weights_file import load, save
 
@@ -79,14 +79,14 @@ def test_fitted_weights_describe_are_stored_and_lose_the_layer_again(random_para
     params = random_params(model_preset("tiny"))
     before = np.asarray(describe(params, BEV))
     samples = before[:1] + RNG.normal(scale=0.1, size=(600, 256)).astype(np.float32)
-    fitted = whitened(params, samples)
+    fitted = with_whitening(params, samples)
     expected = before @ fit_whitening(samples)
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(describe(fitted, BEV), expected, atol=1e-4)
     np.testing.assert_allclose(describe(load(save(fitted, tmp_path / "weights")), BEV), expected, atol=1e-4)
-    chex.assert_trees_all_equal(unwhitened(fitted), params)
+    chex.assert_trees_all_equal(without_whitening(fitted), params)
     with pytest.raises(ValueError, match="without a whitening layer"):
-        whitened(fitted, samples)
+        with_whitening(fitted, samples)
 
 
 @pytest.fixture(scope="module")
@@ -144,8 +144,8 @@ def test_the_hash_changes_with_one_value_and_one_name(params):
 @pytest.mark.slow
 @pytest.mark.parametrize("tap", ["tokens", "pixels"])
 @pytest.mark.parametrize("name", ["paper", "circular", "sglpr"])
-def test_what_describes_is_what_a_model_without_a_segmentation_head_has(name, tap):
+def test_the_layers_of_descriptors_are_those_of_a_model_without_a_segmentation_head(name, tap):
     config = model_preset(name)
     config = dataclasses.replace(config, head=dataclasses.replace(config.head, tap=tap))
     whole = Params(as_tree(dict(weight_shapes(config))), config)
-    assert set(by_name(describing(whole))) == set(weight_shapes(dataclasses.replace(config, categories=0)))
+    assert set(by_name(descriptor_layers(whole))) == set(weight_shapes(dataclasses.replace(config, categories=0)))

@@ -48,7 +48,7 @@ def embed_scans(describe, recording, *, distance, labels=False, **options):
     made = HandcraftedMethod("mean", "this test", "labelled points" if labels else "points", describe)
     with pytest.MonkeyPatch.context() as patched:
         patched.setitem(HANDCRAFTED, "mean", made)
-        method = dataclasses.replace(handcrafted("mean", recording, GRID), distance=distance)
+        method = dataclasses.replace(handcrafted("mean", GRID), distance=distance)
     return embed(method, recording, **options)
 
 

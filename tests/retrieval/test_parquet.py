@@ -38,9 +38,9 @@ def scans(tmp_path) -> Path:
 
 
 @pytest.fixture
-def method(scans) -> Method:
+def method() -> Method:
     """A method without weights."""
-    return method_named("polar-fft", None, opened(scans))
+    return method_named("polar-fft")
 
 
 def opened(folder: Path) -> sglpr_jax.Recording:

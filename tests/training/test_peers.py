@@ -52,7 +52,7 @@ class Rings(nn.Module):
         return nn.Dense(8)(nn.relu(x))
 
 
-def rolled(key, inputs):
+def roll_azimuths(key, inputs):
     by = jax.random.randint(key, (len(inputs),), 0, 2)
     return jax.vmap(jnp.roll)(inputs, by)
 
@@ -65,10 +65,9 @@ TINY = LearnedMethod(
     weights=24 * 16 + 16 + 32 + 16 * 8 + 8,
     network=Rings(),
     prepare=ranges,
-    turned=rolled,
+    rotate_inputs=roll_azimuths,
     loss=functools.partial(triplet, margin=0.5, closest_positive=True, reduction="sum"),
     recipe=Recipe(
-        published="this test",
         sampling=TupleConfig(positives=1, negatives=2, revisit_gap=5),
         tuples=10,
         learning_rates=(1e-6, 1e-2, 2e-2),
@@ -168,7 +167,7 @@ def test_a_step_is_that_of_adam_with_weight_decay():
     assert int(after.step) == 1
 
     def loss_of(params):
-        inputs = rolled(jax.random.fold_in(jax.random.key(5), 0), jnp.asarray(batch.inputs))
+        inputs = roll_azimuths(jax.random.fold_in(jax.random.key(5), 0), jnp.asarray(batch.inputs))
         hidden = inputs @ params["Dense_0"]["kernel"] + params["Dense_0"]["bias"][None]
         hidden = (hidden - hidden.mean(0)[None]) / jnp.sqrt(hidden.var(0) + 1e-5)[None]
         hidden = hidden * params["BatchNorm_0"]["scale"][None] + params["BatchNorm_0"]["bias"][None]

@@ -17,20 +17,8 @@ _METHODS = (
         "scan-context", 'Kim and Kim, "Scan Context", IROS 2018', "points", scan_context, scan_context_distance
     ),
     HandcraftedMethod("m2dp", 'He, Wang and Zhang, "M2DP", IROS 2016', "points", m2dp),
-    HandcraftedMethod(
-        "lidar-iris",
-        'Wang et al., "LiDAR Iris for Loop-Closure Detection", IROS 2020',
-        "points",
-        lidar_iris,
-        lidar_iris_distance,
-    ),
-    HandcraftedMethod(
-        "ssc",
-        'Li et al., "SSC: Semantic Scan Context for Large-Scale Place Recognition", IROS 2021',
-        "labelled points",
-        ssc,
-        ssc_distance,
-    ),
+    HandcraftedMethod("lidar-iris", 'Wang et al., "LiDAR Iris", IROS 2020', "points", lidar_iris, lidar_iris_distance),
+    HandcraftedMethod("ssc", 'Li et al., "Semantic Scan Context", IROS 2021', "labelled points", ssc, ssc_distance),
     HandcraftedMethod(
         "ssc-24",
         "SSC with the 24 rings from 5 m of its authors' last version",
@@ -39,26 +27,12 @@ _METHODS = (
         partial(ssc_distance, grid=NEWEST),
     ),
     HandcraftedMethod("solid", 'Kim et al., "Narrowing your FOV with SOLiD", RA-L 2024', "points", solid),
+    HandcraftedMethod("ring", 'Lu et al., "RING++", T-RO 2023', "points", ring, ring_distance),
     HandcraftedMethod(
-        "ring",
-        'Lu et al., "RING++: Roto-Translation Invariant Gram for Global Localization on a Sparse Scan Map", T-RO 2023',
-        "points",
-        ring,
-        ring_distance,
+        "probe", 'this project, after the abstract of Lee et al., "PROBE", RA-L 2026', "points", probe, probe_distance
     ),
     HandcraftedMethod(
-        "probe",
-        'this project, after the abstract of Lee et al., "PROBE", RA-L 2026',
-        "points",
-        probe,
-        probe_distance,
-    ),
-    HandcraftedMethod(
-        "polar-fft",
-        "this project",
-        "images",
-        polar_fft,
-        describe_ready_made=partial(polar_fft, radius=READY_MADE_RADIUS),
+        "polar-fft", "this project", "images", polar_fft, None, partial(polar_fft, radius=READY_MADE_RADIUS)
     ),
 )
 HANDCRAFTED: dict[str, HandcraftedMethod] = {method.name: method for method in _METHODS}

@@ -34,11 +34,11 @@ def probe(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "2400"]:
     """
     radius, angle, z = polar(points)
     height = z - GROUND_M
-    counted = (radius < RADIUS_M) & (height > CLEARANCE_M)
+    valid = (radius < RADIUS_M) & (height > CLEARANCE_M)
     ring = np.floor(radius * (RINGS / RADIUS_M)).astype(np.int64)
     sector = np.floor(angle * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
-    cell = (ring * SECTORS + sector)[counted]
-    return extreme(np.maximum, (RINGS * SECTORS,), cell, height[counted]).astype(np.float32)
+    cell = (ring * SECTORS + sector)[valid]
+    return extreme(np.maximum, (RINGS * SECTORS,), cell, height[valid]).astype(np.float32)
 
 
 def occupancy(heights: Cells) -> Float64[np.ndarray, "n 40 60"]:
@@ -76,8 +76,8 @@ def _prepare(rows: Float32[np.ndarray, "n 2400"]) -> tuple[Cells, ...]:
     """Return the heights, scaled to length 1, p, p', and log(p' / (1 - p'))."""
     heights = rows.reshape(-1, RINGS, SECTORS)
     occupied = occupancy(heights)
-    doubt = np.minimum(DEVIATIONS, 1)[None, :, None]
-    smoothed = ((1 - doubt) * occupied + doubt / 2).clip(0.01, 0.99)
+    uncertainty = np.minimum(DEVIATIONS, 1)[None, :, None]
+    smoothed = ((1 - uncertainty) * occupied + uncertainty / 2).clip(0.01, 0.99)
     parts = (part.astype(np.float32) for part in (occupied, smoothed, np.log(smoothed / (1 - smoothed))))
     return unit_length(rows).reshape(heights.shape), *parts
 
@@ -90,15 +90,15 @@ def _jaccard(
 ) -> Float[Array, "q n"]:
     """Return the Jaccard index of each pair, with the sectors of the query shifted by `shifts`."""
     weights = np.exp(-DEVIATIONS * (SECTORS / (2 * np.pi))).astype(np.float32)[None, :, None]
-    places = (np.arange(SECTORS)[None, :] - np.arange(SECTORS)[:, None]) % SECTORS
+    sectors = (np.arange(SECTORS)[None, :] - np.arange(SECTORS)[:, None]) % SECTORS
 
-    def of_query(query):
+    def query_row(query):
         *parts, shifts = query
         # A table of all shifts is fast.
-        occupied, smoothed, logit = (jnp.moveaxis(part[:, places], 1, 0)[shifts] for part in parts)
+        occupied, smoothed, logit = (jnp.moveaxis(part[:, sectors], 1, 0)[shifts] for part in parts)
         divergence = (smoothed - database[1]) * (logit - database[2])  # of both directions together
         union = weights * jnp.maximum(occupied, database[0])
         total = union.sum((1, 2))
         return (union * jnp.exp(-divergence)).sum((1, 2)) / jnp.where(total > 0, total, 1.0)
 
-    return jax.lax.map(of_query, (*queries, shifts))
+    return jax.lax.map(query_row, (*queries, shifts))

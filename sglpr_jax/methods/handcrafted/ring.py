@@ -41,14 +41,14 @@ def sinogram(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "60 120"
     occupied = np.bincount(cells @ [SIDE, 1], minlength=SIDE**2).reshape(SIDE, SIDE) > 0
     centres = np.stack(occupied.nonzero()) - (SIDE - 1) / 2
     x, y = centres[:, np.hypot(*centres) < (SIDE - 1) / 2]
-    turn = np.radians(180 / ANGLES * np.arange(ANGLES))[:, None]
-    place = np.cos(turn) * x[None] + np.sin(turn) * y[None] + (SIDE - 1) / 2
-    low = np.floor(place).astype(np.int64)
-    flat, share = low + SIDE * np.arange(ANGLES)[:, None], place - low
-    found = np.zeros(ANGLES * SIDE)
-    for offset, part in ((0, 1 - share), (1, share)):
-        found += np.bincount((flat + offset).ravel(), part.ravel(), minlength=ANGLES * SIDE)
-    return found.reshape(ANGLES, SIDE)
+    angle = np.radians(180 / ANGLES * np.arange(ANGLES))[:, None]
+    offset = np.cos(angle) * x[None] + np.sin(angle) * y[None] + (SIDE - 1) / 2
+    low = np.floor(offset).astype(np.int64)
+    flat, share = low + SIDE * np.arange(ANGLES)[:, None], offset - low
+    lines = np.zeros(ANGLES * SIDE)
+    for step, weight in ((0, 1 - share), (1, share)):
+        lines += np.bincount((flat + step).ravel(), weight.ravel(), minlength=ANGLES * SIDE)
+    return lines.reshape(ANGLES, SIDE)
 
 
 def ring_distance(
@@ -64,16 +64,16 @@ def ring_distance(
     def compare(queries, database):
         return 1 - correlate(queries, database).max(axis=-1)
 
-    return in_blocks(compare, queries, database, block=BLOCK, prepare=_standardised)
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=_standardise)
 
 
-def _standardised(rows: Float32[np.ndarray, "n 3660"]) -> Float32[np.ndarray, "n 61 60"]:
+def _standardise(rows: Float32[np.ndarray, "n 3660"]) -> Float32[np.ndarray, "n 61 60"]:
     """Return the magnitudes with mean 0 and length 1 over all 120 frequencies. 59 of them occur twice."""
-    times = np.full(FREQUENCIES, 2.0)
-    times[[0, -1]] = 1
+    occurrences = np.full(FREQUENCIES, 2.0)
+    occurrences[[0, -1]] = 1
     magnitudes = rows.reshape(-1, ANGLES, FREQUENCIES).astype(np.float64)
-    mean = (magnitudes @ times).sum(axis=1) / (ANGLES * SIDE)
-    weighted = (magnitudes - mean[:, None, None]) * np.sqrt(times)
+    mean = (magnitudes @ occurrences).sum(axis=1) / (ANGLES * SIDE)
+    weighted = (magnitudes - mean[:, None, None]) * np.sqrt(occurrences)
     length = np.sqrt((weighted**2).sum(axis=(1, 2), keepdims=True))
     unit = np.divide(weighted, length, out=np.zeros_like(weighted), where=length > 0)
     return unit.swapaxes(1, 2).astype(np.float32)

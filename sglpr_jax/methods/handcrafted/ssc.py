@@ -14,25 +14,25 @@ from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.pairwise import in_blocks
 
 SECTORS = 360
-WINDOW = np.arange(-10, 10)
+PARTNER_SECTORS = np.arange(-10, 10)
 """Sectors in which the partner of a landmark is searched, relative to its own sector."""
 GATE_M = 3.0
 """Maximum distance of partners along x and along y, in metres."""
 STEPS = 100
 """Maximum number of iterations of the iterative closest point method."""
-STANDSTILL_M = 1e-5
+SMALLEST_STEP_M = 1e-5
 """The iteration stops when a step is shorter than this along x and along y, in metres."""
 FARTHEST_MOVE_M = 5.0
 """Maximum translation along x and along y, in metres. Larger translations count as failures."""
 FARTHEST_M = 50.0
-STRONGER = (17, 9, 10, 11, 12, 15, 13, 14, 16, 18, 19)
+USED_CLASSES = (17, 9, 10, 11, 12, 15, 13, 14, 16, 18, 19)
 """The classes that are used (`labels.CATEGORIES`), in rising order of priority in a cell. Other classes are ignored."""
 LANDMARKS = (13, 14, 16, 18, 19)
 """Building, fence, trunk, pole and traffic sign: the classes whose outlines are aligned."""
 
-FINER = 3
-"""A scan is stored in cells of a third of a ring and a third of a sector. The alignment moves these cells."""
-FINE_SECTORS = FINER * SECTORS
+FINE = 3
+"""A scan is stored in fine cells of a third of a ring and a third of a sector. The alignment moves these cells."""
+FINE_SECTORS = FINE * SECTORS
 RANK_BITS = 4
 PACKED = 6
 """Cells per number of a descriptor: float32 represents integers of 24 bits exactly."""
@@ -55,17 +55,17 @@ class PolarGrid:
 
     @property
     def fine_m(self) -> float:
-        """Width of the stored rings, in metres. They begin at the sensor."""
-        return (FARTHEST_M - self.nearest_m) / self.rings / FINER
+        """Width of the fine rings, in metres. They begin at the sensor."""
+        return (FARTHEST_M - self.nearest_m) / self.rings / FINE
 
     @property
     def inner(self) -> int:
-        """Number of stored rings within `nearest_m`. A translation may move them beyond it."""
+        """Number of fine rings within `nearest_m`. A translation may move them beyond it."""
         return round(self.nearest_m / self.fine_m)
 
     @property
     def fine_rings(self) -> int:
-        """Number of stored rings. They reach as far out as a translation may bring cells in from."""
+        """Number of fine rings. They reach as far out as a translation may bring cells in from."""
         return math.ceil((FARTHEST_M + math.sqrt(2) * FARTHEST_MOVE_M) / self.fine_m)
 
     @property
@@ -83,24 +83,23 @@ NEWEST = PolarGrid(24, 5.0)
 def ssc(
     points: Float32[np.ndarray, "n 3"], classes: Int32[np.ndarray, " n"], grid: PolarGrid = PAPER
 ) -> Float32[np.ndarray, " d"]:
-    """Return the strongest class of every stored cell, six to a number, and x (360) and y (360) of the landmarks.
+    """Return the rank of the strongest class of every fine cell, six to a number, and x (360) and y (360) of landmarks.
 
     Points are in metres, z up; classes are those of `labels.to_classes`. Sectors are degrees from the back. The
     landmark of a sector is its last landmark point, at any nonzero range, or x = y = 0.
     """
     x, y = points[:, :2].astype(np.float64).T
     radius, angle, _ = polar(points)
-    ring, sector = (
-        np.floor(part).astype(np.int64) for part in (radius / grid.fine_m, (180 + np.degrees(angle)) * FINER)
-    )
+    ring = np.floor(radius / grid.fine_m).astype(np.int64)
+    sector = np.floor((180 + np.degrees(angle)) * FINE).astype(np.int64)
     inside = (ring < grid.fine_rings) & (sector < FINE_SECTORS)
     ranks = np.zeros(len(CATEGORIES))
-    ranks[list(STRONGER)] = 1 + np.arange(len(STRONGER))
+    ranks[list(USED_CLASSES)] = 1 + np.arange(len(USED_CLASSES))
     shape = (grid.fine_rings, FINE_SECTORS)
     cells = extreme(np.maximum, shape, (ring[inside], sector[inside]), ranks[classes[inside]])
     landmarks = np.flatnonzero(np.isin(classes, LANDMARKS) & (radius > 0) & (sector < FINE_SECTORS))
     outline = np.zeros((2, SECTORS))
-    outline[:, sector[landmarks] // FINER] = x[landmarks], y[landmarks]  # in each sector, the last landmark wins
+    outline[:, sector[landmarks] // FINE] = x[landmarks], y[landmarks]  # in each sector, the last landmark wins
     packed = cells.reshape(-1, PACKED) @ (1 << RANK_BITS * np.arange(PACKED))
     return np.concatenate([packed, *outline]).astype(np.float32)
 
@@ -111,27 +110,28 @@ def ssc_distance(
     """Return 1 - (cells of equal class) / (cells occupied in either scan), after alignment; 1 if no cell is occupied.
 
     The scan of the database is rotated and moved onto the query (`align`). The published method then sorts its points
-    into cells again. Here no points are stored, so the centres of its occupied stored cells are sorted instead.
+    into cells again. Here no points are stored, so the centres of its occupied fine cells are sorted instead.
     """
 
-    def still(rows):
-        fine, outlines = _unpacked(grid, rows)
-        compared = fine[:, grid.inner : grid.inner + FINER * grid.rings]
-        cells = compared.reshape(-1, grid.rings, FINER, SECTORS, FINER).max(axis=(2, 4))
+    def prepare(rows):
+        fine, outlines = _unpack(grid, rows)
+        compared = fine[:, grid.inner : grid.inner + FINE * grid.rings]
+        cells = compared.reshape(-1, grid.rings, FINE, SECTORS, FINE).max(axis=(2, 4))
         return outlines, cells.astype(np.int32)
 
-    def moved(rows):
-        fine, outlines = _unpacked(grid, rows)
+    def prepare_database(rows):
+        fine, outlines = _unpack(grid, rows)
         return outlines, *_occupied(grid, fine)
 
     compare = functools.partial(_compare, grid)
-    return in_blocks(compare, queries, database, block=BLOCK, threads=None, prepare=still, prepare_database=moved)
+    options = {"block": BLOCK, "threads": None, "prepare": prepare, "prepare_database": prepare_database}
+    return in_blocks(compare, queries, database, **options)
 
 
-def _unpacked(
+def _unpack(
     grid: PolarGrid, rows: Float32[np.ndarray, "n d"]
 ) -> tuple[UInt8[np.ndarray, "n rings sectors"], Float32[np.ndarray, "n 2 360"]]:
-    """Return the rank of every stored cell, and the outlines."""
+    """Return the rank of every fine cell, and the outlines (x and y of each sector's landmark)."""
     if rows.shape[1] != grid.numbers:
         raise ValueError(f"expected rows of {grid.numbers} numbers ({grid.rings} rings), found {rows.shape[1]}")
     packed, outlines = rows[:, : -2 * SECTORS].astype(np.int32), rows[:, -2 * SECTORS :].reshape(-1, 2, SECTORS)
@@ -150,7 +150,7 @@ def _occupied(
     place = np.arange(len(scan)) - np.repeat(np.cumsum(counts) - counts, counts)
     width = max(1, math.ceil(counts.max() / WIDTH_STEP)) * WIDTH_STEP
     centres, ranks = np.zeros((len(fine), 2, width), np.float32), np.zeros((len(fine), width), np.int32)
-    radius, angle = (ring + 0.5) * grid.fine_m, np.radians((sector + 0.5) / FINER - 180)
+    radius, angle = (ring + 0.5) * grid.fine_m, np.radians((sector + 0.5) / FINE - 180)
     centres[scan, :, place] = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     ranks[scan, place] = fine[scan, ring, sector]
     return centres, ranks
@@ -164,9 +164,9 @@ def _compare(grid: PolarGrid, queries: tuple[Array, ...], database: tuple[Array,
     def distance(query, other):
         (outline, cells), (other_outline, centres, ranks) = query, other
         shift, move = align(outline, other_outline)
-        found = _cells_of(grid, turn(centres, shift) + move[:, None], ranks)
-        either = (cells > 0) | (found > 0)
-        return 1 - jnp.sum(either & (cells == found)) / jnp.maximum(either.sum(), 1)
+        other_cells = _cells_of(grid, rotate(centres, shift) + move[:, None], ranks)
+        either = (cells > 0) | (other_cells > 0)
+        return 1 - jnp.sum(either & (cells == other_cells)) / jnp.maximum(either.sum(), 1)
 
     return jax.lax.map(lambda query: jax.lax.map(lambda other: distance(query, other), database), queries)
 
@@ -174,7 +174,7 @@ def _compare(grid: PolarGrid, queries: tuple[Array, ...], database: tuple[Array,
 def _cells_of(grid: PolarGrid, points: Float[Array, "2 n"], ranks: Int[Array, " n"]) -> Int[Array, "rings 360"]:
     """Return the highest rank in every cell."""
     x, y = points
-    ring = jnp.floor((jnp.sqrt(x**2 + y**2) - grid.nearest_m) / (FINER * grid.fine_m)).astype(jnp.int32)
+    ring = jnp.floor((jnp.sqrt(x**2 + y**2) - grid.nearest_m) / (FINE * grid.fine_m)).astype(jnp.int32)
     sector = jnp.floor(180 + jnp.degrees(_angle(x, y))).astype(jnp.int32)
     inside = (ring >= 0) & (ring < grid.rings) & (sector < SECTORS)
     cells = jnp.zeros((grid.rings, SECTORS), jnp.int32)
@@ -187,16 +187,15 @@ def _angle(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, " n"]:
     octant = low / jnp.maximum(high, jnp.finfo(x.dtype).tiny)
     quadrant = octant * jnp.polyval(jnp.asarray(ARCTAN), octant**2)
     half = jnp.where(jnp.abs(y) > jnp.abs(x), np.pi / 2 - quadrant, quadrant)
-    turned = jnp.where(x < 0, np.pi - half, half)
-    return jnp.where(y < 0, -turned, turned)
+    whole = jnp.where(x < 0, np.pi - half, half)
+    return jnp.where(y < 0, -whole, whole)
 
 
 def align(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> tuple[Int[Array, ""], Float[Array, "2"]]:
     """Return the clockwise rotation of the outline `other`, in degrees, and then its translation (x, y), in metres. A
     translation of more than 5 m along x or y is replaced by 0."""
     shift = best_shift(jnp.hypot(*query), jnp.hypot(*other))
-    turned = turn(jnp.roll(other, -shift, axis=1), shift)
-    move = best_move(query, turned)
+    move = best_move(query, rotate(jnp.roll(other, -shift, axis=1), shift))
     return shift, jnp.where(jnp.all(jnp.abs(move) <= FARTHEST_MOVE_M), move, 0.0)
 
 
@@ -209,7 +208,7 @@ def best_shift(query: Float[Array, "360"], other: Float[Array, "360"]) -> Int[Ar
     return jnp.argmin(costs)
 
 
-def turn(points: Float[Array, "2 n"], degrees: Int[Array, ""]) -> Float[Array, "2 n"]:
+def rotate(points: Float[Array, "2 n"], degrees: Int[Array, ""]) -> Float[Array, "2 n"]:
     """Return x and y after a clockwise rotation."""
     cos, sin = jnp.cos(jnp.radians(degrees)), jnp.sin(jnp.radians(degrees))
     x, y = points
@@ -223,22 +222,22 @@ def best_move(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> Flo
     step is the sum of the differences of the n pairs within 3 m along x and y, divided by n + 1. Steps are added until
     one is shorter than 10 um, at most 100 times.
     """
-    partners = (np.arange(SECTORS) + WINDOW[:, None]) % SECTORS
+    partners = (np.arange(SECTORS) + PARTNER_SECTORS[:, None]) % SECTORS
     candidates = jnp.moveaxis(other[:, partners], 1, 0)
     may_pair = _is_landmark(query)[None, :] & _is_landmark(other)[partners]
 
     def step(state):
         move, _, count = state
-        apart = _to_nearest(query - move[:, None], candidates, may_pair)
-        near = jnp.all(jnp.abs(apart) < GATE_M, axis=0)
-        by = jnp.where(near, apart, 0.0).sum(axis=1) / (1 + near.sum())
-        return move + by, by, count + 1
+        offset = _to_nearest(query - move[:, None], candidates, may_pair)
+        near = jnp.all(jnp.abs(offset) < GATE_M, axis=0)
+        last_step = jnp.where(near, offset, 0.0).sum(axis=1) / (1 + near.sum())
+        return move + last_step, last_step, count + 1
 
-    def goes_on(state):
-        _, by, count = state
-        return (count < STEPS) & jnp.any(jnp.abs(by) >= STANDSTILL_M)
+    def has_moved(state):
+        _, last_step, count = state
+        return (count < STEPS) & jnp.any(jnp.abs(last_step) >= SMALLEST_STEP_M)
 
-    return jax.lax.while_loop(goes_on, step, (jnp.zeros(2), jnp.full(2, jnp.inf), 0))[0]
+    return jax.lax.while_loop(has_moved, step, (jnp.zeros(2), jnp.full(2, jnp.inf), 0))[0]
 
 
 def _to_nearest(
@@ -247,10 +246,10 @@ def _to_nearest(
     """Return the offset in x and y from each point's nearest candidate to the point; infinity without a candidate."""
 
     def nearer(best, candidate):
-        squared, apart = best
-        to_candidate = points - candidate[0]
-        found = jnp.where(candidate[1], jnp.sum(to_candidate**2, axis=0), jnp.inf)
-        return (jnp.minimum(found, squared), jnp.where(found < squared, to_candidate, apart)), None
+        best_square, best_offset = best
+        offset = points - candidate[0]
+        square = jnp.where(candidate[1], jnp.sum(offset**2, axis=0), jnp.inf)
+        return (jnp.minimum(square, best_square), jnp.where(square < best_square, offset, best_offset)), None
 
     start = jnp.full(SECTORS, jnp.inf), jnp.full((2, SECTORS), jnp.inf)
     # One candidate for all sectors at a time keeps the arrays small and the loop simple.

@@ -1,8 +1,9 @@
 """BEVPlace++ (Luo et al., 2025) on density images, and its ablation ResNet-34 + NetVLAD, which has no rotations.
 
-Differences from the published recipe: trained from scratch, half of the positives come from another visit, mining
-describes 256 random places every 25 steps, and images are rotated by any angle. BEVPlace++ has 2 tuples a step, because
-a step of 24 images already needs 6 GB.
+Published recipe: Adam 1e-4, constant; max over negatives of [0.3 + d_positive - d_negative]_+ with d = L2; 4 tuples of
+1 positive and 10 hardest negatives, 40 epochs of KITTI 00; ResNet-34 from ImageNet, NetVLAD from k-means. Differences:
+trained from scratch, half of the positives come from another visit, mining describes 256 random places every 25 steps,
+and images are rotated by any angle. BEVPlace++ has 2 tuples a step, because a step of 24 images already needs 6 GB.
 """
 
 import functools
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float, Float32, Float64, Int32, Num, UInt8
+from jaxtyping import Array, Float, Float64, Num, UInt8
 
 from sglpr_jax.bev import rotate_image
 from sglpr_jax.data.scan import Scan, check_cloud
@@ -30,6 +31,7 @@ from sglpr_jax.methods.learned.layers import (
 from sglpr_jax.methods.learned.method import LearnedMethod, triplet
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
 from sglpr_jax.models.convolution import convolve
+from sglpr_jax.models.input_image import Taps, resample
 from sglpr_jax.models.layers import l2_normalize
 
 GREY = 256.0
@@ -43,7 +45,7 @@ SHARPNESS = -0.75
 """Parameter a of the cubic kernel. PyTorch uses -0.75, `jax.image.resize` -0.5."""
 
 
-class Block(nn.Module):
+class ResidualBlock(nn.Module):
     """Residual block of two convolutions 3 x 3. A stride needs a shortcut with its own convolution 1 x 1."""
 
     features: int
@@ -51,7 +53,6 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b _ _ {self.features}"]:
-        """Return the sum of the shortcut and the convolved images, after ReLU."""
         strides = (self.stride, self.stride)
         y = batch_norm(train)(Convolution(self.features, strides=strides)(x))
         y = batch_norm(train)(Convolution(self.features)(nn.relu(y)))
@@ -69,21 +70,19 @@ class Encoder(nn.Module):
         kernel = self.param("kernel", HE, (7, 7, 3, 64))
         x = convolve(images[..., None], kernel.sum(2, keepdims=True), (2, 2), False)
         x = max_pool(nn.relu(batch_norm(train)(x)), size=3, border=1)
-        for _ in range(3):
-            x = Block(64)(x, train=train)
-        x = Block(128, stride=2)(x, train=train)
-        for _ in range(3):
-            x = Block(128)(x, train=train)
+        blocks = [(64, 1)] * 3 + [(128, 2)] + [(128, 1)] * 3
+        for i, (features, stride) in enumerate(blocks):
+            x = ResidualBlock(features, stride, name=f"Block_{i}")(x, train=train)  # the name in weight files
         return x
 
 
 class REIN(nn.Module):
     """Encoder of eight rotations or one, the maximum of its results, and NetVLAD: 8192 numbers of unit length.
 
-    The image is rotated by multiples of 45 degrees, and each result is rotated back. A quarter turn of the image only
-    permutes the rotations, so it does not change the descriptor. For this, the number of pixels minus 1 must be a
-    multiple of 8; `bordered` adds zeros. The published network resamples every rotation and normalises each by its own
-    statistics. Here quarter turns are exact, and the eight rotations are one batch.
+    The image is rotated by multiples of 45 degrees, and each result is rotated back. A rotation of the image by 90
+    degrees only permutes the eight, so it does not change the descriptor. The published network resamples every
+    rotation and normalises each by its own statistics. Here rotations by 90 degrees are exact, and the eight are one
+    batch.
     """
 
     rotations: int = 8
@@ -91,13 +90,12 @@ class REIN(nn.Module):
 
     @nn.compact
     def __call__(self, images: Num[Array, "b h h"], *, train: bool = False) -> Float[Array, "b 8192"]:
-        """Return the descriptors of grey images from 0 to 255."""
         x = bordered(images.astype(jnp.float32) / GREY)
         encoder = Encoder()
         if self.rotations == 1:
             maps = encoder(x, train=train)
         else:
-            maps = functools.reduce(jnp.maximum, turned_back(encoder(eight_turns(x), train=train)))
+            maps = functools.reduce(jnp.maximum, rotated_back(encoder(eight_rotations(x), train=train)))
         local = l2_normalize(resized(maps, images.shape[1] // DENSER))
         local = local.reshape(len(local), -1, local.shape[-1])
         self.sow(LOCAL, FEATURES, local)
@@ -105,8 +103,10 @@ class REIN(nn.Module):
 
 
 def bordered(images: Float[Array, "b h h"]) -> Float[Array, "b _ _"]:
-    """Add zeros on all sides, so that all resolutions of the encoder have a pixel at the centre. Raises ValueError if
-    the number of rows is even."""
+    """Add zeros on all sides, so that all resolutions of the encoder have a pixel at the centre.
+
+    Raises ValueError if the number of rows is even.
+    """
     size = images.shape[1]
     if size % 2 == 0:
         raise ValueError(f"expected images with an odd number of rows, found {size}")
@@ -114,36 +114,31 @@ def bordered(images: Float[Array, "b h h"]) -> Float[Array, "b _ _"]:
     return jnp.pad(images, ((0, 0), (side, side), (side, side)))
 
 
-def eight_turns(images: Float[Array, "b h h"]) -> Float[Array, "8*b h h"]:
+def eight_rotations(images: Float[Array, "b h h"]) -> Float[Array, "8*b h h"]:
     """Return the images rotated by 0, 90, 180, 270, then 45, 135, 225 and 315 degrees."""
-    between = resampled(images, turned_taps(images.shape[1], 45))
+    between = resample(images.reshape(len(images), -1, 1), rotation_taps(images.shape[1], 45)).reshape(images.shape)
     return jnp.concatenate([jnp.rot90(x, k, (1, 2)) for x in (images, between) for k in range(4)])
 
 
-def turned_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
-    """Undo the rotations of `eight_turns`."""
+def rotated_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
+    """Undo the rotations of `eight_rotations`."""
     parts = [jnp.rot90(x, -(k % 4), (1, 2)) for k, x in enumerate(jnp.split(maps, 8))]
-    between = resampled_maps(jnp.concatenate(parts[4:]), turned_taps(maps.shape[1], -45))
+    between = resampled_maps(jnp.concatenate(parts[4:]), rotation_taps(maps.shape[1], -45))
     return jnp.concatenate([*parts[:4], between]).reshape(8, -1, *maps.shape[1:])
 
 
-Taps = tuple[Int32[np.ndarray, "points 16"], Float32[np.ndarray, "points 16"]]
-"""Index in the flattened image of the 16 pixels around each point of a resampled image, and their weights."""
-
-
 @functools.cache
-def turned_taps(size: int, degrees: int) -> Taps:
-    """Return the table that rotates a square image about its centre, counter-clockwise, with zeros outside."""
+def rotation_taps(size: int, degrees: int) -> Taps:
+    """Return the 16 source pixels of each pixel of a square image that is rotated about its centre, counter-clockwise,
+    with zeros outside."""
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     down, right = (np.mgrid[:size, :size] - (size - 1) / 2).reshape(2, -1)
     at = np.stack([cos * down + sin * right, cos * right - sin * down]) + (size - 1) / 2
-    first = np.floor(at) - 1
-    rows, columns = lines = first[..., None] + np.arange(4)
-    down, right = cubic(lines - at[..., None]) * ((lines >= 0) & (lines < size))
-    rows, columns = (line.clip(0, size - 1).astype(np.int32) for line in (rows, columns))
-    pixels = rows[:, :, None] * size + columns[:, None]
-    weights = (down[:, :, None] * right[:, None]).astype(np.float32)
-    return pixels.reshape(-1, 16), weights.reshape(-1, 16)
+    lines = np.floor(at)[:, None] + np.arange(-1, 3)[:, None]  # rows, and columns, of 4 pixels each
+    down, right = cubic(lines - at[:, None]) * ((lines >= 0) & (lines < size))
+    rows, columns = lines.clip(0, size - 1).astype(np.int32)
+    pixels, weights = rows[:, None] * size + columns, (down[:, None] * right).astype(np.float32)
+    return Taps(pixels.reshape(16, -1), weights.reshape(16, -1))
 
 
 def cubic(distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
@@ -154,18 +149,11 @@ def cubic(distance: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
     return np.where(x <= 1, near, np.where(x < 2, far, 0.0))
 
 
-def resampled(images: Float[Array, "b h h"], taps: Taps) -> Float[Array, "b h h"]:
-    """Return images resampled by a table of the same size."""
-    flat = images.reshape(len(images), -1)
-    parts = (flat[:, pixels] * weights[None] for pixels, weights in zip(taps[0].T, taps[1].T, strict=True))
-    return functools.reduce(jnp.add, parts).reshape(images.shape)
-
-
 def resampled_maps(maps: Float[Array, "b h h c"], taps: Taps) -> Float[Array, "b h h c"]:
     """Return small maps of many channels resampled by a table, as a product with a dense matrix."""
-    pixels, weights = taps
-    matrix = np.zeros((len(pixels),) * 2, np.float32)
-    np.add.at(matrix, (np.arange(len(matrix))[:, None], pixels), weights)
+    pixels = taps.pixel.shape[1]
+    matrix = np.zeros((pixels, pixels), np.float32)
+    np.add.at(matrix, (np.arange(pixels)[None], taps.pixel), taps.weight)
     return jnp.einsum("pq,bqc->bpc", matrix, maps.reshape(len(maps), -1, maps.shape[-1])).reshape(maps.shape)
 
 
@@ -178,8 +166,10 @@ def resized(maps: Float[Array, "b h h c"], size: int) -> Float[Array, "b {size} 
 
 
 def grey_image(scan: Scan) -> UInt8[np.ndarray, "151 151"]:
-    """Return the ready-made density image of a record, or the density image of a scan, as grey values. Raises
-    ValueError for another image, or for a scan that shows no place."""
+    """Return the ready-made density image, or the density image of the points of a scan, as grey values.
+
+    Raises ValueError for another image, or for a scan that shows no place.
+    """
     if scan.points is not None:
         check_cloud(scan.points, name=scan.name)
     check_ready_made(scan, "density")
@@ -191,24 +181,20 @@ def grey_image(scan: Scan) -> UInt8[np.ndarray, "151 151"]:
     return np.rint(counts * (255 / DENSITY_MAX_COUNT)).clip(0, 255).astype(np.uint8)
 
 
-def turned(key: Array, images: Num[Array, "b h h"]) -> Num[Array, "b h h"]:
+def rotate_images(key: Array, images: Num[Array, "b h h"]) -> Num[Array, "b h h"]:
     """Rotate each image about its centre by a random angle, bilinearly, with zeros outside."""
     angles = jax.random.uniform(key, (len(images),), maxval=2 * jnp.pi)
     rotated = rotate_image(images.astype(jnp.float32), angles)
     return jnp.rint(rotated).astype(images.dtype)
 
 
-PUBLISHED = (
-    "Adam 1e-4, constant; max over negatives of [0.3 + d_positive - d_negative]_+ with d = L2; 4 tuples of 1 positive "
-    "and 10 hardest negatives, 40 epochs of KITTI 00; ResNet-34 from ImageNet, NetVLAD from k-means"
-)
 SAMPLING = TupleConfig(positive_m=5.0, negative_m=7.0, mining="hardest", hardest=10, refresh_steps=25, mined_places=256)
 """To describe 256 places takes about an eighth of the training time."""
 
 
 def _method(name: str, source: str, *, rotations: int, tuples: int) -> LearnedMethod:
-    """Return the method of one number of rotations. All weights start at random."""
-    recipe, network = Recipe(PUBLISHED, SAMPLING, tuples, learning_rates=(3e-5, 1e-4, 3e-4)), REIN(rotations)
+    """Return the method of one number of rotations."""
+    network = REIN(rotations)
     return LearnedMethod(
         name=name,
         source=source,
@@ -217,9 +203,9 @@ def _method(name: str, source: str, *, rotations: int, tuples: int) -> LearnedMe
         weights=1_364_288,
         network=network,
         prepare=grey_image,
-        turned=turned,
+        rotate_inputs=rotate_images,
         loss=functools.partial(triplet, margin=MARGIN, closest_positive=False),
-        recipe=recipe,
+        recipe=Recipe(SAMPLING, tuples, learning_rates=(3e-5, 1e-4, 3e-4)),
         start=functools.partial(with_clusters, network),
     )
 
@@ -231,4 +217,4 @@ RESNET34_NETVLAD = _method(
     rotations=1,
     tuples=4,
 )
-"""The same network without rotations. It has the same weights and recipe; a step has 48 images instead of 24."""
+"""The same network without rotations; a step has 48 images instead of 24."""

@@ -1,7 +1,9 @@
 """DiSCO (Xu et al., 2021): the spectrum of a polar map that a U-Net computes from the occupancy of a scan.
 
-Differences from the published recipe: 2 tuples of 2 positives and 9 random negatives a step, with the distances of the
-other methods. The head for the yaw is left out, because place recognition does not use it.
+Published recipe: Adam 1e-5, constant; lazy quadruplet with margins 0.5 and 0.2 on squared L2, and cross entropy of the
+yaw; positives within 1.5 m, negatives beyond 2 m, 20 epochs of NCLT. Differences: 2 tuples of 2 positives and 9 random
+negatives a step, with the distances of the other methods. The head for the yaw is left out, because place recognition
+does not use it.
 """
 
 import functools
@@ -14,7 +16,7 @@ from jaxtyping import Array, Float, Shaped, UInt8
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.cells import polar
 from sglpr_jax.methods.learned.layers import Convolution, batch_norm, max_pool
-from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rolled
+from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, roll_azimuths
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
 
 RINGS, SECTORS, LAYERS = 40, 120, 20
@@ -22,7 +24,7 @@ NEAREST_M, FARTHEST_M = 1.0, 70.0
 """Horizontal distances from the sensor between which points count, in metres. A ring is 1.75 m wide."""
 LOWEST_M, LAYER_M = -1.5, 0.5
 """Height of the lowest layer relative to the sensor, and height of a layer, in metres."""
-KEPT = 32
+FREQUENCIES = 32
 """Number of lowest frequencies that are kept along the rings and along the sectors."""
 
 
@@ -30,9 +32,8 @@ def occupancy(scan: Scan) -> UInt8[np.ndarray, "40 120 20"]:
     """Return the occupied cells of a polar grid as 1: rings of 1.75 m, sectors of 3 degrees and layers of 0.5 m.
 
     Sectors are counter-clockwise from x. The layers reach from 0.23 m to 10.23 m above the ground of a sensor at 1.73
-    m, so that all can be filled and a façade reaches several of them. The published layers are 2 m high and begin 2 m
-    above the zero of NCLT's vehicle. Points beyond 70 m are dropped; the published grid adds the corners of a square to
-    its last ring. Raises ValueError if the scan shows no place.
+    m; the published ones are 2 m high and begin 2 m above the zero of NCLT's vehicle. Points beyond 70 m are dropped;
+    the published grid adds the corners of a square to its last ring. Raises ValueError if the scan shows no place.
     """
     radius, angle, z = polar(finite_points(scan))
     layer = np.floor((z - LOWEST_M) / LAYER_M)
@@ -44,7 +45,7 @@ def occupancy(scan: Scan) -> UInt8[np.ndarray, "40 120 20"]:
     return cells
 
 
-class Block(nn.Module):
+class DoubleConvolution(nn.Module):
     """Two convolutions 3 x 3 with batch normalisation. The sectors wrap around, and zeros surround the rings."""
 
     features: int
@@ -53,7 +54,6 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w {self.features}"]:
-        """Convolve polar maps."""
         for activation in ("relu", self.last):
             x = Convolution(self.features, circular=True, use_bias=True)(x)
             x = getattr(nn, activation)(batch_norm(train)(x))
@@ -61,26 +61,27 @@ class Block(nn.Module):
 
 
 class DiSCO(nn.Module):
-    """U-Net of a polar occupancy grid, and the magnitudes of the 32 x 32 lowest frequencies of its map.
+    """U-Net of a polar occupancy grid, and the amplitudes of the 32 x 32 lowest frequencies of its map, from -16 to 15.
 
-    The published network pads the sectors with zeros and interpolates between corners that coincide. Here the sectors
-    wrap around in all layers. A rotation by 24 degrees (8 sectors) therefore does not change the descriptor. Other
-    rotations change it a little, because three poolings by 2 keep the phase of the sectors.
+    The sectors wrap around in all layers; the published network pads them with zeros. A rotation by 24 degrees (8
+    sectors) therefore does not change the descriptor. Other rotations change it a little, because three poolings by 2
+    keep the phase of the sectors.
     """
 
     @nn.compact
     def __call__(self, cells: Shaped[Array, "b 40 120 20"], *, train: bool = False) -> Float[Array, "b 1024"]:
-        """Return the descriptors, which have no unit length."""
-        x, skipped = cells.astype(jnp.float32), []
-        for features in (64, 128, 256):
-            x = Block(features)(x, train=train)
-            skipped.append(x)
-            x = max_pool(x, size=2)
-        x = Block(512)(x, train=train)
-        for features, skip in zip((256, 128, 64), reversed(skipped), strict=True):
-            x = jnp.concatenate([skip, doubled(x)], axis=-1)
-            x = Block(features, "sigmoid" if features == 64 else "relu")(x, train=train)
-        return spectrum(nn.Dense(1)(x)[..., 0])
+        x, skips = cells.astype(jnp.float32), []
+        for i, features in enumerate((64, 128, 256, 512, 256, 128, 64)):
+            if i > 3:
+                x = jnp.concatenate([skips.pop(), doubled(x)], axis=-1)
+            last_activation = "sigmoid" if i == 6 else "relu"
+            x = DoubleConvolution(features, last_activation, name=f"Block_{i}")(x, train=train)  # as in weight files
+            if i < 3:
+                skips.append(x)
+                x = max_pool(x, size=2)
+        amplitudes = jnp.abs(jnp.fft.fft2(nn.Dense(1)(x)[..., 0], norm="ortho"))
+        centred = jnp.roll(amplitudes, (FREQUENCIES // 2, FREQUENCIES // 2), axis=(1, 2))
+        return centred[:, :FREQUENCIES, :FREQUENCIES].reshape(len(cells), -1)
 
 
 def doubled(x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c"]:
@@ -94,18 +95,6 @@ def doubled(x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c"]:
     return jnp.stack([left, right], axis=3).reshape(*x.shape[:2], -1, x.shape[3])
 
 
-def spectrum(maps: Float[Array, "b 40 120"]) -> Float[Array, "b 1024"]:
-    """Return the magnitudes of the orthonormal Fourier transform at frequencies -16 to 15 along both axes."""
-    magnitude = jnp.abs(jnp.fft.fft2(maps, norm="ortho"))
-    lowest = jnp.roll(magnitude, (KEPT // 2, KEPT // 2), axis=(1, 2))[:, :KEPT, :KEPT]
-    return lowest.reshape(len(maps), -1)
-
-
-PUBLISHED = (
-    "Adam 1e-5, constant; lazy quadruplet with margins 0.5 and 0.2 on squared L2, and cross entropy of the yaw; "
-    "positives within 1.5 m, negatives beyond 2 m, 20 epochs of NCLT"
-)
-
 DISCO = LearnedMethod(
     name="disco",
     source='Xu et al., "DiSCO", RA-L 2021, with circular padding',
@@ -114,7 +103,7 @@ DISCO = LearnedMethod(
     weights=7_798_337,
     network=DiSCO(),
     prepare=occupancy,
-    turned=rolled,
+    rotate_inputs=roll_azimuths,
     loss=functools.partial(quadruplet, closest_positive=False),
-    recipe=Recipe(PUBLISHED, TupleConfig(positives=2, negatives=9), tuples=2, learning_rates=(3e-6, 1e-5, 1e-4)),
+    recipe=Recipe(TupleConfig(positives=2, negatives=9), tuples=2, learning_rates=(3e-6, 1e-5, 1e-4)),
 )

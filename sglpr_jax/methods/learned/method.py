@@ -1,4 +1,4 @@
-"""Interface of a learned method: network, input, loss and recipe. Points, rotations and losses that several share."""
+"""Interface of a learned method: network, input, loss and recipe. Rotations and losses that several methods share."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -51,9 +51,9 @@ class LearnedMethod:
     """Number of trained weights."""
     network: nn.Module
     prepare: Callable[[Scan], Shaped[np.ndarray, "..."]]
-    """Makes the input of the network from a record. All inputs have one shape and type."""
-    turned: Callable[[Array, Shaped[Array, "b ..."]], Shaped[Array, "b ..."]]
-    """`turned(key, inputs)` rotates each input about the vertical axis by its own random angle, for the training."""
+    """Makes the input of the network from a scan. All inputs have one shape and type."""
+    rotate_inputs: Callable[[Array, Shaped[Array, "b ..."]], Shaped[Array, "b ..."]]
+    """Rotates each input about the vertical axis by its own random angle, given a random key, for the training."""
     loss: Callable[[Variables, Tuples], Float[Array, ""]]
     recipe: Recipe
     compare: Callable[[Variables, Float[Array, "q d"], Float[Array, "n d"]], Float[Array, "q n"]] | None = None
@@ -69,13 +69,13 @@ def finite_points(scan: Scan) -> Float32[np.ndarray, "n 3"]:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def rolled(key: Array, inputs: Shaped[Array, "b r s *_"]) -> Shaped[Array, "b r s *_"]:
+def roll_azimuths(key: Array, inputs: Shaped[Array, "b r s *_"]) -> Shaped[Array, "b r s *_"]:
     """Roll each input along the axis after the first one, the azimuths, by its own random number of columns."""
     shifts = jax.random.randint(key, (len(inputs),), 0, inputs.shape[2])
-    return jax.vmap(lambda one, shift: jnp.roll(one, shift, axis=1))(inputs, shifts)
+    return jax.vmap(lambda image, shift: jnp.roll(image, shift, axis=1))(inputs, shifts)
 
 
-def rotated_points(key: Array, points: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
+def rotate_clouds(key: Array, points: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
     """Rotate the first three coordinates of the points of each input about z by its own random angle."""
     angles = jax.random.uniform(key, (len(points),), maxval=2 * jnp.pi)
     return points.at[..., :3].set(rotate_points(points[..., :3], angles))
@@ -83,7 +83,7 @@ def rotated_points(key: Array, points: Float[Array, "b n c"]) -> Float[Array, "b
 
 def triplet(variables: Variables, tuples: Tuples, *, squared: bool = False, **options) -> Float[Array, ""]:
     """Return the mean over the tuples of `losses.lazy_triplet` with these options, with d = L2 or its square."""
-    return lazy_triplet(*_from_anchors(tuples, squared=squared), **options).mean()
+    return lazy_triplet(*_anchor_distances(tuples, squared=squared), **options).mean()
 
 
 def quadruplet(variables: Variables, tuples: Tuples, *, closest_positive: bool) -> Float[Array, ""]:
@@ -94,7 +94,7 @@ def quadruplet(variables: Variables, tuples: Tuples, *, closest_positive: bool) 
     p is the closest or the farthest positive. The published other negative o is far from all places of the tuple. Here
     it is the anchor of the next tuple, at any distance from the negatives. A single tuple has no second term.
     """
-    positive, negative = _from_anchors(tuples, squared=True)
+    positive, negative = _anchor_distances(tuples, squared=True)
     total = lazy_triplet(positive, negative, margin=MARGIN, closest_positive=closest_positive)
     if len(tuples.descriptors) > 1:
         others = jnp.roll(tuples.descriptors[:, :1], -1, axis=0)
@@ -104,7 +104,7 @@ def quadruplet(variables: Variables, tuples: Tuples, *, closest_positive: bool) 
     return total.mean()
 
 
-def _from_anchors(tuples: Tuples, *, squared: bool) -> list[Float[Array, "t _"]]:
+def _anchor_distances(tuples: Tuples, *, squared: bool) -> list[Float[Array, "t _"]]:
     """Return the distances of the anchors to their positives and to their negatives."""
     anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
     distances = descriptor_distance(*jnp.broadcast_arrays(anchors, others), squared=squared)

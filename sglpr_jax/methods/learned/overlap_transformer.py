@@ -1,7 +1,8 @@
 """OverlapTransformer (Ma et al., 2022), rebuilt from the paper: attention between the columns of a range image.
 
-Differences from the published recipe: 2 tuples a step, a constant learning rate, and distances instead of overlaps
-decide which places are positives.
+Published recipe: Adam 5e-6, times 0.9 every 5 epochs; sum over negatives of [0.5 + d_positive - d_negative]_+ with d =
+L2 squared; 1 tuple of 6 positives (overlap above 0.3) and 6 negatives, 100 epochs of KITTI. Differences: 2 tuples a
+step, a constant learning rate, and distances instead of overlaps decide which places are positives.
 """
 
 import functools
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float, Float32
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.cells import extreme, polar
 from sglpr_jax.methods.learned.layers import HE, NetVLAD
-from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, rolled, triplet
+from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, roll_azimuths, triplet
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
 from sglpr_jax.models.layers import l2_normalize
 
@@ -51,14 +52,12 @@ class OverlapTransformer(nn.Module):
     """Convolutions along the rows, one transformer layer between the columns, and NetVLAD: 256 numbers of unit length.
 
     No layer knows the position of a column, so a rotation by whole columns (0.4 degrees) does not change the
-    descriptor. The paper gives the order of the layers, the sizes of the transformer and of NetVLAD. Chosen here: the
-    heights of the kernels, no normalisation of the convolutions, the layer norms, unit length of the local features,
-    and the context gating.
+    descriptor. The paper gives the order of the layers and the sizes of the transformer and of NetVLAD. The heights of
+    the kernels, the normalisations and the context gating are choices of this project.
     """
 
     @nn.compact
     def __call__(self, images: Float[Array, "b 64 900"], *, train: bool = False) -> Float[Array, "b 256"]:
-        """Return the descriptors of range images. Training and evaluation do not differ."""
         x = images[..., None]
         for height, stride, features in HEIGHTS:
             x = nn.relu(dense(features, stacked(x, height=height, stride=stride)))
@@ -73,7 +72,6 @@ class Transformer(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
-        """Let every column attend to all columns of its image."""
         x = nn.LayerNorm()(x + nn.MultiHeadDotProductAttention(HEADS)(x))
         return nn.LayerNorm()(x + dense(x.shape[-1], nn.relu(dense(HIDDEN, x))))
 
@@ -90,11 +88,6 @@ def dense(features: int, x: Float[Array, "*b c"]) -> Float[Array, "*b {features}
     return y.reshape(*x.shape[:-1], features)
 
 
-PUBLISHED = (
-    "Adam 5e-6, times 0.9 every 5 epochs; sum over negatives of [0.5 + d_positive - d_negative]_+ with d = L2 squared; "
-    "1 tuple of 6 positives (overlap above 0.3) and 6 negatives, 100 epochs of KITTI"
-)
-
 OVERLAP_TRANSFORMER = LearnedMethod(
     name="overlap-transformer",
     source='Ma et al., "OverlapTransformer", RA-L 2022, rebuilt from the paper',
@@ -103,7 +96,7 @@ OVERLAP_TRANSFORMER = LearnedMethod(
     weights=9_484_848,
     network=OverlapTransformer(),
     prepare=range_image,
-    turned=rolled,
+    rotate_inputs=roll_azimuths,
     loss=functools.partial(triplet, squared=True, margin=MARGIN, closest_positive=False, reduction="sum"),
-    recipe=Recipe(PUBLISHED, TupleConfig(positives=6, negatives=6), tuples=2, learning_rates=(2e-6, 5e-6, 1e-4)),
+    recipe=Recipe(TupleConfig(positives=6, negatives=6), tuples=2, learning_rates=(2e-6, 5e-6, 1e-4)),
 )

@@ -1,7 +1,9 @@
 """PointNetVLAD (Uy and Lee, 2018): features of points, pooled by NetVLAD. The TensorFlow form of its authors.
 
-Differences from the published recipe: a constant learning rate, 8 negatives, because a step of 22 scans needs 4 GB, no
-mining, rotated scans, and one scan instead of a submap of 20 m.
+Published recipe: Adam 5e-5, times 0.9 every 5 epochs, at least 1e-5; lazy quadruplet with margins 0.5 and 0.2 on
+squared L2; 2 tuples of 2 positives within 10 m, 18 negatives beyond 50 m and 1 other negative; 20 epochs; hard
+negatives from epoch 6; no rotations. Differences: a constant learning rate, 8 negatives, because a step of 22 scans
+needs 4 GB, no mining, rotated scans, and one scan instead of a submap of 20 m.
 """
 
 import functools
@@ -14,10 +16,10 @@ from jaxtyping import Array, Float, Float32
 
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.cells import voxel_means
-from sglpr_jax.methods.learned.layers import maximum
-from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rotated_points
+from sglpr_jax.methods.learned.layers import batch_norm
+from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rotate_clouds
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
-from sglpr_jax.models.layers import l2_normalize
+from sglpr_jax.models.layers import l2_normalize, maximum, residual_sums
 
 POINTS = 4096
 RANGE_M = 40.0
@@ -28,6 +30,8 @@ VOXEL_M = 0.4
 """Side of the voxels whose means replace the points, as in the authors' submaps."""
 CLUSTERS = 64
 NUMBERS = 256
+EPSILON = 1e-3
+"""TensorFlow's epsilon of batch normalisation."""
 
 
 class Mlp(nn.Module):
@@ -38,18 +42,12 @@ class Mlp(nn.Module):
 
     @nn.compact
     def __call__(self, rows: Float[Array, "n c"], *, train: bool) -> Float[Array, "n _"]:
-        """Return the features of the last layer."""
         for width in self.widths:
             rows = nn.Dense(width, kernel_init=nn.initializers.glorot_uniform())(rows)
             if self.normalised:
-                rows = normalised(train)(rows)
+                rows = batch_norm(train, epsilon=EPSILON)(rows)
             rows = nn.relu(rows)
         return rows
-
-
-def normalised(train: bool) -> nn.BatchNorm:
-    """Return a batch normalisation with TensorFlow's epsilon."""
-    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-3)
 
 
 class TNet(nn.Module):
@@ -57,10 +55,9 @@ class TNet(nn.Module):
 
     @nn.compact
     def __call__(self, points: Float[Array, "b n c"], *, train: bool) -> Float[Array, "b n c"]:
-        """Return the transformed points."""
         b, n, c = points.shape
         features = Mlp((64, 128, 1024), normalised=True)(points.reshape(b * n, c), train=train)
-        whole = Mlp((512, 256), normalised=True)(maximum(features.reshape(b, n, -1), 1), train=train)
+        whole = Mlp((512, 256), normalised=True)(maximum(features.reshape(b, n, -1), (1,)), train=train)
         matrix = nn.Dense(c * c, kernel_init=nn.initializers.zeros)(whole).reshape(b, c, c)
         return points @ (matrix + jnp.eye(c)[None])
 
@@ -68,25 +65,23 @@ class TNet(nn.Module):
 class Vlad(nn.Module):
     """NetVLAD with batch normalisation and context gating.
 
-        a[n, k] = softmax over k of BN(x W);  v[d, k] = sum over n of a[n, k] (x[n, d] - centre[d, k])
+    a[n, k] = softmax over k of BN(x W);  v = residual_sums(x, a, centres), L2-normalised
 
-    v has length 1 over d, then as a whole. y = BN(v H), and the result is y * sigmoid(BN(y G)).
+    y = BN(v H);  output = y * sigmoid(BN(y G))
     """
 
     @nn.compact
     def __call__(self, features: Float[Array, "b n d"], *, train: bool) -> Float[Array, "b 256"]:
-        """Pool the features of each scan."""
         b, n, d = features.shape
         init = nn.initializers.normal(d**-0.5)
         logits = nn.Dense(CLUSTERS, use_bias=False, kernel_init=init, name="clusters")(features.reshape(b * n, d))
-        share = nn.softmax(normalised(train)(logits)).reshape(b, n, CLUSTERS)
+        assignment = nn.softmax(batch_norm(train, epsilon=EPSILON)(logits)).reshape(b, n, CLUSTERS)
         centres = self.param("centres", init, (d, CLUSTERS))
-        residuals = features.swapaxes(1, 2) @ share - share.sum(1)[:, None] * centres[None]
-        vlad = l2_normalize(l2_normalize(residuals, axis=1).reshape(b, -1))
+        vlad = l2_normalize(residual_sums(features, assignment, centres).reshape(b, -1))
         hidden = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(CLUSTERS**-0.5), name="hidden")
-        y = normalised(train)(hidden(vlad))
+        y = batch_norm(train, epsilon=EPSILON)(hidden(vlad))
         gate = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(NUMBERS**-0.5), name="gate")
-        return y * nn.sigmoid(normalised(train)(gate(y)))
+        return y * nn.sigmoid(batch_norm(train, epsilon=EPSILON)(gate(y)))
 
 
 class PointNetVlad(nn.Module):
@@ -94,21 +89,20 @@ class PointNetVlad(nn.Module):
 
     @nn.compact
     def __call__(self, points: Float[Array, "b n 3"], *, train: bool = False) -> Float[Array, "b 256"]:
-        """Return the descriptors of scans whose coordinates are between -1 and 1."""
         b, n, _ = points.shape
-        moved = TNet()(points, train=train)
-        features = Mlp((64, 64))(moved.reshape(b * n, 3), train=train)
-        moved = TNet()(features.reshape(b, n, -1), train=train)
-        features = Mlp((64, 128, 1024))(moved.reshape(b * n, -1), train=train)
+        transformed = TNet()(points, train=train)
+        features = Mlp((64, 64))(transformed.reshape(b * n, 3), train=train)
+        transformed = TNet()(features.reshape(b, n, -1), train=train)
+        features = Mlp((64, 128, 1024))(transformed.reshape(b * n, -1), train=train)
         return l2_normalize(Vlad()(l2_normalize(features).reshape(b, n, -1), train=train))
 
 
 def scaled_points(scan: Scan) -> Float32[np.ndarray, "4096 3"]:
-    """Return 4096 points above the ground, with coordinates between -1 and 1.
+    """Return 4096 points above the ground, divided by 40 m, so that coordinates are between -1 and 1.
 
-    The points are the means of the voxels of 0.4 m. They are drawn without replacement with the same seed for every
-    scan. If a scan has fewer voxels, all are used, and some of them are drawn again. Raises ValueError if the scan
-    shows no place, or has no points above the ground within 40 m.
+    They are drawn without replacement from the means of the voxels of 0.4 m, with the same seed for every scan. If a
+    scan has fewer voxels, some are drawn again. Raises ValueError if the scan shows no place, or has no points above
+    the ground within 40 m.
     """
     points = finite_points(scan)
     near = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]
@@ -132,15 +126,10 @@ POINTNETVLAD = LearnedMethod(
     weights=19_784_393,
     network=PointNetVlad(),
     prepare=scaled_points,
-    turned=rotated_points,
+    rotate_inputs=rotate_clouds,
     loss=functools.partial(quadruplet, closest_positive=True),
     recipe=Recipe(
-        published=(
-            "Adam 5e-5, times 0.9 every 5 epochs, at least 1e-5; lazy quadruplet loss with margins 0.5 and 0.2 and "
-            "squared distances; 2 tuples of 2 positives within 10 m, 18 negatives beyond 50 m and 1 other negative; 20 "
-            "epochs; hard negatives from epoch 6; no rotations"
-        ),
-        sampling=TupleConfig(positives=2, negatives=8, positive_m=10.0, negative_m=50.0),
+        TupleConfig(positives=2, negatives=8, positive_m=10.0, negative_m=50.0),
         tuples=2,
         learning_rates=(1.5e-5, 5e-5, 1.5e-4),
     ),

@@ -1,7 +1,8 @@
 """RINet (Li et al., 2022): rings of 360 degrees, one for each of 12 classes, and a learned distance. Variant attention.
 
-Differences from the published recipe: 512 tuples of one positive and one negative, that is 1024 pairs, and half of the
-positives from another visit. Each scan has its own draw of the lost columns. Scans are not paired with themselves.
+Published recipe: Adam 0.02, weight decay 1e-6; cross entropy of a soft label and contrastive loss; 1024 pairs, 20
+epochs. Differences: 512 tuples of one positive and one negative, that is 1024 pairs, and half of the positives from
+another visit. Each scan has its own draw of the lost columns. Scans are not paired with themselves.
 """
 
 import jax
@@ -48,32 +49,29 @@ def ring_image(scan: Scan) -> Float32[np.ndarray, "12 360"]:
     points, classes = scan.upright_points, classes_of(scan, 20)
     row_of = np.full(20, -1)
     row_of[list(CLASSES)] = np.arange(len(CLASSES))
-    reach, angle, _ = polar(np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.inf))
+    radius, angle, _ = polar(np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.inf))
     row = row_of[classes]
-    kept = (reach <= RANGE_M) & (row >= 0)
+    inside = (radius <= RANGE_M) & (row >= 0)
     # Exactly 180 degrees would be column 360. The authors drop such points; here they are those of -180 degrees.
-    column = np.floor((angle[kept] + np.pi) * (COLUMNS / (2 * np.pi))).astype(np.int64) % COLUMNS
-    nearest, farthest = (
-        extreme(choose, (len(CLASSES), COLUMNS), (row[kept], column), reach[kept])
-        for choose in (np.minimum, np.maximum)
-    )
-    nearest[ROAD] = farthest[ROAD]
-    return (nearest / RANGE_M).astype(np.float32)
+    column = np.floor((angle[inside] + np.pi) * (COLUMNS / (2 * np.pi))).astype(np.int64) % COLUMNS
+    cells, shape = (row[inside], column), (len(CLASSES), COLUMNS)
+    image = extreme(np.minimum, shape, cells, radius[inside])
+    image[ROAD] = extreme(np.maximum, shape, cells, radius[inside])[ROAD]
+    return (image / RANGE_M).astype(np.float32)
 
 
-def turned(key: Array, inputs: Float[Array, "b 12 360"]) -> Float[Array, "b 12 360"]:
-    """Turn each input by its own whole number of degrees. Half of them lose up to 60 neighbouring columns first."""
-    keys = jax.random.split(key, len(inputs))
+def rotate_with_losses(key: Array, inputs: Float[Array, "b 12 360"]) -> Float[Array, "b 12 360"]:
+    """Rotate each input by its own whole number of degrees. Half of them lose up to 60 neighbouring columns first."""
 
-    def turn(key, image):
+    def rotate(key, image):
         chance, size, place, angle = jax.random.split(key, 4)
         lost = jax.random.randint(size, (), 0, LOST_COLUMNS + 1) * jax.random.bernoulli(chance)
         start = jax.random.randint(place, (), 0, COLUMNS + 1 - lost)
         column = jnp.arange(COLUMNS)
-        kept = (column < start) | (column >= start + lost)
-        return jnp.roll(image * kept[None], jax.random.randint(angle, (), 0, COLUMNS), axis=1)
+        visible = (column < start) | (column >= start + lost)
+        return jnp.roll(image * visible[None], jax.random.randint(angle, (), 0, COLUMNS), axis=1)
 
-    return jax.vmap(turn)(keys, inputs)
+    return jax.vmap(rotate)(jax.random.split(key, len(inputs)), inputs)
 
 
 class RINet(nn.Module):
@@ -97,13 +95,12 @@ class RINet(nn.Module):
 
 
 class RingConvolution(nn.Module):
-    """Convolution over three neighbours on a ring, batch normalisation and leaky ReLU."""
+    """Convolution over columns i, i + 1 and i + 2 of a ring, batch normalisation and leaky ReLU."""
 
     channels: int
 
     @nn.compact
     def __call__(self, x: Float[Array, "b l c"], *, train: bool) -> Float[Array, "b l {self.channels}"]:
-        """Apply the layer. Column i of the result depends on the columns i, i + 1 and i + 2."""
         around = jnp.concatenate([x, x[:, :2]], axis=1)
         x = nn.Conv(self.channels, (3,), padding="VALID")(around)
         return nn.leaky_relu(batch_norm(train)(x), SLOPE)
@@ -114,7 +111,6 @@ class Attention(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b l c"]) -> Float[Array, "b l c"]:
-        """Return the scaled channels."""
         return x * nn.sigmoid(nn.Dense(x.shape[-1])(x.mean(1)))[:, None]
 
 
@@ -123,7 +119,6 @@ class Score(nn.Module):
 
     @nn.compact
     def __call__(self, difference: Float[Array, "*b 288"]) -> Float[Array, "*b"]:
-        """Return the logits."""
         hidden = nn.leaky_relu(nn.Dense(128)(difference), SLOPE)
         return nn.Dense(1)(hidden)[..., 0]
 
@@ -136,15 +131,10 @@ def strongest_phase(x: Float[Array, "b l c"], factor: int) -> Float[Array, "b l/
     return jnp.take_along_axis(phases, best[:, None, None, None], axis=2)[:, :, 0]
 
 
-def same_place(apart_m: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the label of pairs at these distances in metres: 1 for one place, 0 for different places."""
-    return jnp.where(apart_m < SAME_M, 1.0, nn.sigmoid((HALF_M - apart_m) / WIDTH_M))
-
-
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     """Return the cross entropy of the scores plus the contrastive loss of the descriptors, for the pairs of anchors."""
-    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
-    label = same_place(tuples.apart_m[:, 1:])
+    anchors, others, apart_m = tuples.descriptors[:, :1], tuples.descriptors[:, 1:], tuples.apart_m[:, 1:]
+    label = jnp.where(apart_m < SAME_M, 1.0, nn.sigmoid((HALF_M - apart_m) / WIDTH_M))
     entropy = optax.sigmoid_binary_cross_entropy(_logits(variables, jnp.abs(anchors - others)), label)
     apart = descriptor_distance(jnp.broadcast_to(anchors, others.shape), others)
     contrast = label * apart**2 + (1 - label) * nn.relu(MARGIN - apart) ** 2
@@ -156,16 +146,11 @@ def compare(
 ) -> Float[Array, "q n"]:
     """Return one minus the probability that two descriptors show one place."""
 
-    def with_all(query):
-        return 1 - nn.sigmoid(_logits(variables, jnp.abs(query[None] - database)))
-
-    return jax.lax.map(with_all, queries)
+    return jax.lax.map(lambda query: 1 - nn.sigmoid(_logits(variables, jnp.abs(query[None] - database))), queries)
 
 
 def _logits(variables: Variables, difference: Float[Array, "*b 288"]) -> Float[Array, "*b"]:
-    found = Score().apply({"params": variables["params"]["score"]}, difference)
-    assert isinstance(found, jax.Array)  # not the pair that a call with mutable variables returns
-    return found
+    return jnp.asarray(Score().apply({"params": variables["params"]["score"]}, difference))
 
 
 RINET = LearnedMethod(
@@ -177,13 +162,11 @@ RINET = LearnedMethod(
     weights=98_765,
     network=RINet(),
     prepare=ring_image,
-    turned=turned,
+    rotate_inputs=rotate_with_losses,
     loss=loss,
     compare=compare,
     recipe=Recipe(
-        published="Adam 0.02, weight decay 1e-6; cross entropy of a soft label and contrastive loss; 1024 pairs, "
-        "20 epochs",
-        sampling=TupleConfig(positives=1, negatives=1, positive_m=LIMIT_M, negative_m=LIMIT_M),
+        TupleConfig(positives=1, negatives=1, positive_m=LIMIT_M, negative_m=LIMIT_M),
         tuples=512,
         learning_rates=(0.002, 0.02, 0.06),
         weight_decay=1e-6,

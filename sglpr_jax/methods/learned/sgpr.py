@@ -1,7 +1,8 @@
 """SGPR (Kong et al., 2020): a network on the semantic graph of a scan, with a learned comparison of two graphs.
 
-Differences from the published recipe: the pairs are those of an anchor with the places of its tuple, and graphs are
-only rotated.
+Published recipe: Adam 1e-3 with weight decay 5e-4; binary cross-entropy of 128 pairs in both orders; positives within 3
+m, negatives beyond 20 m; 500 epochs. Differences: the pairs are those of an anchor with the places of its tuple, and
+graphs are only rotated.
 """
 
 import jax
@@ -16,9 +17,10 @@ from scipy.spatial import KDTree
 from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.methods.cells import means, voxels
-from sglpr_jax.methods.learned.layers import batch_norm, maximum
-from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables, rotated_points
+from sglpr_jax.methods.learned.layers import batch_norm
+from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables, rotate_clouds
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
+from sglpr_jax.models.layers import maximum
 
 NEIGHBOURS = 10
 WIDTHS = (64, 64, 32)
@@ -28,8 +30,6 @@ TENSORS = 16
 TIE = 1e-4
 """Weight of the distance in space, per metre, among nodes whose classes are equally near."""
 NODES = 100
-
-
 RULES = {
     1: (0.5, 100),  # car
     4: (0.5, 100),  # truck
@@ -46,9 +46,9 @@ RULES = {
 }
 """Published rules of the 12 classes of nodes: the maximum distance of neighbouring points of a cluster, in metres, and
 the minimum number of points of a cluster. Other classes are ignored."""
-MOST_POINTS = 50_000
+MAX_POINTS = 50_000
 """Larger clusters are dropped."""
-FINER = 4
+VOXELS_PER_GAP = 4
 """Points are first merged into voxels whose side is the gap divided by this number."""
 
 
@@ -63,24 +63,20 @@ def semantic_graph(scan: Scan) -> Float32[np.ndarray, "100 15"]:
     check_cloud(points, name=scan.name)
     finite = np.isfinite(points).all(axis=1)
     points, classes = points[finite], classes[finite]
-    found = [_nodes(points[classes == kind], column, *rule) for column, (kind, rule) in enumerate(RULES.items())]
-    counts, nodes = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    if len(nodes) == 0:
+    sizes, nodes = [], []
+    for one_hot, (class_number, (gap_m, min_points)) in zip(np.eye(len(RULES)), RULES.items(), strict=True):
+        class_points = points[classes == class_number]
+        cluster = clusters(class_points, gap_m)
+        counts = np.bincount(cluster)
+        valid = (counts >= min_points) & (counts <= MAX_POINTS)
+        centres = means(class_points, cluster, counts)[valid]
+        sizes.append(counts[valid])
+        nodes.append(np.concatenate([centres, np.broadcast_to(one_hot, (len(centres), len(RULES)))], axis=1))
+    largest = np.sort(np.argsort(-np.concatenate(sizes), kind="stable")[:NODES])
+    if len(largest) == 0:
         raise ValueError(f"{scan.name}: expected clusters of {len(RULES)} classes, found none in {len(points)} points")
-    largest = np.sort(np.argsort(-counts, kind="stable")[:NODES])
-    return np.pad(nodes[largest], ((0, NODES - len(largest)), (0, 0)))
-
-
-def _nodes(
-    points: Float32[np.ndarray, "n 3"], column: int, gap_m: float, fewest: int
-) -> tuple[Int[np.ndarray, " k"], Float32[np.ndarray, "k 15"]]:
-    """Return the numbers of points and the nodes of the clusters of one class."""
-    cluster = clusters(points, gap_m)
-    counts = np.bincount(cluster)
-    kept = (counts >= fewest) & (counts <= MOST_POINTS)
-    centres = means(points, cluster, counts)[kept]
-    kinds = np.broadcast_to(np.eye(len(RULES))[column], (len(centres), len(RULES)))
-    return counts[kept], np.concatenate([centres, kinds], axis=1).astype(np.float32)
+    graph = np.concatenate(nodes)[largest].astype(np.float32)
+    return np.pad(graph, ((0, NODES - len(largest)), (0, 0)))
 
 
 def clusters(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, " n"]:
@@ -90,7 +86,7 @@ def clusters(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, 
     """
     if len(points) == 0:
         return np.zeros(0, np.int64)
-    voxel, counts = voxels(points, gap_m / FINER)
+    voxel, counts = voxels(points, gap_m / VOXELS_PER_GAP)
     pairs = KDTree(means(points, voxel, counts)).query_pairs(gap_m, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(counts), len(counts)))
     return connected_components(links, directed=False)[1][voxel].astype(np.int64)
@@ -119,19 +115,17 @@ class EdgeConv(nn.Module):
     def __call__(
         self, x: Float[Array, "b n c"], neighbours: Int[Array, "b n 10"], *, train: bool
     ) -> Float[Array, "b n {self.features}"]:
-        """Return the features of the nodes."""
         relative = nn.Dense(self.features, use_bias=False, name="relative")(x)
         own = nn.Dense(self.features, use_bias=False, name="own")(x) - relative
-        edges = jax.vmap(lambda rows, places: rows[places])(relative, neighbours) + own[:, :, None]
-        return maximum(nn.leaky_relu(batch_norm(train)(edges), 0.2), 2)
+        edges = jax.vmap(lambda nodes, numbers: nodes[numbers])(relative, neighbours) + own[:, :, None]
+        return maximum(nn.leaky_relu(batch_norm(train)(edges), 0.2), (2,))
 
 
-class Attention(nn.Module):
+class GraphAttention(nn.Module):
     """Sum of the nodes x_i, weighted by sigmoid(x_i . tanh(mean of W x))."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b c"]:
-        """Return the vector of each graph."""
         init = nn.initializers.glorot_uniform()
         context = nn.tanh(nn.Dense(x.shape[-1], use_bias=False, kernel_init=init)(x).mean(1))
         weights = nn.sigmoid((x * context[:, None]).sum(-1))
@@ -158,36 +152,33 @@ class TensorNetwork(nn.Module):
 class Sgpr(nn.Module):
     """Three layers of EdgeConv on positions and on classes, and attention: a vector of 32 numbers.
 
-    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others. Classes
-    have equal distances, so the published neighbours of the first layer depend on the order of the nodes. Here nodes
-    that are nearer in space come first.
+    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others. Among
+    equal classes, nodes that are nearer in space come first; the published choice depends on the order of the nodes.
     """
 
     def setup(self):
-        """Create the parts."""
         self.space = [EdgeConv(width) for width in WIDTHS]
         self.kinds = [EdgeConv(width) for width in WIDTHS]
         self.joint = nn.Dense(NUMBERS, use_bias=False)
         self.norm = nn.BatchNorm(momentum=0.9, epsilon=1e-5)
-        self.attention = Attention()
+        self.attention = GraphAttention()
         self.comparison = TensorNetwork()
 
     def __call__(self, graphs: Float[Array, "b n 15"], *, train: bool = False) -> Float[Array, "b 32"]:
         """Return the vectors of graphs: nodes with x, y, z in metres and a class as 12 numbers."""
         space, kinds = graphs[..., :3], graphs[..., 3:]
         ties = TIE * jnp.sqrt(jnp.maximum(squared_distances(space), 0))
-        for depth, (of_space, of_kinds) in enumerate(zip(self.space, self.kinds, strict=True)):
-            space = of_space(space, nearest(squared_distances(space)), train=train)
-            apart = squared_distances(kinds) + (ties if depth == 0 else 0)
-            kinds = of_kinds(kinds, nearest(apart), train=train)
-        both = self.joint(jnp.concatenate([space, kinds], axis=-1))
-        vectors = self.attention(nn.leaky_relu(self.norm(both, use_running_average=not train), 0.2))
+        for depth, (space_layer, kind_layer) in enumerate(zip(self.space, self.kinds, strict=True)):
+            space = space_layer(space, nearest(squared_distances(space)), train=train)
+            kind_distances = squared_distances(kinds) + (ties if depth == 0 else 0)
+            kinds = kind_layer(kinds, nearest(kind_distances), train=train)
+        joint = self.joint(jnp.concatenate([space, kinds], axis=-1))
+        vectors = self.attention(nn.leaky_relu(self.norm(joint, use_running_average=not train), 0.2))
         if self.is_initializing():
             self.comparison(vectors, vectors)
         return vectors
 
     def logits(self, queries: Float[Array, "q 32"], others: Float[Array, "n 32"]) -> Float[Array, "q n"]:
-        """Return the result of `TensorNetwork` for all pairs."""
         return self.comparison(queries, others)
 
 
@@ -210,13 +201,13 @@ def compare(variables: Variables, queries: Float[Array, "q 32"], database: Float
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     """Return the mean binary cross-entropy of each anchor with its positives (1) and negatives (0), in both orders."""
 
-    def of_tuple(vectors: Float[Array, "k d"]) -> Float[Array, "k-1"]:
+    def tuple_loss(vectors: Float[Array, "k d"]) -> Float[Array, ""]:
         anchor, others = vectors[:1], vectors[1:]
-        same = jnp.arange(len(others)) < tuples.positives
-        orders = jnp.stack([_logits(variables, anchor, others)[0], _logits(variables, others, anchor)[:, 0]])
-        return nn.softplus(jnp.where(same[None], -orders, orders)).mean(0)
+        is_positive = jnp.arange(len(others)) < tuples.positives
+        logits = jnp.stack([_logits(variables, anchor, others)[0], _logits(variables, others, anchor)[:, 0]])
+        return nn.softplus(jnp.where(is_positive[None], -logits, logits)).mean()
 
-    return jax.vmap(of_tuple)(tuples.descriptors).mean()
+    return jax.vmap(tuple_loss)(tuples.descriptors).mean()
 
 
 SGPR = LearnedMethod(
@@ -227,14 +218,10 @@ SGPR = LearnedMethod(
     weights=47_985,
     network=NETWORK,
     prepare=semantic_graph,
-    turned=rotated_points,
+    rotate_inputs=rotate_clouds,
     loss=loss,
     recipe=Recipe(
-        published=(
-            "Adam 1e-3 with weight decay 5e-4; binary cross-entropy of 128 pairs in both orders; positives within 3 m, "
-            "negatives beyond 20 m; 500 epochs"
-        ),
-        sampling=TupleConfig(positives=1, negatives=3, positive_m=3.0, negative_m=20.0),
+        TupleConfig(positives=1, negatives=3, positive_m=3.0, negative_m=20.0),
         tuples=32,
         learning_rates=(3e-4, 1e-3, 3e-3),
         weight_decay=5e-4,

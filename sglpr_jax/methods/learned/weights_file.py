@@ -1,4 +1,4 @@
-"""Weights of learned methods: random ones, and those in the same files as the weights of the models."""
+"""Weights of learned methods: random ones, and those in files, which are the same as for models."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,7 +26,7 @@ RANDOM = "random:"
 
 
 def example_inputs(method: LearnedMethod) -> np.ndarray:
-    """Return the input (1, ...) of an artificial scan. It defines the shapes of the weights."""
+    """Return the input (1, ...) of an artificial scan, which defines the shapes of the weights."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-40, -40, -1.5), (40, 40, 5), (5000, 3)).astype(np.float32)
     labels = np.full(len(points), 50, np.int32)  # buildings
@@ -40,7 +40,7 @@ def random_variables(method: LearnedMethod, *, seed: int) -> Variables:
 
 
 def save_variables(folder: Path, method: LearnedMethod, variables: Variables, about: Mapping[str, Any]) -> None:
-    """Write the variables of a trained network, and `about`: the settings of its training, as JSON values.
+    """Write the variables of a trained network, and the settings of its training (`about`) as JSON values.
 
     Raises OSError if the folder cannot be written or holds other files than earlier weights.
     """
@@ -65,12 +65,10 @@ def load_variables(source: Path | str, method: LearnedMethod) -> Variables:
             raise ValueError(f"expected a seed after {RANDOM!r}, found {seed!r}")
         return random_variables(method, seed=int(seed))
     folder = last_weights(Path(source))
-    found = method_of(folder)
-    if found != method.name:
-        raise ValueError(
-            f"{folder}: expected weights of the method {method.name!r}, found those of {found or 'sglpr'!r}"
-        )
-    values = read_tensors(folder / WEIGHTS_FILE)
+    stored = method_of(folder) or "sglpr"
+    if stored != method.name:
+        raise ValueError(f"{folder}: expected weights of the method {method.name!r}, found those of {stored!r}")
+    values, _ = read_tensors(folder / WEIGHTS_FILE)
     expected = by_name(jax.eval_shape(lambda: random_variables(method, seed=0)))
     check_leaves(values, expected, source=folder / WEIGHTS_FILE)
     return jax.device_put(as_tree(values))
@@ -79,8 +77,8 @@ def load_variables(source: Path | str, method: LearnedMethod) -> Variables:
 def method_of(folder: Path) -> str | None:
     """Return the name of the learned method of a run or of weights, or None if the folder has none."""
     about = read_json(folder / CONFIG_FILE) if (folder / CONFIG_FILE).is_file() else None
-    found = about.get("method") if isinstance(about, dict) else None
-    return found if isinstance(found, str) else None
+    name = about.get("method") if isinstance(about, dict) else None
+    return name if isinstance(name, str) else None
 
 
 def variables_hash(variables: Variables) -> str:
