@@ -29,7 +29,7 @@ from sglpr_jax.files import write_json
 from sglpr_jax.loops.calibration import calibration_error, reliability
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import planar_loop
-from sglpr_jax.loops.consistency import agree
+from sglpr_jax.loops.consistency import are_consistent
 from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.sequence import neighbour_weights
 from sglpr_jax.models.params import Params
@@ -98,7 +98,9 @@ def fit_model(
         table.add_row(f"without {name}", *_row(*_whole(held_out(found, sceneries, kinds, without=name))))
     Console().print(table)
     for one in reliability(probability, is_loop):
-        print(f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.said:.3f}, {one.share:.3f} are loops")
+        print(
+            f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.probability:.3f}, {one.share:.3f} are loops"
+        )
     everything = fitted(found, kinds)
     write_json(out, everything.to_json())
     print(everything)
@@ -172,16 +174,14 @@ def _pairs(path: Path, odometry: Odometry, breaks: bool, params: Params) -> Pair
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if poses is None else poses[i]
         continues = not (breaks and i == len(frames) // 2)
-        found += finder.add_keyframe(
-            seen, time=float(drive.times[i]), odometry=pose, compared=frame, continues=continues
-        )
+        found += finder.add_keyframe(seen, time=float(drive.times[i]), odometry=pose, fits=frame, continues=continues)
     found = [one for one in found if one.evidence.deviation <= finder.present_drift.max_deviation]
     fits = [transform(*(float(value) for value in one.alignment[:3])) for one in found]
     errors = pose_errors([(one.query, one.match) for one in found], np.array(fits), drive.world_from_lidar)
     evidence = np.array([one.evidence for one in found], np.float64).reshape(-1, len(ALL))
     loops = [planar_loop(one.query, one.match, one.alignment, probability=0.5) for one in found]
     way_m = np.maximum.accumulate([float(finder.motion.travelled[one.query]) for one in found])
-    agreeing = agree(loops, finder.motion.path, drift=finder.present_drift)
+    agreeing = are_consistent(loops, finder.motion.path, drift=finder.present_drift)
     neighbours = neighbour_weights(way_m, np.arange(len(found))) * np.where(agreeing, 1.0, -1.0)
     wrong = errors.wrong if odometry != "none" else errors.wrong & (errors.storey_m <= STOREY_M)
     return Pairs(Evidence(*evidence.T), neighbours, errors.right, errors.right | wrong)

@@ -224,7 +224,7 @@ def images(
         print(f"{name}: {counts.loops} loops, {counts.wrong} wrong, recall {counts.recall}; {told(found.loops, poses)}")
         assert found.model is not None
         for one in reliability_of(found.sessions[0].candidates, found.model, poses[:, :3, 3]):
-            share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.said:.4f} said"
+            share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.probability:.4f} said"
             print(f"  probability {one.low:g} to {one.high:g}: {share}")
         _report_top1(found, poses, sglpr_jax.embed(params, recording).descriptors)
 

@@ -19,7 +19,7 @@ from benchmarks.quality.scoring import WAY_M, pose_errors
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.figures import overlaid
 from sglpr_jax.loops.comparison import Fits
-from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import transform, travelled
@@ -48,7 +48,7 @@ class Revisit(NamedTuple):
     def along_m(self) -> float:
         """Stated uncertainty of the right pose along its least certain direction, in metres."""
         images = self.image(self.query), self.image(int(self.fits.frames[self.right]))
-        found = refined(*images, self.fits.peaks.at(self.right), config=VERIFICATION)
+        found = refine(*images, self.fits.peaks.at(self.right), config=VERIFICATION)
         return float(jax.device_get(found.along_m)) / self.drive.scale
 
     def image(self, frame: int) -> UInt8[np.ndarray, "m m"]:

@@ -32,7 +32,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.files import replacing
 from sglpr_jax.frame_log import FrameLog
-from sglpr_jax.loops.acceptance import accepted
+from sglpr_jax.loops.acceptance import accept_loops
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import frame_bytes, read_frame
 from sglpr_jax.loops.comparison import Fits
@@ -179,7 +179,7 @@ def compared(
                 finder.add_keyframe(
                     keyframe, time=stamp, odometry=pose, continues=not (breaks and i == len(drive.keyframe) // 2)
                 )
-                log.append(i, frame_bytes(None, finder.compared))
+                log.append(i, frame_bytes(None, finder.fits))
             log.close()
     return [read_frame(content, i, {}, source=path)[1] for i, content in FrameLog(path).records()]
 
@@ -232,10 +232,10 @@ def _counts(path: Path, drive: RenderedDrive, params: Params, odometry: Odometry
     frames = compared(path, drive, params, odometry=odometry)
     for i, (keyframe, frame) in enumerate(zip(drive.keyframe, frames, strict=True)):
         pose = None if given is None else given[i]
-        detector.add_keyframe(keyframe, time=float(drive.times[i]), odometry=pose, compared=frame)
+        detector.add_keyframe(keyframe, time=float(drive.times[i]), odometry=pose, fits=frame)
     drift = detector.finder.present_drift
     path = detector.finder.motion.path
-    loops = detector.loops if given is None else accepted(detector.loops, path, drift=drift)[0]
+    loops = detector.loops if given is None else accept_loops(detector.loops, path, drift=drift)[0]
     fits = np.array([one.match_from_query for one in loops])
     errors = pose_errors([(one.query, one.match) for one in loops], fits, drive.world_from_lidar)
     right = {loop.query for loop, ok in zip(loops, errors.right, strict=True) if ok}

@@ -59,7 +59,7 @@ def loops(
             link = (
                 BevRegistration(*map(np.asarray, (STEP_M, 0.0, 2 * np.pi / LAP, spread, 0.9, 0.3))) if frame else None
             )
-            detector.add_keyframe(own, time=STEP_S * frame, compared=NO_FITS._replace(link=link))
+            detector.add_keyframe(own, time=STEP_S * frame, fits=NO_FITS._replace(link=link))
         held = held_bytes(detector) - before
         describing = _mean_s(lambda scan: finder.keyframe(scan), records, repeats)
         adding = _mean_s(lambda scan: detector.add(scan, time=STEP_S * len(detector)), records, repeats)

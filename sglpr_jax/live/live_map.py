@@ -17,7 +17,7 @@ from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.messages import LiveFrame, LoopEdge, Report
 from sglpr_jax.live.odometry_input import Clock, Continuity, FirstScans
-from sglpr_jax.loops.arguments import given_pose
+from sglpr_jax.loops.arguments import as_pose
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.comparison import Fits
@@ -144,7 +144,7 @@ class LiveMap:
 
         Raises ValueError if the scan or its odometry is invalid.
         """
-        scan, pose = frame.scan, given_pose(frame.odometry)
+        scan, pose = frame.scan, as_pose(frame.odometry)
         if scan.points is None or not np.isfinite(scan.points).all(axis=1).any():
             raise ValueError(f"{scan.name or 'scan'}: expected points, found none")
         if scan.mounting is None:
@@ -155,7 +155,7 @@ class LiveMap:
         if placed is None:
             return None
         loops = self.detector.add_keyframe(keyframe, time=clock, odometry=placed.pose, continues=placed.continues)
-        compared, stamp, wall = self.detector.finder.compared, float(frame.time), time.time()
+        compared, stamp, wall = self.detector.finder.fits, float(frame.time), time.time()
         stamp, part = stamp if np.isfinite(stamp) else 0.0, self._part + (not placed.continues)
         described = LiveScan(keyframe, compared, placed.pose, part, scan.name, stamp, clock, wall)
         self._note(described)
@@ -173,7 +173,7 @@ class LiveMap:
 
     def _extend(self, scan: LiveScan) -> None:
         """Add a scan of the log."""
-        known = {"compared": scan.compared, "continues": scan.part == self._part}
+        known = {"fits": scan.compared, "continues": scan.part == self._part}
         self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **known)
         self._note(scan)
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.loops.closure import to_upright
-from sglpr_jax.loops.consistency import accepted_between
-from sglpr_jax.loops.frame_alignment import aligned_frames
+from sglpr_jax.loops.consistency import accept_between
+from sglpr_jax.loops.frame_alignment import align_frames
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
@@ -61,17 +61,17 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
         level = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
         upright.append(dataclasses.replace(level, query=offset + loop.query))
     motion = BevOdometry.joined([BevOdometry.of(one.upright_poses()) for one in (before, new)])
-    sets, _ = accepted_between(upright, motion, drift=DriftModel())
+    sets, _ = accept_between(upright, motion, drift=DriftModel())
     if not sets:
         return None
     accepted = {loop.query - offset for loop in sets[0]}
     common = [loop for loop in loops if loop.query in accepted]
-    found = aligned_frames(
+    found = align_frames(
         common,
         before.world_from_place,
         new.world_from_place,
-        match_way=travelled(before.world_from_place),
-        query_way=travelled(new.world_from_place),
+        match_travelled_m=travelled(before.world_from_place),
+        query_travelled_m=travelled(new.world_from_place),
         drift=DriftModel(),
     )
     there = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])

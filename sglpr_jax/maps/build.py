@@ -15,7 +15,7 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
-from sglpr_jax.loops.arguments import check_is, given_poses
+from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.comparison import NO_FITS, Fits
@@ -66,7 +66,7 @@ def map_recording(
       TypeError: If an argument is not a recording, parameters or an array.
     """
     check_is(recording, Recording, by="open_recording")
-    poses = given_poses(poses, of="poses")
+    poses = as_poses(poses, of="poses")
     if len(poses) != len(recording) or not len(recording):
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
     check_level(poses, recording)
@@ -89,9 +89,9 @@ def map_recording(
             looked_at.append(done)
         done = len(poses)
 
-    def add(keyframe: Keyframe | None, compared: Fits | None) -> None:
+    def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
         descriptions.append(keyframe)
-        finder.add_keyframe(keyframe, compared=NO_FITS)
+        finder.add_keyframe(keyframe, fits=NO_FITS)
 
     add_scans(
         scaled(recording, scale),

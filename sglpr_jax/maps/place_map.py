@@ -20,7 +20,7 @@ from sglpr_jax.data.scaled import scaled_poses, scaled_scan
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, replacing
-from sglpr_jax.loops.arguments import given_poses, given_scan
+from sglpr_jax.loops.arguments import as_poses, as_scan
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import LoopClosure, in_metres, planar_loop, to_lidar
 from sglpr_jax.loops.comparison import KeyframeComparison, Query
@@ -178,7 +178,7 @@ class PlaceMap(Keyframes):
         """
         check_value(candidates, PlaceCount, "candidates")
         finder = CandidateSearch(params)
-        given = given_scan(scan)
+        given = as_scan(scan)
         if len(self) and not isinstance(scan, Scan) and given.points is not None:
             given = dataclasses.replace(given, mounting=self.query_mounting(given.points))
         keyframe = finder.keyframe(scaled_scan(given, self.scale))
@@ -210,7 +210,7 @@ class PlaceMap(Keyframes):
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
         answers = []
         for row in order[np.sort(first)][:candidates].tolist():
-            one = comparer.candidate(query, fits, row, self)
+            one = comparer.verify(query, fits, row, self)
             sensors = keyframe.mounting, self.mounting(one.match).scaled(self.scale)
             loop = planar_loop(*one[:3], probability=float(model.probability(one.evidence)), sensors=sensors)
             loop = in_metres(to_lidar(loop, query=sensors[0], match=sensors[1]), self.scale)
@@ -286,7 +286,7 @@ def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
     check_columns(arrays, ARRAYS, n=len(index))
     if arrays["images"].shape[1] % 2:
         raise ValueError(f"expected images of an even number of cells, found {arrays['images'].shape[1:]}")
-    given_poses(arrays["world_from_place"], of="world_from_place")
+    as_poses(arrays["world_from_place"], of="world_from_place")
     for height, *up in np.unique(arrays["mountings"], axis=0).tolist():
         Mounting(height, tuple(up))
         if abs(np.linalg.norm(up) - 1) > ROTATION_TOLERANCE:

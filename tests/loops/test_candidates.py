@@ -138,7 +138,7 @@ def driven(params, step_m: float, turn_deg: float = 0.0, *, frames: int = 41, **
     finder = finder_of(params, **limits)
     for frame in range(frames):
         pose = transform(step_m * frame, 0.0, np.radians(turn_deg * frame))
-        finder.add_keyframe(seen_by(finder, BLANK), odometry=pose, compared=NO_FITS)
+        finder.add_keyframe(seen_by(finder, BLANK), odometry=pose, fits=NO_FITS)
     return finder
 
 
@@ -152,7 +152,7 @@ def test_a_scan_near_the_last_stored_one_is_not_stored_unless_the_sensor_turned(
 def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):
     finder = finder_of(params, keyframe_m=1e9)
     for _ in range(3):  # without links the motion is unknown
-        finder.add_keyframe(seen_by(finder, BLANK), compared=NO_FITS)
+        finder.add_keyframe(seen_by(finder, BLANK), fits=NO_FITS)
     assert finder.stored.frames.tolist() == [int(np.flatnonzero(finder.motion.segments == k)[0]) for k in range(3)]
 
 

@@ -50,7 +50,7 @@ def compared(
 def comparer_along(poses: Sequence[np.ndarray], *, drift: DriftModel = EXACT, joined=()) -> KeyframeComparison:
     joined = np.array(joined, np.int64).reshape(-1, 2)
     motion = BevOdometry.of(np.stack(poses))
-    return KeyframeComparison(motion, drift, joined=joined)
+    return KeyframeComparison(motion, drift, loops=joined)
 
 
 def test_the_place_is_found_and_no_other_place_fits_as_well():
@@ -113,12 +113,12 @@ def test_passes_that_a_loop_joins_do_not_compete():
 def test_elsewhere_is_farther_than_a_shift_and_the_drift():
     poses = [transform(float(x), 0.0, 0.0) for x in range(0, 200, 2)]
     drift = DriftModel(metres_per_metre=0.05, degrees_per_metre=0.0, sideways=0.0)
-    found = comparer_along(poses, drift=drift).elsewhere(np.arange(100), 50)
+    found = comparer_along(poses, drift=drift).are_elsewhere(np.arange(100), 50)
     apart = np.abs(np.arange(100) - 50) * 2.0
     np.testing.assert_array_equal(found, apart > np.sqrt(2) * 12 + 4 * 0.05 * apart)
     unknown = comparer_along(poses)
     unknown.motion.add(0.0, continues=False)
-    assert not unknown.elsewhere(np.arange(100), 100).any()
+    assert not unknown.are_elsewhere(np.arange(100), 100).any()
 
 
 def test_a_surprise_falls_with_the_poses_that_the_motion_allows():
