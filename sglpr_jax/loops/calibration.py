@@ -22,13 +22,11 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import level_odometry
-from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
+from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.same_place import NEGATIVE_M
 
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 """Edges of the bins. They are narrow where loops are accepted and rejected."""
-
-
 LOOP_M = 10.0
 """Maximum distance of the two scans of a loop, in metres."""
 NEAR_M = (2.0, 10.0)
@@ -56,13 +54,11 @@ class Bin(NamedTuple):
         return self.loops / self.pairs
 
 
-def reliability(
-    probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"], *, edges: Sequence[float] = EDGES
-) -> tuple[Bin, ...]:
-    """Sort pairs into bins. Returns the bins with pairs, in order of probability."""
+def reliability(probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"]) -> tuple[Bin, ...]:
+    """Sort pairs into the bins of `EDGES`. Returns the bins with pairs, in order of probability."""
     bins = []
-    for low, high in itertools.pairwise(edges):
-        inside = (probability >= low) & ((probability < high) | (high == edges[-1]))
+    for low, high in itertools.pairwise(EDGES):
+        inside = (probability >= low) & ((probability < high) | (high == EDGES[-1]))
         if inside.any():
             mean = float(probability[inside].mean().clip(low, high))  # rounding may move the mean of equal numbers out
             bins.append(Bin(low, high, int(inside.sum()), int(is_loop[inside].sum()), mean))
@@ -169,5 +165,4 @@ class _Drive:
             even = even_cells(jnp.asarray(picture(scan, None)[0]))
             rotated_scan = Scan(image=np.asarray(rotate_image(even, jnp.float32(angle))))
         keyframe = self.finder.keyframe(rotated_scan)
-        image = np.asarray(within_reach(keyframe.image))
-        return Query(len(self.motion) - 1, keyframe.descriptor, image, query_spectra(image))
+        return Query(len(self.motion) - 1, keyframe.descriptor, np.asarray(within_reach(keyframe.image)))

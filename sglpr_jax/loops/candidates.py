@@ -23,7 +23,7 @@ from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.registration.background import Background
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_search import CorrelationPeak, search_near
-from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
+from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
@@ -73,7 +73,8 @@ class CandidateSearch:
         self.odometry_check = OdometryCheck()
         self.background = Background()
         self._empty = GrowingArray(np.empty(0, bool))
-        self._times = GrowingArray(np.empty(0))
+        self._time: float | None = None
+        """Time of the last frame, in seconds. None if the frames have no times."""
         self._last: Reference | None = None
         self._keyframe: Reference | None = None
         self._checked: Reference | None = None
@@ -90,19 +91,14 @@ class CandidateSearch:
         return self.stored.index
 
     @property
-    def times(self) -> Float[np.ndarray, " n"] | None:
-        """Time of each frame in seconds, or None if they have no times."""
-        return self._times.rows if len(self._times) else None
-
-    @property
     def empty(self) -> Bool[np.ndarray, " n"]:
         """Whether each frame is almost empty: it has fewer than `MIN_CELLS` occupied cells."""
         return self._empty.rows
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of all frames: descriptors, compressed images, poses and times."""
-        return sum(array.nbytes for array in (self.stored, self.motion, self._times, self._empty))
+        """Number of bytes of all frames: descriptors, compressed images and poses."""
+        return sum(array.nbytes for array in (self.stored, self.motion, self._empty))
 
     @property
     def present_drift(self) -> DriftModel:
@@ -163,8 +159,7 @@ class CandidateSearch:
         if not is_empty:
             self.stored.check(frame, image)
         foreground = self.background.without(image)
-        spectra = None if is_empty or fits is not None else query_spectra(foreground, config=self.verification)
-        query = None if is_empty else Query(frame, keyframe.descriptor, foreground, spectra)
+        query = None if is_empty else Query(frame, keyframe.descriptor, foreground, self.verification)
         motion_keyframe = self.motion.keyframe
         link = self._add_motion(query, keyframe.mounting, time, odometry, fits, continues=continues)
         comparer = KeyframeComparison(self.motion, self.present_drift, self.config, self.verification, self.loops.rows)
@@ -179,9 +174,7 @@ class CandidateSearch:
         if not is_empty and self.stored.is_new_place(frame, self.motion):
             self.stored.add(frame, keyframe.descriptor, foreground)
         self._empty.append(is_empty)
-        if time is not None:
-            self._times.append(time)
-        self.fits = fits
+        self._time, self.fits = time, fits
         return candidates
 
     def _check(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
@@ -189,13 +182,13 @@ class CandidateSearch:
         if not len(self):
             return
         for name, is_given, is_expected in (
-            ("a time", time is not None, self.times is not None),
+            ("a time", time is not None, self._time is not None),
             ("odometry", odometry is not None, self.has_odometry),
         ):
             if is_given != is_expected:
                 raise ValueError(f"expected {name} for every frame or for none, found both (frame {len(self)})")
-        if time is not None and self.times is not None and time < self.times[-1]:
-            raise ValueError(f"expected times that do not decrease, found {time} after {self.times[-1]}")
+        if time is not None and self._time is not None and time < self._time:
+            raise ValueError(f"expected times that do not decrease, found {time} after {self._time}")
 
     def _add_motion(
         self,

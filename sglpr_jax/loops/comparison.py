@@ -5,6 +5,7 @@ well as the match, the fit proves little. Neither frame rate nor speed matters: 
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, search
+from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar
 
@@ -69,15 +71,20 @@ class Fits(NamedTuple):
 NO_FITS = Fits(np.zeros(0, np.int64), NO_PEAKS)
 
 
-class Query(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Query:
     """A scan that is compared with others."""
 
     frame: int
     """Frame number in the motion."""
     descriptor: Float32[np.ndarray, " d"]
     image: UInt8[np.ndarray, "m m"]
-    spectra: Complex[Array, "2 s t f"] | None
-    """Result of `query_spectra`. None if the comparisons are already known."""
+    verification: VerificationConfig = VerificationConfig()
+
+    @functools.cached_property
+    def spectra(self) -> Complex[Array, "2 s t f"]:
+        """Result of `query_spectra`, computed at the first comparison."""
+        return query_spectra(self.image, config=self.verification)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -211,7 +218,6 @@ class KeyframeComparison:
         rows = scans.nearest(query.descriptor, count, among)
         if not len(rows):
             return rows, np.zeros(0)
-        assert query.spectra is not None
         matches = _batched(scans.spectra(rows), COARSE_BATCH)
         correlations = coarse_correlations(query.spectra, matches, len(rows), config=self.verification)
         coarse = np.asarray(correlations)[: len(rows)]
@@ -222,7 +228,6 @@ class KeyframeComparison:
         """Compare the images of a query and of stored scans at all rotations and shifts."""
         if not len(rows):
             return NO_FITS
-        assert query.spectra is not None
         matches = _batched(scans.spectra(rows), BATCH)
         peaks = jax.device_get(search(query.spectra, matches, len(rows), config=self.verification))
         return Fits(scans.frames[rows], peaks.at(slice(len(rows))))

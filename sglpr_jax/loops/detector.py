@@ -61,7 +61,7 @@ class LoopDetector:
     def nbytes(self) -> int:
         """Number of bytes of all frames, without results and the spectra of the last compared scans (13 MB at most).
 
-        With `max_places`, only poses and times still grow: 305 bytes a frame, and up to as much in spare capacity.
+        With `max_places`, only poses still grow: 297 bytes a frame, and up to as much in spare capacity.
         """
         return self.finder.nbytes
 

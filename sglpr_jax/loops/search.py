@@ -45,7 +45,6 @@ from sglpr_jax.loops.sequence import pair_of, probable_loops, rejection_reason
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.registration.gicp import check_installed, is_installed
 from sglpr_jax.se3 import inverse
 
@@ -347,9 +346,7 @@ def _candidates_between(
     for row, frame in enumerate(own_scans.frames.tolist()):
         if should_stop():
             break
-        image = own_scans.image(row)
-        spectra = query_spectra(image, config=matches.verification)
-        query = Query(frame, own_scans.index.descriptors[row], image, spectra)
+        query = Query(frame, own_scans.index.descriptors[row], own_scans.image(row), matches.verification)
         fits = comparer.compare(query, matches.stored, own_scans)
         candidates += comparer.candidates(query, fits, matches.stored, possible=fits.frames < offset)
         on_progress(row + 1)

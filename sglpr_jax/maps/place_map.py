@@ -30,7 +30,7 @@ from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
+from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import NEGATIVE_M
 from sglpr_jax.schema import Column, check_columns
@@ -203,7 +203,7 @@ class PlaceMap(Keyframes):
             return []
         model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
-        query = Query(len(self), keyframe.descriptor, image, query_spectra(image))
+        query = Query(len(self), keyframe.descriptor, image)
         comparer = KeyframeComparison(self._motion, NO_DRIFT, config)
         fits = comparer.compare(query, self)
         order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")

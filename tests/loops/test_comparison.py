@@ -10,7 +10,6 @@ from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 
@@ -43,7 +42,7 @@ def compared(
     for frame, one in enumerate(images):
         stored.add(frame, np.ones(2, np.float32), one)
     shown = image(TRUE, THERE, noise=1) if shown is None else shown
-    query = Query(len(images), np.ones(2, np.float32), shown, query_spectra(shown))
+    query = Query(len(images), np.ones(2, np.float32), shown)
     return comparer.candidates(query, comparer.compare(query, stored), stored)
 
 
