@@ -51,7 +51,7 @@ class LoopDetector:
         """Pairs whose later neighbours may still be added."""
         self._returned: set[int] = set()
         self._contradicting: set[int] = set()
-        """Queries of the returned loops, and of those that contradict the motion."""
+        """Queries of the returned loops, and queries of the loops that contradict the motion."""
 
     def __len__(self) -> int:
         """Number of added frames."""

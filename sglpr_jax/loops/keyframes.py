@@ -94,7 +94,7 @@ class Keyframes(abc.ABC):
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Rows of up to k (0 or more) scans with the nearest descriptors of those in `among`, the nearest first."""
+        """Rows of up to k (0 or more) scans in `among` with the nearest descriptors, the nearest first."""
         rows = self.index.query(descriptor, k, exclude=~(among & self.searchable)).rows if k else np.zeros(0, np.int64)
         return rows[rows >= 0]
 
