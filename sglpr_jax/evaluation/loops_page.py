@@ -145,7 +145,9 @@ def _reliability(result: LoopSearchResult) -> list[Picture | Text | TextTable]:
     if not bins:
         return [missing("No pair was compared.")]
     header = ("probability", "pairs", "loops", "share", "said")
-    rows = [(f"{b.low:g} to {b.high:g}", f"{b.pairs}", f"{b.loops}", f"{b.share:.3f}", f"{b.probability:.3f}") for b in bins]
+    rows = [
+        (f"{b.low:g} to {b.high:g}", f"{b.pairs}", f"{b.loops}", f"{b.share:.3f}", f"{b.probability:.3f}") for b in bins
+    ]
     table = TextTable(header, rows, header[1:])
     if not figures.can_draw():
         return [table]
