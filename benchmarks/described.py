@@ -21,7 +21,7 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Keyframe, described
+from sglpr_jax.loops.keyframes import Keyframe, describe_scan
 from sglpr_jax.models.params import Params
 from sglpr_jax.se3 import travelled
 from sglpr_jax.sim.recording import SimulatedRecording
@@ -62,7 +62,7 @@ class DescribedDrive(NamedTuple):
 def store(path: Path, drive: SimulatedRecording, params: Params, *, scale: Scale = 1, **facts: Any) -> None:
     """Render and describe a drive, and write its file."""
     recording = scaled(drive, scale)
-    keyframes = [described(params, recording.scan(i, labels=False)) for i in range(len(recording))]
+    keyframes = [describe_scan(params, recording.scan(i, labels=False)) for i in range(len(recording))]
     arrays = {
         "descriptors": np.stack([one.descriptor for one in keyframes]),
         "images": np.stack([one.image for one in keyframes]),

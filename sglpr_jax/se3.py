@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+PlanarPose = Float[np.ndarray, "... 3"]
+"""Poses in the x-y plane: x and y in metres, yaw in radians counter-clockwise."""
 ROTATION_TOLERANCE = 0.01
 """Tolerance for rotations in files with few digits."""
 
@@ -28,6 +30,32 @@ def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"
 def yaw_of(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n"]:
     """Yaw of the x axis of frame b in frame a, in radians."""
     return np.asarray(np.arctan2(a_from_b[..., 1, 0], a_from_b[..., 0, 0]))
+
+
+def planar_pose(a_from_b: Float[np.ndarray, "*n 4 4"]) -> PlanarPose:
+    """Projection of poses to the x-y plane of frame a."""
+    return np.concatenate([a_from_b[..., :2, 3], yaw_of(a_from_b)[..., None]], axis=-1)
+
+
+def compose_planar(a_from_b: PlanarPose, b_from_c: PlanarPose) -> PlanarPose:
+    """Planar pose a_from_c."""
+    a_from_b, b_from_c = np.broadcast_arrays(a_from_b, b_from_c)
+    x, y, yaw = np.moveaxis(b_from_c, -1, 0)
+    cos, sin = np.cos(a_from_b[..., 2]), np.sin(a_from_b[..., 2])
+    moved = a_from_b[..., 0] + cos * x - sin * y, a_from_b[..., 1] + sin * x + cos * y
+    return np.stack([*moved, wrap_angle(a_from_b[..., 2] + yaw)], axis=-1)
+
+
+def inverse_planar(a_from_b: PlanarPose) -> PlanarPose:
+    """Planar pose b_from_a."""
+    x, y, yaw = np.moveaxis(a_from_b, -1, 0)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack([-cos * x - sin * y, sin * x - cos * y, -yaw], axis=-1)
+
+
+def wrap_angle(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Wrap angles in radians to the range from -pi to pi."""
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

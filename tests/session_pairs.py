@@ -9,7 +9,7 @@ from recordings import of_images
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, aligned_frames
+from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, align_frames
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse, transform, travelled
@@ -44,8 +44,8 @@ def found_pair(*, odometry: tuple[np.ndarray, np.ndarray] | None = None) -> Loop
     loops = loops_between(first, second, true)
     given = (first, second) if odometry is None else odometry
     parts = [TrajectorySegment(session, 0, len(poses) - 1, True) for session, poses in enumerate(given)]
-    ways = {"match_way": travelled(given[0]), "query_way": travelled(given[1])}
-    alignment = aligned_frames(loops, *given, **ways, drift=DriftModel())
+    ways = {"match_travelled_m": travelled(given[0]), "query_travelled_m": travelled(given[1])}
+    alignment = align_frames(loops, *given, **ways, drift=DriftModel())
     sessions = tuple(
         Session(_recording(len(poses), name), len(poses), poses)
         for name, poses in zip(("monday", "tuesday"), given, strict=True)

@@ -36,7 +36,7 @@ from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights_file import LAST
-from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_search import search
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
 from sglpr_jax.reproduce.reproduction import content_of
@@ -254,5 +254,5 @@ def _verified(file: DescriptorFile, images: Float32[np.ndarray, "n h w"]) -> Top
 def _correlations(images: np.ndarray, query: int, nearest: np.ndarray) -> np.ndarray:
     """Return the correlation of a frame with each of its nearest places; -1 where there is no further place."""
     peaks = search(query_spectra(images[query]), match_spectra(images[nearest]))
-    aligned = (refined(images[query], images[place], peaks.at(k)) for k, place in enumerate(nearest))
+    aligned = (refine(images[query], images[place], peaks.at(k)) for k, place in enumerate(nearest))
     return np.where(nearest >= 0, [float(one.correlation) for one in aligned], -1.0)

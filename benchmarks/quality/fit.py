@@ -28,7 +28,7 @@ from sglpr_jax.files import write_json
 from sglpr_jax.loops.calibration import calibration_error, reliability
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import planar_loop
-from sglpr_jax.loops.consistency import agree
+from sglpr_jax.loops.consistency import are_consistent
 from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.sequence import neighbour_weights
 from sglpr_jax.models.params import Params
@@ -103,7 +103,9 @@ def fit_model(
         reduced = _joined(held_out(pairs, without=name))
         table.add(f"without {name}", *_cells(reduced.probability, reduced.is_loop))
     for one in reliability(everything.probability, everything.is_loop):
-        print(f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.said:.3f}, {one.share:.3f} are loops")
+        print(
+            f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.probability:.3f}, {one.share:.3f} are loops"
+        )
     model = fitted(pairs)
     write_json(out, model.to_json())
     print(model)
@@ -119,7 +121,7 @@ def _pairs(drive: DescribedDrive, odometry: Odometry, params: Params, *, breaks:
     evidence = np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(ALL))
     loops = [planar_loop(one.query, one.match, one.alignment, probability=0.5) for one in candidates]
     way_m = np.maximum.accumulate([float(search.motion.travelled[one.query]) for one in candidates])
-    agreeing = agree(loops, search.motion.path, drift=search.present_drift)
+    agreeing = are_consistent(loops, search.motion.path, drift=search.present_drift)
     neighbours = neighbour_weights(way_m, np.arange(len(candidates))) * np.where(agreeing, 1.0, -1.0)
     wrong = errors.wrong if odometry != "none" else errors.wrong & (errors.storey_m <= STOREY_M)
     kind = f"{drive.facts['world']}-{drive.facts['route']}-{odometry}"

@@ -17,7 +17,7 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.figures import overlaid
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Fits
-from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import transform, travelled
@@ -46,7 +46,7 @@ class Revisit(NamedTuple):
     def along_m(self) -> float:
         """Stated uncertainty of the right pose along its least certain direction, in metres."""
         images = self.image(self.query), self.image(int(self.fits.frames[self.right]))
-        alignment = refined(*images, self.fits.peaks.at(self.right), config=VERIFICATION)
+        alignment = refine(*images, self.fits.peaks.at(self.right), config=VERIFICATION)
         return float(jax.device_get(alignment.along_m)) / self.drive.scale
 
     def image(self, frame: int) -> UInt8[np.ndarray, "m m"]:
@@ -107,7 +107,7 @@ def _compared_revisits(drive: DescribedDrive, params: sglpr_jax.Params) -> list[
     poses, revisits, search = drive.world_from_lidar, list[Revisit](), CandidateSearch(params)
     way_m, is_revisit = travelled(poses), drive.revisits
     for query, _ in enumerate(replay(search, drive)):
-        fits = search.compared
+        fits = search.fits
         peaks = zip(fits.peaks.x, fits.peaks.y, fits.peaks.yaw, strict=True)
         fitted = np.array([transform(*map(float, peak)) for peak in peaks]).reshape(-1, 4, 4)
         errors = pose_errors([(query, frame) for frame in fits.frames.tolist()], fitted, poses)

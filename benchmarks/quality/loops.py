@@ -37,7 +37,7 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.evaluation.protocols.protocol import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
-from sglpr_jax.loops.acceptance import accepted
+from sglpr_jax.loops.acceptance import accept_loops
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import StoredScans
@@ -93,7 +93,7 @@ def _by_detector(task: Task, detector: LoopDetector) -> Answer:
     for _ in replay(detector, task.drive, task.odometry):
         pass
     loops, drift = detector.loops, detector.finder.present_drift
-    loops = loops if task.odometry is None else accepted(loops, detector.finder.motion.path, drift=drift)[0]
+    loops = loops if task.odometry is None else accept_loops(loops, detector.finder.motion.path, drift=drift)[0]
     return Answer(closures_of(loops), None, loops)
 
 
@@ -265,7 +265,7 @@ def images(
         print(f"{name}: {counts.loops} loops, {counts.wrong} wrong, recall {counts.recall}; {told(found.loops, poses)}")
         assert found.model is not None
         for one in reliability_of(found.sessions[0].candidates, found.model, poses[:, :3, 3]):
-            share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.said:.4f} said"
+            share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.probability:.4f} said"
             print(f"  probability {one.low:g} to {one.high:g}: {share}")
         _report_top1(found, poses, sglpr_jax.embed(params, recording).descriptors)
 

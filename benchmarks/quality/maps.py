@@ -15,7 +15,7 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.loops.keyframes import Keyframe, described
+from sglpr_jax.loops.keyframes import Keyframe, describe_scan
 from sglpr_jax.odometry.kiss_icp import scan_odometry
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import distances, inverse, yaw_of
@@ -196,7 +196,7 @@ def sensors(
             places = sglpr_jax.map_recording(first_pass, params, drive.poses[mapped], spacing_m=spacing_m).places
             numbers = [list(PASSES).index(name) for name in ("opposite", "same")]
             asked = rows[np.isin(drive.passes[rows], numbers)][:: max(1, round(spacing_m))]
-            keyframes = [described(params, recording.scan(row)) for row in asked.tolist()]
+            keyframes = [describe_scan(params, recording.scan(row)) for row in asked.tolist()]
             passes.setdefault(sensor, []).append(MappedDrive(places, keyframes, drive.poses[asked]))
     table = Table("map", "query", "recall@1", "right", "wrong at .99", "queries")
     for mapped in sensors:

@@ -27,7 +27,7 @@ from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.closure import LoopClosure, planar_loop, to_lidar
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.registration import bev_search
-from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
 from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import distances, transform_covariance
@@ -127,7 +127,7 @@ def _aligned(recording: Recording, pairs: np.ndarray) -> Iterator[LoopClosure]:
         ours, theirs = (square_image(recording.scan(frame, labels=False)) for frame in (query, match))
         peak = bev_search.search(query_spectra(ours), match_spectra(theirs[None])).at(0)
         sensors = recording.mounting_of(query), recording.mounting_of(match)
-        loop = planar_loop(query, match, jax.device_get(refined(ours, theirs, peak)), probability=1.0, sensors=sensors)
+        loop = planar_loop(query, match, jax.device_get(refine(ours, theirs, peak)), probability=1.0, sensors=sensors)
         yield to_lidar(loop, query=sensors[0], match=sensors[1])
 
 

@@ -57,7 +57,7 @@ def loops(
             spread = np.diag([0.1, 0.1, 0.0]) ** 2
             motion = map(np.asarray, (STEP_M, 0.0, 2 * np.pi / LAP, spread, 0.9, 0.3))
             link = BevRegistration(*motion) if frame else None
-            detector.add_keyframe(keyframe, time=STEP_S * frame, compared=NO_FITS._replace(link=link))
+            detector.add_keyframe(keyframe, time=STEP_S * frame, fits=NO_FITS._replace(link=link))
         held = held_bytes(detector) - before
         describing = _mean_s(lambda scan: finder.keyframe(scan), scans, repeats)
         adding = _mean_s(lambda scan: detector.add(scan, time=STEP_S * len(detector)), scans, repeats)

@@ -10,7 +10,7 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, missing, render
 from sglpr_jax.evaluation.report import TextTable
 from sglpr_jax.loops.calibration import reliability_of
-from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, counted, to_upright
+from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, count_reasons, to_upright
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import LoopSearchResult, diagnose_no_loops
 from sglpr_jax.odometry.path import level_odometry
@@ -144,7 +144,9 @@ def _reliability(result: LoopSearchResult) -> list[Picture | Text | TextTable]:
     if not bins:
         return [missing("No pair was compared.")]
     header = ("probability", "pairs", "loops", "share", "said")
-    rows = [(f"{b.low:g} to {b.high:g}", f"{b.pairs}", f"{b.loops}", f"{b.share:.3f}", f"{b.said:.3f}") for b in bins]
+    rows = [
+        (f"{b.low:g} to {b.high:g}", f"{b.pairs}", f"{b.loops}", f"{b.share:.3f}", f"{b.probability:.3f}") for b in bins
+    ]
     table = TextTable(header, rows, header[1:])
     if not figures.can_draw():
         return [table]
@@ -152,7 +154,7 @@ def _reliability(result: LoopSearchResult) -> list[Picture | Text | TextTable]:
         f"Share of loops among all candidates, before neighbours and odometry are considered. A loop is a pair up to "
         f"10 m apart by {session.recording.pose_source}; pairs 10 to 20 m apart are ignored. Labels: number of pairs."
     )
-    plot = figures.reliability([(b.said, b.share, b.pairs) for b in bins])
+    plot = figures.reliability([(b.probability, b.share, b.pairs) for b in bins])
     return [figure_picture(plot, "Share of loops over probability", caption=caption), table]
 
 
@@ -185,7 +187,7 @@ def _reasons(rejected: Sequence[RejectedClosure]) -> list[Text | TextTable]:
     """Table of the reasons for rejections, with counts."""
     if not rejected:
         return [missing("No pair was rejected.")]
-    rows = [(reason, str(count), MEANING[reason]) for reason, count in counted(rejected).items()]
+    rows = [(reason, str(count), MEANING[reason]) for reason, count in count_reasons(rejected).items()]
     about = "Pairs that look like loops but were rejected. They are listed in rejected.jsonl."
     return [Text(about), TextTable(("reason", "pairs", "meaning"), rows, ("pairs",))]
 

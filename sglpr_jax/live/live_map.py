@@ -17,7 +17,7 @@ from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.messages import LiveFrame, LoopEdge, Report
 from sglpr_jax.live.odometry_input import Clock, Continuity, FirstScans
-from sglpr_jax.loops.arguments import given_pose
+from sglpr_jax.loops.arguments import as_pose
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.comparison import Fits
@@ -175,7 +175,7 @@ class LiveMap:
 
         Raises ValueError if the scan or its odometry is invalid.
         """
-        scan, pose = frame.scan, given_pose(frame.odometry)
+        scan, pose = frame.scan, as_pose(frame.odometry)
         if scan.points is None or not np.isfinite(scan.points).all(axis=1).any():
             raise ValueError(f"{scan.name or 'scan'}: expected points, found none")
         if scan.mounting is None:
@@ -191,12 +191,12 @@ class LiveMap:
         loops = self._add(described)
         if self.detector.finder.empty[-1]:
             self._report("empty", f"{scan.name or f'scan {len(self) - 1}'}: expected a place, found almost no points")
-        self._write(described, self.detector.finder.compared, loops)
+        self._write(described, self.detector.finder.fits, loops)
         return [self._edge(loop, frame.received) for loop in loops]
 
     def _add(self, scan: LiveScan) -> list[LoopClosure]:
         """Add a scan to the detector and the trajectory, and return the loops that it closes."""
-        options = {"compared": scan.compared, "continues": scan.part == self._part}
+        options = {"fits": scan.compared, "continues": scan.part == self._part}
         loops = self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **options)
         self.detector.candidates.clear()  # they are in the log
         self._part = scan.part

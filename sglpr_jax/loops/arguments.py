@@ -1,4 +1,4 @@
-"""Validation of arguments of the Python API, before any work starts."""
+"""Conversion and validation of the arguments of the Python API, before any work starts."""
 
 import datetime
 import os
@@ -18,11 +18,11 @@ MOST_COLUMNS = 8
 def check_is(value: Any, kind: type, *, by: str) -> None:
     """Raise TypeError if `value` is not of type `kind`. The message names `by`, the function that returns one."""
     if not isinstance(value, kind):
-        raise TypeError(f"expected a {kind.__name__}, found {_said(value)}; sglpr_jax.{by} returns one")
+        raise TypeError(f"expected a {kind.__name__}, found {_value_or_type(value)}; sglpr_jax.{by} returns one")
 
 
-def given_scan(scan: Any) -> Scan:
-    """Convert points (n, 3) or an image (h, w) to a record. Accepts records, too."""
+def as_scan(scan: Any) -> Scan:
+    """Convert points (n, 3) or an image (h, w) to a `Scan`. Accepts a `Scan`, too."""
     if isinstance(scan, Scan):
         return scan
     expected = "points (n, 3) or an image (h, w)"
@@ -34,12 +34,12 @@ def given_scan(scan: Any) -> Scan:
     return Scan(points=values) if values.shape[1] == 3 else Scan(image=values)
 
 
-def given_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
+def as_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
     """Convert a pose to a 4 x 4 array. Returns None for None."""
     return None if odometry is None else _poses(odometry, "odometry (4, 4)", 2)
 
 
-def given_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
+def as_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
     """Convert an array or a list of 4 x 4 arrays to poses. Errors name them by `of`, for instance "odometry"."""
     return _poses(poses, f"{of} (n, 4, 4)", 3)
 
@@ -49,16 +49,16 @@ def _poses(values: Any, expected: str, ndim: int) -> Float[np.ndarray, "*n 4 4"]
     poses = _numbers(values, np.float64, expected, by="read_odometry")
     if poses.ndim != ndim or poses.shape[-2:] != (4, 4):
         raise ValueError(f"expected {expected}, found an array of shape {poses.shape}")
-    last = np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(-1, initial=0) < ROTATION_TOLERANCE
-    wrong = np.ravel(~(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[..., :3, :3]) & last))
-    if wrong.any():
-        row = int(wrong.argmax())
-        found = poses.reshape(-1, 4, 4)[row].tolist()
-        raise ValueError(f"expected {expected}, with rotations, found {found} in row {row}")
+    matrices = poses.reshape(-1, 4, 4)
+    valid = np.isfinite(matrices).all((-2, -1)) & are_rotations(matrices[:, :3, :3])
+    valid &= np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(-1) < ROTATION_TOLERANCE
+    if not valid.all():
+        row = int(valid.argmin())
+        raise ValueError(f"expected {expected}, with rotations, found {matrices[row].tolist()} in row {row}")
     return poses
 
 
-def given_time(time: Any) -> float | None:
+def as_seconds(time: Any) -> float | None:
     """Convert a time to a number, and a date to seconds. Returns None for None."""
     if time is None:
         return None
@@ -71,7 +71,7 @@ def given_time(time: Any) -> float | None:
     try:
         seconds = float(time / np.timedelta64(1, "s") if isinstance(time, np.timedelta64) else time)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"expected a time in seconds, found {_said(time)}") from error
+        raise TypeError(f"expected a time in seconds, found {_value_or_type(time)}") from error
     if not np.isfinite(seconds):
         raise ValueError(f"expected a time in seconds, found {seconds}")
     return seconds
@@ -84,9 +84,9 @@ def _numbers(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"expected {expected}, found {_said(values)} ({in_short(error)})") from error
+        raise TypeError(f"expected {expected}, found {_value_or_type(values)} ({in_short(error)})") from error
 
 
-def _said(value: Any) -> str:
+def _value_or_type(value: Any) -> str:
     """The value itself if it is a string or path, otherwise its type."""
     return f"{value!r}" if isinstance(value, str | os.PathLike) else f"a {type(value).__name__}"

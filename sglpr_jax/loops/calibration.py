@@ -21,11 +21,17 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import level_odometry
-from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
+from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.same_place import NEGATIVE_M
 
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 """Edges of the bins. They are narrow where loops are accepted and rejected."""
+LOOP_M = 10.0
+"""Maximum distance of the two scans of a loop, in metres."""
+NEAR_M = (2.0, 10.0)
+"""Minimum and maximum distance of a positive pair, in metres."""
+SAME_PASS_M = 50.0
+"""Maximum travelled distance between the frames of a positive pair, in metres."""
 
 
 class Bin(NamedTuple):
@@ -38,7 +44,7 @@ class Bin(NamedTuple):
     """Number of pairs."""
     loops: int
     """Number of pairs that are loops."""
-    said: float
+    probability: float
     """Mean probability of the pairs."""
 
     @property
@@ -47,42 +53,31 @@ class Bin(NamedTuple):
         return self.loops / self.pairs
 
 
-def reliability(
-    probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"], *, edges: Sequence[float] = EDGES
-) -> tuple[Bin, ...]:
-    """Sort pairs into bins. Returns the bins with pairs, in order of probability."""
-    found = []
-    for low, high in itertools.pairwise(edges):
-        chosen = (probability >= low) & ((probability < high) | (high == edges[-1]))
-        if chosen.any():
-            said = float(probability[chosen].mean().clip(low, high))  # rounding may move the mean of equal numbers out
-            found.append(Bin(low, high, int(chosen.sum()), int(is_loop[chosen].sum()), said))
-    return tuple(found)
+def reliability(probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"]) -> tuple[Bin, ...]:
+    """Sort pairs into the bins of `EDGES`. Returns the bins with pairs, in order of probability."""
+    bins = []
+    for low, high in itertools.pairwise(EDGES):
+        inside = (probability >= low) & ((probability < high) | (high == EDGES[-1]))
+        if inside.any():
+            mean = float(probability[inside].mean().clip(low, high))  # rounding may move the mean of equal numbers out
+            bins.append(Bin(low, high, int(inside.sum()), int(is_loop[inside].sum()), mean))
+    return tuple(bins)
 
 
 def calibration_error(bins: Sequence[Bin]) -> float:
     """Expected calibration error: mean difference between probability and share of loops, weighted by pairs."""
-    pairs = np.array([one.pairs for one in bins])
-    return float(pairs @ [abs(one.said - one.share) for one in bins] / pairs.sum())
+    pairs = np.array([each.pairs for each in bins])
+    return float(pairs @ [abs(each.probability - each.share) for each in bins] / pairs.sum())
 
 
 def reliability_of(
     candidates: Sequence[Candidate], model: LoopModel, positions: Float[np.ndarray, "n 3"]
 ) -> tuple[Bin, ...]:
     """Reliability of candidates with known positions: loops are up to 10 m apart, others more than 20 m."""
-    apart = np.array([np.linalg.norm(positions[one.query] - positions[one.match]) for one in candidates])
-    clear = (apart <= LOOP_M) | (apart > NEGATIVE_M)
-    evidence = Evidence.stack([one.evidence for one, kept in zip(candidates, clear, strict=True) if kept])
-    return reliability(model.probability(evidence), apart[clear] <= LOOP_M)
-
-
-LOOP_M = 10.0
-"""Maximum distance of the two scans of a loop, in metres."""
-
-NEAR_M = (2.0, 10.0)
-"""Minimum and maximum distance of a positive pair, in metres."""
-SAME_PASS_M = 50.0
-"""Maximum travelled distance between the frames of a positive pair, in metres."""
+    pairs = [(np.linalg.norm(positions[pair.query] - positions[pair.match]), pair.evidence) for pair in candidates]
+    clear = [(apart_m, evidence) for apart_m, evidence in pairs if apart_m <= LOOP_M or apart_m > NEGATIVE_M]
+    probability = model.probability(Evidence.stack([evidence for _, evidence in clear]))
+    return reliability(probability, np.array([apart_m <= LOOP_M for apart_m, _ in clear], bool))
 
 
 def calibrated(
@@ -119,11 +114,12 @@ def certain_pairs(
     drive = _Drive(params, recording, odometry)
     rng = np.random.default_rng(seed)
     evidence, is_loop = [], []
-    for done, frame in enumerate(rng.permutation(n)[: 2 * pairs].tolist()):
-        pair = drive.pair(frame, rng.uniform(0, 2 * np.pi), positive=bool(done % 2))
+    for draw, frame in enumerate(rng.permutation(n)[: 2 * pairs].tolist()):
+        positive = bool(draw % 2)
+        pair = drive.pair(frame, rng.uniform(0, 2 * np.pi), positive=positive)
         if pair is not None:
             evidence.append(pair.evidence)
-            is_loop.append(bool(done % 2))
+            is_loop.append(positive)
     if not evidence or all(is_loop) or not any(is_loop):
         raise ValueError(
             f"{recording.name}: expected frames {NEAR_M[0]:g} to {NEAR_M[1]:g} m apart, and frames farther apart than "
@@ -146,27 +142,26 @@ class _Drive:
         self.comparer = KeyframeComparison(self.motion, DriftModel())
 
     def pair(self, frame: int, angle: float, *, positive: bool) -> Candidate | None:
-        """Pair of a frame that is rotated by `angle` (radians) and a near or far one, or None."""
-        poses, frames, way_m = self.motion.poses, self.stored.frames, self.motion.travelled[self.stored.frames]
-        apart = np.linalg.norm(poses[frames, :3, 3] - poses[frame, :3, 3], axis=1)
-        far = (apart > NEGATIVE_M) & self.comparer.elsewhere(frames, frame)
-        near = (apart >= NEAR_M[0]) & (apart <= NEAR_M[1])
-        near &= np.abs(way_m - self.motion.travelled[frame]) <= SAME_PASS_M
+        """Best fit of a frame, rotated by `angle` (radians), among near frames (`positive`) or far ones, or None."""
+        poses, frames = self.motion.poses, self.stored.frames
+        apart_m = np.linalg.norm(poses[frames, :3, 3] - poses[frame, :3, 3], axis=1)
+        far = (apart_m > NEGATIVE_M) & self.comparer.are_elsewhere(frames, frame)
+        near = (apart_m >= NEAR_M[0]) & (apart_m <= NEAR_M[1])
+        near &= self.comparer.travelled_between(frames, frame) <= SAME_PASS_M
+        possible = near if positive else far
         query = self.rotated(frame, angle)
-        scans = self.stored.some(far | near if positive else far)
-        fits = self.comparer.compare(query, scans, possible=near if positive else far)
-        matches = np.isin(fits.frames, frames[near if positive else far])
-        found = self.comparer.candidates(query, fits, self.stored, possible=matches)
-        return found[0] if found else None
+        scans = self.stored.view(searchable=far | possible)
+        fits = self.comparer.compare(query, scans, possible=possible)
+        candidates = self.comparer.candidates(query, fits, scans, possible=np.isin(fits.frames, frames[possible]))
+        return candidates[0] if candidates else None
 
     def rotated(self, frame: int, angle: float) -> Query:
         """A frame rotated by `angle` (radians), as a query of unknown pose."""
         scan = self.recording.scan(frame, labels=False)
         if scan.points is not None:
-            turned = Scan(points=rotated(scan.upright_points, angle))
+            rotated_scan = Scan(points=rotated(scan.upright_points, angle))
         else:
-            whole = even_cells(jnp.asarray(picture(scan, None)[0]))
-            turned = Scan(image=np.asarray(rotate_image(whole, jnp.float32(angle))))
-        keyframe = self.finder.keyframe(turned)
-        image = np.asarray(within_reach(keyframe.image))
-        return Query(len(self.motion) - 1, keyframe.descriptor, image, query_spectra(image))
+            even = even_cells(jnp.asarray(picture(scan, None)[0]))
+            rotated_scan = Scan(image=np.asarray(rotate_image(even, jnp.float32(angle))))
+        keyframe = self.finder.keyframe(rotated_scan)
+        return Query(len(self.motion) - 1, keyframe.descriptor, np.asarray(within_reach(keyframe.image)))

@@ -48,13 +48,13 @@ COLUMNS = {
 
 
 def frame_bytes(
-    keyframe: Keyframe | None, compared: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **about: Any
+    keyframe: Keyframe | None, fits: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **about: Any
 ) -> bytes:
     """Return the compressed bytes of a frame, with further JSON values."""
     arrays = {
-        "fitted": np.asarray(compared.frames, np.int64),
-        "fits": np.stack(compared.peaks, axis=1).astype(np.float64),
-        "links": np.array([[float(getattr(compared.link, name, np.nan)) for name in LINK]]),  # NaN without a link
+        "fitted": np.asarray(fits.frames, np.int64),
+        "fits": np.stack(fits.peaks, axis=1).astype(np.float64),
+        "links": np.array([[float(getattr(fits.link, name, np.nan)) for name in LINK]]),  # NaN without a link
     }
     if keyframe is not None:
         arrays |= {"descriptor": keyframe.descriptor, "image": keyframe.image}
@@ -69,7 +69,7 @@ def frame_bytes(
 def read_frame(
     content: bytes, frame: int, about: Mapping[str, Any], *, source: Path | None
 ) -> tuple[Keyframe | None, Fits, Float[np.ndarray, "4 4"] | None, dict[str, Any]]:
-    """Return the scan, the comparisons, the pose and the JSON values of `frame_bytes`.
+    """Return the keyframe, the comparisons, the pose and the JSON values of `frame_bytes`.
 
     `about` has the annotation of each JSON value (`schema.check_about`). Raises ValueError, which names the file
     `source`, if the content is invalid.
@@ -78,44 +78,41 @@ def read_frame(
         plain = zlib.decompress(content)
         arrays = safetensors.numpy.load(plain)
         size = int.from_bytes(plain[:8], "little")
-        found = json.loads(json.loads(plain[8 : 8 + size])["__metadata__"]["scan"])
-        check_about(found, about, format=FRAME_FORMAT)
+        values = json.loads(json.loads(plain[8 : 8 + size])["__metadata__"]["scan"])
+        check_about(values, about, format=FRAME_FORMAT)
         check_columns(arrays, COLUMNS)
-        fitted, (link,) = arrays["fitted"], arrays["links"]
-        if ((fitted < 0) | (fitted >= frame)).any():
+        frames, (link,) = arrays["fitted"], arrays["links"]
+        if ((frames < 0) | (frames >= frame)).any():
             raise ValueError(f"expected comparisons of frame {frame}, found others")
-        keyframe, mounting = None, found.get("mounting")
+        keyframe, mounting = None, values.get("mounting")
         if "image" in arrays:
             mounting = None if mounting is None else Mounting(**{**mounting, "up": tuple(mounting["up"])})
             keyframe = Keyframe(arrays["descriptor"], arrays["image"], mounting)
     except Exception as error:  # another program may have written it
         raise ValueError(f"{source}: expected frame {frame}, found another content ({in_short(error)})") from error
     x, y, yaw, correlation, second, along_m = link
-    spread = np.diag([along_m, along_m, 0.0]) ** 2
-    known = None if np.isnan(link).all() else BevRegistration(x, y, yaw, spread, correlation, second)
-    return (
-        keyframe,
-        Fits(fitted, CorrelationPeak(*arrays["fits"].T), known),
-        arrays.get("pose"),
-        {name: found[name] for name in about},
-    )
+    covariance = np.diag([along_m, along_m, 0.0]) ** 2
+    registration = None if np.isnan(link).all() else BevRegistration(x, y, yaw, covariance, correlation, second)
+    fits = Fits(frames, CorrelationPeak(*arrays["fits"].T), registration)
+    return keyframe, fits, arrays.get("pose"), {name: values[name] for name in about}
 
 
 def settings(
-    recording: Recording, finder: CandidateSearch, **given: np.ndarray | int | float | str | None
+    recording: Recording, finder: CandidateSearch, **arguments: np.ndarray | int | float | str | None
 ) -> dict[str, Any]:
-    """Settings that determine the frames, as JSON values. `given` are further arguments of the run."""
+    """Settings that determine the frames, as JSON values. `arguments` are those of the run, arrays by their hash."""
+    hashed = {
+        name: hashlib.sha256(value.tobytes()).hexdigest()[:16] if isinstance(value, np.ndarray) else value
+        for name, value in arguments.items()
+    }
     return {
         "format": FORMAT,
         "recording": [recording.name, fingerprint(recording, contents="some")],
         "weights": finder.index.weights_hash,
         "candidates": dataclasses.asdict(finder.config),
-        "drift": [dataclasses.asdict(one) for one in (finder.drift, MOTION_DRIFT)],
+        "drift": [dataclasses.asdict(drift) for drift in (finder.drift, MOTION_DRIFT)],
         "verification": dataclasses.asdict(finder.verification),
-        **{
-            name: hashlib.sha256(value.tobytes()).hexdigest()[:16] if isinstance(value, np.ndarray) else value
-            for name, value in given.items()
-        },
+        **hashed,
     }
 
 
@@ -129,27 +126,27 @@ def remove(folder: Path) -> None:
 def add_scans(
     recording: Recording,
     finder: CandidateSearch,
-    add: Callable[[Keyframe | None, Fits | None], None],
+    add: Callable[[Keyframe | None, Fits | None], object],
     *,
     rows: Iterable[int] | None = None,
     kept_in: Path | str | None,
     on_bad_scan: OnBadScan | None,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
-    **given: np.ndarray | int | float | str | None,
+    **arguments: np.ndarray | int | float | str | None,
 ) -> None:
     """Add the frames of a checkpoint directory, then read, describe and add further scans.
 
     Arguments:
       recording: The scans.
-      finder: Finder without frames.
-      add: Function that adds the next frame to the finder. It receives descriptor and image, or None for a bad scan,
-        and the comparisons of a frame of the checkpoint.
+      finder: Candidate search without frames.
+      add: Function that adds the next frame to the finder. It receives the keyframe, or None for a bad scan, and the
+        comparisons of a frame of the checkpoint.
       rows: Rows of the scans that the checkpoint lacks, by default all further rows. A row is taken after the previous
         scan was added.
       kept_in: Checkpoint directory, or None.
       on_bad_scan: See `scan_stream`, also for the next two. Without it, the checkpoint ends at the first bad scan.
-      given: Further arguments that determine the frames (`settings`).
+      arguments: Further arguments that determine the frames (`settings`).
 
     Raises the errors of `RunLog` and `scan_stream`.
     """
@@ -158,17 +155,17 @@ def add_scans(
         raise ValueError(
             f"{path.parent}: expected a checkpoint of this version, found that of an earlier one; delete it"
         )
-    with RunLog(path, {} if path is None else settings(recording, finder, **given)) as log:
+    with RunLog(path, {} if path is None else settings(recording, finder, **arguments)) as log:
         for frame, content in enumerate(log.records):
-            keyframe, compared, *_ = read_frame(content, frame, {}, source=log.path)
+            keyframe, fits, *_ = read_frame(content, frame, {}, source=log.path)
             if keyframe is None and on_bad_scan is None:
                 break
-            add(keyframe, compared)
+            add(keyframe, fits)
         if len(finder):
             on_progress(len(finder))
-        left = range(len(finder), len(recording)) if rows is None else rows
+        further = range(len(finder), len(recording)) if rows is None else rows
         options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-        for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), rows=left, **options):
+        for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), rows=further, **options):
             add(keyframe, None)
             if path is not None:
-                log.append(len(finder) - 1, frame_bytes(keyframe, finder.compared))
+                log.append(len(finder) - 1, frame_bytes(keyframe, finder.fits))

@@ -1,13 +1,9 @@
-"""Options and defaults of loops and maps.
-
-They are a separate module, so that `--help` does not import the rest.
-"""
+"""Settings and defaults of loops and maps, readable without JAX."""
 
 import dataclasses
-import math
 from typing import Annotated, Literal
 
-from sglpr_jax.fields import Bounds, Positive, check_fields
+from sglpr_jax.fields import Bounds, Count, NotNegative, Positive, Share, check_fields
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.registration.config import VerificationConfig
 
@@ -59,12 +55,12 @@ class CandidateConfig:
 class DetectorConfig:
     """Thresholds for accepting a loop closure."""
 
-    min_probability: float = MIN_PROBABILITY
+    min_probability: Share = MIN_PROBABILITY
     """Minimum probability of a returned loop, given its neighbours."""
-    keyframe_m: float = 0.5
+    keyframe_m: NotNegative = 0.5
     """Minimum distance of a stored scan from the previous one, in metres. Nearer scans that are turned by less than 20
     degrees are searched for loops, but not stored. 0 stores every scan."""
-    max_places: int | None = None
+    max_places: Count | None = None
     """Maximum number of stored scans. Beyond it, scans with a loop to a newer stored scan are forgotten first, then the
     oldest. None stores all."""
     candidates: CandidateConfig = CandidateConfig()
@@ -73,10 +69,9 @@ class DetectorConfig:
     """Drift of the odometry. Loops that contradict it are rejected."""
 
     def __post_init__(self):
-        """Raises ValueError if the probability is outside [0, 1], or if a limit of the stored scans is invalid."""
-        if not 0 <= self.min_probability <= 1:
-            raise ValueError(f"expected min_probability from 0 to 1, found {self.min_probability}")
-        if not 0 <= self.keyframe_m < math.inf:
-            raise ValueError(f"expected keyframe_m of 0 or more, found {self.keyframe_m}")
-        if self.max_places is not None and self.max_places < 1:
-            raise ValueError(f"expected max_places of 1 or more, found {self.max_places}")
+        """Raises ValueError if a field has an invalid value."""
+        check_fields(self)
+
+    def at_scale(self, scale: float) -> "DetectorConfig":
+        """The settings for scans with all lengths multiplied by `scale`. Those of the images stay as they are."""
+        return dataclasses.replace(self, keyframe_m=self.keyframe_m * scale, drift=self.drift.at_scale(scale))

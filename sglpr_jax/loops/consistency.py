@@ -5,24 +5,16 @@ errors, one of them is wrong. After Mangelson et al., Pairwise Consistent Measur
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.loops.closure import (
-    LoopClosure,
-    Reason,
-    RejectedClosure,
-    compose,
-    frames_of,
-    inverse_planar,
-    planar,
-    planar_loops,
-    relative,
-)
+from sglpr_jax.loops.closure import LoopClosure, Reason, RejectedClosure, frames_of, planar_measurements
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar, planar_pose
 
 BLOCK = 64
 """Number of loops compared with all others at a time, to limit memory."""
@@ -34,26 +26,75 @@ CYCLE_DEVIATIONS = 3.0
 """Maximum closure error of the cycle of two consistent loops, in standard deviations."""
 
 
-def agree(
+def are_consistent(
     loops: Sequence[LoopClosure],
     path: DrivenPath,
     others: Sequence[LoopClosure] | None = None,
     *,
-    way: Float[np.ndarray, " n"] | None = None,
+    travelled_m: Float[np.ndarray, " n"] | None = None,
     drift: DriftModel = DriftModel(),
 ) -> Bool[np.ndarray, "a b"]:
     """Whether each loop is consistent with each of the `others`, by default with each of `loops`.
 
-    All are between gravity-aligned frames. `way` is the travelled distance at each frame in metres, by default that of
-    the path, whose length costs no time.
+    All loops are between gravity-aligned frames of `path`. `travelled_m` is the travelled distance at each frame, by
+    default that of the path.
     """
-    way = path.travelled if way is None else way
-    a, b = (_columns(each, path, way) for each in (loops, loops if others is None else others))
-    pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)
+    travelled_m = path.travelled if travelled_m is None else travelled_m
+    a = _arrays(loops, path, travelled_m)
+    b = a if others is None else _arrays(others, path, travelled_m)
+    pairs = np.empty((len(a.query_m), len(b.query_m)), bool)
     for start in range(0, len(pairs), BLOCK):
         rows = slice(start, start + BLOCK)
-        pairs[rows] = _closes({name: values[rows] for name, values in a.items()}, b, drift)
+        pairs[rows] = _cycles_close(_LoopArrays(*(values[rows] for values in a)), b, drift)
     return pairs
+
+
+class _LoopArrays(NamedTuple):
+    """Loops as arrays, one row for each loop."""
+
+    measured: PlanarPose
+    """Pose of the query in the frame of the match."""
+    query_pose: PlanarPose
+    match_pose: PlanarPose
+    """Poses by odometry."""
+    query_m: Float[np.ndarray, " n"]
+    match_m: Float[np.ndarray, " n"]
+    """Travelled distance at query and match, in metres."""
+    position_variance: Float[np.ndarray, " n"]
+    yaw_variance: Float[np.ndarray, " n"]
+    """Variances of the measured pose, in square metres and square radians."""
+
+
+def _arrays(loops: Sequence[LoopClosure], path: DrivenPath, travelled_m: Float[np.ndarray, " n"]) -> _LoopArrays:
+    query, match = frames_of(loops)
+    measured, covariances = planar_measurements(loops)
+    return _LoopArrays(
+        measured,
+        planar_pose(path.leveled(query)),
+        planar_pose(path.leveled(match)),
+        travelled_m[query],
+        travelled_m[match],
+        covariances[:, 0, 0] + covariances[:, 1, 1],
+        covariances[:, 2, 2],
+    )
+
+
+def _cycles_close(a: _LoopArrays, b: _LoopArrays, drift: DriftModel) -> Bool[np.ndarray, "a b"]:
+    """Whether the cycle of each loop of a with each loop of b closes."""
+    # From a's match by odometry to b's match, by loop b to b's query, by odometry to a's query: should equal loop a.
+    query_a_from_b = compose_planar(inverse_planar(a.query_pose)[:, None], b.query_pose[None])
+    match_a_from_b = compose_planar(inverse_planar(a.match_pose)[:, None], b.match_pose[None])
+    predicted = compose_planar(match_a_from_b, compose_planar(b.measured[None], inverse_planar(query_a_from_b)))
+    error = compose_planar(inverse_planar(a.measured)[:, None], predicted)
+    length_m = np.abs(a.query_m[:, None] - b.query_m) + np.abs(a.match_m[:, None] - b.match_m)
+    yaw_variance = np.radians(CYCLE_DEG) ** 2 + a.yaw_variance[:, None] + b.yaw_variance
+    yaw_variance += (np.radians(drift.degrees_per_metre) * length_m) ** 2
+    variance = (
+        CYCLE_M**2 + a.position_variance[:, None] + b.position_variance + (drift.metres_per_metre * length_m) ** 2
+    )
+    variance += yaw_variance * np.hypot(query_a_from_b[..., 0], query_a_from_b[..., 1]) ** 2
+    near = error[..., 0] ** 2 + error[..., 1] ** 2 <= CYCLE_DEVIATIONS**2 * variance
+    return near & (np.abs(error[..., 2]) <= CYCLE_DEVIATIONS * np.sqrt(yaw_variance))
 
 
 def largest_consistent_set(pairs: Bool[np.ndarray, "n n"]) -> Int[np.ndarray, " k"]:
@@ -76,49 +117,17 @@ def largest_consistent_set(pairs: Bool[np.ndarray, "n n"]) -> Int[np.ndarray, " 
 
 def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[np.ndarray, " n"]) -> list[np.int64]:
     """Greedy consistent set from `start`. `degrees` is the number of loops that each loop is consistent with."""
-    members, chosen, left = [], start, np.ones(len(pairs), bool)
+    members, newest, candidates = [], start, np.ones(len(pairs), bool)
     while True:
-        members.append(chosen)
-        stay = left & pairs[chosen]
-        stay[chosen] = False
+        members.append(newest)
+        remaining = candidates & pairs[newest]
+        remaining[newest] = False
         # Each loop is removed once, so updating the degrees costs as much in total as computing them once.
-        degrees = degrees - pairs[left & ~stay].sum(0)
-        left = stay
-        if not left.any():
+        degrees = degrees - pairs[candidates & ~remaining].sum(0)
+        candidates = remaining
+        if not candidates.any():
             return members
-        chosen = np.argmax(np.where(left, degrees, -1))
-
-
-def _columns(loops: Sequence[LoopClosure], path: DrivenPath, way: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
-    query, match = frames_of(loops)
-    query_pose, match_pose = (planar(path.leveled(frames)) for frames in (query, match))
-    poses, covariances = planar_loops(loops)
-    return {
-        "pose": poses,
-        "query_pose": query_pose,
-        "match_pose": match_pose,
-        "query_way": way[query],
-        "match_way": way[match],
-        "place": covariances[:, 0, 0] + covariances[:, 1, 1],
-        "turn": covariances[:, 2, 2],
-    }
-
-
-def _closes(a: dict[str, np.ndarray], b: dict[str, np.ndarray], drift: DriftModel) -> Bool[np.ndarray, "a b"]:
-    """Whether the cycle of each loop of a with each loop of b closes, from their `_columns`."""
-    # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: should equal loop a.
-    query_from_query = relative(a["query_pose"][:, None], b["query_pose"][None])
-    match_from_match = relative(a["match_pose"][:, None], b["match_pose"][None])
-    around = compose(match_from_match, compose(b["pose"][None], inverse_planar(query_from_query)))
-    apart = relative(a["pose"][:, None], around)
-    length = np.abs(a["query_way"][:, None] - b["query_way"]) + np.abs(a["match_way"][:, None] - b["match_way"])
-    lever = np.hypot(query_from_query[..., 0], query_from_query[..., 1])
-    turn = np.radians(CYCLE_DEG) ** 2 + a["turn"][:, None] + b["turn"][None]
-    turn = turn + (np.radians(drift.degrees_per_metre) * length) ** 2
-    place = CYCLE_M**2 + a["place"][:, None] + b["place"][None] + (drift.metres_per_metre * length) ** 2
-    place = place + turn * lever**2
-    close = apart[..., 0] ** 2 + apart[..., 1] ** 2 <= CYCLE_DEVIATIONS**2 * place
-    return close & (np.abs(apart[..., 2]) <= CYCLE_DEVIATIONS * np.sqrt(turn))
+        newest = np.argmax(np.where(candidates, degrees, -1))
 
 
 MIN_LOOPS = 5
@@ -129,7 +138,7 @@ MAX_RIVAL = 0.5
 """Maximum size of the second largest consistent set, as a fraction of the largest one."""
 
 
-def accepted_between(
+def accept_between(
     loops: Sequence[LoopClosure], motion: BevOdometry, *, drift: DriftModel
 ) -> tuple[list[list[LoopClosure]], list[RejectedClosure]]:
     """Accept sets of consistent loops between two sessions, at most one for each segment of each session.
@@ -144,21 +153,21 @@ def accepted_between(
     """
     query, match = frames_of(loops)
     segments = np.stack([motion.segments[match], motion.segments[query]], axis=1)
-    found, rejected = [], []
+    accepted, rejected = [], []
     for pair in np.unique(segments, axis=0):
-        some = [loops[row] for row in np.flatnonzero((segments == pair).all(axis=1)).tolist()]
-        pairs = agree(some, motion.path, way=motion.travelled, drift=drift)
-        members = largest_consistent_set(pairs).tolist()
-        others = np.setdiff1d(np.arange(len(some)), members)
+        members = [loops[row] for row in np.flatnonzero((segments == pair).all(axis=1)).tolist()]
+        pairs = are_consistent(members, motion.path, travelled_m=motion.travelled, drift=drift)
+        largest = largest_consistent_set(pairs).tolist()
+        others = np.setdiff1d(np.arange(len(members)), largest)
         rival = largest_consistent_set(pairs[np.ix_(others, others)])
-        chosen = [some[k] for k in members]
+        consistent = [members[row] for row in largest]
+        lengths_m = [np.ptp(motion.travelled[frames]) for frames in frames_of(consistent) if len(frames)]
         reason: Reason = "contradicts other loops"
-        ways = [np.ptp(motion.travelled[frames]) for frames in frames_of(chosen) if len(frames)]
-        if len(chosen) < MIN_LOOPS or min(ways) < MIN_TRAVELLED_M:
-            reason, others = "too few neighbours", np.arange(len(some))
-        elif len(rival) > MAX_RIVAL * len(members):
-            others = np.arange(len(some))
+        if len(consistent) < MIN_LOOPS or min(lengths_m) < MIN_TRAVELLED_M:
+            reason, others = "too few neighbours", np.arange(len(members))
+        elif len(rival) > MAX_RIVAL * len(consistent):
+            others = np.arange(len(members))
         else:
-            found.append(chosen)
-        rejected += [RejectedClosure(some[k], reason) for k in others]
-    return sorted(found, key=len, reverse=True), rejected
+            accepted.append(consistent)
+        rejected += [RejectedClosure(members[row], reason) for row in others]
+    return sorted(accepted, key=len, reverse=True), rejected

@@ -8,14 +8,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.loops.arguments import given_pose, given_scan, given_time
+from sglpr_jax.loops.arguments import as_pose, as_scan, as_seconds
 from sglpr_jax.loops.candidates import CandidateSearch
-from sglpr_jax.loops.closure import LoopClosure, Reason, RejectedClosure, to_lidar
+from sglpr_jax.loops.closure import LoopClosure, Reason, RejectedClosure
 from sglpr_jax.loops.comparison import Candidate, Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.loops.sequence import WINDOW_M, Pair, pair_of, probable_loops, verdict
+from sglpr_jax.loops.sequence import WINDOW_M, Pair, pair_of, probable_loops, rejection_reason
 from sglpr_jax.models.params import Params
 
 MAX_WAITING = 240
@@ -36,13 +36,7 @@ class LoopDetector:
               print(loop.query, loop.match, loop.match_from_query, loop.probability)
     """
 
-    def __init__(
-        self,
-        params: Params,
-        *,
-        model: LoopModel | None = None,
-        config: DetectorConfig = DetectorConfig(),
-    ):
+    def __init__(self, params: Params, *, model: LoopModel | None = None, config: DetectorConfig = DetectorConfig()):
         """Create a detector without frames. The default `model` of the probabilities is the one shipped."""
         self.finder = CandidateSearch(params, config)
         self.model = default_model() if model is None else model
@@ -54,8 +48,10 @@ class LoopDetector:
         self.rejected: list[RejectedClosure] = []
         """All other pairs of frames that are old enough, each with the reason for its rejection."""
         self._waiting: list[Pair] = []
+        """Pairs whose later neighbours may still be added."""
         self._returned: set[int] = set()
         self._contradicting: set[int] = set()
+        """Queries of the returned loops, and queries of the loops that contradict the motion."""
 
     def __len__(self) -> int:
         """Number of added frames."""
@@ -65,7 +61,7 @@ class LoopDetector:
     def nbytes(self) -> int:
         """Number of bytes of all frames, without results and the spectra of the last compared scans (13 MB at most).
 
-        With `max_places`, only poses and times still grow: 305 bytes a frame, and up to as much in spare capacity.
+        With `max_places`, only poses still grow: 297 bytes a frame, and up to as much in spare capacity.
         """
         return self.finder.nbytes
 
@@ -80,7 +76,7 @@ class LoopDetector:
         """Add the next frame. Returns the loops that it closes or confirms, of this and of the last few frames.
 
         Arguments:
-          scan: A record (with the mounting of its sensor), points (n, 3) in metres, or an image (h, w) from
+          scan: A `Scan` (with the mounting of its sensor), points (n, 3) in metres, or an image (h, w) from
             `density_bev`.
           time: Time of the scan in any unit, or a date. Only ratios of time steps count.
           odometry: Pose of the LiDAR in a fixed frame. It may drift.
@@ -91,8 +87,8 @@ class LoopDetector:
           ValueError: If a value has another shape, if times decrease, or if only some frames have a time or odometry.
           TypeError: If a value is not an array of numbers, for instance a path.
         """
-        scan, pose = given_scan(scan), given_pose(odometry)
-        return self.add_keyframe(self.finder.keyframe(scan), time=given_time(time), odometry=pose, continues=continues)
+        keyframe, pose = self.finder.keyframe(as_scan(scan)), as_pose(odometry)
+        return self.add_keyframe(keyframe, time=as_seconds(time), odometry=pose, continues=continues)
 
     def add_keyframe(
         self,
@@ -100,57 +96,55 @@ class LoopDetector:
         *,
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
-        compared: Fits | None = None,
+        fits: Fits | None = None,
         continues: bool = True,
     ) -> list[LoopClosure]:
         """Add a described frame (`CandidateSearch.add_keyframe`), and return loops as `add` does."""
-        candidates = self.finder.add_keyframe(
-            keyframe, time=time, odometry=odometry, compared=compared, continues=continues
-        )
+        finder = self.finder
+        candidates = finder.add_keyframe(keyframe, time=time, odometry=odometry, fits=fits, continues=continues)
         self.candidates += candidates
         if self.config.max_places is not None:
             del self.candidates[: -self.config.max_places]
-        about = self.model, self.finder.motion, self.finder.mountings
-        self._waiting += [pair_of(one, *about, knows_height=self.finder.knows_height) for one in candidates]
-        oldest_m = self.finder.motion.travelled[len(self) - 1] - WINDOW_M
-        old = [one.way_m < oldest_m for one in self._waiting]
-        count = max(sum(old), len(self._waiting) - MAX_WAITING)
-        self.rejected += self._verdicts(self._waiting[:count])
-        self._waiting = self._waiting[count:]
-        new = []
-        if candidates:
-            allowed = [one for one in self._waiting if self._is_allowed(one)]
-            others = [one for one in self._waiting if not self._is_allowed(one)]
-            reason: Reason = "contradicts the odometry" if self.finder.has_odometry else "contradicts the motion"
-            self.rejected += [RejectedClosure(loop, reason) for loop in self._probable(others, self._contradicting)]
-            new = self._probable(allowed, self._returned)
-        self.loops += new
-        for loop in new:
-            self.finder.close_loop(loop.query, loop.match)
-        return new
+        about = self.model, finder.motion, finder.mountings
+        self._waiting += [pair_of(candidate, *about, knows_height=finder.knows_height) for candidate in candidates]
+        oldest_m = finder.motion.travelled[len(self) - 1] - WINDOW_M
+        decided = sum(pair.travelled_m < oldest_m for pair in self._waiting)
+        decided = max(decided, len(self._waiting) - MAX_WAITING)
+        self.rejected += self._reject(self._waiting[:decided])
+        self._waiting = self._waiting[decided:]
+        if not candidates:
+            return []
+        allowed = [pair for pair in self._waiting if self._is_allowed(pair)]
+        excluded = [pair for pair in self._waiting if not self._is_allowed(pair)]
+        reason: Reason = "contradicts the odometry" if finder.has_odometry else "contradicts the motion"
+        self.rejected += [RejectedClosure(loop, reason) for loop in self._probable(excluded, self._contradicting)]
+        loops = self._probable(allowed, self._returned)
+        self.loops += loops
+        for loop in loops:
+            finder.close_loop(loop.query, loop.match)
+        return loops
 
     def undecided(self) -> list[RejectedClosure]:
-        """Verdicts about the pairs of the last frames, if no further frame follows."""
-        return self._verdicts(self._waiting)
+        """Rejections of the pairs of the last frames, if no further frame follows."""
+        return self._reject(self._waiting)
 
-    def _probable(self, pairs: Sequence[Pair], done: set[int]) -> list[LoopClosure]:
-        """Pairs that are probable enough given their neighbours. Queries that are `done` are left out, and noted."""
+    def _probable(self, pairs: Sequence[Pair], known_queries: set[int]) -> list[LoopClosure]:
+        """Loops that are probable given their neighbours, without `known_queries`. Adds their queries to that set."""
         finder = self.finder
-        found = probable_loops(pairs, self.model, finder.motion.path, drift=finder.present_drift, config=self.config)
-        new = [self._handed_out(loop) for loop in found if loop is not None and loop.query not in done]
-        done |= {loop.query for loop in new}
+        loops = probable_loops(pairs, self.model, finder.motion.path, drift=finder.present_drift, config=self.config)
+        new = [self.finder.to_lidar(loop) for loop in loops if loop is not None and loop.query not in known_queries]
+        known_queries |= {loop.query for loop in new}
         return new
 
-    def _is_allowed(self, one: Pair) -> bool:
+    def _is_allowed(self, pair: Pair) -> bool:
         """Whether the motion allows the pose of a pair."""
-        return bool(one.evidence.deviation <= self.finder.present_drift.max_deviation)
+        return bool(pair.evidence.deviation <= self.finder.present_drift.max_deviation)
 
-    def _verdicts(self, pairs: Sequence[Pair]) -> list[RejectedClosure]:
-        """Reasons why pairs that were not returned are no loops."""
-        left = [one for one in pairs if one.loop.query not in self._returned and self._is_allowed(one)]
+    def _reject(self, pairs: Sequence[Pair]) -> list[RejectedClosure]:
+        """Rejections, with reasons, of the pairs that were not returned although the motion allows them."""
         least = self.config.min_probability
-        return [RejectedClosure(self._handed_out(one.loop), verdict(one, self.model, least)) for one in left]
-
-    def _handed_out(self, loop: LoopClosure) -> LoopClosure:
-        """The loop between LiDAR frames."""
-        return to_lidar(loop, query=self.finder.mountings[loop.query], match=self.finder.mountings[loop.match])
+        return [
+            RejectedClosure(self.finder.to_lidar(pair.loop), rejection_reason(pair, self.model, least))
+            for pair in pairs
+            if pair.loop.query not in self._returned and self._is_allowed(pair)
+        ]

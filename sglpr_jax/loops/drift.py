@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.loops.closure import LoopClosure, Planar, compose, frames_of, planar, planar_loops, wrap_angle
+from sglpr_jax.loops.closure import LoopClosure, frames_of, planar_measurements
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.se3 import travelled
+from sglpr_jax.se3 import PlanarPose, compose_planar, planar_pose, travelled, wrap_angle
 
 GRAPH_M = 100.0
 """Travelled distance at which the drift of a pose graph equals that of the model, in metres."""
@@ -22,14 +22,12 @@ def deviations(
     """Mahalanobis distance of each loop from the odometry between its gravity-aligned frames.
 
     The distance is `sqrt(e' S^-1 e)` with 3 degrees of freedom. e is x, y and yaw of the query by the loop minus those
-    by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model. If
-    the loop has no errors, the distance is the smallest RMS drift that explains the loop, as a multiple of the model's
-    drift.
+    by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model.
 
-    If the deviation in height alone is larger, it is returned instead. Floors of a building look alike, so a difference
-    in height must not be outweighed by a good fit in the plane. The length of the path costs no time.
+    If the deviation in height alone is larger, it is returned instead. Floors of a building look alike, so a good fit
+    in the plane must not outweigh a difference in height.
     """
-    poses, covariances = planar_loops(loops)
+    poses, covariances = planar_measurements(loops)
     heights = np.array([loop.match_from_query[2, 3] for loop in loops])
     variances = np.array([loop.covariance[2, 2] for loop in loops])
     errors = {"covariances": covariances, "heights": heights, "height_variances": variances}
@@ -40,55 +38,58 @@ def planar_deviations(
     path: DrivenPath,
     query: Int[np.ndarray, " k"],
     match: Int[np.ndarray, " k"],
-    match_from_query: Planar,
+    match_from_query: PlanarPose,
     *,
     drift: DriftModel,
     covariances: Float[np.ndarray, "k 3 3"] | float = 0.0,
     heights: Float[np.ndarray, " k"] | float = 0.0,
     height_variances: Float[np.ndarray, " k"] | float = 0.0,
 ) -> Float[np.ndarray, " k"]:
-    """Return `deviations` of poses in the plane, with the heights of the queries in the frames of the matches.
+    """Return `deviations` of planar poses, with the heights of the queries in the frames of the matches, in metres.
 
     The matches may be earlier or later than the queries. The covariances are in the frames of the queries.
     """
-    start, last = path.leveled(match), path.leveled(query)
-    by_loop = compose(planar(start), match_from_query)
-    error = by_loop - planar(last)
+    match_pose, query_pose = path.leveled(match), path.leveled(query)
+    by_loop = compose_planar(planar_pose(match_pose), match_from_query)
+    error = by_loop - planar_pose(query_pose)
     error[:, 2] = wrap_angle(error[:, 2])
-    spread = planar_spread(path, query, match, drift=drift)
-    turn = np.tile(np.eye(3), (len(error), 1, 1))  # from the frames of the queries to that of the odometry
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(by_loop[:, 2])
-    turn[:, 1, 0] = np.sin(by_loop[:, 2])
-    turn[:, 0, 1] = -turn[:, 1, 0]
-    spread += turn @ np.broadcast_to(covariances, spread.shape) @ np.swapaxes(turn, 1, 2)
+    world_from_query = np.tile(np.eye(3), (len(error), 1, 1))
+    world_from_query[:, 0, 0] = world_from_query[:, 1, 1] = np.cos(by_loop[:, 2])
+    world_from_query[:, 1, 0] = np.sin(by_loop[:, 2])
+    world_from_query[:, 0, 1] = -world_from_query[:, 1, 0]
+    spread = planar_covariance(path, query, match, drift=drift)
+    loop_covariances = np.broadcast_to(covariances, spread.shape)
+    spread += world_from_query @ loop_covariances @ np.swapaxes(world_from_query, 1, 2)
     in_plane = np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
     shifts = np.column_stack([match_from_query[:, :2], np.broadcast_to(heights, len(error))])
-    apart = np.einsum("kj,kj->k", start[:, 2, :3], shifts) + start[:, 2, 3] - last[:, 2, 3]
-    height_spread = np.hypot(drift.height_m, drift.height_per_metre * (path.travelled[query] - path.travelled[match]))
-    return np.maximum(in_plane, np.abs(apart) / np.sqrt(height_spread**2 + height_variances))
+    height_error = np.einsum("kj,kj->k", match_pose[:, 2, :3], shifts) + match_pose[:, 2, 3] - query_pose[:, 2, 3]
+    height_drift = np.hypot(drift.height_m, drift.height_per_metre * (path.travelled[query] - path.travelled[match]))
+    return np.maximum(in_plane, np.abs(height_error) / np.sqrt(height_drift**2 + height_variances))
 
 
-def planar_spread(
+def planar_covariance(
     path: DrivenPath, query: Int[np.ndarray, " k"], match: Int[np.ndarray, " k"], *, drift: DriftModel
 ) -> Float[np.ndarray, "k 3 3"]:
-    """Covariance of x, y, yaw of each query relative to its match by a path.
+    """Covariance of x, y, yaw of each query relative to its match by a path, in the level world of the path.
 
     The rates of drift along the path are independent. Their integral has the variance of a constant rate.
     """
-    last, between = path.leveled(query)[:, :2, 3], path.between(match, query).turned(path.level[:2])
-    length = between.length[:, None, None]
-    crossed = last[:, :, None] * between.first[:, None]
-    levers = length * last[:, :, None] * last[:, None] - crossed - np.swapaxes(crossed, 1, 2) + between.squares
-    left = np.array([[0.0, -1], [1, 0]])
-    found = np.zeros((len(last), 3, 3))
-    found[:, :2, :2] = left @ levers @ left.T
-    found[:, :2, 2] = found[:, 2, :2] = (between.length[:, None] * last - between.first) @ left.T
-    found[:, 2, 2] = between.length
-    found *= np.radians(drift.degrees_per_metre) ** 2
+    end, integrals = path.leveled(query)[:, :2, 3], path.between(match, query).rotated(path.level[:2])
+    length = integrals.length[:, None, None]
+    crossed = end[:, :, None] * integrals.position[:, None]
+    levers = length * end[:, :, None] * end[:, None] - crossed - np.swapaxes(crossed, 1, 2)
+    levers += integrals.position_products
+    quarter_turn = np.array([[0.0, -1], [1, 0]])
+    covariance = np.zeros((len(end), 3, 3))
+    covariance[:, :2, :2] = quarter_turn @ levers @ quarter_turn.T
+    lever = integrals.length[:, None] * end - integrals.position
+    covariance[:, :2, 2] = covariance[:, 2, :2] = lever @ quarter_turn.T
+    covariance[:, 2, 2] = integrals.length
+    covariance *= np.radians(drift.degrees_per_metre) ** 2
     share = drift.sideways**2
-    directions = (1 - share) * between.directions + share * length * np.eye(2)
-    found[:, :2, :2] += drift.metres_per_metre**2 * directions
-    return found * length + np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
+    directions = (1 - share) * integrals.direction_products + share * length * np.eye(2)
+    covariance[:, :2, :2] += drift.metres_per_metre**2 * directions
+    return covariance * length + np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
 
 
 def step_deviations(
@@ -99,9 +100,6 @@ def step_deviations(
     Steps of a graph are independent: their variances add up with the distance, while those of the model grow with its
     square. Both are equal after `GRAPH_M`.
     """
-    root = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
-    metres, degrees = (
-        np.hypot(drift.metres_per_metre * root, STEP_M),
-        np.hypot(drift.degrees_per_metre * root, STEP_DEG),
-    )
-    return metres, np.radians(degrees)
+    root_m = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
+    metres = np.hypot(drift.metres_per_metre * root_m, STEP_M)
+    return metres, np.radians(np.hypot(drift.degrees_per_metre * root_m, STEP_DEG))

@@ -34,8 +34,8 @@ class Keyframe(NamedTuple):
     """Mounting of the sensor. Descriptor and image are gravity-aligned."""
 
 
-def described(params: Params, scan: Scan) -> Keyframe:
-    """Descriptor and 8-bit density image of a scan or image."""
+def describe_scan(params: Params, scan: Scan) -> Keyframe:
+    """Descriptor and 8-bit density image of a scan or ready-made image."""
     model = params.config
     check_ready_made(scan, model.image)
     whole, _ = picture(scan, None)
@@ -43,20 +43,20 @@ def described(params: Params, scan: Scan) -> Keyframe:
         bev = image_view(whole, None, model.grid).image
     else:
         bev = view(scan, model.grid, image=model.image).image
-    return Keyframe(np.asarray(describe(params, bev)), _kept(whole), scan.mounting)
+    return Keyframe(np.asarray(describe(params, bev)), _square_8_bit(whole), scan.mounting)
 
 
-def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
+def square_image(scan: Scan) -> UInt8[np.ndarray, "n n"]:
+    """Image for the comparison of scans: the density image or the ready-made image, as 8 bits."""
+    return _square_8_bit(picture(scan, None)[0])
+
+
+def _square_8_bit(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
     """Central square of an image, with an even number of cells, as 8 bits."""
     even = even_cells(jnp.asarray(image, jnp.float32))
     size = min(even.shape)
     grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / DENSITY_MAX_COUNT)
     return np.round(grey).clip(0, 255).astype(np.uint8)
-
-
-def square_image(scan: Scan) -> UInt8[np.ndarray, "n n"]:
-    """Image for the verification of loops: the density image or the ready-made image, as 8 bits."""
-    return _kept(picture(scan, None)[0])
 
 
 LEVEL = 1
@@ -68,12 +68,19 @@ SPECTRA = 512
 PARTS = 16
 """The stored scans are forgotten in this many parts, because each removal moves all rows that follow."""
 
+EVERY = np.array(True)
+"""Flag of all scans."""
+
 
 class Keyframes(abc.ABC):
     """Described scans with which queries are compared: those of a session, or the places of a map."""
 
     index: Index
     """Descriptor of each scan."""
+    verification = VerificationConfig()
+    """Settings of the spectra."""
+    searchable: Bool[np.ndarray, "*n"] = EVERY
+    """Whether each scan may be one of the nearest, or one value for all."""
 
     @property
     @abc.abstractmethod
@@ -87,13 +94,13 @@ class Keyframes(abc.ABC):
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k (0 or more) scans with the nearest descriptors among those with a flag, nearest first."""
-        rows = self.index.query(descriptor, k, exclude=~among).rows if k else np.zeros(0, np.int64)
+        """Rows of up to k (0 or more) scans in `among` with the nearest descriptors, the nearest first."""
+        rows = self.index.query(descriptor, k, exclude=~(among & self.searchable)).rows if k else np.zeros(0, np.int64)
         return rows[rows >= 0]
 
     def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        """Spectrum of each scan's image (`match_spectra`)."""
-        return [image_spectrum(self.image(row), VerificationConfig()) for row in rows.tolist()]
+        """Spectrum of the image of each row (`match_spectra`)."""
+        return [image_spectrum(self.image(row), self.verification) for row in rows.tolist()]
 
 
 class StoredScans(Keyframes):
@@ -109,55 +116,46 @@ class StoredScans(Keyframes):
     ):
         """Start with an index without places. The limits are those of `DetectorConfig`."""
         self.index, self.verification, self.keyframe_m, self.max_places = index, verification, keyframe_m, max_places
-        self._first = 0
-        self._kept: Bool[np.ndarray, " n"] | None = None
+        self._first_frame = 0
         self._frames = GrowingArray(np.empty(0, np.int64))
-        self._repeated = GrowingArray(np.empty(0, bool))
+        self._superseded = GrowingArray(np.empty(0, bool))
         """Whether each scan has a loop to a newer stored scan."""
-        self._packed: list[bytes] = []
+        self._compressed: list[bytes] = []
         self._shape = 0, 0
         self._spectra: OrderedDict[int, Complex64[np.ndarray, "s f"]] = OrderedDict()
         """Spectra by frame, the last used one at the end."""
 
     def __len__(self) -> int:
-        return len(self._packed)
+        return len(self._compressed)
 
     @property
     def frames(self) -> Int[np.ndarray, " n"]:
         """See `Keyframes`. They increase."""
-        return self._frames.rows + self._first
+        return self._frames.rows + self._first_frame
 
-    def shifted(self, first: int) -> "StoredScans":
-        """The same scans with frame numbers that begin at `first`. The scans are shared."""
-        found = copy.copy(self)
-        found._first = first
-        return found
+    def view(self, *, first_frame: int = 0, searchable: Bool[np.ndarray, "*n"] = EVERY) -> "StoredScans":
+        """The same scans, in shared memory.
 
-    def some(self, kept: Bool[np.ndarray, " n"]) -> "StoredScans":
-        """The same scans. Only those with a flag are nearest ones of a descriptor. They are shared."""
-        found = copy.copy(self)
-        found._kept = kept
-        return found
-
-    def nearest(
-        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
-    ) -> Int[np.ndarray, " j"]:
-        """See `Keyframes`."""
-        return super().nearest(descriptor, k, among if self._kept is None else among & self._kept)
+        Frame numbers begin at `first_frame`. With `searchable`, `nearest` returns only scans that it flags.
+        """
+        scans = copy.copy(self)
+        scans._first_frame, scans.searchable = first_frame, searchable
+        return scans
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of descriptors and compressed images, without the kept spectra (`SPECTRA`)."""
-        return self.index.nbytes + self._frames.nbytes + self._repeated.nbytes + sum(map(len, self._packed))
+        """Number of bytes of descriptors and compressed images, without the spectra (`SPECTRA`)."""
+        arrays = self.index.nbytes + self._frames.nbytes + self._superseded.nbytes
+        return arrays + sum(map(len, self._compressed))
 
     def is_new_place(self, frame: int, motion: BevOdometry) -> bool:
         """Whether a frame is far enough from the last stored scan, or its motion from there is unknown."""
         if not self.keyframe_m or not len(self):
             return True
         last = self.frames[-1:]
-        moved, rotation = motion.moved(int(last[0]), motion.poses[frame])
-        near = moved < self.keyframe_m and rotation < np.radians(KEYFRAME_DEG)
-        return not (near and motion.same(frame, last).all())
+        moved_m, rotation = motion.moved(int(last[0]), motion.poses[frame])
+        is_near = moved_m < self.keyframe_m and rotation < np.radians(KEYFRAME_DEG)
+        return not (is_near and motion.same(frame, last).all())
 
     def check(self, frame: int, image: UInt8[np.ndarray, "m m"]) -> None:
         """Raises ValueError if an image has another shape than the stored ones."""
@@ -171,43 +169,39 @@ class StoredScans(Keyframes):
             self.forget(max(self.max_places // PARTS, 1))
         self.index.add(descriptor, ids=f"{frame:06d}")
         self._frames.append(frame)
-        self._repeated.append(False)
-        self._packed.append(zlib.compress(image.tobytes(), LEVEL))
+        self._superseded.append(False)
+        self._compressed.append(zlib.compress(image.tobytes(), LEVEL))
         self._shape = image.shape
 
     def close_loop(self, query: int, match: int) -> None:
         """Note a loop between two frames. If both are stored, the query represents the place from now on."""
-        if query in self and match in self:
-            self._repeated.rows[np.searchsorted(self.frames, match)] = True
+        if query in self.frames and match in self.frames:
+            self._superseded.rows[np.searchsorted(self.frames, match)] = True
 
     def forget(self, count: int) -> None:
-        """Remove some scans: first those that have a loop to a newer stored scan, then the oldest."""
-        kept = np.ones(len(self), bool)
-        kept[np.argsort(~self._repeated.rows, kind="stable")[:count]] = False
-        self.index.keep(kept)
-        self._frames.keep(kept)
-        self._repeated.keep(kept)
-        self._packed = [packed for packed, one in zip(self._packed, kept, strict=True) if one]
-
-    def __contains__(self, frame: int) -> bool:
-        row = np.searchsorted(self.frames, frame)
-        return bool(row < len(self) and self.frames[row] == frame)
+        """Remove this many scans: first those that have a loop to a newer stored scan, then the oldest."""
+        remains = np.ones(len(self), bool)
+        remains[np.argsort(~self._superseded.rows, kind="stable")[:count]] = False
+        self.index.keep(remains)
+        self._frames.keep(remains)
+        self._superseded.keep(remains)
+        self._compressed = [self._compressed[row] for row in np.flatnonzero(remains)]
 
     def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
         """See `Keyframes`."""
-        return np.frombuffer(zlib.decompress(self._packed[row]), np.uint8).reshape(self._shape)
+        return np.frombuffer(zlib.decompress(self._compressed[row]), np.uint8).reshape(self._shape)
 
     def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        """See `Keyframes`. The last ones are kept."""
-        found = []
+        """See `Keyframes`. The last used ones stay in memory."""
+        spectra = []
         for row, frame in zip(rows.tolist(), self._frames.rows[rows].tolist(), strict=True):
             if frame not in self._spectra:
                 self._spectra[frame] = image_spectrum(self.image(row), self.verification)
             self._spectra.move_to_end(frame)
-            found.append(self._spectra[frame])
+            spectra.append(self._spectra[frame])
         while len(self._spectra) > SPECTRA:
             self._spectra.popitem(last=False)
-        return found
+        return spectra
 
 
 def image_spectrum(image: UInt8[np.ndarray, "m m"], config: VerificationConfig) -> Complex64[np.ndarray, "s f"]:

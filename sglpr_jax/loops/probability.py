@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
+from scipy.special import expit
 
 DEFAULT = Path(__file__).with_name("probability.json")
 """File of the model fitted in the simulator. See docs/decisions.md."""
@@ -35,7 +36,7 @@ RIDGE = 0.02
 
 
 class Evidence(NamedTuple):
-    """Evidence for pairs of scans, one number of each kind for each pair (`KeyframeComparison`)."""
+    """Evidence that pairs of scans show one place, one number of each kind for each pair (`KeyframeComparison`)."""
 
     ambiguity_ratio: Float[np.ndarray, "*n"]
     """Correlation with the best other place, or at the best other pose, divided by the correlation with the match."""
@@ -47,9 +48,8 @@ class Evidence(NamedTuple):
     """Logarithm of all poses over those that the motion allows. It is negative if the motion is unknown."""
 
     @classmethod
-    def of(cls, ambiguity_ratio: Any, along_m: Any, deviation: Any, surprise: Any) -> "Evidence":
-        """Create the evidence of one pair."""
-        values = (ambiguity_ratio, along_m, deviation, surprise)
+    def of(cls, *values: Any) -> "Evidence":
+        """Create the evidence of one pair, from numbers in the order of the fields."""
         return cls(*(np.asarray(value, np.float64) for value in values))
 
     @classmethod
@@ -60,7 +60,7 @@ class Evidence(NamedTuple):
 
 ALL = Evidence._fields
 TESTED = ("alone", "support", "surprise")
-"""Log odds of a pair alone, what its neighbours say (the sum of their strengths, weighted and signed), and surprise."""
+"""Arguments of the model with neighbours: log odds of a pair alone, support by its neighbours, and surprise."""
 
 
 class Curve(NamedTuple):
@@ -68,10 +68,6 @@ class Curve(NamedTuple):
 
     knots: tuple[float, ...]
     values: tuple[float, ...]
-
-    def __call__(self, numbers: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Evaluate the function."""
-        return np.asarray(np.interp(numbers, self.knots, self.values))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,16 +79,9 @@ class AdditiveModel:
     bias: float
 
     def __call__(self, values: Mapping[str, Float[np.ndarray, "*n"]]) -> Float[np.ndarray, "*n"]:
-        """Log odds of pairs with these values of the arguments."""
-        return np.asarray(self.bias + sum(curve(np.asarray(values[name])) for name, curve in self.curves.items()))
-
-    def scaled(self, gain: float, shift: float) -> "AdditiveModel":
-        """Model whose log odds are `gain` times those of this one, plus `shift`."""
-        curves = {
-            name: Curve(curve.knots, tuple(gain * value for value in curve.values))
-            for name, curve in self.curves.items()
-        }
-        return AdditiveModel(curves, gain * self.bias + shift)
+        """Log odds of pairs, from the value of each argument at each pair."""
+        terms = (np.interp(values[name], curve.knots, curve.values) for name, curve in self.curves.items())
+        return np.asarray(self.bias + sum(terms))
 
     def to_json(self) -> dict[str, Any]:
         """Convert to a JSON value for `from_json`."""
@@ -100,24 +89,25 @@ class AdditiveModel:
 
     @classmethod
     def from_json(cls, value: Any, names: Sequence[str]) -> "AdditiveModel":
-        """Build a model of some of these arguments from the output of `to_json`. Raises ValueError if it is invalid."""
+        """Build a model of arguments with these names from the output of `to_json`. Raises ValueError if invalid."""
         try:
-            curves = {name: Curve(tuple(one["knots"]), tuple(one["values"])) for name, one in value["curves"].items()}
-            found = cls(curves, value["bias"])
-            numbers = [found.bias, *(number for one in curves.values() for number in (*one.knots, *one.values))]
-            fits = set(curves) <= set(names) and all(math.isfinite(number) for number in numbers)
-            fits = fits and all(len(one.knots) == len(one.values) > 0 for one in curves.values())
-            fits = fits and all((np.diff(one.knots) > 0).all() for one in curves.values())
+            curves = {
+                name: Curve(tuple(curve["knots"]), tuple(curve["values"])) for name, curve in value["curves"].items()
+            }
+            is_valid = set(curves) <= set(names) and math.isfinite(value["bias"])
+            for knots, values in curves.values():
+                is_valid &= len(knots) == len(values) > 0 and all(map(math.isfinite, (*knots, *values)))
+                is_valid &= bool((np.diff(knots) > 0).all())
         except (TypeError, KeyError, AttributeError, OverflowError):
-            fits = False
-        if not fits:
+            is_valid = False
+        if not is_valid:
             raise ValueError(f"expected curves of {', '.join(names)} and a bias, found others")
-        return found
+        return cls(curves, value["bias"])
 
 
-_SAME = Curve((-50.0, 50.0), (-50.0, 50.0))
-ADDED = AdditiveModel({"alone": _SAME, "support": _SAME}, 0.0)
-"""Log odds alone plus the support of the neighbours, as they are."""
+_IDENTITY = Curve((-50.0, 50.0), (-50.0, 50.0))
+ADDED = AdditiveModel({"alone": _IDENTITY, "support": _IDENTITY}, 0.0)
+"""Model with neighbours that adds their support to the log odds of a pair alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,23 +123,25 @@ class LoopModel:
 
     def probability(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """Probability that each pair alone is a loop."""
-        return np.asarray(1 / (1 + np.exp(-np.clip(self.log_odds(evidence), -50, 50))))
+        return np.asarray(expit(self.log_odds(evidence)))
 
     def log_odds(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """Log odds of each pair alone: the logarithm of probability / (1 - probability)."""
         return self.alone(evidence._asdict())
 
     def tested_log_odds(self, evidence: Evidence, support: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Log odds of each pair, given the support of its neighbours."""
+        """Log odds of each pair, given the support by its neighbours."""
         return self.tested({"alone": self.log_odds(evidence), "support": support, "surprise": evidence.surprise})
 
     def strength(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """How much a pair says about its neighbours: its log odds by the images, from 0 to `MAX_STRENGTH`.
+        """Strength with which a pair supports its neighbours: log odds by the images alone, from 0 to `MAX_STRENGTH`.
 
         The motion between the two passes is common to neighbours, so it does not count again.
         """
-        nothing = {"deviation": np.zeros_like(evidence.deviation), "surprise": np.zeros_like(evidence.surprise)}
-        return np.clip(self.log_odds(evidence._replace(**nothing)), 0.0, MAX_STRENGTH)
+        without_motion = evidence._replace(
+            deviation=np.zeros_like(evidence.deviation), surprise=np.zeros_like(evidence.surprise)
+        )
+        return np.clip(self.log_odds(without_motion), 0.0, MAX_STRENGTH)
 
     def to_json(self) -> dict[str, Any]:
         """Convert to a JSON value for `from_json`."""
@@ -175,8 +167,8 @@ def fit(
 ) -> AdditiveModel:
     """Fit a monotone model to labelled pairs by maximum likelihood, by default with equal weights.
 
-    `values` has an argument of the model, with a name of `KNOTS`, at each pair. Raises ValueError if all pairs are
-    loops, or no pair is.
+    `values` has the value of each argument (a name of `KNOTS`) at each pair. Raises ValueError if all pairs are loops,
+    or no pair is.
     """
     if is_loop.all() or not is_loop.any():
         raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
@@ -191,19 +183,19 @@ def fit(
 
     def cost(steps: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
         margin = sign * (columns @ steps)
-        slope = -weights * sign / (1 + np.exp(np.clip(margin, -50, 50)))
         penalty = RIDGE * np.append(steps[:-1], 0.0)
-        return float(weights @ np.logaddexp(0, -margin) + penalty @ steps / 2), columns.T @ slope + penalty
+        gradient = columns.T @ (-weights * sign * expit(-margin)) + penalty
+        return float(weights @ np.logaddexp(0, -margin) + penalty @ steps / 2), gradient
 
     bounds = [(0.0, None)] * (columns.shape[1] - 1) + [(None, None)]
     steps = minimize(cost, np.zeros(columns.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x
-    curves, used = {}, 0
+    curves, first = {}, 0
     for name in values:
         count = len(KNOTS[name]) - 1
-        rise = np.concatenate([[0.0], np.cumsum(steps[used : used + count])])
+        rise = np.concatenate([[0.0], np.cumsum(steps[first : first + count])])
         heights = rise if name in RISING else (rise[-1] - rise)
         curves[name] = Curve(KNOTS[name], tuple(np.round(heights, 4).tolist()))
-        used += count
+        first += count
     return AdditiveModel(curves, float(steps[-1]))
 
 
@@ -215,13 +207,18 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
         return float(np.logaddexp(0, -sign * (line[0] * log_odds + line[1])).sum() + (line[0] - 1) ** 2)
 
     gain, shift = minimize(cost, np.array([1.0, 0.0]), method="L-BFGS-B", bounds=[(0.0, None), (None, None)]).x
-    return LoopModel(model.alone.scaled(float(gain), float(shift)), made_with, model.tested)
+    curves = {
+        name: Curve(curve.knots, tuple(float(gain) * value for value in curve.values))
+        for name, curve in model.alone.curves.items()
+    }
+    alone = AdditiveModel(curves, float(gain) * model.alone.bias + float(shift))
+    return LoopModel(alone, made_with, model.tested)
 
 
 def default_model(path: Path = DEFAULT) -> LoopModel:
     """Read the shipped model, or that of another file. Raises FileNotFoundError, or ValueError if it is invalid."""
     try:
-        found = json.loads(path.read_text())
+        value = json.loads(path.read_text())
     except ValueError as error:
         raise ValueError(f"{path}: expected JSON ({error})") from error
-    return LoopModel.from_json(found, source=str(path))
+    return LoopModel.from_json(value, source=str(path))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, counted
+from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, convert_rejected, count_reasons
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.frame_alignment import SegmentAlignment
@@ -62,12 +62,12 @@ class LoopSearchResult:
     @property
     def whole(self) -> bool:
         """Whether the search was completed."""
-        ended = (one.frames == len(one.recording) and not one.unregistered for one in self.sessions)
+        ended = (session.frames == len(session.recording) and not session.unregistered for session in self.sessions)
         return not self.stopped and all(ended)
 
     def split(self, poses: Float[np.ndarray, "n 4 4"]) -> list[Float[np.ndarray, "_ 4 4"]]:
         """Divide the poses of all searched frames by session."""
-        return np.split(poses, np.cumsum([one.frames for one in self.sessions])[:-1])
+        return np.split(poses, np.cumsum([session.frames for session in self.sessions])[:-1])
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
@@ -79,43 +79,49 @@ class LoopSearchResult:
         ends = match, query
         return dataclasses.replace(
             self,
-            loops=tuple(one for one in self.loops if _ends(one) == ends),
-            rejected=tuple(one for one in self.rejected if _ends(one.loop) == ends),
-            transforms=tuple(one for one in self.transforms if (one.match.session, one.query.session) == ends),
+            loops=tuple(loop for loop in self.loops if _sessions(loop) == ends),
+            rejected=tuple(closure for closure in self.rejected if _sessions(closure.loop) == ends),
+            transforms=tuple(
+                transform for transform in self.transforms if (transform.match.session, transform.query.session) == ends
+            ),
         )
 
     def within(self, session: int) -> "LoopSearchResult":
         """The results of one session, as if it had been searched alone."""
-        found, alone = self.between(session, session), {"match_session": 0, "query_session": 0}
-        loops = (dataclasses.replace(loop, **alone) for loop in found.loops)
-        others = (dataclasses.replace(one, loop=dataclasses.replace(one.loop, **alone)) for one in found.rejected)
+
+        def alone(loop: LoopClosure) -> LoopClosure:
+            return dataclasses.replace(loop, match_session=0, query_session=0)
+
+        result = self.between(session, session)
         return dataclasses.replace(
-            found, sessions=(self.sessions[session],), loops=tuple(loops), rejected=tuple(others)
+            result,
+            sessions=(self.sessions[session],),
+            loops=tuple(map(alone, result.loops)),
+            rejected=tuple(convert_rejected(result.rejected, alone)),
         )
 
     def without_degenerate(self) -> "LoopSearchResult":
-        """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction
-        (`is_degenerate`). Transforms stay, because their weights contain this uncertainty.
-        """
-        kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
-        others = [RejectedClosure(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
-        return dataclasses.replace(self, loops=kept, rejected=tuple(ordered_rejections([*self.rejected, *others])))
+        """Reject the degenerate loops (`LoopClosure.is_degenerate`). Transforms stay, because they weigh the loops."""
+        loops = tuple(loop for loop in self.loops if not loop.is_degenerate)
+        degenerate = [RejectedClosure(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
+        rejected = ordered_rejections([*self.rejected, *degenerate])
+        return dataclasses.replace(self, loops=loops, rejected=tuple(rejected))
 
     def __str__(self) -> str:
-        within = (self.within(number)._session_in_words() for number in range(len(self.sessions)))
-        return "\n".join([*within, *(self.between(*pair)._pair_in_words(*pair) for pair in self.pairs)])
+        sessions = (self.within(number)._describe_session() for number in range(len(self.sessions)))
+        return "\n".join([*sessions, *(self.between(*pair)._describe_pair(*pair) for pair in self.pairs)])
 
-    def _session_in_words(self) -> str:
-        one = self.sessions[0]
+    def _describe_session(self) -> str:
+        session = self.sessions[0]
         degenerate = sum(loop.is_degenerate for loop in self.loops)
         loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
-        found = f"{loops} in {one.frames} of {len(one.recording)} frames of {one.recording.name}"
-        skipped = f", {len(one.skipped)} scans skipped" if one.skipped else ""
-        left = f", {one.unregistered} not registered" if one.unregistered else ""
+        text = f"{loops} in {session.frames} of {len(session.recording)} frames of {session.recording.name}"
+        skipped = f", {len(session.skipped)} scans skipped" if session.skipped else ""
+        unregistered = f", {session.unregistered} not registered" if session.unregistered else ""
         scale = f", scale {self.scale}" if self.scale != 1 else ""
-        return f"{found}, {len(self.rejected)} rejected{self._reasons()}{left}{skipped}{scale}"
+        return f"{text}, {len(self.rejected)} rejected{self._reasons()}{unregistered}{skipped}{scale}"
 
-    def _pair_in_words(self, match: int, query: int) -> str:
+    def _describe_pair(self, match: int, query: int) -> str:
         names = f"{self.sessions[match].recording.name} and {self.sessions[query].recording.name}"
         if not self.transforms:
             return f"{names}: no common place found{self._reasons()}"
@@ -123,11 +129,11 @@ class LoopSearchResult:
         return f"{names}: {len(self.loops)} loops, {len(self.rejected)} rejected{self._reasons()}; {transforms}"
 
     def _reasons(self) -> str:
-        counts = (f"{reason}: {count}" for reason, count in counted(self.rejected).items())
+        counts = (f"{reason}: {count}" for reason, count in count_reasons(self.rejected).items())
         return f" ({', '.join(counts)})" if self.rejected else ""
 
 
-def _ends(loop: LoopClosure) -> tuple[int, int]:
+def _sessions(loop: LoopClosure) -> tuple[int, int]:
     """Sessions of match and query."""
     return loop.match_session, loop.query_session
 
@@ -135,21 +141,21 @@ def _ends(loop: LoopClosure) -> tuple[int, int]:
 def ordered_rejections(rejected: Iterable[RejectedClosure]) -> list[RejectedClosure]:
     """Pairs within the sessions, then those between them, in the order of their frames."""
 
-    def order(one: RejectedClosure) -> tuple[bool, tuple[int, int], int, int]:
-        match, query = _ends(one.loop)
-        return match != query, (match, query), one.loop.query, one.loop.match
+    def order(closure: RejectedClosure) -> tuple[bool, tuple[int, int], int, int]:
+        match, query = _sessions(closure.loop)
+        return match != query, (match, query), closure.loop.query, closure.loop.match
 
     return sorted(rejected, key=order)
 
 
-def diagnose_no_loops(found: LoopSearchResult) -> list[str]:
+def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
     """Reasons why sessions have no loops of their own, one sentence each. With several, names begin the sentences."""
-    if len(found.sessions) != 1:
-        each = ((one.recording.name, diagnose_no_loops(found.within(k))) for k, one in enumerate(found.sessions))
-        return [f"{name}: {line}" for name, lines in each for line in lines]
-    if found.loops:
+    if len(result.sessions) != 1:
+        names = [session.recording.name for session in result.sessions]
+        return [f"{name}: {line}" for k, name in enumerate(names) for line in diagnose_no_loops(result.within(k))]
+    if result.loops:
         return []
-    session = found.sessions[0]
+    session = result.sessions[0]
     if not session.frames:
         return ["The search was stopped before the first scan."]
     reasons, scans = [], len(session.recording)
@@ -162,12 +168,12 @@ def diagnose_no_loops(found: LoopSearchResult) -> list[str]:
         )
     if 2 * len(session.skipped) > session.frames:
         reasons.append(f"{len(session.skipped)} of {session.frames} scans cannot be read.")
-    if found.rejected:
-        reason, count = next(iter(counted(found.rejected).items()))
-        return [*reasons, f"{len(found.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]
+    if result.rejected:
+        reason, count = next(iter(count_reasons(result.rejected).items()))
+        return [*reasons, f"{len(result.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]
     source = "images" if session.odometry is None else "odometry"
     return [
         *reasons,
         f"No pair was compared: according to the {source}, no scan came back to a place after at least "
-        f"{found.config.candidates.recent_m:g} m of travelled distance.",
+        f"{result.config.candidates.recent_m:g} m of travelled distance.",
     ]

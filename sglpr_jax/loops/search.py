@@ -1,7 +1,7 @@
 """Search for the loops within and between sessions: a detector over the scans of each one, then joint acceptance.
 
 Loops between two sessions: each stored scan of the later one is compared with the stored scans of the earlier one.
-Comparison, probability and sequential test are the same as within a session. Scans of both show other places.
+Comparison, probability and sequential test are the same as within a session. Scans of both sessions are distractors.
 """
 
 import dataclasses
@@ -21,48 +21,41 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.acceptance import AXES, accepted, check_odometry, registered_loops
-from sglpr_jax.loops.arguments import check_is, given_poses
+from sglpr_jax.loops.acceptance import AXES, accept_loops, check_odometry, register_loops
+from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, in_metres, scaled_drift, to_lidar, to_upright
+from sglpr_jax.loops.closure import (
+    LoopClosure,
+    RejectedClosure,
+    convert_rejected,
+    in_metres,
+    to_lidar,
+)
 from sglpr_jax.loops.comparison import Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.consistency import accepted_between
+from sglpr_jax.loops.consistency import accept_between
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, aligned_frames
+from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, align_frames
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.result import LoopSearchResult, Session, ordered_rejections
-from sglpr_jax.loops.sequence import pair_of, probable_loops, verdict
+from sglpr_jax.loops.sequence import pair_of, probable_loops, rejection_reason
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.registration.gicp import check_installed, is_installed
 from sglpr_jax.se3 import inverse
 
 
-class Input(NamedTuple):
-    """Input of a search: a recording, the pose of the LiDAR at each of its scans, and the settings."""
+class SearchedSession(NamedTuple):
+    """A session after the search within it. Lengths are multiplied by the scale of the search."""
 
     recording: Recording
     odometry: Float[np.ndarray, "n 4 4"] | None
-    config: DetectorConfig
-
-    def scaled(self, scale: Scale) -> "Input":
-        """The same input with all lengths multiplied by `scale`. Lengths of the images' settings stay as they are."""
-        odometry = None if self.odometry is None else scaled_poses(self.odometry, float(scale))
-        keyframe_m, drift = self.config.keyframe_m * scale, scaled_drift(self.config.drift, float(scale))
-        config = dataclasses.replace(self.config, keyframe_m=keyframe_m, drift=drift)
-        return Input(scaled(self.recording, scale), odometry, config)
-
-
-class Searched(NamedTuple):
-    """A session after the search within it. Lengths are multiplied by the scale of the search."""
-
-    given: Input
-    """The drift is that of the odometry, estimated from the drive. None without usable odometry."""
+    """Pose of the LiDAR at each scan. None without usable odometry."""
+    drift: DriftModel
+    """Drift of the odometry, estimated from the drive."""
     detector: LoopDetector
     loops: list[LoopClosure]
     rejected: list[RejectedClosure]
@@ -118,52 +111,57 @@ def find_loops(
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
-    several = isinstance(recordings, list | tuple)
-    some: Any = recordings if several else [recordings]
-    poses: Any = odometry if several else [odometry]
-    poses = [None] * len(some) if poses is None else list(poses)
-    if not some or len(poses) != len(some):
-        raise ValueError(f"expected recordings with odometry of each, found {len(some)} with odometry of {len(poses)}")
-    for one in some:
-        check_is(one, Recording, by="open_recording")
-    registered = all(map(can_register, some)) if registered is None else registered
-    given = [_checked(*pair, config, registered=registered) for pair in zip(some, poses, strict=True)]
-    options = {"registered": registered, "should_stop": should_stop}
-    steps, searches = 0, list[Searched]()
-    loops, rejected, transforms = [], [], []
-    for number, one in enumerate(given):
-        folder = None if kept_in is None else Path(kept_in) / f"{number}" if len(given) > 1 else Path(kept_in)
-        large = one.scaled(scale)
-        found = _search_session(
-            large,
-            LoopDetector(params, model=model, config=large.config),
+    is_list = isinstance(recordings, list | tuple)
+    all_recordings: Any = recordings if is_list else [recordings]
+    all_odometry: Any = odometry if is_list else [odometry]
+    all_odometry = [None] * len(all_recordings) if all_odometry is None else list(all_odometry)
+    if not all_recordings or len(all_odometry) != len(all_recordings):
+        counts = f"{len(all_recordings)} with odometry of {len(all_odometry)}"
+        raise ValueError(f"expected recordings with odometry of each, found {counts}")
+    for recording in all_recordings:
+        check_is(recording, Recording, by="open_recording")
+    registered = all(map(can_register, all_recordings)) if registered is None else registered
+    inputs = [_check_input(*pair, registered=registered) for pair in zip(all_recordings, all_odometry, strict=True)]
+    steps, searched = 0, list[SearchedSession]()
+    loops, rejected, transforms = list[LoopClosure](), list[RejectedClosure](), list[SegmentAlignment]()
+
+    def report(done: int) -> None:
+        on_progress(steps + done)
+
+    options = {"registered": registered, "should_stop": should_stop, "on_progress": report}
+    for number, (recording, poses) in enumerate(inputs):
+        session = _search_session(
+            scaled(recording, scale),
+            None if poses is None else scaled_poses(poses, float(scale)),
+            LoopDetector(params, model=model, config=config.at_scale(float(scale))),
             scale=scale,
             on_bad_scan=on_bad_scan,
-            kept_in=folder,
-            on_progress=lambda done, before=steps: on_progress(before + done),
+            kept_in=None if kept_in is None else Path(kept_in) / (f"{number}" if len(inputs) > 1 else ""),
             **options,
         )
-        searches.append(found)
-        own = {"match_session": number, "query_session": number}
-        loops += [dataclasses.replace(loop, **own) for loop in found.loops]
-        rejected += [RejectedClosure(dataclasses.replace(other.loop, **own), other.reason) for other in found.rejected]
-        steps += len(one.recording)
-    for match, query in itertools.combinations(range(len(given)), 2):
-        pair = _search_pair(
-            match, query, searches, on_progress=lambda done, before=steps: on_progress(before + done), **options
-        )
-        for all_found, new in zip((loops, rejected, transforms), pair, strict=True):
-            all_found += new
-        steps += len(given[query].recording)
+        searched.append(session)
+
+        def in_session(loop: LoopClosure, number: int = number) -> LoopClosure:
+            return dataclasses.replace(loop, match_session=number, query_session=number)
+
+        loops += map(in_session, session.loops)
+        rejected += convert_rejected(session.rejected, in_session)
+        steps += len(recording)
+    for match, query in itertools.combinations(range(len(inputs)), 2):
+        pair_loops, pair_rejected, pair_transforms = _search_pair(match, query, searched, **options)
+        loops += pair_loops
+        rejected += pair_rejected
+        transforms += pair_transforms
+        steps += len(searched[query].recording)
     return LoopSearchResult(
-        tuple(_session(one, found, scale, registered) for one, found in zip(given, searches, strict=True)),
+        tuple(_result_of(*given, session, scale, registered) for given, session in zip(inputs, searched, strict=True)),
         tuple(in_metres(loop, scale) for loop in loops),
-        tuple(RejectedClosure(in_metres(one.loop, scale), one.reason) for one in rejected),
-        tuple(one.in_metres(scale) for one in transforms),
-        model=searches[0].detector.model,
+        tuple(convert_rejected(rejected, lambda loop: in_metres(loop, scale))),
+        tuple(transform.in_metres(scale) for transform in transforms),
+        model=searched[0].detector.model,
         config=config,
         scale=scale,
-        stopped=len(given) > 1 and should_stop(),
+        stopped=len(inputs) > 1 and should_stop(),
     )
 
 
@@ -172,9 +170,11 @@ def can_register(recording: Recording) -> bool:
     return not recording.has_images and is_installed()
 
 
-def _checked(recording: Recording, odometry: ArrayLike | None, config: DetectorConfig, *, registered: bool) -> Input:
-    """Check recording and odometry before any work. Returns the odometry as an array, and gravity of scans by it."""
-    poses = None if odometry is None else given_poses(odometry, of="odometry")
+def _check_input(
+    recording: Recording, odometry: ArrayLike | None, *, registered: bool
+) -> tuple[Recording, Float[np.ndarray, "n 4 4"] | None]:
+    """Check recording and odometry before any work. The odometry levels the scans of a sensor that tilts."""
+    poses = None if odometry is None else as_poses(odometry, of="odometry")
     if poses is not None and len(poses) != len(recording):
         raise ValueError(
             f"expected odometry of {len(recording)} poses, one for each scan of {recording.name}, found {len(poses)}"
@@ -185,26 +185,33 @@ def _checked(recording: Recording, odometry: ArrayLike | None, config: DetectorC
         check_installed()
     if poses is not None:
         recording = with_odometry(recording, poses)
-    return Input(recording, poses, config)
+    return recording, poses
 
 
-def _session(given: Input, found: Searched, scale: Scale, registered: bool) -> Session:
-    """The searched recording, in metres."""
-    finder = found.detector.finder
+def _result_of(
+    recording: Recording,
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    searched: SearchedSession,
+    scale: Scale,
+    registered: bool,
+) -> Session:
+    """Result of a session, from the recording and odometry in metres and the search at a scale."""
+    finder = searched.detector.finder
     return Session(
-        given.recording,
+        recording,
         len(finder),
-        odometry=None if found.given.odometry is None else given.odometry,
-        drift=scaled_drift(found.given.config.drift, 1 / scale),
-        skipped=tuple(given.recording.ids[row] for row in finder.missing),
+        odometry=None if searched.odometry is None else odometry,
+        drift=searched.drift.at_scale(1 / scale),
+        skipped=tuple(recording.ids[row] for row in finder.missing),
         empty=int(finder.empty.sum()) - len(finder.missing),
-        unregistered=sum(loop.overlap is None for loop in found.loops) if registered else 0,
-        candidates=tuple(found.detector.candidates),
+        unregistered=sum(loop.overlap is None for loop in searched.loops) if registered else 0,
+        candidates=tuple(searched.detector.candidates),
     )
 
 
 def _search_session(
-    given: Input,
+    recording: Recording,
+    odometry: Float[np.ndarray, "n 4 4"] | None,
     detector: LoopDetector,
     *,
     registered: bool,
@@ -213,17 +220,16 @@ def _search_session(
     kept_in: Path | None,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
-) -> Searched:
+) -> SearchedSession:
     """Search one session with a detector without frames. The input is already checked and scaled."""
-    (recording, odometry, config), finder = given, detector.finder
+    config, finder = detector.config, detector.finder
     stream = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
 
-    def add(keyframe: Keyframe | None, compared: Fits | None) -> None:
+    def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
         row = len(detector)
         time = None if recording.times is None else float(recording.times[row])
-        detector.add_keyframe(
-            keyframe, time=time, odometry=None if odometry is None else odometry[row], compared=compared
-        )
+        pose = None if odometry is None else odometry[row]
+        detector.add_keyframe(keyframe, time=time, odometry=pose, fits=fits)
 
     # With a limit of places, the loops decide which scans are stored, and so does all that decides about loops.
     decisive = None if config.max_places is None else repr((config, detector.model)).encode()
@@ -250,73 +256,67 @@ def _search_session(
         )
         again = LoopDetector(finder.params, model=detector.model, config=config)
         options = {"registered": registered, "scale": scale, "kept_in": None, **stream}
-        return _search_session(given._replace(odometry=None), again, **options)
-    loops, rejected, path = detector.loops, list[RejectedClosure](), finder.motion.path
+        return _search_session(recording, None, again, **options)
+    loops, rejected = detector.loops, list[RejectedClosure]()
+    drift, path = config.drift if odometry is None else finder.present_drift, finder.motion.path
     if odometry is not None:
-        config = dataclasses.replace(config, drift=finder.present_drift)
-        kept, others = accepted([_moved(to_upright, loop, finder) for loop in loops], path, drift=config.drift)
-        loops = [_moved(to_lidar, loop, finder) for loop in kept]
-        rejected = [RejectedClosure(_moved(to_lidar, one.loop, finder), one.reason) for one in others]
+        upright, contradicting = accept_loops(list(map(finder.to_upright, loops)), path, drift=drift)
+        loops, rejected = list(map(finder.to_lidar, upright)), convert_rejected(contradicting, finder.to_lidar)
     if registered:
         options = {"knows_height": finder.knows_height, "should_stop": should_stop}
-        loops, others = registered_loops(recording, recording, loops, **options)
-        rejected += others
+        loops, without_overlap = register_loops(recording, recording, loops, **options)
+        rejected += without_overlap
     rejected = ordered_rejections([*rejected, *detector.rejected, *detector.undecided()])
     if odometry is not None:
-        against = [_moved(to_upright, one.loop, finder) for one in rejected if one.reason == "contradicts the odometry"]
-        check_odometry(recording.name, loops, against, path, config, scale)
-    return Searched(given._replace(config=config), detector, loops, rejected)
-
-
-def _moved(to_frames: Callable[..., LoopClosure], loop: LoopClosure, finder: CandidateSearch) -> LoopClosure:
-    """A loop within a session between the gravity-aligned frames (`to_upright`) or the LiDAR frames (`to_lidar`)."""
-    return to_frames(loop, query=finder.mountings[loop.query], match=finder.mountings[loop.match])
+        against = [finder.to_upright(each.loop) for each in rejected if each.reason == "contradicts the odometry"]
+        check_odometry(recording.name, loops, against, path, drift, scale)
+    return SearchedSession(recording, odometry, drift, detector, loops, rejected)
 
 
 def _search_pair(
     match: int,
     query: int,
-    searches: Sequence[Searched],
+    searched: Sequence[SearchedSession],
     *,
     registered: bool,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
 ) -> tuple[list[LoopClosure], list[RejectedClosure], list[SegmentAlignment]]:
-    """Loops, rejected pairs and transforms between two sessions, numbers `match` and `query` of the searched ones."""
-    both = searches[match], searches[query]
-    finders = both[0].detector.finder, both[1].detector.finder
+    """Loops, rejected pairs and transforms between two of the searched sessions, given by their numbers."""
+    sessions = searched[match], searched[query]
+    finders = sessions[0].detector.finder, sessions[1].detector.finder
     motion = BevOdometry.joined([finder.motion for finder in finders])
     mountings = [*finders[0].mountings, *finders[1].mountings]
     knows_height = all(finder.knows_height for finder in finders)
-    model, config, drift = both[0].detector.model, both[0].given.config, finders[1].present_drift
+    model, config, drift = sessions[0].detector.model, sessions[0].detector.config, finders[1].present_drift
     candidates = _candidates_between(*finders, motion, should_stop=should_stop, on_progress=on_progress)
-    pairs = [pair_of(one, model, motion, mountings, knows_height=knows_height) for one in candidates]
+    pairs = [pair_of(candidate, model, motion, mountings, knows_height=knows_height) for candidate in candidates]
     probable = probable_loops(pairs, model, motion.path, drift=drift, config=config)
     improbable = [
-        RejectedClosure(pair.loop, verdict(pair, model, config.min_probability))
+        RejectedClosure(pair.loop, rejection_reason(pair, model, config.min_probability))
         for pair, loop in zip(pairs, probable, strict=True)
         if loop is None
     ]
     likely = [loop for loop in probable if loop is not None]
-    sets, contradicting = accepted_between(likely, motion, drift=drift)
-    offset, ends = len(finders[0]), {"match_session": match, "query_session": query}
+    consistent_sets, contradicting = accept_between(likely, motion, drift=drift)
 
-    def of_sessions(loop: LoopClosure) -> LoopClosure:
+    def between_sessions(loop: LoopClosure) -> LoopClosure:
+        """Convert a loop between gravity-aligned frames of the joined motion."""
         loop = to_lidar(loop, query=mountings[loop.query], match=mountings[loop.match])
-        return dataclasses.replace(loop, query=loop.query - offset, **ends)
+        return dataclasses.replace(loop, query=loop.query - len(finders[0]), match_session=match, query_session=query)
 
-    rejected = [RejectedClosure(of_sessions(one.loop), one.reason) for one in [*improbable, *contradicting]]
-    loops, transforms = [], []
-    for some in sets:
-        some = list(map(of_sessions, some))
+    rejected = convert_rejected([*improbable, *contradicting], between_sessions)
+    loops, transforms = list[LoopClosure](), list[SegmentAlignment]()
+    for consistent in consistent_sets:
+        accepted = list(map(between_sessions, consistent))
         if registered:
-            recordings = both[1].given.recording, both[0].given.recording
+            recordings = sessions[1].recording, sessions[0].recording
             options = {"knows_height": knows_height, "should_stop": should_stop}
-            some, little = registered_loops(*recordings, some, **options)
-            rejected += little
-        if some:
-            transforms.append(_aligned(some, both, motion, drift))
-            loops += some
+            accepted, without_overlap = register_loops(*recordings, accepted, **options)
+            rejected += without_overlap
+        if accepted:
+            transforms.append(_align_segments(accepted, sessions, motion, drift))
+            loops += accepted
     return sorted(loops, key=lambda loop: (loop.query, loop.match)), ordered_rejections(rejected), transforms
 
 
@@ -332,43 +332,40 @@ def _candidates_between(
 
     Raises ValueError if the images of the two sessions have other sizes.
     """
-    found, offset = list[Candidate](), len(matches)
+    candidates, offset = list[Candidate](), len(matches)
     if not len(queries.stored) or not len(matches.stored):
-        return found
-    ours, theirs = (finder.stored.image(0).shape for finder in (queries, matches))
-    if ours != theirs:
-        raise ValueError(f"expected images of one size in both recordings, found {theirs} and {ours} cells")
-    joined = np.concatenate([matches.joined.rows, queries.joined.rows + offset])
-    comparer = KeyframeComparison(motion, queries.present_drift, matches.config, matches.verification, joined)
-    own = queries.stored.shifted(offset)
-    for row, frame in enumerate(own.frames.tolist()):
+        return candidates
+    query_shape, match_shape = (finder.stored.image(0).shape for finder in (queries, matches))
+    if query_shape != match_shape:
+        raise ValueError(f"expected images of one size in both recordings, found {match_shape} and {query_shape} cells")
+    loops = np.concatenate([matches.loops.rows, queries.loops.rows + offset])
+    comparer = KeyframeComparison(motion, queries.present_drift, matches.config, matches.verification, loops)
+    own_scans = queries.stored.view(first_frame=offset)
+    for row, frame in enumerate(own_scans.frames.tolist()):
         if should_stop():
             break
-        image = own.image(row)
-        spectra = query_spectra(image, config=matches.verification)
-        query = Query(frame, own.index.descriptors[row], image, spectra)
-        fits = comparer.compare(query, matches.stored, own)
-        found += comparer.candidates(query, fits, matches.stored, possible=fits.frames < offset)
+        query = Query(frame, own_scans.index.descriptors[row], own_scans.image(row), matches.verification)
+        fits = comparer.compare(query, matches.stored, own_scans)
+        candidates += comparer.candidates(query, fits, matches.stored, possible=fits.frames < offset)
         on_progress(row + 1)
-    return found
+    return candidates
 
 
-def _aligned(
-    loops: Sequence[LoopClosure], both: Sequence[Searched], motion: BevOdometry, drift: DriftModel
+def _align_segments(
+    loops: Sequence[LoopClosure], sessions: Sequence[SearchedSession], motion: BevOdometry, drift: DriftModel
 ) -> SegmentAlignment:
-    """Transform between the parts of two sessions to which some loops belong."""
-    first = loops[0]
-    ends = (first.match_session, first.match), (first.query_session, first.query)
-    parts, poses = [], []
-    for (session, frame), one in zip(ends, both, strict=True):
-        finder, odometry = one.detector.finder, one.given.odometry
+    """Transform between the two trajectory segments that loops connect. `motion` and `drift` are those of both."""
+    ends = (loops[0].match_session, loops[0].match), (loops[0].query_session, loops[0].query)
+    segments, poses = [], []
+    for (session, frame), searched in zip(ends, sessions, strict=True):
+        finder, odometry = searched.detector.finder, searched.odometry
         rows = np.flatnonzero(finder.motion.segments == finder.motion.segments[frame])
-        parts.append(TrajectorySegment(session, int(rows[0]), int(rows[-1]), odometry is not None))
+        segments.append(TrajectorySegment(session, int(rows[0]), int(rows[-1]), odometry is not None))
         if odometry is None:
-            keyframe = finder.motion.poses @ one.given.recording.uprights[: len(finder)]
-            poses.append(inverse(keyframe[rows[0]]) @ keyframe)
+            lidar_poses = finder.motion.poses @ searched.recording.uprights[: len(finder)]
+            poses.append(inverse(lidar_poses[rows[0]]) @ lidar_poses)
         else:
             poses.append(odometry[: len(finder)])
-    match_way, query_way = np.split(motion.travelled, [len(poses[0])])
-    found = aligned_frames(loops, *poses, match_way=match_way, query_way=query_way, drift=drift)
-    return SegmentAlignment(parts[0], parts[1], *found, len(loops))
+    match_m, query_m = np.split(motion.travelled, [len(poses[0])])
+    transform = align_frames(loops, *poses, match_travelled_m=match_m, query_travelled_m=query_m, drift=drift)
+    return SegmentAlignment(segments[0], segments[1], *transform, len(loops))

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.loops.closure import to_upright
-from sglpr_jax.loops.consistency import accepted_between
-from sglpr_jax.loops.frame_alignment import aligned_frames
+from sglpr_jax.loops.consistency import accept_between
+from sglpr_jax.loops.frame_alignment import align_frames
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
@@ -61,17 +61,17 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
         upright = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
         upright_loops.append(dataclasses.replace(upright, query=len(before) + loop.query))
     motion = BevOdometry.joined([BevOdometry.of(places.upright_poses()) for places in (before, new)])
-    groups, _ = accepted_between(upright_loops, motion, drift=DriftModel())
+    groups, _ = accept_between(upright_loops, motion, drift=DriftModel())
     if not groups:
         return None
     accepted = {loop.query - len(before) for loop in groups[0]}
     common = [loop for loop in loops if loop.query in accepted]
-    old_from_new, covariance = aligned_frames(
+    old_from_new, covariance = align_frames(
         common,
         before.world_from_place,
         new.world_from_place,
-        match_way=travelled(before.world_from_place),
-        query_way=travelled(new.world_from_place),
+        match_travelled_m=travelled(before.world_from_place),
+        query_travelled_m=travelled(new.world_from_place),
         drift=DriftModel(),
     )
     located = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])

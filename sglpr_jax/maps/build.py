@@ -14,7 +14,7 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
-from sglpr_jax.loops.arguments import check_is, given_poses
+from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.comparison import NO_FITS, Fits
@@ -65,7 +65,7 @@ def map_recording(
       TypeError: If an argument is not a recording, parameters or an array.
     """
     check_is(recording, Recording, by="open_recording")
-    poses = given_poses(poses, of="poses")
+    poses = as_poses(poses, of="poses")
     if len(poses) != len(recording) or not len(recording):
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
     recording = with_odometry(recording, poses)
@@ -87,9 +87,9 @@ def map_recording(
             frame_rows.append(done)
         done = len(poses)
 
-    def add(keyframe: Keyframe | None, compared: Fits | None) -> None:
+    def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
         keyframes.append(keyframe)
-        finder.add_keyframe(keyframe, compared=NO_FITS)
+        finder.add_keyframe(keyframe, fits=NO_FITS)
 
     add_scans(
         scaled(recording, scale),

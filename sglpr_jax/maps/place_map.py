@@ -19,7 +19,7 @@ from sglpr_jax.data.scaled import scaled_poses, scaled_scan
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, replacing
-from sglpr_jax.loops.arguments import given_poses, given_scan
+from sglpr_jax.loops.arguments import as_poses, as_scan
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import LoopClosure, in_metres, planar_loop, to_lidar
 from sglpr_jax.loops.comparison import KeyframeComparison, Query
@@ -29,7 +29,7 @@ from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
+from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import NEGATIVE_M
 from sglpr_jax.schema import Column, check_columns
@@ -177,7 +177,7 @@ class PlaceMap(Keyframes):
           TypeError: If an argument is not parameters, a scan or an array.
         """
         check_value(candidates, PlaceCount, "candidates")
-        finder, query = CandidateSearch(params), given_scan(scan)
+        finder, query = CandidateSearch(params), as_scan(scan)
         if len(self) and not isinstance(scan, Scan) and query.points is not None:
             query = dataclasses.replace(query, mounting=self.query_mounting(query.points))
         return self.relocate_keyframe(
@@ -204,14 +204,14 @@ class PlaceMap(Keyframes):
             return []
         model = default_model() if model is None else model
         config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
-        query = Query(len(self), keyframe.descriptor, image, query_spectra(image))
+        query = Query(len(self), keyframe.descriptor, image)
         comparison = KeyframeComparison(self._motion, NO_DRIFT, config)
         fits = comparison.compare(query, self)
         order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
         answers = []
         for row in order[np.sort(first)][:candidates].tolist():
-            candidate = comparison.candidate(query, fits, row, self)
+            candidate = comparison.verify(query, fits, row, self)
             place, probability = candidate.match, float(model.probability(candidate.evidence))
             mountings = keyframe.mounting, self.mounting(place).scaled(self.scale)
             loop = planar_loop(*candidate[:3], probability=probability, sensors=mountings)
@@ -288,7 +288,7 @@ def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
     check_columns(arrays, ARRAYS, n=len(index))
     if arrays["images"].shape[1] % 2:
         raise ValueError(f"expected images of an even number of cells, found {arrays['images'].shape[1:]}")
-    given_poses(arrays["world_from_place"], of="world_from_place")
+    as_poses(arrays["world_from_place"], of="world_from_place")
     for height, *up in np.unique(arrays["mountings"], axis=0).tolist():
         Mounting(height, tuple(up))
         if abs(np.linalg.norm(up) - 1) > ROTATION_TOLERANCE:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.bev_alignment import BevRegistration
-from sglpr_jax.se3 import inverse, transform, travelled, yaw_of
+from sglpr_jax.se3 import inverse, planar_pose, transform, travelled, yaw_of
 
 MOST_STEPS = 3.0
 """Maximum time step, as a multiple of the previous one, for which a pose is extrapolated. A longer one is a gap."""
@@ -64,10 +64,12 @@ class BevOdometry:
 
     def __init__(self):
         self.keyframe = 0
+        """Frame in whose frame the next link is expressed."""
         self.path = DrivenPath()
         """Planar poses of all added frames or, with odometry, its gravity-aligned poses."""
         self._numbers = GrowingArray(np.empty(0, NUMBERS))
         self._coasted = 0
+        """Number of extrapolated frames since the last registered one."""
         self._m_per_s: float | None = None
         """Last known forward speed, in metres per second. None while it was never known."""
 
@@ -77,25 +79,26 @@ class BevOdometry:
     @classmethod
     def of(cls, poses: Float[np.ndarray, "n 4 4"]) -> "BevOdometry":
         """Motion along known poses, such as those of the places of a map."""
-        found, numbers = cls(), np.zeros(len(poses), NUMBERS)
+        motion, numbers = cls(), np.zeros(len(poses), NUMBERS)
         numbers["travelled"] = travelled(poses) if len(poses) else 0.0
-        found._numbers.extend(numbers)
-        found.path.extend(poses, np.zeros(len(poses)))
-        return found
+        motion._numbers.extend(numbers)
+        motion.path.extend(poses, np.zeros(len(poses)))
+        return motion
 
     @classmethod
     def joined(cls, motions: "Sequence[BevOdometry]") -> "BevOdometry":
         """Motion of several recordings, one after the other, in level worlds. Poses between two of them are unknown."""
-        found = cls()
-        for one in motions:
-            numbers, last = one._numbers.rows.copy(), found._numbers.rows[-1:]
-            numbers["guessed_m"] += UNKNOWN_M * len(last)
-            numbers["travelled"] += GAP_M * len(last)
-            for name in ("segment", "travelled", "guessed_m") if len(last) else ():
-                numbers[name] += last[name] + (name == "segment")
-            found._numbers.extend(numbers)
-            found.path.extend(one.path.leveled(np.arange(len(one))), numbers["guessed_m"])
-        return found
+        joined = cls()
+        for motion in motions:
+            numbers = motion._numbers.rows.copy()
+            if len(joined):
+                last = joined._numbers.rows[-1]
+                numbers["segment"] += last["segment"] + 1
+                numbers["travelled"] += last["travelled"] + GAP_M
+                numbers["guessed_m"] += last["guessed_m"] + UNKNOWN_M
+            joined._numbers.extend(numbers)
+            joined.path.extend(motion.path.leveled(np.arange(len(motion))), numbers["guessed_m"])
+        return joined
 
     @property
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
@@ -118,6 +121,10 @@ class BevOdometry:
         return self._numbers.rows["guessed_m"]
 
     @property
+    def _times(self) -> Float[np.ndarray, " n"]:
+        return self._numbers.rows["time"]
+
+    @property
     def nbytes(self) -> int:
         """Number of bytes that the arrays hold."""
         return self.path.nbytes + self._numbers.nbytes
@@ -135,86 +142,79 @@ class BevOdometry:
         An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown.
         """
         if len(self) and not continues:
-            self._append(
-                time,
-                self.poses[-1] if pose is None else pose,
-                segment=int(self.segments[-1]) + 1,
-                travelled=self.travelled[-1] + GAP_M,
-                guessed_m=self.guessed_m[-1] + UNKNOWN_M,
-            )
-            self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
+            self._add_after_restart(time, pose)
             return
-        key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
+        extrapolates, is_ambiguous, along_m = False, False, math.inf
         if pose is None and link is not None:
-            prior = self.prior(time, key)
-            surprises = link.angle_to(prior[2]) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
-            ambiguous = surprises or not self.is_trusted(link, prior)
-            along_m = float(link.along_m) if self.is_ridge(link) else along_m
-            pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
+            prior = self.prior(time, self.keyframe)
+            is_surprising = link.angle_to(prior[2]) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
+            is_ambiguous = is_surprising or not self.is_trusted(link, prior)
+            along_m = float(link.along_m) if self.is_ridge(link) else math.inf
+            pose = self.poses[self.keyframe] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < MAX_COASTING:
-            pose, coasts = self._expected(time), True
-        self._coasted = self._coasted + 1 if coasts else 0
+            pose, extrapolates = self._extrapolated(time), True
+        self._coasted = self._coasted + 1 if extrapolates else 0
         if not len(self):
             self._append(time, np.eye(4) if pose is None else pose, segment=0, travelled=0.0, guessed_m=0.0)
         elif pose is None:
-            self._guess(time)
+            self._add_guess(time)
         else:
-            moved, rotation = self.moved(key, pose)
-            travelled = self.travelled[key] + moved
-            guessed_m = self.guessed_m[key]
-            if coasts or ambiguous:
-                drifted_m = self._drifted_m(time, share=1.0 if coasts else AMBIGUOUS_SHARE)
+            moved_m, rotation = self.moved(self.keyframe, pose)
+            guessed_m, is_guess = self.guessed_m[self.keyframe], extrapolates or is_ambiguous
+            if is_guess:
+                drifted_m = self._drifted_m(time, share=1.0 if extrapolates else AMBIGUOUS_SHARE)
                 guessed_m = min(drifted_m, self.guessed_m[-1] + M_PER_UNCERTAIN_M * along_m)
-            self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
-            is_far = moved > KEYFRAME_M or rotation > np.radians(KEYFRAME_DEG)
-            if not (is_far or coasts or ambiguous):
+            travelled_m, segment = self.travelled[self.keyframe] + moved_m, int(self.segments[self.keyframe])
+            self._append(time, pose, segment=segment, travelled=travelled_m, guessed_m=guessed_m)
+            if not (is_guess or moved_m > KEYFRAME_M or rotation > np.radians(KEYFRAME_DEG)):
                 return
         self.keyframe = len(self) - 1
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
-        """Expected x, y and yaw in the frame of an earlier frame, at constant velocity. NaN if unknown."""
-        expected = self._expected(time)
-        if expected is None:
-            return np.full(3, np.nan)
-        moved = inverse(self.poses[frame]) @ expected
-        return np.array([moved[0, 3], moved[1, 3], yaw_of(moved)])
+        """Expected x, y (metres) and yaw (radians) in an earlier frame, at constant velocity. NaN if unknown."""
+        expected = self._extrapolated(time)
+        return np.full(3, np.nan) if expected is None else planar_pose(inverse(self.poses[frame]) @ expected)
 
-    def _expected(self, time: float) -> Float[np.ndarray, "4 4"] | None:
-        moving = self._last_moving
-        if moving is None:
-            return None
-        before, after = moving
-        steps = self._steps(time)
-        if not 0 < steps <= MOST_STEPS:
-            return None
-        last = inverse(self.poses[before]) @ self.poses[after]
-        return self.poses[-1] @ transform(steps * last[0, 3], steps * last[1, 3], steps * float(yaw_of(last)))
+    def same(self, frame: int, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+        """Whether the pose of each of `rows` relative to `frame` is known."""
+        return self.segments[rows] == self.segments[frame]
 
-    def _steps(self, time: float) -> float:
-        """Time since the last frame, as a multiple of the last time step with a known motion. 1 without such a step."""
-        moving = self._last_moving
-        if moving is None:
-            return 1.0
-        before, after = moving
-        return float((time - self._times[-1]) / (self._times[after] - self._times[before]))
+    def is_trusted(self, link: BevRegistration, prior: Float[np.ndarray, " 3"]) -> bool:
+        """Whether a link shows how the sensor moved: no other pose fits about as well.
 
-    @property
-    def _last_moving(self) -> tuple[int, int] | None:
-        """Rows, from the end, of the last step with a known motion. A scan that was added twice makes no step."""
-        for after in (-1, -2):
-            before = after - 1
-            if len(self) < -before or self.segments[after] != self.segments[before]:
-                return None
-            moved = float(np.linalg.norm((self.poses[after] - self.poses[before])[:3, 3]))
-            known = self._times[after] > self._times[before]
-            if known and (moved > STANDING_M or after == -2):
-                return before, after
-        return None
+        A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
+        """
+        limit, apart_m = MAX_SECOND, float(np.hypot(link.x - prior[0], link.y - prior[1]))
+        if apart_m > MAX_JUMP * self._last_step_m + 1.0:
+            limit = MAX_SECOND_OF_JUMP
+        elif apart_m <= EXPECTED_M and link.angle_to(prior[2]) <= np.radians(EXPECTED_DEG):
+            limit = MAX_SECOND_EXPECTED
+        return bool(link.correlation >= MIN_CORRELATION and link.second <= limit) and not self.is_ridge(link)
 
-    def _guess(self, time: float) -> None:
-        """Add a frame whose motion is unknown."""
+    def is_ridge(self, link: BevRegistration) -> bool:
+        """Whether the images show the position across a direction only, as between walls."""
+        return bool(link.along_m > MAX_ALONG_M and link.correlation < EQUAL)
+
+    def moved(self, frame: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+        """Distance (metres) and rotation (radians) from a frame to a pose."""
+        motion = inverse(self.poses[frame]) @ pose
+        return float(np.linalg.norm(motion[:3, 3])), abs(float(yaw_of(motion)))
+
+    def _add_after_restart(self, time: float, pose: Float[np.ndarray, "4 4"] | None) -> None:
+        """Add a frame whose distance from the last one is unknown, by odometry that may begin in another frame."""
+        self._append(
+            time,
+            self.poses[-1] if pose is None else pose,
+            segment=int(self.segments[-1]) + 1,
+            travelled=self.travelled[-1] + GAP_M,
+            guessed_m=self.guessed_m[-1] + UNKNOWN_M,
+        )
+        self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
+
+    def _add_guess(self, time: float) -> None:
+        """Add a frame whose motion is a guess: straight on at the last known speed. It begins a new segment."""
         seconds = time - self._times[-1]
-        if len(self) > 1 and self.segments[-1] == self.segments[-2] and self._times[-1] > self._times[-2]:
+        if self._knows_last_step and self._times[-1] > self._times[-2]:
             step = inverse(self.poses[-2]) @ self.poses[-1]
             self._m_per_s = float(step[0, 3]) / (self._times[-1] - self._times[-2])
         self._append(
@@ -225,25 +225,6 @@ class BevOdometry:
             guessed_m=self._drifted_m(time),
         )
 
-    def _drifted_m(self, time: float, *, share: float = 1.0) -> float:
-        """Next value of `guessed_m`, if the motion since the last frame is a guess, or if this share of it is."""
-        step_m = max(self._guessed_step_m(time), LEAST_STEP_M)
-        return self.guessed_m[-1] + share * GUESS_FACTOR * step_m
-
-    def _guessed_step_m(self, time: float) -> float:
-        """Length of the next step, if it is a guess."""
-        if len(self) > 1 and self.segments[-1] == self.segments[-2]:
-            return self._last_step_m * max(self._steps(time), 1.0)
-        if self._m_per_s is not None:
-            return abs(self._m_per_s) * (time - self._times[-1])
-        return UNKNOWN_STEP_M
-
-    @property
-    def _last_step_m(self) -> float:
-        """Length of the longer one of the last two steps. The last scan may have been added twice."""
-        ends = self.poses[-3:, :3, 3]
-        return float(np.linalg.norm(np.diff(ends, axis=0), axis=1).max(initial=0.0))
-
     def _append(
         self, time: float, pose: Float[np.ndarray, "4 4"], *, segment: int, travelled: float, guessed_m: float
     ) -> None:
@@ -251,32 +232,49 @@ class BevOdometry:
         self._numbers.append((time, segment, travelled, guessed_m))
 
     @property
-    def _times(self) -> Float[np.ndarray, " n"]:
-        return self._numbers.rows["time"]
+    def _knows_last_step(self) -> bool:
+        return len(self) > 1 and bool(self.segments[-1] == self.segments[-2])
 
-    def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
-        """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
-        return self.segments[rows] == self.segments[frame]
+    @property
+    def _last_moving(self) -> tuple[int, int] | None:
+        """Rows, from the end, of the last step with a known motion. A scan that was added twice makes no step."""
+        for after in (-1, -2):
+            before = after - 1
+            if len(self) < -before or self.segments[after] != self.segments[before]:
+                return None
+            moved_m = float(np.linalg.norm((self.poses[after] - self.poses[before])[:3, 3]))
+            if self._times[after] > self._times[before] and (moved_m > STANDING_M or after == -2):
+                return before, after
+        return None
 
-    def is_trusted(self, link: BevRegistration, prior: Float[np.ndarray, " 3"]) -> bool:
-        """Whether a link shows how the sensor moved: no other pose fits about as well.
+    def _steps(self, time: float) -> float:
+        """Time since the last frame, as a multiple of the last time step with a known motion. 1 without such a step."""
+        rows = self._last_moving
+        if rows is None:
+            return 1.0
+        return float((time - self._times[-1]) / (self._times[rows[1]] - self._times[rows[0]]))
 
-        A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
-        """
-        most = MAX_SECOND
-        apart = float(np.hypot(link.x - prior[0], link.y - prior[1]))
-        if apart > MAX_JUMP * self._last_step_m + 1.0:
-            most = MAX_SECOND_OF_JUMP
-        elif apart <= EXPECTED_M and link.angle_to(prior[2]) <= np.radians(EXPECTED_DEG):
-            most = MAX_SECOND_EXPECTED
-        fits = bool(link.correlation >= MIN_CORRELATION and link.second <= most)
-        return fits and not self.is_ridge(link)
+    def _extrapolated(self, time: float) -> Float[np.ndarray, "4 4"] | None:
+        """Pose at constant velocity, or None if the velocity is unknown or the last frame is too old."""
+        rows, steps = self._last_moving, self._steps(time)
+        if rows is None or not 0 < steps <= MOST_STEPS:
+            return None
+        step = inverse(self.poses[rows[0]]) @ self.poses[rows[1]]
+        return self.poses[-1] @ transform(steps * step[0, 3], steps * step[1, 3], steps * float(yaw_of(step)))
 
-    def is_ridge(self, link: BevRegistration) -> bool:
-        """Whether the images show the position across a direction only, as between walls."""
-        return bool(link.along_m > MAX_ALONG_M and link.correlation < EQUAL)
+    def _drifted_m(self, time: float, *, share: float = 1.0) -> float:
+        """Next value of `guessed_m`, if this share of the motion since the last frame is a guess."""
+        return self.guessed_m[-1] + share * GUESS_FACTOR * max(self._guessed_step_m(time), LEAST_STEP_M)
 
-    def moved(self, frame: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-        """Distance (metres) and rotation (radians) from a frame to a pose."""
-        moved = inverse(self.poses[frame]) @ pose
-        return float(np.linalg.norm(moved[:3, 3])), abs(float(yaw_of(moved)))
+    def _guessed_step_m(self, time: float) -> float:
+        """Length of the next step, if it is a guess, in metres."""
+        if self._knows_last_step:
+            return self._last_step_m * max(self._steps(time), 1.0)
+        if self._m_per_s is not None:
+            return abs(self._m_per_s) * (time - self._times[-1])
+        return UNKNOWN_STEP_M
+
+    @property
+    def _last_step_m(self) -> float:
+        """Length of the longer one of the last two steps, in metres. The last scan may have been added twice."""
+        return float(np.linalg.norm(np.diff(self.poses[-3:, :3, 3], axis=0), axis=1).max(initial=0.0))

@@ -1,7 +1,6 @@
 """Settings of odometry and of its drift, readable without JAX."""
 
 import dataclasses
-import math
 from typing import Literal
 
 from sglpr_jax.fields import NotNegative, Positive, check_fields
@@ -21,32 +20,33 @@ DRIFT_HEIGHT_PERCENT = 0.3
 class DriftModel:
     """Standard deviations of odometry per metre of travelled distance."""
 
-    metres_per_metre: float = DRIFT_PERCENT / 100
+    metres_per_metre: NotNegative = DRIFT_PERCENT / 100
     """Position drift in the direction of travel."""
-    degrees_per_metre: float = DRIFT_DEG_PER_100M / 100
+    degrees_per_metre: NotNegative = DRIFT_DEG_PER_100M / 100
     """Heading drift. It rotates the rest of the path and so moves the position, too."""
-    sideways: float = 0.25
+    sideways: NotNegative = 0.25
     """Position drift across the direction of travel, as a fraction of the drift along it."""
-    height_per_metre: float = DRIFT_HEIGHT_PERCENT / 100
+    height_per_metre: NotNegative = DRIFT_HEIGHT_PERCENT / 100
     """Height drift. A place on another floor of a building contradicts the odometry if this is small enough."""
-    position_m: float = 0.5
-    height_m: float = 0.3
-    yaw_deg: float = 1.5
+    position_m: Positive = 0.5
+    height_m: Positive = 0.3
+    yaw_deg: Positive = 1.5
     """Standard deviations of the comparison itself, independent of the distance, in metres and degrees."""
-    max_deviation: float = 4.0
+    max_deviation: Positive = 4.0
     """Maximum deviation of a loop from the odometry. Loops beyond it contradict the odometry."""
 
     def __post_init__(self):
         """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
-        for name, value in dataclasses.asdict(self).items():
-            positive = name in ("position_m", "height_m", "yaw_deg", "max_deviation")
-            if not math.isfinite(value) or value < 0 or (positive and value == 0):
-                raise ValueError(f"expected {name} {'> 0' if positive else '>= 0'}, found {value}")
+        check_fields(self)
 
     def scaled(self, factor: float) -> "DriftModel":
         """The same model with `factor` times the drift per metre."""
         names = ("metres_per_metre", "degrees_per_metre", "height_per_metre")
         return dataclasses.replace(self, **{name: factor * getattr(self, name) for name in names})
+
+    def at_scale(self, scale: float) -> "DriftModel":
+        """The drift of the same odometry with all translations multiplied by `scale`."""
+        return dataclasses.replace(self, degrees_per_metre=self.degrees_per_metre / scale)
 
     def __str__(self) -> str:
         return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"

@@ -30,18 +30,22 @@ class OdometryCheck:
 
     def __init__(self):
         self._last: Float[np.ndarray, "4 4"] | None = None
+        """Pose by odometry of the last compared scan."""
         self._frames = 0
-        self._by_odometry, self._by_images = np.eye(4), np.eye(4)
-        self._way_m = 0.0
+        """Number of scans since then."""
+        self._start_window()
         self._errors: list[tuple[float, float]] = []
         """Errors of length and angle (degrees) per metre, one of each window."""
+
+    def _start_window(self) -> None:
+        self._by_odometry, self._by_images, self._length_m = np.eye(4), np.eye(4), 0.0
 
     def is_due(self, pose: Float[np.ndarray, "4 4"]) -> bool:
         """Whether the next scan, with this pose by odometry, is compared with the last compared one."""
         if self._last is None or self._frames + 1 >= MOST_FRAMES:
             return True
-        moved = inverse(self._last) @ pose
-        return bool(np.linalg.norm(moved[:3, 3]) >= STEP_M or abs(yaw_of(moved)) >= np.radians(STEP_DEG))
+        motion = inverse(self._last) @ pose
+        return bool(np.linalg.norm(motion[:3, 3]) >= STEP_M or abs(yaw_of(motion)) >= np.radians(STEP_DEG))
 
     def restart(self) -> None:
         """Note that the motion since the last scan is unknown."""
@@ -52,22 +56,21 @@ class OdometryCheck:
         self._frames += 1
 
     def add(self, pose: Float[np.ndarray, "4 4"], link: BevRegistration | None) -> None:
-        """Add a compared scan: its gravity-aligned pose, and by the images that in the last compared one."""
-        step = np.eye(4) if self._last is None else inverse(self._last) @ pose
-        far = float(np.linalg.norm(step[:3, 3])) > MAX_STEP_M
-        is_clear = link is not None and link.second <= MAX_SECOND and link.along_m <= MAX_ALONG_M
-        if self._last is None or link is None or far or not is_clear:
-            self._by_odometry, self._by_images, self._way_m = np.eye(4), np.eye(4), 0.0
-        else:
-            seen = transform(float(link.x), float(link.y), float(link.yaw))
-            self._by_odometry, self._by_images = self._by_odometry @ step, self._by_images @ seen
-            self._way_m += max(float(np.linalg.norm(one[:3, 3])) for one in (step, seen))
+        """Add a compared scan: its gravity-aligned pose, and by the images its pose in the last compared one."""
+        step = None if self._last is None else inverse(self._last) @ pose
         self._last, self._frames = pose, 0
-        if self._way_m >= WINDOW_M:
-            lengths = [float(np.linalg.norm(one[:2, 3])) for one in (self._by_odometry, self._by_images)]
-            turned = float(yaw_of(inverse(self._by_images) @ self._by_odometry))
-            self._errors.append(((lengths[0] - lengths[1]) / self._way_m, np.degrees(turned) / self._way_m))
-            self._by_odometry, self._by_images, self._way_m = np.eye(4), np.eye(4), 0.0
+        is_clear = link is not None and link.second <= MAX_SECOND and link.along_m <= MAX_ALONG_M
+        if step is None or link is None or not is_clear or np.linalg.norm(step[:3, 3]) > MAX_STEP_M:
+            self._start_window()
+            return
+        image_step = transform(float(link.x), float(link.y), float(link.yaw))
+        self._by_odometry, self._by_images = self._by_odometry @ step, self._by_images @ image_step
+        self._length_m += max(float(np.linalg.norm(motion[:3, 3])) for motion in (step, image_step))
+        if self._length_m >= WINDOW_M:
+            excess_m = np.linalg.norm(self._by_odometry[:2, 3]) - np.linalg.norm(self._by_images[:2, 3])
+            angle = np.degrees(float(yaw_of(inverse(self._by_images) @ self._by_odometry)))
+            self._errors.append((float(excess_m) / self._length_m, angle / self._length_m))
+            self._start_window()
 
     @property
     def errors(self) -> tuple[float, float]:
@@ -86,8 +89,5 @@ class OdometryCheck:
     def drift(self, stated: DriftModel) -> DriftModel:
         """Drift of the odometry: the stated one or, if it is larger, the estimate."""
         length, angle = self.errors
-        return dataclasses.replace(
-            stated,
-            metres_per_metre=max(stated.metres_per_metre, length),
-            degrees_per_metre=max(stated.degrees_per_metre, angle),
-        )
+        larger = max(stated.metres_per_metre, length), max(stated.degrees_per_metre, angle)
+        return dataclasses.replace(stated, metres_per_metre=larger[0], degrees_per_metre=larger[1])

@@ -33,16 +33,12 @@ MIN_OVERLAP = 0.55
 have more, scans of other places mostly less."""
 
 
-class _Input(NamedTuple):
-    """Points of a scan in the form that kiss-icp expects."""
-
-    points: Float[np.ndarray, "n 3"]
-    times: Float[np.ndarray, " m"]
-    """Time of each point relative to the scan in seconds, or an empty array."""
+Cloud = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"]]
+"""Points of a scan in metres, and the time of each point relative to the scan in seconds or an empty array."""
 
 
 class _Registered(NamedTuple):
-    """Pose of a scan, and how it was found."""
+    """Pose of a scan, and how well it was registered."""
 
     pose: Float[np.ndarray, "4 4"]
     points: int
@@ -99,7 +95,7 @@ def scan_odometry(
 
 
 def _settings(recording: Recording, config: OdometryConfig, scale: Scale) -> dict[str, Any]:
-    """All that determines the poses."""
+    """Settings that determine the poses."""
     scans = [recording.name, fingerprint(recording, contents="some")]
     return {"scans": scans, "kiss-icp": version("kiss-icp"), "scale": scale, **dataclasses.asdict(config)}
 
@@ -113,19 +109,28 @@ def _register(
     **options: Any,
 ) -> Float[np.ndarray, "n 17"]:
     """Pose of each scan and time of its last point. Adds new ones to the log, and warns of doubtful ones."""
-    timed = has_point_times(recording)
+    is_timed = has_point_times(recording)
     rows, registered = list(known), dict[int, _Registered]()
-    for row, given in scan_stream(scaled(recording, scale), lambda _, record: _input(record, timed), **options):
-        found = front_end.add(given, known=known[row, :16].reshape(4, 4) if row < len(known) else None)
-        if given is not None:
-            registered[row] = found
+    for row, cloud in scan_stream(scaled(recording, scale), lambda _, scan: _cloud(scan, is_timed), **options):
+        result = front_end.add(cloud, known=known[row, :16].reshape(4, 4) if row < len(known) else None)
+        if cloud is not None:
+            registered[row] = result
         if row >= len(known):
-            rows.append(np.append(found.pose, 0.0 if given is None else given.times.max(initial=0)))
+            rows.append(np.append(result.pose, 0.0 if cloud is None else cloud[1].max(initial=0)))
             log.append(row, rows[row].tobytes())
     if len(rows) == len(recording):
         check_readable(recording, len(registered))
         _warn_of_doubtful(recording, registered)
     return np.array(rows).reshape(-1, 17)
+
+
+def _cloud(scan: Scan, is_timed: bool) -> Cloud:
+    """Measured points of a scan, with their times if the scans have times."""
+    points = scan.points
+    assert points is not None
+    valid = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    times = scan.point_times if is_timed else None
+    return points[valid].astype(np.float64), np.zeros(0) if times is None else times[valid].astype(np.float64)
 
 
 class _FrontEnd:
@@ -134,22 +139,21 @@ class _FrontEnd:
     def __init__(self, config: OdometryConfig):
         library, used = _library(), config.effective
         data = {"max_range": used.max_range_m, "min_range": used.min_range_m, "deskew": True}
-        of_library = importlib.import_module("kiss_icp.config")
-        settings = of_library.KISSConfig(data=data, mapping={"voxel_size": used.voxel_m})
+        settings = importlib.import_module("kiss_icp.config").KISSConfig(
+            data=data, mapping={"voxel_size": used.voxel_m}
+        )
         self._icp, self._voxel_m = library.KissICP(settings), float(used.voxel_m or 0)
-        self._before: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
+        self._previous: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
 
-    def add(self, given: _Input | None, *, known: Float[np.ndarray, "4 4"] | None = None) -> _Registered:
+    def add(self, cloud: Cloud | None, *, known: Float[np.ndarray, "4 4"] | None = None) -> _Registered:
         """Register the next scan, or add it at its known pose. Without a scan, extrapolate the motion.
 
         These are the steps of kiss-icp's `register_frame`, which takes no known pose.
         """
         icp, guess = self._icp, self._icp.last_pose @ self._icp.last_delta
-        if given is None:
-            icp.last_pose = guess
-            return _Registered(guess, 0, 1.0)
-        frame = icp.preprocessor.preprocess(given.points, given.times, icp.last_delta)
-        source, mapped = icp.voxelize(frame)
+        source, mapped = np.zeros((0, 3)), np.zeros((0, 3))
+        if cloud is not None:
+            source, mapped = icp.voxelize(icp.preprocessor.preprocess(*cloud, icp.last_delta))
         if len(source) < MIN_POINTS:
             icp.last_pose = guess
             return _Registered(guess, len(source), 1.0)
@@ -172,22 +176,13 @@ class _FrontEnd:
         """Share of points with a point of the previous scans within a voxel."""
         from scipy.spatial import KDTree  # imported here because the import is slow
 
-        before = list(self._before)
-        self._before.append(transformed(pose, mapped))
-        if len(before) < PREVIOUS:
+        previous = list(self._previous)
+        self._previous.append(transformed(pose, mapped))
+        if len(previous) < PREVIOUS:
             return 1.0
-        tree = KDTree(np.concatenate(before), balanced_tree=False)
-        apart, _ = tree.query(transformed(pose, source), distance_upper_bound=self._voxel_m)
-        return float(np.isfinite(apart).mean())
-
-
-def _input(record: Scan, timed: bool) -> _Input:
-    """Measured points of a scan, with their times if the scans have times."""
-    points = record.points
-    assert points is not None
-    valid = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
-    times = record.point_times if timed else None
-    return _Input(points[valid].astype(np.float64), np.zeros(0) if times is None else times[valid].astype(np.float64))
+        tree = KDTree(np.concatenate(previous), balanced_tree=False)
+        distances, _ = tree.query(transformed(pose, source), distance_upper_bound=self._voxel_m)
+        return float(np.isfinite(distances).mean())
 
 
 def _at_times_of_scans(
@@ -198,24 +193,24 @@ def _at_times_of_scans(
     if end == 0 or recording.times is None or len(poses) < 2:
         return poses
     times = recording.times[: len(poses)]
-    found = poses_at(times, times + end, poses)
-    return inverse(found[0]) @ found
+    earlier = poses_at(times, times + end, poses)
+    return inverse(earlier[0]) @ earlier
 
 
 def _warn_of_doubtful(recording: Recording, registered: dict[int, _Registered]) -> None:
     """Warn of scans with few points and of scans without overlap. Raises ValueError if all scans have few points."""
-    few = [row for row, one in registered.items() if one.points < MIN_POINTS]
+    few = [row for row, result in registered.items() if result.points < MIN_POINTS]
     if len(few) == len(registered):
         raise ValueError(
             f"sequence {recording.name}: expected scans with {MIN_POINTS} points or more for odometry, found at most "
-            f"{max(one.points for one in registered.values())} after downsampling; use --scale 4 in rooms"
+            f"{max(result.points for result in registered.values())} after downsampling; use --scale 4 in rooms"
         )
     if few:
         warn(
             f"{recording.name}: expected {MIN_POINTS} points or more in each scan, found fewer in {len(few)}, first in "
             f"scan {recording.ids[few[0]]}; their odometry is extrapolated"
         )
-    apart = [row for row, one in registered.items() if one.overlap < MIN_OVERLAP]
+    apart = [row for row, result in registered.items() if result.overlap < MIN_OVERLAP]
     if apart:
         warn(
             f"{recording.name}: expected scans that overlap the previous ones, found {len(apart)} that do not, first "
@@ -227,10 +222,10 @@ def about(recording: Recording, config: OdometryConfig, *, scale: Scale) -> str:
     """Describe how the odometry of a recording is computed, with lengths in its metres."""
     used = config.effective
     assert used.voxel_m is not None
-    moved = "motion within scans removed" if has_point_times(recording) else "without times of points"
+    deskewing = "motion within scans removed" if has_point_times(recording) else "without times of points"
     return (
         f"odometry: kiss-icp {version('kiss-icp')}, points up to {used.max_range_m / scale:g} m, voxels of "
-        f"{used.voxel_m / scale:g} m, {moved}"
+        f"{used.voxel_m / scale:g} m, {deskewing}"
     )
 
 

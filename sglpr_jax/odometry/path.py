@@ -1,4 +1,4 @@
-"""A path with the integrals that drift needs, so that the drift between two frames takes constant time."""
+"""Path of a sensor with sums along it, from which the drift between any two frames follows in constant time."""
 
 from typing import NamedTuple
 
@@ -12,8 +12,8 @@ from sglpr_jax.se3 import inverse
 
 UPPER = np.triu_indices(3)
 """Rows and columns of the stored half of a symmetric matrix."""
-WHOLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Number of the stored element at each place of the matrix."""
+FROM_UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Index of each element of a symmetric matrix in the stored half."""
 SUMS = 1 + 3 + 6 + 6
 """Number of integrals of a frame: length, position, and the upper halves of two matrices."""
 
@@ -22,17 +22,18 @@ class PathIntegrals(NamedTuple):
     """Integrals over the path from one frame to another, in metres and products of metres."""
 
     length: Float[np.ndarray, " k"]
-    first: Float[np.ndarray, "k d"]
+    """Length of the path, in metres."""
+    position: Float[np.ndarray, "k d"]
     """Integral of the position."""
-    directions: Float[np.ndarray, "k d d"]
+    direction_products: Float[np.ndarray, "k d d"]
     """Integral of the outer product of the direction of travel with itself."""
-    squares: Float[np.ndarray, "k d d"]
+    position_products: Float[np.ndarray, "k d d"]
     """Integral of the outer product of the position with itself."""
 
-    def turned(self, rotation: Float[np.ndarray, "d 3"]) -> "PathIntegrals":
-        """The integrals in rotated coordinates, or in some of them."""
-        twice = (rotation @ part @ rotation.T for part in (self.directions, self.squares))
-        return PathIntegrals(self.length, self.first @ rotation.T, *twice)
+    def rotated(self, rotation: Float[np.ndarray, "d 3"]) -> "PathIntegrals":
+        """The integrals in rotated coordinates: all three, or the first d."""
+        products = (rotation @ matrix @ rotation.T for matrix in (self.direction_products, self.position_products))
+        return PathIntegrals(self.length, self.position @ rotation.T, *products)
 
 
 class DrivenPath:
@@ -45,7 +46,7 @@ class DrivenPath:
         *,
         tilted: bool = False,
     ):
-        """Start with some poses, as in `extend`."""
+        """Start with these poses, as in `extend`."""
         self.tilted = tilted
         """Whether the sensor is tilted. If not, the z axis of the fixed frame counts as up."""
         self._poses = GrowingArray(np.empty((0, 4, 4)))
@@ -90,20 +91,22 @@ class DrivenPath:
 
         Guessed motion drifts like a path of unknown direction.
         """
+        if not len(poses):
+            return
         guessed_m = np.full(len(poses), self._guessed_m) if guessed_m is None else guessed_m
+        origin = (self.poses if len(self) else poses)[0, :3, 3]
         if len(self):
-            known, guesses = np.concatenate([self.poses[-1:], poses]), np.append(self._guessed_m, guessed_m)
-            steps = _integrals(known[:, :3, 3] - self.poses[0, :3, 3], guesses)
-            self._sums.extend(self._sums.rows[-1] + steps.cumsum(0))
-        elif len(poses):
-            steps = _integrals(poses[:, :3, 3] - poses[0, :3, 3], guessed_m)
+            ends, guesses_m = np.concatenate([self.poses[-1:], poses]), np.append(self._guessed_m, guessed_m)
+            self._sums.extend(self._sums.rows[-1] + _integrals(ends[:, :3, 3] - origin, guesses_m).cumsum(0))
+        else:
+            steps = _integrals(poses[:, :3, 3] - origin, guessed_m)
             self._sums.extend(np.concatenate([np.zeros((1, SUMS)), steps.cumsum(0)]))
         self._poses.extend(poses)
         self._up += poses[:, :3, 2].sum(axis=0)
-        self._guessed_m = float(guessed_m[-1]) if len(poses) else self._guessed_m
+        self._guessed_m = float(guessed_m[-1])
 
     def leveled(self, frames: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 4 4"]:
-        """Poses of some frames in a level world, with positions counted from that of the first frame."""
+        """Poses of these frames in a level world, with positions relative to that of the first frame."""
         poses = self.poses[frames]
         if len(self):
             poses[:, :3, 3] -= self.poses[0, :3, 3]
@@ -113,24 +116,25 @@ class DrivenPath:
     def between(self, start: Int[np.ndarray, " k"], end: Int[np.ndarray, " k"]) -> PathIntegrals:
         """Integrals from frames `start` to frames `end`. Positions count from that of the first frame."""
         length, first, directions, squares = np.split(self._sums.rows[end] - self._sums.rows[start], [1, 4, 10], axis=1)
-        return PathIntegrals(length[:, 0], first, directions[:, WHOLE], squares[:, WHOLE])
+        return PathIntegrals(length[:, 0], first, directions[:, FROM_UPPER], squares[:, FROM_UPPER])
 
     def position_deviations(
         self, rows: Int[np.ndarray, " k"], frame: int, *, drift: DriftModel = DriftModel()
     ) -> Float[np.ndarray, " k"]:
-        """Standard deviation of the positions of some frames relative to a frame, in metres, over all directions."""
-        here, sums = self.poses[frame, :3, 3] - self.poses[0, :3, 3], self._sums.rows[rows] - self._sums.rows[frame]
-        weights = np.zeros(SUMS)  # integral of the squared distance from here: |p|^2 - 2 p here + |here|^2
-        weights[0], weights[1:4], weights[10 + WHOLE.diagonal()] = here @ here, -2 * here, 1
-        lever, length = np.abs(sums @ weights), np.abs(sums[:, 0])
-        across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
-        return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
+        """Standard deviation of the position of each row relative to a frame, in metres, over all directions."""
+        position = self.poses[frame, :3, 3] - self.poses[0, :3, 3]
+        sums = self._sums.rows[rows] - self._sums.rows[frame]
+        weights = np.zeros(SUMS)  # of the integral of |p - position|^2 = |p|^2 - 2 p position + |position|^2
+        weights[0], weights[1:4], weights[10 + FROM_UPPER.diagonal()] = position @ position, -2 * position, 1
+        lever, length_m = np.abs(sums @ weights), np.abs(sums[:, 0])
+        by_length = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length_m
+        return np.sqrt(by_length**2 + np.radians(drift.degrees_per_metre) ** 2 * length_m * lever)
 
 
 def level_odometry(
     odometry: Float[np.ndarray, "n 4 4"], upright_from_lidar: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Gravity-aligned poses of the sensor in a level world, from poses of the LiDAR."""
+    """Convert poses of the LiDAR to gravity-aligned poses of the sensor in a level world."""
     path = DrivenPath(odometry @ inverse(upright_from_lidar), tilted=is_tilted(upright_from_lidar))
     poses = path.poses.copy()
     poses[:, :3] = path.level @ poses[:, :3]
@@ -139,11 +143,12 @@ def level_odometry(
 
 def _integrals(positions: Float[np.ndarray, "n 3"], guessed_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m s"]:
     """Integrals over each step of a path, one step fewer than positions. s is `SUMS`."""
-    steps, middle, more = np.diff(positions, axis=0), (positions[:-1] + positions[1:]) / 2, np.diff(guessed_m)
-    moved = np.linalg.norm(steps, axis=1)
-    length = moved + more
-    square = steps[:, :, None] * steps[:, None]
-    directions = square / np.maximum(moved, 1e-12)[:, None, None] + more[:, None, None] * np.diag([1.0, 1.0, 0.0])
-    squares = length[:, None, None] * (middle[:, :, None] * middle[:, None] + square / 12)
-    halves = (part[:, *UPPER] for part in (directions, squares))
-    return np.concatenate([length[:, None], length[:, None] * middle, *halves], axis=1)
+    steps, middles = np.diff(positions, axis=0), (positions[:-1] + positions[1:]) / 2
+    moved_m, guesses_m = np.linalg.norm(steps, axis=1), np.diff(guessed_m)
+    length_m = moved_m + guesses_m
+    products = steps[:, :, None] * steps[:, None]
+    horizontal = guesses_m[:, None, None] * np.diag([1.0, 1.0, 0.0])
+    directions = products / np.maximum(moved_m, 1e-12)[:, None, None] + horizontal
+    squares = length_m[:, None, None] * (middles[:, :, None] * middles[:, None] + products / 12)
+    halves = (matrices[:, *UPPER] for matrices in (directions, squares))
+    return np.concatenate([length_m[:, None], length_m[:, None] * middles, *halves], axis=1)

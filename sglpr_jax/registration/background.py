@@ -34,17 +34,16 @@ class Background:
         if not image.size:
             return image
         root = np.sqrt(image, dtype=np.float32)
-        if self._root is None or self.added < MIN_FRAMES:
-            more = np.maximum(root - ring_medians(root), 0)
-        else:
-            more = np.maximum(root - np.maximum(self._root, ring_medians(root)), 0)
-        return np.round(more**2).astype(np.uint8)
+        background = ring_medians(root)
+        if self._root is not None and self.added >= MIN_FRAMES:
+            background = np.maximum(self._root, background)
+        return np.round(np.maximum(root - background, 0) ** 2).astype(np.uint8)
 
 
 def ring_medians(image: Float32[np.ndarray, "n n"]) -> Float32[np.ndarray, "n n"]:
     """Median of the cells of each ring around the sensor. It is above 0 where a flat floor or ceiling is a ring."""
     order, starts, ring = _rings(len(image))
-    medians = [np.median(part) for part in np.split(image.reshape(-1)[order], starts)]
+    medians = [np.median(cells) for cells in np.split(image.reshape(-1)[order], starts)]
     return np.array(medians, np.float32)[ring]
 
 

@@ -1,4 +1,4 @@
-"""Alignment of two images, and its covariance from the shape of the peak: small at a corner, long along a wall.
+"""Registration of two images, and its covariance from the shape of the peak: small at a corner, long along a wall.
 
 The covariance sums least squares at the peak, the extent of the ridge under it, and small fixed errors. The constants
 were fitted on simulated drives (`benchmarks/quality/poses.py`).
@@ -17,18 +17,17 @@ from sglpr_jax.registration.bev_search import CorrelationPeak, search
 from sglpr_jax.registration.bev_spectra import (
     DEFAULT,
     AnyArray,
+    column_counts,
     match_spectra,
-    prepared,
+    prepare_image,
     query_spectra,
-    rotations,
+    rotate,
     spectrum,
-    twice,
 )
 from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.se3 import wrap_angle
 
-NOISE = 0.8
-NOISE_CELLS = 300.0
-NOISE_RANGE_M = 10.0
+NOISE, NOISE_CELLS, NOISE_RANGE_M = 0.8, 300.0, 10.0
 """Noise of the correlation: `NOISE` (1 - c) / c for a peak of height c, times 1 / occupied cells + 1 / `NOISE_CELLS`.
 The second term accounts for correlated errors of neighbouring cells. The noise doubles for scans `NOISE_RANGE_M` apart,
 because each scan sees other sides of objects."""
@@ -65,9 +64,9 @@ def _peak_covariance(
     strengths, directions = jnp.linalg.eigh(curvature)
     spread = noise / (jnp.maximum(strengths, 0) + noise / FLAT_M**2)
     peak = (directions * spread[None]) @ directions.T
-    others = jnp.trace(ridge[:2, :2]) * np.array([RIDGE_ACROSS, RIDGE_ACROSS, RIDGE_YAW], np.float32) ** 2
+    across_ridge = jnp.trace(ridge[:2, :2]) * np.array([RIDGE_ACROSS, RIDGE_ACROSS, RIDGE_YAW], np.float32) ** 2
     least = np.array([LEAST_POSITION_M, LEAST_POSITION_M, np.radians(LEAST_YAW_DEG)], np.float32) ** 2
-    return peak + ridge + jnp.diag(others + least)
+    return peak + ridge + jnp.diag(across_ridge + least)
 
 
 def _ridge_covariance(
@@ -81,40 +80,46 @@ def _ridge_covariance(
 
     Along a wall the correlation falls only because the two images share less area. In a bend the ridge rotates with the
     distance, so the best of several rotations counts. Samples beyond a minimum belong to another peak and count no more
-    than the minimum. `products` are Fourier transforms (`rfft2`) of the correlation at the rotations `yaws`, that of
-    the peak first.
+    than the minimum.
+
+    Arguments:
+      products: Fourier transforms (`rfft2`) of the correlation at each rotation of `yaws`.
+      pose: x, y (metres) and yaw (radians) of the peak.
+      yaws: Rotations in radians, that of the peak first.
+      curvature: Negative Hessian of the correlation at the peak.
+      config: Settings of the comparison.
     """
     steps = int(config.max_shift_m / RIDGE_STEP_M)
-    along = np.arange(-steps, steps + 1, dtype=np.float32) * np.float32(RIDGE_STEP_M)
-    turned = jnp.asarray(yaws - pose[2]).at[0].set(0.0)
-    at_best_yaw = curvature[:2, 2:] * curvature[2:, :2] / jnp.maximum(curvature[2, 2], 1e-4)
-    planar = curvature[:2, :2] - at_best_yaw
+    along_m = np.arange(-steps, steps + 1, dtype=np.float32) * np.float32(RIDGE_STEP_M)
+    turns = jnp.asarray(yaws - pose[2]).at[0].set(0.0)
+    yaw_part = curvature[:2, 2:] * curvature[2:, :2] / jnp.maximum(curvature[2, 2], 1e-4)
+    planar = curvature[:2, :2] - yaw_part  # curvature in x and y at the best yaw of each position
     weak_axis = jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2 + np.float32(np.pi / 2)
-    heading = weak_axis + turned / 2  # the chord of an arc
-    moved = along[None, :, None] * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)[:, None]
-    points = pose[None, None, :2] + moved
+    heading = weak_axis + turns / 2  # the chord of an arc
+    shifts = along_m[None, :, None] * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)[:, None]
+    points = pose[None, None, :2] + shifts
     area = _shared_area(jnp.hypot(points[..., 0], points[..., 1]), config.reach_m)
     heights = jax.vmap(functools.partial(_heights, cell_m=DENSITY_RESOLUTION_M))(products, points) / area
     share = heights.max(0) / jnp.maximum(heights[0, steps], 1e-6)
     share = jnp.concatenate([jax.lax.cummin(share[steps::-1])[::-1], jax.lax.cummin(share[steps:])[1:]])
     best = heights.argmax(0)
-    apart = jnp.concatenate([moved[best, np.arange(len(along))], turned[best][:, None]], axis=1)
-    inside = (jnp.abs(points[0]).max(1) <= config.max_shift_m + RIDGE_STEP_M) | (along == 0)
+    apart = jnp.concatenate([shifts[best, np.arange(len(along_m))], turns[best][:, None]], axis=1)
+    inside = (jnp.abs(points[0]).max(1) <= config.max_shift_m + RIDGE_STEP_M) | (along_m == 0)
     weight = jnp.where(inside, jnp.exp(-jnp.maximum(1 - share, 0) / RIDGE_DROP), 0)
-    outside = (np.abs(along) >= RIDGE_START_M).astype(np.float32)
+    outside = (np.abs(along_m) >= RIDGE_START_M).astype(np.float32)
     return jnp.einsum("k,ki,kj->ij", weight * outside, apart, apart) / weight.sum()
 
 
 def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m: float) -> Float[Array, " k"]:
-    """Low frequencies of a correlation at given points, up to a common factor."""
+    """Low frequencies of a correlation at points (x, y) in metres, up to a common factor."""
     size = product.shape[0]
     band = int(RIDGE_BAND * size)
-    kept = jnp.concatenate([product[-band:, :band], product[:band, :band]])
+    low = jnp.concatenate([product[-band:, :band], product[:band, :band]])
     phases = points * np.float32(2 * np.pi / (cell_m * size))
     rows = jnp.exp(-1j * phases[:, 1:] * np.arange(-band, band, dtype=np.float32)[None])
     columns = jnp.exp(1j * phases[:, :1] * np.arange(band, dtype=np.float32)[None])
-    twice = np.where(np.arange(band) == 0, 1, 2).astype(np.float32)  # half of a real image's spectrum is stored
-    return ((rows @ kept) * columns).real @ twice
+    counts = np.where(np.arange(band) == 0, 1, 2).astype(np.float32)  # half of a real image's spectrum is stored
+    return ((rows @ low) * columns).real @ counts
 
 
 def _shared_area(apart_m: Float[Array, "*b"], reach_m: float) -> Float[Array, "*b"]:
@@ -148,7 +153,7 @@ class BevRegistration(NamedTuple):
 
     def angle_to(self, yaw: float) -> float:
         """Angle between the rotation and another one, in radians, from 0 to pi. NaN if the other one is unknown."""
-        return float(abs((float(self.yaw) - float(yaw) + np.pi) % (2 * np.pi) - np.pi))
+        return float(abs(wrap_angle(np.asarray(float(self.yaw) - float(yaw)))))
 
 
 REFINE_DEG = 3.0
@@ -174,37 +179,37 @@ def align(
     ValueError for other images.
     """
     spectra = query_spectra(query, config=config), match_spectra(jnp.asarray(match)[None], config=config)
-    return refined(query, match, search(*spectra, config=config).at(0), config=config)
+    return refine(query, match, search(*spectra, config=config).at(0), config=config)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def refined(
+def refine(
     query: Num[Array | np.ndarray, "h w"],
     match: Num[Array | np.ndarray, "h w"],
     peak: CorrelationPeak,
     *,
     config: VerificationConfig = DEFAULT,
 ) -> BevRegistration:
-    """Refine a peak of `search` on cells that are not merged. Raises the errors of `align`."""
+    """Register two images from a peak of `search`, on cells that are not merged. Raises the errors of `align`."""
     second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
-    query, match = prepared(query, config), prepared(match, config)
-    pose, correlation, covariance = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
+    query, match = prepare_image(query, config), prepare_image(match, config)
+    pose, correlation, covariance = _refine_peak(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
     yaw = jnp.mod(pose[2] + jnp.pi, 2 * jnp.pi) - jnp.pi
     return BevRegistration(pose[0], pose[1], yaw, covariance, correlation, second)
 
 
-def _refined(
+def _refine_peak(
     query: Float[Array, "m m"], match: Float[Array, "m m"], start: Float[Array, " 3"], config: VerificationConfig
 ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, "3 3"]]:
     """Peak near the pose `start`: (x, y, yaw), its correlation, and the covariance of the pose."""
     cell_m, step_rad = DENSITY_RESOLUTION_M, np.float32(np.radians(REFINE_DEG) / TURN_STEPS)
     yaws = start[2] + jnp.arange(-TURN_STEPS, TURN_STEPS + 1) * step_rad
-    product = spectrum(match[None], cell_m, config) * jnp.conj(spectrum(rotations(query, yaws), cell_m, config))
+    product = spectrum(match[None], cell_m, config) * jnp.conj(spectrum(rotate(query, yaws), cell_m, config))
     size = product.shape[1]
     steps = np.arange(-SHIFT_STEPS, SHIFT_STEPS + 1, dtype=np.float32) * (cell_m / 2)
     xs, ys = start[0] + steps, start[1] + steps
     rows = _waves(-ys / cell_m, np.fft.fftfreq(size))
-    columns = _waves(xs / cell_m, np.fft.rfftfreq(size)) * twice(size)
+    columns = _waves(xs / cell_m, np.fft.rfftfreq(size)) * column_counts(size)
     volume = jnp.einsum("tij,yi,xj->xyt", product, rows, columns).real / size**2
     peak = jnp.unravel_index(jnp.argmax(volume), volume.shape)
     middle = [jnp.clip(at, 1, n - 2) for at, n in zip(peak, volume.shape, strict=True)]

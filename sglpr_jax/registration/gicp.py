@@ -17,9 +17,15 @@ from jaxtyping import Float, Float32, Int
 
 from sglpr_jax.se3 import transformed
 
+COARSE_VOXEL_M, VOXEL_M = 1.0, 0.25
+"""Edges of the voxels of KISS-Matcher and of GICP, in metres."""
 NEIGHBOURS = 20
 """Number of neighbours from which the normal of a point is estimated. With 10, normals on the rings of 16 beams are
-arbitrary, and GICP aligns the rings of the two scans. Roll and pitch were 0.3 degrees off."""
+arbitrary, and GICP aligns the rings of the two scans: roll and pitch were 0.3 degrees off."""
+MAX_APART_M, ITERATIONS = 1.0, 40
+"""Maximum distance of corresponding points in GICP, in metres, and maximum number of iterations."""
+OVERLAP_VOXEL_M, OVERLAP_REACH_M = 1.0, 40.0
+"""Edge of the voxels of the overlap, and maximum distance from both sensors of points that count in it, in metres."""
 POINTS = 4000
 """Target number of points of the query for the covariance. Clouds with fewer points are not thinned."""
 BLOCK_M = 8.0
@@ -29,24 +35,13 @@ SCALE, HEIGHT_SCALE = 1.15, 0.8
 SPARSE, SPARSE_TILT = 3.2, 9.0
 """Growth of standard deviations with the share of sparse ground: of x, y and yaw, and of roll and pitch. Ground is
 sparse where the neighbours of a point lie on one line, so that its normal is arbitrary."""
-FLAT_COSINE = 0.9
-"""Minimum cosine between the z axis and the normal of a surface that is ground."""
-LINE = 0.05
-"""Maximum ratio of the second to the first variance of neighbours that lie on a line."""
+FLAT_COSINE, LINE = 0.9, 0.05
+"""Minimum cosine between the z axis and the normal of ground, and maximum ratio of the second to the first variance of
+neighbours that lie on a line."""
 SLIDING = 0.04
 """Share of the squared components of all normals below which a direction is degenerate: scans can slide along it."""
 UNKNOWN_M = 3.0
 """Standard deviation along a degenerate direction if the first guess has no covariance, in metres."""
-
-
-COARSE_VOXEL_M, VOXEL_M = 1.0, 0.25
-"""Edges of the voxels of KISS-Matcher and of GICP, in metres."""
-MAX_APART_M = 1.0
-"""Maximum distance of corresponding points in GICP, in metres."""
-ITERATIONS = 40
-"""Maximum number of GICP iterations."""
-OVERLAP_VOXEL_M, OVERLAP_REACH_M = 1.0, 40.0
-"""Edge of the voxels of the overlap, and maximum distance from both sensors of points that count in it, in metres."""
 LEAST_POSITION_M, LEAST_ROTATION_DEG = 0.002, 0.005
 """Standard deviations added to every covariance, in metres and degrees."""
 
@@ -85,27 +80,27 @@ def register(
       ValueError: If a scan has fewer than 100 finite points.
 
     Example:
-      found = register(recording.points(52), recording.points(4501))
-      found.overlap >= 0.6  # it is a loop
+      registration = register(recording.points(52), recording.points(4501))
+      registration.overlap >= 0.6  # it is a loop
     """
     gicp = _library("small_gicp")
     query, match = _finite(query, "query"), _finite(match, "match")
     initial = coarse_pose(query, match) if initial is None else initial
-    target, tree = _preprocessed(match)
-    source, _ = _preprocessed(query)
-    found = gicp.align(
-        target,
-        source,
-        tree,
+    match_cloud, match_tree = _preprocess(match)
+    query_cloud, _ = _preprocess(query)
+    result = gicp.align(
+        match_cloud,
+        query_cloud,
+        match_tree,
         init_T_target_source=np.asarray(initial, np.float64),
         registration_type="GICP",
         max_correspondence_distance=MAX_APART_M,
         max_iterations=ITERATIONS,
     )
-    pose = np.asarray(found.T_target_source)
+    pose = np.asarray(result.T_target_source)
     order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp puts rotation first
-    information = np.asarray(found.H)[order][:, order]
-    covariance = _registration_covariance(information, source, target, tree, pose, initial_covariance)
+    information = np.asarray(result.H)[order][:, order]
+    covariance = _registration_covariance(information, query_cloud, match_cloud, match_tree, pose, initial_covariance)
     least = np.repeat([LEAST_POSITION_M, np.radians(LEAST_ROTATION_DEG)], 3) ** 2
     return Registration(pose, covariance + np.diag(least), overlap(query, match, pose))
 
@@ -113,9 +108,9 @@ def register(
 def coarse_pose(query: Float32[np.ndarray, "n 3"], match: Float32[np.ndarray, "m 3"]) -> Float[np.ndarray, "4 4"]:
     """Estimate `match_from_query` with KISS-Matcher, without a first guess. Raises ImportError without extra `slam`."""
     matcher = _library("kiss_matcher")
-    found = matcher.KISSMatcher(matcher.KISSMatcherConfig(COARSE_VOXEL_M)).estimate(query, match)
+    result = matcher.KISSMatcher(matcher.KISSMatcherConfig(COARSE_VOXEL_M)).estimate(query, match)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = found.rotation, found.translation
+    pose[:3, :3], pose[:3, 3] = result.rotation, result.translation
     return pose
 
 
@@ -123,17 +118,17 @@ def overlap(
     query: Float[np.ndarray, "n 3"], match: Float[np.ndarray, "m 3"], match_from_query: Float[np.ndarray, "4 4"]
 ) -> float:
     """Number of voxels that both scans fill, divided by the number that the smaller scan fills, near both sensors."""
-    sensors, side, filled = (np.zeros(3), match_from_query[:3, 3]), 2 * int(OVERLAP_REACH_M / OVERLAP_VOXEL_M) + 4, []
+    sensors, side, voxels = (np.zeros(3), match_from_query[:3, 3]), 2 * int(OVERLAP_REACH_M / OVERLAP_VOXEL_M) + 4, []
     for cloud in (transformed(match_from_query, query), match):
         near = np.all([np.linalg.norm(cloud - sensor, axis=1) < OVERLAP_REACH_M for sensor in sensors], axis=0)
         x, y, z = np.floor(cloud[near] / OVERLAP_VOXEL_M).astype(np.int64).T + side // 2
-        filled.append(np.unique((z * side + y) * side + x))
-    fewer = min(map(len, filled))
-    return len(np.intersect1d(*filled, assume_unique=True)) / fewer if fewer else 0.0
+        voxels.append(np.unique((z * side + y) * side + x))
+    fewer = min(map(len, voxels))
+    return len(np.intersect1d(*voxels, assume_unique=True)) / fewer if fewer else 0.0
 
 
-def _preprocessed(cloud: Float32[np.ndarray, "n 3"]) -> tuple[Any, Any]:
-    """Downsampled cloud with the covariances of its surface, and its search tree."""
+def _preprocess(cloud: Float32[np.ndarray, "n 3"]) -> tuple[Any, Any]:
+    """Downsample a cloud and estimate the covariances of its surface. Returns it with its search tree."""
     options = {"downsampling_resolution": VOXEL_M, "num_neighbors": NEIGHBOURS}
     return _library("small_gicp").preprocess_points(cloud.astype(np.float64), **options)
 
@@ -155,33 +150,34 @@ def _registration_covariance(
 ) -> Float[np.ndarray, "6 6"]:
     """Covariance of a small motion of the query in its own frame: metres, then radians.
 
-    `information` is GICP's matrix of the same motion. Clouds and search tree are results of `_preprocessed`. The
-    covariance of the first guess is kept along degenerate directions.
+    `information` is GICP's matrix of the same motion. Clouds and search tree are results of `_preprocess`. The
+    covariance of the first guess stays along degenerate directions.
     """
-    turn = match_from_query[:3, :3]
-    points, theirs = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))
-    each = max(1, len(points) // POINTS)  # a subset of the points of the query, each with its nearest neighbour
-    moved = points[::each] @ turn.T + match_from_query[:3, 3]
-    nearest, squares = (np.asarray(values) for values in tree.batch_nearest_neighbor_search(moved))
-    near = np.flatnonzero(squares < MAX_APART_M**2)
-    points, nearest = points[::each][near], nearest[near].astype(np.int64)
-    ours_spread = np.stack([query.cov(int(i) * each)[:3, :3] for i in near]) if len(near) else np.zeros((0, 3, 3))
-    theirs_spread = np.stack([match.cov(int(i))[:3, :3] for i in nearest]) if len(near) else np.zeros((0, 3, 3))
-    weights = np.linalg.inv(theirs_spread + turn @ ours_spread @ turn.T)
+    rotation = match_from_query[:3, :3]
+    points, match_points = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))
+    stride = max(1, len(points) // POINTS)
+    moved = points[::stride] @ rotation.T + match_from_query[:3, 3]
+    nearest, squared = (np.asarray(values) for values in tree.batch_nearest_neighbor_search(moved))
+    near = np.flatnonzero(squared < MAX_APART_M**2)
+    points, nearest = points[::stride][near], nearest[near].astype(np.int64)
+    query_surface = np.array([query.cov(int(row) * stride)[:3, :3] for row in near]).reshape(-1, 3, 3)
+    match_surface = np.array([match.cov(int(row))[:3, :3] for row in nearest]).reshape(-1, 3, 3)
+    weights = np.linalg.inv(match_surface + rotation @ query_surface @ rotation.T)
     # Scatter of the gradient of GICP's error over blocks of space.
-    pull = np.einsum("kij,kj->ki", weights, theirs[nearest] - moved[near]) @ turn
+    pull = np.einsum("kij,kj->ki", weights, match_points[nearest] - moved[near]) @ rotation
     gradient = np.concatenate([pull, np.cross(points, pull)], axis=1)
     _, block = np.unique(np.floor(points / BLOCK_M).astype(np.int64), axis=0, return_inverse=True)
     sums = np.zeros((block.max(initial=-1) + 1, 6))
     np.add.at(sums, block.reshape(-1), gradient)
-    noise = sums.T @ sums * each**2
+    noise = sums.T @ sums * stride**2
     inverse = np.linalg.pinv(information, hermitian=True)
-    grow = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * _sparse_ground(theirs, tree, nearest[::4])), 3)
-    grow[[2, 5]] = SCALE * HEIGHT_SCALE, grow[0]
-    found = (inverse @ noise @ inverse) * np.outer(grow, grow)
-    normals = np.linalg.eigh(theirs_spread)[1][:, :, 0] @ turn  # of the neighbours' surfaces, in the query's frame
-    found[:3, :3] += _sliding(normals, initial_covariance)
-    return found
+    sparse = _sparse_ground(match_points, tree, nearest[::4])
+    growth = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * sparse), 3)
+    growth[[2, 5]] = SCALE * HEIGHT_SCALE, growth[0]
+    covariance = (inverse @ noise @ inverse) * np.outer(growth, growth)
+    normals = np.linalg.eigh(match_surface)[1][:, :, 0] @ rotation  # in the query's frame
+    covariance[:3, :3] += _sliding(normals, initial_covariance)
+    return covariance
 
 
 def _sliding(
@@ -191,8 +187,8 @@ def _sliding(
     strengths, directions = np.linalg.eigh(normals.T @ normals)
     shares = strengths / max(strengths.sum(), 1e-9)
     guess = np.eye(3) * UNKNOWN_M**2 if initial_covariance is None else initial_covariance[:3, :3]
-    kept = np.exp(-((shares / SLIDING) ** 2)) * np.einsum("ij,ik,kj->j", directions, guess, directions)
-    return (directions * kept) @ directions.T
+    variances = np.exp(-((shares / SLIDING) ** 2)) * np.einsum("ij,ik,kj->j", directions, guess, directions)
+    return (directions * variances) @ directions.T
 
 
 def _sparse_ground(cloud: Float[np.ndarray, "n 3"], tree: Any, rows: Int[np.ndarray, " k"]) -> float:

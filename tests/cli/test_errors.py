@@ -30,7 +30,7 @@ ERRORS = {
     "live ros:1 --out {out}": "ros:1: expected one of the sources folder, bag, dds, zenoh, found ros",
     "live folder:{root} --out {out} --poses {out}/trajectory.tum": "odometry that this run does not overwrite",
     f"{LOOPS} --optimize": "--odometry, found none",
-    f"{LOOPS} --odometry {{walk}}/poses.tum --min-probability nan": "min_probability from 0 to 1, found nan",
+    f"{LOOPS} --odometry {{walk}}/poses.tum --min-probability nan": "min_probability: expected a finite number",
     f"{LOOPS} --odometry {{root}}/none.tum": "none.tum: expected odometry",
     "loops {town} --seq 08 --out {file}": "expected a folder to write into, found a file",
     f"{MAP} {{out}}.npz": "expected --out to end in .safetensors",

@@ -9,8 +9,7 @@ from drives import drive, revisit, street  # noqa: F401
 import sglpr_jax
 from sglpr_jax.loops.comparison import Candidate, KeyframeComparison
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.keyframes import Keyframe
-from sglpr_jax.loops.keyframes import described as describe_scan
+from sglpr_jax.loops.keyframes import Keyframe, describe_scan
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.models.params import Params
 from sglpr_jax.registration.bev_alignment import BevRegistration

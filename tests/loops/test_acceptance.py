@@ -11,13 +11,12 @@ from recordings import of_scans
 
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import acceptance
-from sglpr_jax.loops.acceptance import accepted, check_odometry, count_revisit_segments
+from sglpr_jax.loops.acceptance import accept_loops, check_odometry, count_revisit_segments
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.pose_graph.optimize import solved_graph, trajectory_error
+from sglpr_jax.pose_graph.optimize import solved_graph
 from sglpr_jax.registration.gicp import Registration
 from sglpr_jax.se3 import transform, travelled
 
@@ -40,28 +39,20 @@ def of_a_car_park() -> tuple[np.ndarray, list[LoopClosure]]:
 def test_of_places_that_repeat_no_loop_is_accepted_and_the_odometry_stays(scene):
     odometry, wrong = scene()
     assert len(wrong) >= 50 and deviations(wrong, DrivenPath(odometry)).min() > 8
-    kept, rejected = accepted(wrong, DrivenPath(odometry))
+    kept, rejected = accept_loops(wrong, DrivenPath(odometry))
     assert not kept and {one.reason for one in rejected} == {"contradicts the odometry"}
     found = solved_graph({0: odometry}, wrong)
     np.testing.assert_array_equal(found.poses, odometry)
     assert not found.inliers.any() and str(found).startswith(f"trajectory not corrected: {len(wrong)} loops need")
 
 
-@pytest.mark.slow
-def test_true_loops_are_kept_and_correct_the_drift():
+def test_true_loops_are_kept():
     true = town()
     odometry = drifted(true, percent=1, deg_per_100m=0.5, noise=1.0)
     loops = true_loops(true, every=6)
     assert len(loops) >= 52 and deviations(loops, DrivenPath(odometry)).max() < 1.7
-    kept, rejected = accepted(loops, DrivenPath(odometry))
+    kept, rejected = accept_loops(loops, DrivenPath(odometry))
     assert kept == loops and not rejected
-    found = solved_graph({0: odometry}, kept)
-    assert found.inliers.all() and found.deviation < 2
-    before, after = (trajectory_error(poses, true[:, :3, 3]) for poses in (odometry, found.poses))
-    assert after < 0.5 * before
-    moved = np.linalg.norm(found.poses[:, :3, 3] - odometry[:, :3, 3], axis=1)
-    assert found.moved_m == moved.max() and found.moved_rms_m == pytest.approx(np.sqrt(np.mean(moved**2)))
-    assert f"moved by {moved.max():.2f} m at most, " in str(found) and "sigmas of the stated drift" in str(found)
 
 
 def test_a_loop_within_the_drift_that_contradicts_the_others_is_rejected():
@@ -69,7 +60,7 @@ def test_a_loop_within_the_drift_that_contradicts_the_others_is_rejected():
     loops = true_loops(true, every=6)
     wrong = dataclasses.replace(loops[-5], match_from_query=loops[-5].match_from_query @ transform(6.0, 0.0, 0.0))
     odometry = drifted(true, percent=1, deg_per_100m=0.5)
-    kept, rejected = accepted([*loops, wrong], DrivenPath(odometry))
+    kept, rejected = accept_loops([*loops, wrong], DrivenPath(odometry))
     assert kept == loops and [(one.loop, one.reason) for one in rejected] == [(wrong, "contradicts other loops")]
 
 
@@ -77,10 +68,10 @@ def test_a_loop_within_the_drift_that_contradicts_the_others_is_rejected():
 def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_can_be_stated():
     true = town()
     odometry, loops = drifted(true, percent=10, deg_per_100m=5), true_loops(true, every=3)
-    kept, rejected = accepted(loops, DrivenPath(odometry))
+    kept, rejected = accept_loops(loops, DrivenPath(odometry))
     assert not kept
     with pytest.warns(DataWarning, match="Either places repeat, or the odometry drifts by about") as told:
-        check_odometry("08", kept, [one.loop for one in rejected], DrivenPath(odometry), DetectorConfig(), 1)
+        check_odometry("08", kept, [one.loop for one in rejected], DrivenPath(odometry), DriftModel(), 1)
     message = str(told[0].message)
     assert (
         "the odometry contradicts the loops of 106 of 106 frames" in message
@@ -92,20 +83,18 @@ def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_ca
     )
     assert 5 < percent < 20 and 2 < degrees < 10
     drift = DriftModel(percent / 100, degrees / 100)
-    kept, _ = accepted(loops, DrivenPath(odometry), drift=drift)
+    kept, _ = accept_loops(loops, DrivenPath(odometry), drift=drift)
     assert len(kept) > 0.98 * len(loops)
-    found = solved_graph({0: odometry}, kept, drift)
-    assert trajectory_error(found.poses, true[:, :3, 3]) < 0.3 * trajectory_error(odometry, true[:, :3, 3])
 
 
 def test_a_few_wrong_loops_among_many_true_ones_are_no_reason_to_doubt_the_odometry():
     true = town()
     loops = true_loops(true, every=6)
     wrong = [LoopClosure(300 + i, 100 + i, np.eye(4), loops[0].covariance, 1.0) for i in range(20)]
-    kept, rejected = accepted([*wrong, *loops], DrivenPath(true))
+    kept, rejected = accept_loops([*wrong, *loops], DrivenPath(true))
     assert kept == loops and len(rejected) == 20
     against = [one.loop for one in rejected]
-    check_odometry("08", kept, against, DrivenPath(true), DetectorConfig(), 1)  # a warning is an error
+    check_odometry("08", kept, against, DrivenPath(true), DriftModel(), 1)  # a warning is an error
 
 
 def test_loops_in_a_row_are_one_part_of_the_drive():
@@ -115,25 +104,6 @@ def test_loops_in_a_row_are_one_part_of_the_drive():
     assert count_revisit_segments(loops, travelled(poses)) == 2 and count_revisit_segments([], travelled(poses)) == 0
     same_match = [LoopClosure(query, 100 + i, np.eye(4), np.eye(6), 1.0) for i, query in enumerate(at)]
     assert count_revisit_segments(same_match, travelled(poses)) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("wrong", "right"), [(4, 48), (10, 0)])
-def test_a_solution_beyond_the_drift_loses_the_loops_that_bend_it_or_is_not_taken(wrong, right):
-    """Loops 8 m off agree with the odometry of a long path and with each other, but not beside the true loops."""
-    true = town()
-    loops = true_loops(true, every=6)
-    aside = [
-        dataclasses.replace(one, match_from_query=one.match_from_query @ transform(0.0, 8.0, 0.0))
-        for one in loops[-wrong:]
-    ]
-    assert deviations(aside, DrivenPath(true)).max() < 1
-    found = solved_graph({0: true}, (*loops[:-wrong], *aside))
-    assert found.inliers.sum() == right and not found.inliers[-wrong:].any()
-    assert found.deviation < 1 and found.moved_m < 1
-    if not right:
-        np.testing.assert_array_equal(found.poses, true)
-        assert str(found).startswith("trajectory not corrected: 53 loops need more than 4 sigmas of the stated drift")
 
 
 @pytest.mark.parametrize(
@@ -146,7 +116,7 @@ def test_scans_that_overlap_little_are_a_loop_if_both_poses_agree(monkeypatch, o
     monkeypatch.setattr(acceptance, "register", registered)
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
     loop = LoopClosure(1, 0, np.eye(4), 0.01 * np.eye(6), 0.99)
-    loops, rejected = acceptance.registered_loops(recording, recording, [loop], should_stop=lambda: False)
+    loops, rejected = acceptance.register_loops(recording, recording, [loop], should_stop=lambda: False)
     (found,) = loops if kept else [one.loop for one in rejected]
     assert found.overlap == overlap and found.match_from_query[0, 3] == off_m
     assert [one.reason for one in rejected] == ([] if kept else ["little overlap"])

@@ -12,7 +12,7 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.arguments import given_pose, given_poses, given_scan, given_time
+from sglpr_jax.loops.arguments import as_pose, as_poses, as_scan, as_seconds
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
@@ -29,29 +29,29 @@ EMPTY = Keyframe(np.ones(256, np.float32), np.zeros((152, 152), np.uint8), None)
 
 
 def test_lists_are_taken_for_arrays():
-    np.testing.assert_array_equal(given_poses(POSES, of="odometry"), np.array(POSES))
-    np.testing.assert_array_equal(given_pose(POSES[0]), np.eye(4))
+    np.testing.assert_array_equal(as_poses(POSES, of="odometry"), np.array(POSES))
+    np.testing.assert_array_equal(as_pose(POSES[0]), np.eye(4))
     scan = Scan()
-    assert given_scan(scan) is scan
-    points = given_scan([[1, 2, 3], [4, 5, 6]])
+    assert as_scan(scan) is scan
+    points = as_scan([[1, 2, 3], [4, 5, 6]])
     assert points.points.dtype == np.float32 and points.points.shape == (2, 3) and points.mounting is None
-    assert given_scan(np.ones((9, 9), int)).image.shape == (9, 9)
-    assert given_time(np.int64(3)) == 3.0 and given_time(None) is None and given_pose(None) is None
+    assert as_scan(np.ones((9, 9), int)).image.shape == (9, 9)
+    assert as_seconds(np.int64(3)) == 3.0 and as_seconds(None) is None and as_pose(None) is None
 
 
 @pytest.mark.parametrize(
     ("call", "kind", "message"),
     [
-        (lambda: given_poses(Path("a.tum"), of="poses"), TypeError, "path a.tum; read it with sglpr_jax.read_odometry"),
-        (lambda: given_poses([np.eye(4), np.eye(3)], of="poses"), TypeError, r"poses \(n, 4, 4\), found a list"),
-        (lambda: given_poses(np.zeros((5, 3)), of="odometry"), ValueError, r"odometry .*, found .* shape \(5, 3\)"),
-        (lambda: given_poses(FLAT, of="odometry"), ValueError, r"with rotations, found \[\[0\.0.* in row 0"),
-        (lambda: given_pose(np.eye(3)), ValueError, r"odometry \(4, 4\), found an array of shape \(3, 3\)"),
-        (lambda: given_scan("000000.bin"), TypeError, "found the path 000000.bin; read it with sglpr_jax.read_scan"),
-        (lambda: given_scan([[1, 2, 3], [4]]), TypeError, r"points \(n, 3\) or an image \(h, w\), found a list"),
-        (lambda: given_scan(np.zeros((3, 3, 3))), ValueError, r"found an array of shape \(3, 3, 3\)"),
-        (lambda: given_time("now"), TypeError, "expected a time in seconds, found 'now'"),
-        (lambda: given_time(np.nan), ValueError, "expected a time in seconds, found nan"),
+        (lambda: as_poses(Path("a.tum"), of="poses"), TypeError, "path a.tum; read it with sglpr_jax.read_odometry"),
+        (lambda: as_poses([np.eye(4), np.eye(3)], of="poses"), TypeError, r"poses \(n, 4, 4\), found a list"),
+        (lambda: as_poses(np.zeros((5, 3)), of="odometry"), ValueError, r"odometry .*, found .* shape \(5, 3\)"),
+        (lambda: as_poses(FLAT, of="odometry"), ValueError, r"with rotations, found \[\[0\.0.* in row 0"),
+        (lambda: as_pose(np.eye(3)), ValueError, r"odometry \(4, 4\), found an array of shape \(3, 3\)"),
+        (lambda: as_scan("000000.bin"), TypeError, "found the path 000000.bin; read it with sglpr_jax.read_scan"),
+        (lambda: as_scan([[1, 2, 3], [4]]), TypeError, r"points \(n, 3\) or an image \(h, w\), found a list"),
+        (lambda: as_scan(np.zeros((3, 3, 3))), ValueError, r"found an array of shape \(3, 3, 3\)"),
+        (lambda: as_seconds("now"), TypeError, "expected a time in seconds, found 'now'"),
+        (lambda: as_seconds(np.nan), ValueError, "expected a time in seconds, found nan"),
     ],
 )
 def test_what_is_something_else_is_named(call, kind, message):
@@ -103,9 +103,9 @@ def test_loops_and_maps_warn_of_poses_in_the_cameras_axes(params):
 def test_dates_are_seconds_and_numbers_stay_as_they_are():
     day, later = np.datetime64("2026-01-02", "D"), np.timedelta64(1_500_000_000, "ns")
     for one in ("s", "ms", "us", "ns"):
-        assert given_time(day.astype(f"datetime64[{one}]")) == 1767312000
-    assert given_time(day.astype("datetime64[ns]") + later) == 1767312001.5
-    assert given_time(later) == 1.5 == given_time(datetime.timedelta(seconds=1.5))
+        assert as_seconds(day.astype(f"datetime64[{one}]")) == 1767312000
+    assert as_seconds(day.astype("datetime64[ns]") + later) == 1767312001.5
+    assert as_seconds(later) == 1.5 == as_seconds(datetime.timedelta(seconds=1.5))
     noon = datetime.datetime(2026, 1, 2, 12, tzinfo=datetime.timezone(datetime.timedelta(hours=12)))
-    assert given_time(noon) == 1767312000
-    assert given_time(1500) == 1500
+    assert as_seconds(noon) == 1767312000
+    assert as_seconds(1500) == 1500

@@ -49,9 +49,13 @@ def test_bins_are_counted():
         (0.9, 0.99, 1, 0),
         (0.99, 1.0, 2, 2),
     ]
-    error = sum(b.pairs * abs(b.said - b.share) for b in found) / 6
+    error = sum(b.pairs * abs(b.probability - b.share) for b in found) / 6
     assert calibration_error(found) == pytest.approx(error)
-    assert found[-1].said == pytest.approx(0.995) and found[-1].share == 1 and found[1].said == pytest.approx(0.2)
+    assert (
+        found[-1].probability == pytest.approx(0.995)
+        and found[-1].share == 1
+        and found[1].probability == pytest.approx(0.2)
+    )
 
 
 @given(st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=60))
@@ -60,7 +64,7 @@ def test_every_pair_is_in_one_bin(pairs):
     probability, is_loop = np.array([p for p, _ in pairs]), np.array([loop for _, loop in pairs], bool)
     found = reliability(probability, is_loop)
     assert sum(b.pairs for b in found) == len(pairs) and sum(b.loops for b in found) == is_loop.sum()
-    assert all(b.low <= b.said <= b.high and b.pairs for b in found)
+    assert all(b.low <= b.probability <= b.high and b.pairs for b in found)
     assert {edge for b in found for edge in (b.low, b.high)} <= set(EDGES)
 
 
@@ -71,5 +75,5 @@ def test_candidates_with_true_positions_and_those_in_between_are_left_out():
     candidates = [Candidate(q, 0, None, Evidence.of(0.0, 0.0, 0.0, c)) for q, c in ((3, 6.0), (4, 6.0), (5, -6.0))]
     low, high = reliability_of(candidates, model, positions)
     assert (low.pairs, low.loops, high.pairs, high.loops) == (1, 0, 1, 1)
-    assert high.said == pytest.approx(1 / (1 + np.exp(-6)))
+    assert high.probability == pytest.approx(1 / (1 + np.exp(-6)))
     assert reliability_of([], model, positions) == () == reliability_of(candidates[1:2], model, positions)

@@ -10,7 +10,6 @@ from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
-from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 
@@ -43,14 +42,14 @@ def compared(
     for frame, one in enumerate(images):
         stored.add(frame, np.ones(2, np.float32), one)
     shown = image(TRUE, THERE, noise=1) if shown is None else shown
-    query = Query(len(images), np.ones(2, np.float32), shown, query_spectra(shown))
+    query = Query(len(images), np.ones(2, np.float32), shown)
     return comparer.candidates(query, comparer.compare(query, stored), stored)
 
 
 def comparer_along(poses: Sequence[np.ndarray], *, drift: DriftModel = EXACT, joined=()) -> KeyframeComparison:
     joined = np.array(joined, np.int64).reshape(-1, 2)
     motion = BevOdometry.of(np.stack(poses))
-    return KeyframeComparison(motion, drift, joined=joined)
+    return KeyframeComparison(motion, drift, loops=joined)
 
 
 def test_the_place_is_found_and_no_other_place_fits_as_well():
@@ -113,12 +112,12 @@ def test_passes_that_a_loop_joins_do_not_compete():
 def test_elsewhere_is_farther_than_a_shift_and_the_drift():
     poses = [transform(float(x), 0.0, 0.0) for x in range(0, 200, 2)]
     drift = DriftModel(metres_per_metre=0.05, degrees_per_metre=0.0, sideways=0.0)
-    found = comparer_along(poses, drift=drift).elsewhere(np.arange(100), 50)
+    found = comparer_along(poses, drift=drift).are_elsewhere(np.arange(100), 50)
     apart = np.abs(np.arange(100) - 50) * 2.0
     np.testing.assert_array_equal(found, apart > np.sqrt(2) * 12 + 4 * 0.05 * apart)
     unknown = comparer_along(poses)
     unknown.motion.add(0.0, continues=False)
-    assert not unknown.elsewhere(np.arange(100), 100).any()
+    assert not unknown.are_elsewhere(np.arange(100), 100).any()
 
 
 def test_a_surprise_falls_with_the_poses_that_the_motion_allows():

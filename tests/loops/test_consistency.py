@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from session_pairs import loops_between, two_drives
 
 from sglpr_jax.loops.closure import LoopClosure, planar_loop
-from sglpr_jax.loops.consistency import MIN_LOOPS, accepted_between, agree, largest_consistent_set
+from sglpr_jax.loops.consistency import MIN_LOOPS, accept_between, are_consistent, largest_consistent_set
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
@@ -46,7 +46,7 @@ def test_right_loops_agree_and_wrong_ones_do_not(seed):
     odometry = drifted(poses, percent=rng.normal(), deg_per_100m=rng.normal(scale=0.5))
     right = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[0.1, 0.1, 0.005]))) for i in range(210, 290, 4)]
     wrong = [loop_of(poses, i, i - 200, (15.0 * (-1) ** i, 5.0, 0.0)) for i in range(212, 290, 13)]
-    pairs = agree(right + wrong, DrivenPath(odometry))
+    pairs = are_consistent(right + wrong, DrivenPath(odometry))
     assert pairs[:20, :20].mean() > 0.98
     near = np.abs(np.subtract.outer([one.query for one in right], [one.query for one in wrong])) < 20
     assert not pairs[:20, 20:][near].any()
@@ -58,9 +58,9 @@ def test_a_loop_in_the_other_direction_agrees_with_one_in_the_same():
     poses = square_drive()
     back = poses.copy()
     back[200:] = poses[200:] @ transform(0.0, 0.0, np.pi)
-    assert agree([loop_of(back, 230, 30), loop_of(back, 240, 40)], DrivenPath(back)).all()
+    assert are_consistent([loop_of(back, 230, 30), loop_of(back, 240, 40)], DrivenPath(back)).all()
     turned = [loop_of(back, 230, 30), loop_of(back, 240, 40, (0.0, 0.0, np.pi))]
-    assert not agree(turned, DrivenPath(back))[0, 1]
+    assert not are_consistent(turned, DrivenPath(back))[0, 1]
 
 
 def chosen_by_the_letter(pairs: np.ndarray, starts: int = 20) -> list[int]:
@@ -81,7 +81,7 @@ def chosen_by_the_letter(pairs: np.ndarray, starts: int = 20) -> list[int]:
 @given(n=st.integers(0, 60), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]), seed=st.integers(0, 10**6))
 def test_the_set_is_the_one_that_all_degrees_taken_anew_choose(n, share, seed):
     rng = np.random.default_rng(seed)
-    pairs = rng.random((n, n)) < np.sqrt(share)  # some agree one way alone, some not with themselves
+    pairs = rng.random((n, n)) < np.sqrt(share)  # some are_consistent one way alone, some not with themselves
     assert largest_consistent_set(pairs).tolist() == chosen_by_the_letter(pairs)
 
 
@@ -119,7 +119,7 @@ def test_a_few_wrong_loops_are_rejected_and_the_others_accepted():
         for query, match in ((3, 40), (30, 5), (50, 70), (60, 20))
     ]
     mixed = sorted([*right, *wrong], key=lambda loop: loop.query)
-    sets, rejected = accepted_between(mixed, MOTION, **RULES)
+    sets, rejected = accept_between(mixed, MOTION, **RULES)
     assert [len(one) for one in sets] == [len(right)]
     assert {id(one.loop) for one in rejected} == set(map(id, wrong))
     assert {one.reason for one in rejected} == {"contradicts other loops"}
@@ -128,7 +128,7 @@ def test_a_few_wrong_loops_are_rejected_and_the_others_accepted():
 def test_too_few_loops_or_too_short_a_path_are_no_common_place():
     loops = joined_loops(TRUE)
     for some in (loops[: MIN_LOOPS - 1], loops[: MIN_LOOPS + 2], []):  # 5 loops are 2 m apart: 8 m
-        sets, rejected = accepted_between(some, MOTION, **RULES)
+        sets, rejected = accept_between(some, MOTION, **RULES)
         assert sets == [] and len(rejected) == len(some)
         assert {one.reason for one in rejected} <= {"too few neighbours"}
 
@@ -136,7 +136,7 @@ def test_too_few_loops_or_too_short_a_path_are_no_common_place():
 def test_a_place_that_repeats_gives_two_transforms_and_therefore_none():
     farther = transform(12.0, 0.0, 0.0) @ TRUE
     both = sorted([*joined_loops(TRUE), *joined_loops(farther)], key=lambda loop: loop.query)
-    sets, rejected = accepted_between(both, MOTION, **RULES)
+    sets, rejected = accept_between(both, MOTION, **RULES)
     assert sets == [] and len(rejected) == len(both)
 
 
@@ -145,5 +145,5 @@ def test_parts_without_known_motion_are_accepted_one_by_one():
     middle = int(np.median([loop.query for loop in loops]))
     offset, parts = middle - len(FIRST) + 1, [BevOdometry.of(FIRST)]
     parts += [BevOdometry.of(some) for some in (SECOND[:offset], SECOND[offset:])]
-    sets, rejected = accepted_between(loops, BevOdometry.joined(parts), **RULES)
+    sets, rejected = accept_between(loops, BevOdometry.joined(parts), **RULES)
     assert len(sets) == 2 and sum(map(len, sets)) == len(loops) and not rejected

@@ -77,7 +77,7 @@ def streamed_pairs(params, compare_only):
         compare_only({query: (match, true[query]) for query, match in matches.items()})
         for frame in range(len(THERE_AND_BACK)):
             pose = None if poses is None else poses[frame]
-            detector.add_keyframe(keyframe, odometry=pose, compared=NO_FITS)
+            detector.add_keyframe(keyframe, odometry=pose, fits=NO_FITS)
         return detector
 
     return streamed

@@ -9,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.loops.closure import LoopClosure, inverse_planar
+from sglpr_jax.data.scaled import scaled_poses
+from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.drift import deviations, planar_deviations, step_deviations
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o
-from sglpr_jax.se3 import inverse, transform
+from sglpr_jax.se3 import inverse, inverse_planar, transform
 
 SHARP = dataclasses.replace(DriftModel(), position_m=1e-3, yaw_deg=1e-3)
 
@@ -106,9 +107,20 @@ def test_the_steps_of_a_graph_add_up_to_the_model_after_100_m(tmp_path):
     assert information[0, 0] == pytest.approx(1 / (1.0 + 2.5e-5), rel=1e-6)
 
 
+def test_odometry_drifts_as_much_at_any_scale():
+    """Only the constants of the comparison belong to the images."""
+    poses, pairs = town(), ((300, 40), (700, 120))
+    odometry, drift = drifted(poses, percent=1, deg_per_100m=0.5), dataclasses.replace(SHARP, height_m=1e-3)
+    large, large_odometry = scaled_poses(poses, 4.0), scaled_poses(odometry, 4.0)
+    expected = deviations([exact(poses, *pair) for pair in pairs], DrivenPath(odometry), drift=drift)
+    loops = [exact(large, *pair) for pair in pairs]
+    found = deviations(loops, DrivenPath(large_odometry), drift=drift.at_scale(4.0))
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
 @pytest.mark.parametrize(("name", "value"), [("metres_per_metre", -0.1), ("position_m", 0.0), ("position_m", np.nan)])
 def test_an_impossible_drift_is_an_error(name, value):
-    with pytest.raises(ValueError, match=f"expected {name} >=? ?0, found"):
+    with pytest.raises(ValueError, match=f"DriftModel.{name}: expected a (finite )?number"):
         DriftModel(**{name: value})
     assert str(DriftModel(0.1, 0.05)) == "10 % and 5 degrees per 100 m"
 

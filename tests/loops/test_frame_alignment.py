@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from session_pairs import loops_between, two_drives
 
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.frame_alignment import aligned_frames
+from sglpr_jax.loops.frame_alignment import align_frames
 from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.se3 import inverse, transform, transform_covariance, travelled, yaw_of
 
@@ -17,7 +17,9 @@ EXACT = DriftModel(metres_per_metre=0.0, degrees_per_metre=0.0)
 
 
 def aligned(loops, first, second, drift=EXACT):
-    return aligned_frames(loops, first, second, match_way=travelled(first), query_way=travelled(second), drift=drift)
+    return align_frames(
+        loops, first, second, match_travelled_m=travelled(first), query_travelled_m=travelled(second), drift=drift
+    )
 
 
 def error(loops, first, second, true) -> np.ndarray:

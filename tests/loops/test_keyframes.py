@@ -103,8 +103,8 @@ def test_loops_with_limits_are_right_and_limits_that_are_not_reached_change_noth
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        ({"max_places": 0}, "expected max_places of 1 or more, found 0"),
-        ({"keyframe_m": np.nan}, "expected keyframe_m of 0 or more, found nan"),
+        ({"max_places": 0}, "DetectorConfig.max_places: expected a number from 1 .*, found 0"),
+        ({"keyframe_m": np.nan}, "DetectorConfig.keyframe_m: expected a finite number, found nan"),
     ],
 )
 def test_invalid_limits_are_one_clear_error(limits, message):

@@ -59,7 +59,7 @@ def found(params, compare_only, monkeypatch):
         true = {query: (match, inverse(poses[match]) @ poses[query]) for query, match in ways.items()}
         compare_only(true | {query: (match, np.eye(4)) for query, match in wrong.items()})
         for pose in odometry:
-            detector.add_keyframe(keyframe, odometry=pose, compared=NO_FITS)
+            detector.add_keyframe(keyframe, odometry=pose, fits=NO_FITS)
         monkeypatch.setattr(search, "LoopDetector", lambda *_, **__: detector)
         odometry = scaled_poses(odometry, 1 / scale)
         options = {"odometry": odometry, "config": CONFIG, "registered": False}

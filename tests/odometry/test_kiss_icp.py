@@ -114,16 +114,6 @@ def test_scaled_scans_give_poses_in_metres(start):
     assert ", points up to 50 m, voxels of 0.5 m, without" in kiss_icp.about(start, OdometryConfig(), scale=2)
 
 
-def test_poses_are_those_at_the_times_of_the_scans(start):
-    """kiss-icp's poses are those of the last point of a scan, here .1 s later: that of the next scan."""
-    true = np.tile(np.eye(4), (len(start), 1, 1))
-    true[:, 0, 3] = np.arange(len(start)) ** 2
-    times = 0.1 * np.arange(len(start))
-    late = only(of_scans(dict.fromkeys(start.paths[1:], np.zeros((1, 3))), times=times[1:]), range(len(start) - 1))
-    found = kiss_icp._at_times_of_scans(true[1:], late, np.full(len(late), 0.1))
-    np.testing.assert_allclose(found[2:, 0, 3] - found[1, 0, 3], true[2:-1, 0, 3] - true[1, 0, 3], atol=1e-6)
-
-
 def test_the_motion_within_scans_is_removed():
     """An accelerating, turning sensor between walls: poses are those at the times of the scans, the first points."""
     rng, times, clouds, stamps = np.random.default_rng(0), 0.1 * np.arange(16), {}, np.linspace(0, 0.1, 6000)

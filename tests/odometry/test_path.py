@@ -48,8 +48,8 @@ def test_the_integrals_are_sums_over_small_steps(positions, guesses, ends):
                 squares + step / 200 * np.outer(at, at),
             )
     np.testing.assert_allclose(found.length, sign * length, atol=1e-6)
-    np.testing.assert_allclose(found.first[0], sign * place, atol=1e-4 * max(1, np.abs(place).max()))
-    np.testing.assert_allclose(found.squares[0], sign * squares, atol=1e-4 * max(1, np.abs(squares).max()))
+    np.testing.assert_allclose(found.position[0], sign * place, atol=1e-4 * max(1, np.abs(place).max()))
+    np.testing.assert_allclose(found.position_products[0], sign * squares, atol=1e-4 * max(1, np.abs(squares).max()))
 
 
 def test_positions_drift_along_and_by_the_turns_before():

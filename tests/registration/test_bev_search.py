@@ -9,13 +9,13 @@ from scenes import place, relative, seen_from
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.registration.bev_search import SECOND_DEG, SECOND_M, coarse_correlations, search, search_near
 from sglpr_jax.registration.bev_spectra import (
-    cells,
+    cell_count,
     lower_half,
     match_spectra,
-    merged,
-    prepared,
+    merge_cells,
+    prepare_image,
     query_spectra,
-    rotations,
+    rotate,
     spectrum,
 )
 from sglpr_jax.registration.config import VerificationConfig
@@ -27,10 +27,10 @@ def correlations(query: np.ndarray, match: np.ndarray) -> np.ndarray:
     """Of all rotations and shifts (rotation, down, right), by inverse transforms of the whole spectra."""
     angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
     cell_m = DENSITY_RESOLUTION_M * SMALL.coarse
-    small = [merged(prepared(image, SMALL), SMALL.coarse) for image in (query, match)]
-    queries = np.asarray(spectrum(rotations(small[0], jnp.asarray(angles)), cell_m, SMALL))
+    small = [merge_cells(prepare_image(image, SMALL), SMALL.coarse) for image in (query, match)]
+    queries = np.asarray(spectrum(rotate(small[0], jnp.asarray(angles)), cell_m, SMALL))
     there = np.asarray(spectrum(small[1][None], cell_m, SMALL))
-    size, reach = queries.shape[1], cells(SMALL.max_shift_m, cell_m)
+    size, reach = queries.shape[1], cell_count(SMALL.max_shift_m, cell_m)
     shifted = np.fft.irfft2(there * np.conj(queries), (size, size))
     return np.roll(shifted, (reach, reach), (-2, -1))[:, : 2 * reach + 1, : 2 * reach + 1]
 
@@ -46,7 +46,7 @@ def test_peaks_are_those_of_whole_transforms(seed):
         volume = correlations(query, match)
         turn, down, right = np.unravel_index(volume.argmax(), volume.shape)
         cell_m, step_deg = DENSITY_RESOLUTION_M * SMALL.coarse, 360 / SMALL.turns
-        reach = cells(SMALL.max_shift_m, cell_m)
+        reach = cell_count(SMALL.max_shift_m, cell_m)
         assert found.correlation[k] == pytest.approx(volume.max(), abs=1e-5)
         assert abs(found.x[k] - (right - reach) * cell_m) <= cell_m / 2 + 1e-5
         assert abs(found.y[k] - (reach - down) * cell_m) <= cell_m / 2 + 1e-5
