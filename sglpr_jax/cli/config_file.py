@@ -12,7 +12,7 @@ import difflib
 import json
 import sys
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -38,13 +38,7 @@ class ConfigFlags:
 
 def flag_values(command: Any) -> dict[str, Any]:
     """Return the values of all flags of a command as JSON values, by flag without dashes."""
-    values = {}
-
-    def note(flag: str, _annotation: Any, value: Any) -> Any:
-        values[flag] = value
-        return value
-
-    _visit(type(command), vars(command), note)
+    values = {flag: value for flag, _, value in _flags(type(command), vars(command))}
     return json.loads(json.dumps(values, default=str))
 
 
@@ -117,26 +111,19 @@ def _default(field: dataclasses.Field) -> Any:
 
 def _split_settings(arguments: list[str], command: type, fields: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Take the settings with a dot in their names (--candidates.recent-m 50) out of a command line."""
-    annotations: dict[str, Any] = {}
-
-    def note(flag: str, annotation: Any, value: Any) -> Any:
-        annotations[flag] = annotation
-        return value
-
-    _visit(command, fields, note)
+    lists = {flag for flag, annotation, _ in _flags(command, fields) if typing.get_origin(annotation) is tuple}
     values, others, rest = {}, [], list(arguments)
     while rest:
-        name, _, given = (first := rest.pop(0)).partition("=")
+        name, equals, text = (word := rest.pop(0)).partition("=")
         flag = name.removeprefix("--")
         if not name.startswith("--") or "." not in flag:
-            others.append(first)
+            others.append(word)
             continue
-        texts = [given] if "=" in first else []
-        is_list = typing.get_origin(annotations.get(flag)) is tuple
-        while rest and not rest[0].startswith("--") and (not texts or is_list):
+        texts = [text] if equals else []
+        while rest and not rest[0].startswith("--") and (not texts or flag in lists):
             texts.append(rest.pop(0))
         words = [_json_value(text) for text in texts]
-        values[flag] = words if is_list or len(words) != 1 else words[0]
+        values[flag] = words if flag in lists or len(words) != 1 else words[0]
     return values, others
 
 
@@ -155,36 +142,46 @@ def _with_values(
     Raises ValueError if a setting does not exist or a value does not fit it. The message names the setting, the
     expected and the found value.
     """
-    known = []
-
-    def read(flag: str, annotation: Any, value: Any) -> Any:
-        known.append(flag)
-        return read_value(values[flag], annotation, dashes + flag) if flag in values else value
-
-    changed = _visit(command, fields, read)
-    unknown = next((flag for flag in values if flag not in known), None)
+    flags = [flag for flag, _, _ in _flags(command, fields)]
+    unknown = next((flag for flag in values if flag not in flags), None)
     if unknown is not None:
-        near = difflib.get_close_matches(unknown, known, n=1)
+        near = difflib.get_close_matches(unknown, flags, n=1)
         hint = f"; did you mean {dashes + near[0]!r}?" if near else ""
         raise ValueError(f"expected flags of the command, found {dashes + unknown!r}{hint}")
-    return changed
+    return _replace(command, fields, values, "", dashes)
 
 
-def _visit(
-    config: type, fields: Mapping[str, Any], visit: Callable[[str, Any, Any], Any], prefix: str = ""
+def _replace(
+    config: type, fields: Mapping[str, Any], values: Mapping[str, Any], prefix: str, dashes: str
 ) -> dict[str, Any]:
-    """Return the fields of a dataclass by name, with `visit(flag, annotation, value)` as the value of each flag."""
-    visited = {}
-    for name, annotation in field_types(config).items():
-        flag, value = prefix + name.replace("_", "-"), fields[name]
+    """Return the fields of a dataclass by name, with the values of some flags. `prefix` begins its flags."""
+    replaced = dict(fields)
+    for name, flag, annotation, value in _named_flags(config, fields, prefix):
         if is_config(type(value)):
-            inner = prefix if _is_flat(annotation) else f"{flag}."
-            nested = _visit(type(value), vars(value), visit, inner)
-            with naming(inner.removesuffix(".")) if inner else contextlib.nullcontext():  # fields may be inconsistent
-                visited[name] = dataclasses.replace(value, **nested)
+            nested = _replace(type(value), vars(value), values, flag, dashes)
+            with naming(flag.removesuffix(".")) if flag else contextlib.nullcontext():  # fields may be inconsistent
+                replaced[name] = dataclasses.replace(value, **nested)
+        elif flag in values:
+            replaced[name] = read_value(values[flag], annotation, dashes + flag)
+    return replaced
+
+
+def _flags(config: type, fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield flag, annotation and value of all fields of a dataclass and of the configurations in it."""
+    for _, flag, annotation, value in _named_flags(config, fields, prefix):
+        if is_config(type(value)):
+            yield from _flags(type(value), vars(value), flag)
         else:
-            visited[name] = visit(flag, annotation, value)
-    return visited
+            yield flag, annotation, value
+
+
+def _named_flags(config: type, fields: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, str, Any, Any]]:
+    """Yield name, flag, annotation and value of each field. The flag of a configuration is the prefix of its flags."""
+    for name, annotation in field_types(config).items():
+        flag = prefix + name.replace("_", "-")
+        if is_config(type(fields[name])):
+            flag = prefix if _is_flat(annotation) else f"{flag}."
+        yield name, flag, annotation, fields[name]
 
 
 def _is_flat(annotation: Any) -> bool:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import tyro
 
 from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions, report_bad_scan, resolved_scale
-from sglpr_jax.cli.runtime import progress_bar
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.methods.names import LEARNED_NAMES, NETWORK, AnyMethodName
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     from sglpr_jax.data.recording import Recording

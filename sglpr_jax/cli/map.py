@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
-from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
+from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.files import exclusive_lock, naming
 from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -100,8 +101,14 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     files = AUTO if command.poses == AUTO else (command.poses,)
-    options = {"format": command.pose_format, "kept_in": lambda _: command.out.with_suffix(ODOMETRY)}
-    effective, (recording,), (poses,) = open_with_odometry(command, (command.recording,), files, **options)
+    odometry_checkpoint = command.out.with_suffix(ODOMETRY)
+    effective, (recording,), (poses,) = open_with_odometry(
+        command,
+        (command.recording,),
+        files,
+        format=command.pose_format,
+        checkpoint=lambda number: odometry_checkpoint,
+    )
     if command.poses == AUTO:
         times = recording.numbers.astype(float) if recording.times is None else recording.times
         write_tum(command.out.with_suffix(TRAJECTORY), poses, times)
@@ -138,7 +145,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     remove(unfinished)
-    command.out.with_suffix(ODOMETRY).unlink(missing_ok=True)
+    odometry_checkpoint.unlink(missing_ok=True)
     return 0
 
 

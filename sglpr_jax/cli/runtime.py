@@ -21,7 +21,6 @@ from typing import Annotated, TypeVar
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, with_defaults
 from sglpr_jax.data.warning import DataWarning
@@ -228,16 +227,3 @@ def stop_on_signal() -> Iterator[StopRequest]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def progress_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Context manager that shows a progress bar on stderr, or nothing without a terminal.
-
-    It yields a function; call it with the number of items finished so far.
-    """
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(printable(title), total=total)
-        yield lambda done: progress.update(task, completed=done)

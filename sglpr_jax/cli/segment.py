@@ -8,9 +8,10 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
-from sglpr_jax.cli.runtime import console, progress_bar
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     from sglpr_jax.data.scan import Scan

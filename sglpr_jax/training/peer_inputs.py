@@ -16,6 +16,7 @@ from sglpr_jax.files import file_name, in_short, replacing
 from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.method import LABELLED, require_content
 from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.training.batches import positions_of
 from sglpr_jax.training.tuples import TuplePool
 
 SCANS_AHEAD = 8
@@ -35,7 +36,7 @@ class TrainingInputs:
         return np.stack([self.inputs[pool.recording[place]][pool.frame[place]] for place in places])
 
 
-def prepared(
+def prepare_inputs(
     method: LearnedMethod, recordings: Sequence[Recording], cache: Path, *, progress: Progress = no_progress
 ) -> TrainingInputs:
     """Compute the inputs of all scans, or read them from the cache.
@@ -50,8 +51,7 @@ def prepared(
     """
     for recording in recordings:
         require_content(method.name, method.takes, recording, every_label=True)
-        if recording.positions is None:
-            raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
+        positions_of(recording)
     inputs = tuple(_inputs(method, recording, cache, progress) for recording in recordings)
     for recording, array in zip(recordings, inputs, strict=True):
         _require_alike(array[0], inputs[0][0], name=f"sequence {recording.name}")
