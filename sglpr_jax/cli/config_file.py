@@ -68,17 +68,17 @@ def with_defaults(command: type[T], arguments: Sequence[str] | None = None) -> t
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # the two that set the other flags' defaults
     parser.add_argument("--config", type=Path)
     parser.add_argument("--preset")
-    early, _ = parser.parse_known_args(arguments)
-    file: Any = early.config
+    first_flags, _ = parser.parse_known_args(arguments)
+    file: Any = first_flags.config
     values = {} if file is None else read_json(file)
     require(values, isinstance(values, dict), "an object with a value for each flag", str(file))
     fields = {field.name: _default(field) for field in dataclasses.fields(command)}  # type: ignore[arg-type]
     if "config" in fields:
         from sglpr_jax.training.presets import load_preset  # slow import, not needed by most commands
 
-        in_file = early.preset is None and "preset" in values
+        in_file = first_flags.preset is None and "preset" in values
         with naming(f"{file}: preset") if in_file else contextlib.nullcontext():
-            preset = read_value(values["preset"], str, "") if in_file else early.preset or fields["preset"]
+            preset = read_value(values["preset"], str, "") if in_file else first_flags.preset or fields["preset"]
             fields["config"] = load_preset(preset)
     if values:
         with naming(str(file)):
@@ -86,9 +86,9 @@ def with_defaults(command: type[T], arguments: Sequence[str] | None = None) -> t
     settings, others = _split_settings(arguments, command, fields)
     if settings:
         fields = _with_values(command, fields, settings, dashes="--")
-    made = object.__new__(command)  # the constructor takes no missing values
-    vars(made).update(fields)
-    return made, others
+    default = object.__new__(command)  # the constructor takes no missing values
+    vars(default).update(fields)
+    return default, others
 
 
 def hide_nested(command: Any) -> None:

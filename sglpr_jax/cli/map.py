@@ -132,15 +132,16 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if stopped and before is not None and command.frame == "align":
         print("the new map is not aligned and added before it is complete")
     elif len(places):
-        whole = places if before is None else _added(command, before, places, poses_by_id(recording, poses))
-        if stopped and _holds_more(command.out, len(whole)):
-            print(f"{command.out}: unchanged, because it has more places than the {len(whole)} found until now")
+        place_map = places if before is None else _added(command, before, places, poses_by_id(recording, poses))
+        if stopped and _holds_more(command.out, len(place_map)):
+            print(f"{command.out}: unchanged, because it has more places than the {len(place_map)} found until now")
         else:
-            whole.save(command.out)
-            new = len(whole) - (0 if before is None else len(before))
+            place_map.save(command.out)
+            new = len(place_map) - (0 if before is None else len(before))
             left_out = f", {len(skipped)} scans skipped" if skipped else ""
-            of = f"{scans} of {len(recording)}" if stopped else f"{scans}"
-            print(f"{command.out}: {len(whole)} places, {new} of them from {of} scans of {recording.name}{left_out}")
+            count = f"{scans} of {len(recording)}" if stopped else f"{scans}"
+            new_places = f"{new} of them from {count} scans of {recording.name}{left_out}"
+            print(f"{command.out}: {len(place_map)} places, {new_places}")
     if stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
@@ -160,14 +161,14 @@ def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict
     new = without_known_places(before, new)
     if not len(new):
         return before
-    found = align_maps(before, new)
-    if found is None:
+    alignment = align_maps(before, new)
+    if alignment is None:
         raise ValueError(
             f"{command.add_to}: expected places in common with {command.recording} to align the two world frames, "
             "found too few"
         )
-    print(f"{command.recording}: {found}")
-    world_from_new = found.old_from_new
+    print(f"{command.recording}: {alignment}")
+    world_from_new = alignment.old_from_new
     return before.merged(new.moved(world_from_new), drive={id: world_from_new @ pose for id, pose in drive.items()})
 
 

@@ -85,8 +85,8 @@ def run_peers(command: PeersCommand) -> None:
         settings = RunSettings(rate, seed=command.seed, seconds=command.seconds, images=command.images)
         record_command(dataclasses.replace(command, learning_rate=rate), out)
         options = {"stopped": stopped, "report": print_error, "progress": progress_bar, "resume": resume}
-        found = train_learned(method, data, settings, out, score=score, **options)
-    print(f"{out}: {found.images} images in {found.seconds:.0f} s", file=sys.stderr)
+        run = train_learned(method, data, settings, out, score=score, **options)
+    print(f"{out}: {run.images} images in {run.seconds:.0f} s", file=sys.stderr)
     if stopped():
         stopped.exit("stopped; continue with --resume")
     print(f"run: {out}")
@@ -115,7 +115,7 @@ def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingIn
     cache = command.cache or cache_folder() / "peers"
     if command.held_out is not None and command.held_out.resolve() in {path.resolve() for path in command.data}:
         raise ValueError(f"--held-out {command.held_out}: expected a dataset other than DATA, found one of them")
-    recordings = [one for root in command.data for one in all_recordings(root, title="training on")]
+    recordings = [recording for root in command.data for recording in all_recordings(root, title="training on")]
     if command.held_out is None:
         return prepare_inputs(method, recordings, cache, progress=progress_bar), None
     held_out = all_recordings(command.held_out, title="held out")

@@ -85,13 +85,13 @@ def parse_command(command: type[T], name: str, arguments: list[str] | None = Non
         [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
     )
     about = inspect.getdoc(command) or ""
-    made, arguments = with_defaults(command, arguments)
-    if hasattr(made, "config"):
+    defaults, arguments = with_defaults(command, arguments)
+    if hasattr(defaults, "config"):
         from sglpr_jax.training.presets import preset_names  # slow import, not needed by most commands
 
         about += f"\nPresets: {', '.join(preset_names())}"
-    hide_nested(made)
-    default = line_type(made, ConfigFlags())
+    hide_nested(defaults)
+    default = line_type(defaults, ConfigFlags())
     line = tyro.cli(
         line_type, args=arguments, prog=own_names(f"bin/{name}"), description=own_names(about), default=default
     )
@@ -154,8 +154,8 @@ def _one_line(error: Exception) -> str:
 
 def _check_devices() -> None:
     """Exit with one line if JAX does not find the devices of JAX_PLATFORMS."""
-    asked = os.environ.get("JAX_PLATFORMS")
-    if not asked:
+    platforms = os.environ.get("JAX_PLATFORMS")
+    if not platforms:
         return
     import jax  # slow import, not needed for --help
 
@@ -163,7 +163,7 @@ def _check_devices() -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:
         reason = f"expected a device that JAX finds, found none ({in_short(error)})"
-        sys.exit(_one_line(ValueError(f"JAX_PLATFORMS={asked}: {reason}")))
+        sys.exit(_one_line(ValueError(f"JAX_PLATFORMS={platforms}: {reason}")))
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:

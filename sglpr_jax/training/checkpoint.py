@@ -128,8 +128,8 @@ def _checksums(path: Path, about: Mapping[str, Any]) -> dict[str, str]:
 def _read(path: Path, like: TrainState) -> TrainState:
     expected = _by_path(like)
     with _orbax() as orbax:
-        there: Any = orbax.metadata(path / _STATE).item_metadata
-        check_leaves(there.tree, expected, source=path)
+        stored: Any = orbax.metadata(path / _STATE).item_metadata
+        check_leaves(stored.tree, expected, source=path)
         empty = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
         values = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
     check_leaves(values, expected, source=path)

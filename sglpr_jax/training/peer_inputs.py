@@ -64,36 +64,36 @@ def _inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: 
         with progress(f"prepare {recording.name}", len(recording)) as show:
             _write(path, method, recording, show)
     try:
-        found = np.load(path, mmap_mode="r", allow_pickle=False)
+        inputs = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, EOFError) as error:
         raise ValueError(f"{path}: expected inputs, found a damaged file ({in_short(error)}); delete it") from error
-    if len(found) != len(recording):
-        raise ValueError(f"{path}: expected {len(recording)} inputs, found {len(found)}; delete the file")
-    return found
+    if len(inputs) != len(recording):
+        raise ValueError(f"{path}: expected {len(recording)} inputs, found {len(inputs)}; delete the file")
+    return inputs
 
 
 def _write(path: Path, method: LearnedMethod, recording: Recording, show) -> None:
     """Write the inputs of a recording, completely or not at all."""
     check_readable(recording, len(recording))
     options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD, "on_progress": show}
-    made = scan_stream(recording, lambda row, scan: method.prepare(scan), **options)
+    stream = scan_stream(recording, lambda row, scan: method.prepare(scan), **options)
     with replacing(path) as temporary:
         file = None
-        for row, one in made:
-            assert one is not None  # without `on_bad_scan`, a bad scan is an error
+        for row, inputs in stream:
+            assert inputs is not None  # without `on_bad_scan`, a bad scan is an error
             if file is None:
-                shape = (len(recording), *one.shape)
-                file = np.lib.format.open_memmap(temporary, mode="w+", dtype=one.dtype, shape=shape)
-            _require_alike(one, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
-            file[row] = one
+                shape = (len(recording), *inputs.shape)
+                file = np.lib.format.open_memmap(temporary, mode="w+", dtype=inputs.dtype, shape=shape)
+            _require_alike(inputs, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
+            file[row] = inputs
         del file  # flushes it
 
 
-def _require_alike(found: np.ndarray, expected: np.ndarray, *, name: str) -> None:
-    if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+def _require_alike(inputs: np.ndarray, expected: np.ndarray, *, name: str) -> None:
+    if (inputs.shape, inputs.dtype) != (expected.shape, expected.dtype):
         raise ValueError(
             f"{name}: expected an input {expected.dtype} {expected.shape} as for the other scans, found "
-            f"{found.dtype} {found.shape}"
+            f"{inputs.dtype} {inputs.shape}"
         )
 
 

@@ -130,14 +130,14 @@ def train(
     with contextlib.ExitStack() as opened:
         follower = opened.enter_context(contextlib.closing(callback if callback and is_first_host() else Callback()))
         recordings, also = on_all_hosts(
-            lambda: tuple(_packed(each, cache, follower, stopped) for each in (recordings, also))
+            lambda: (_packed(recordings, cache, follower, stopped), _packed(also, cache, follower, stopped))
         )
         source, score = _source_and_score(recordings, also, config, folder)
-        done = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
-        start_from = None if weights is None or done else _grafted(weights, config)
-        if config.steps < done:
+        last_step = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
+        start_from = None if weights is None or last_step else _grafted(weights, config)
+        if config.steps < last_step:
             raise ValueError(
-                f"{folder}: expected at least the {done} steps that are already done, found {config.steps}"
+                f"{folder}: expected at least the {last_step} steps that are already done, found {config.steps}"
             )
         lock = lock_run(folder, run_settings(config, settings), seed=config.seed, resume=resume, limits=LIMITS)
         on_all_hosts(lambda: is_first_host() and opened.enter_context(lock))
