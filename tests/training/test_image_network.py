@@ -132,20 +132,6 @@ def test_a_segmentation_that_learns_alone_needs_a_loss_of_its_own_and_moves_noth
 
 
 @pytest.mark.slow
-def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, random_params, make_batch):
-    head = dataclasses.replace(config.model.head, input="counts+labels")
-    config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
-    params, batch = random_params(config.model), make_batch(0)
-    gradient, metrics = gradients_of(params, batch, config)
-    assert set(metrics) == {"loss", "triplet", "violations"} and set(gradient) == {"patch_embed", "place_head"}
-    assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
-    relabelled = batch.replace(classes=(batch.classes + 1) % 20)
-    assert gradients_of(params, relabelled, config)[1]["triplet"] != metrics["triplet"]
-    with pytest.raises(ValueError, match="expected class maps"):
-        gradients_of(params, batch.replace(classes=None), config)
-
-
-@pytest.mark.slow
 def test_both_passes_over_a_chunk_drop_the_same_branches(config, random_params, make_batch):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
     backbone = dataclasses.replace(SWIN.backbone, drop_path=0.5)
@@ -203,10 +189,6 @@ def test_of_a_share_of_the_places_the_rotation_is_a_quarter_turn_or_more(config,
     assert 0.4 < whole.mean() < 0.6
     assert np.bincount(np.round(quarters[whole]).astype(int), minlength=4).min() > whole.sum() / 6
     assert np.ptp(np.histogram(quarters[~whole], bins=4, range=(0, 4))[0]) < (~whole).sum() / 6
-    batch = make_batch(0, images=True)
-    all_quarters = dataclasses.replace(config, quarter_turns=1.0)
-    for image, turned in zip(batch.images, chunks_of(batch, all_quarters).images[0], strict=True):
-        assert any(np.allclose(np.rot90(image, k), turned, atol=1e-4) for k in range(4))
 
 
 GRID = Grid(resolution_m=1.0, height=64, width=48)
@@ -273,26 +255,3 @@ def test_labelled_places_come_where_the_segmentation_head_looks_and_go_back(mixe
     assert (seen >= 4).sum() == min(len(seen), 4)
     alone = mixed.replace(also=None)
     np.testing.assert_array_equal(in_network_order(places, alone, every=every), places)
-
-
-@pytest.mark.slow
-def test_the_segmentation_learns_from_labelled_places_alone_and_the_triplet_loss_from_its_own(mixed, config, params):
-    assert mixed.labelled.sum() == 3
-    gradient, metrics = gradients_of(params, mixed, config)
-    assert np.abs(gradient["segmentation_head"]["kernel"]).max() > 1e-3
-    assert metrics["cross_entropy"] > 0 and metrics["triplet"] > 0
-
-    def segmentation_gradient(batch):
-        return gradients_of(params, batch, config)[0]["segmentation_head"]["kernel"]
-
-    other_images = mixed.replace(images=mixed.images[::-1].copy())
-    np.testing.assert_array_equal(segmentation_gradient(other_images), gradient["segmentation_head"]["kernel"])
-    unlabelled = np.flatnonzero(~mixed.labelled[4:])
-    points = mixed.also.points.copy()
-    points[unlabelled] += 3
-    other_scan = mixed.replace(also=mixed.also.replace(points=points))
-    np.testing.assert_array_equal(segmentation_gradient(other_scan), gradient["segmentation_head"]["kernel"])
-    classes = (mixed.also.classes + 1) % 20
-    relabelled = mixed.replace(also=mixed.also.replace(classes=classes))
-    assert np.abs(segmentation_gradient(relabelled) - gradient["segmentation_head"]["kernel"]).max() > 1e-4
-    assert gradients_of(params, relabelled, config)[1]["triplet"] == metrics["triplet"]

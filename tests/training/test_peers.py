@@ -268,13 +268,6 @@ def test_damaged_and_foreign_weights_are_errors(tmp_path):
     save_variables(tmp_path / "less", TINY, {**variables, "params": params}, {})
     with pytest.raises(ValueError, match=r"params/Dense_1/bias as float32 .*, found no array"):
         load_variables(tmp_path / "less", TINY)
-    content = (tmp_path / "w/model.safetensors").read_bytes()
-    (tmp_path / "w/model.safetensors").write_bytes(content[:-4])
-    with pytest.raises(ValueError, match="found a damaged one"):
-        load_variables(tmp_path / "w", TINY)
-    (tmp_path / "w/model.safetensors").write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    with pytest.raises(ValueError, match="SHA-256"):
-        load_variables(tmp_path / "w", TINY)
     with pytest.raises(FileNotFoundError, match=r"config\.json is missing"):
         load_variables(tmp_path / "nothing", TINY)
 

@@ -159,13 +159,6 @@ def test_where_only_some_places_are_described_the_anchors_and_negatives_are_amon
     assert np.isin(rows[:, [0, 2, 3]], some).all() and not np.isin(rows[:, 1], some).all()
 
 
-def test_mining_without_anything_to_choose_is_refused():
-    with pytest.raises(ValueError, match=r"sampling\.negatives above 0 or sampling\.cluster"):
-        TupleConfig(negatives=0, mining="hardest")
-    with pytest.raises(ValueError, match=r"refresh_steps of 1 or more, found 10 and 0"):
-        TupleConfig(mining="hardest", refresh_steps=0)
-
-
 def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
     kept = np.r_[0:40, 100:180]
     config = TupleConfig(negatives=2, revisit_gap=LAP // 2)
