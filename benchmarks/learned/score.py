@@ -43,7 +43,7 @@ from sglpr_jax.reproduce.reproduction import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.revisits import database_end, has_near
-from sglpr_jax.training.peers import SCORES_FILE
+from sglpr_jax.training.trainer import SCORES_FILE
 from sglpr_jax.training.validation import FOUND_M
 
 GRID = model_preset("sglpr").grid

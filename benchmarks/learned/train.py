@@ -29,9 +29,9 @@ from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.metrics_log import read_metrics
-from sglpr_jax.training.peers import FIRST_SNAPSHOT, RATES_FILE, SCORES_FILE
+from sglpr_jax.training.peers import FIRST_SNAPSHOT, RATES_FILE
 from sglpr_jax.training.recipe import WEIGHTS
-from sglpr_jax.training.trainer import METRICS_FILE
+from sglpr_jax.training.trainer import METRICS_FILE, SCORES_FILE
 from sglpr_jax.training.validation import recall_at_1
 
 ONE_CORE = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}

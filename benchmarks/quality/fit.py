@@ -103,9 +103,8 @@ def fit_model(
         reduced = _joined(held_out(pairs, without=name))
         table.add(f"without {name}", *_cells(reduced.probability, reduced.is_loop))
     for one in reliability(everything.probability, everything.is_loop):
-        print(
-            f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.probability:.3f}, {one.share:.3f} are loops"
-        )
+        stated = f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, stated {one.probability:.3f}"
+        print(f"{stated}, {one.share:.3f} are loops")
     model = fitted(pairs)
     write_json(out, model.to_json())
     print(model)

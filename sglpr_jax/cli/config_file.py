@@ -12,7 +12,7 @@ import difflib
 import json
 import sys
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -38,13 +38,7 @@ class ConfigFlags:
 
 def flag_values(command: Any) -> dict[str, Any]:
     """Return the values of all flags of a command as JSON values, by flag without dashes."""
-    values = {}
-
-    def note(flag: str, _annotation: Any, value: Any) -> Any:
-        values[flag] = value
-        return value
-
-    _visit(type(command), vars(command), note)
+    values = {flag: value for flag, _, value in _flags(type(command), vars(command))}
     return json.loads(json.dumps(values, default=str))
 
 
@@ -74,17 +68,17 @@ def with_defaults(command: type[T], arguments: Sequence[str] | None = None) -> t
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # the two that set the other flags' defaults
     parser.add_argument("--config", type=Path)
     parser.add_argument("--preset")
-    early, _ = parser.parse_known_args(arguments)
-    file: Any = early.config
+    first_flags, _ = parser.parse_known_args(arguments)
+    file: Any = first_flags.config
     values = {} if file is None else read_json(file)
     require(values, isinstance(values, dict), "an object with a value for each flag", str(file))
     fields = {field.name: _default(field) for field in dataclasses.fields(command)}  # type: ignore[arg-type]
     if "config" in fields:
         from sglpr_jax.training.presets import load_preset  # slow import, not needed by most commands
 
-        in_file = early.preset is None and "preset" in values
+        in_file = first_flags.preset is None and "preset" in values
         with naming(f"{file}: preset") if in_file else contextlib.nullcontext():
-            preset = read_value(values["preset"], str, "") if in_file else early.preset or fields["preset"]
+            preset = read_value(values["preset"], str, "") if in_file else first_flags.preset or fields["preset"]
             fields["config"] = load_preset(preset)
     if values:
         with naming(str(file)):
@@ -92,9 +86,9 @@ def with_defaults(command: type[T], arguments: Sequence[str] | None = None) -> t
     settings, others = _split_settings(arguments, command, fields)
     if settings:
         fields = _with_values(command, fields, settings, dashes="--")
-    made = object.__new__(command)  # the constructor takes no missing values
-    vars(made).update(fields)
-    return made, others
+    default = object.__new__(command)  # the constructor takes no missing values
+    vars(default).update(fields)
+    return default, others
 
 
 def hide_nested(command: Any) -> None:
@@ -117,26 +111,19 @@ def _default(field: dataclasses.Field) -> Any:
 
 def _split_settings(arguments: list[str], command: type, fields: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Take the settings with a dot in their names (--candidates.recent-m 50) out of a command line."""
-    annotations: dict[str, Any] = {}
-
-    def note(flag: str, annotation: Any, value: Any) -> Any:
-        annotations[flag] = annotation
-        return value
-
-    _visit(command, fields, note)
+    lists = {flag for flag, annotation, _ in _flags(command, fields) if typing.get_origin(annotation) is tuple}
     values, others, rest = {}, [], list(arguments)
     while rest:
-        name, _, given = (first := rest.pop(0)).partition("=")
+        name, equals, text = (word := rest.pop(0)).partition("=")
         flag = name.removeprefix("--")
         if not name.startswith("--") or "." not in flag:
-            others.append(first)
+            others.append(word)
             continue
-        texts = [given] if "=" in first else []
-        is_list = typing.get_origin(annotations.get(flag)) is tuple
-        while rest and not rest[0].startswith("--") and (not texts or is_list):
+        texts = [text] if equals else []
+        while rest and not rest[0].startswith("--") and (not texts or flag in lists):
             texts.append(rest.pop(0))
         words = [_json_value(text) for text in texts]
-        values[flag] = words if is_list or len(words) != 1 else words[0]
+        values[flag] = words if flag in lists or len(words) != 1 else words[0]
     return values, others
 
 
@@ -155,36 +142,46 @@ def _with_values(
     Raises ValueError if a setting does not exist or a value does not fit it. The message names the setting, the
     expected and the found value.
     """
-    known = []
-
-    def read(flag: str, annotation: Any, value: Any) -> Any:
-        known.append(flag)
-        return read_value(values[flag], annotation, dashes + flag) if flag in values else value
-
-    changed = _visit(command, fields, read)
-    unknown = next((flag for flag in values if flag not in known), None)
+    flags = [flag for flag, _, _ in _flags(command, fields)]
+    unknown = next((flag for flag in values if flag not in flags), None)
     if unknown is not None:
-        near = difflib.get_close_matches(unknown, known, n=1)
+        near = difflib.get_close_matches(unknown, flags, n=1)
         hint = f"; did you mean {dashes + near[0]!r}?" if near else ""
         raise ValueError(f"expected flags of the command, found {dashes + unknown!r}{hint}")
-    return changed
+    return _replace(command, fields, values, "", dashes)
 
 
-def _visit(
-    config: type, fields: Mapping[str, Any], visit: Callable[[str, Any, Any], Any], prefix: str = ""
+def _replace(
+    config: type, fields: Mapping[str, Any], values: Mapping[str, Any], prefix: str, dashes: str
 ) -> dict[str, Any]:
-    """Return the fields of a dataclass by name, with `visit(flag, annotation, value)` as the value of each flag."""
-    visited = {}
-    for name, annotation in field_types(config).items():
-        flag, value = prefix + name.replace("_", "-"), fields[name]
+    """Return the fields of a dataclass by name, with the values of some flags. `prefix` begins its flags."""
+    replaced = dict(fields)
+    for name, flag, annotation, value in _named_flags(config, fields, prefix):
         if is_config(type(value)):
-            inner = prefix if _is_flat(annotation) else f"{flag}."
-            nested = _visit(type(value), vars(value), visit, inner)
-            with naming(inner.removesuffix(".")) if inner else contextlib.nullcontext():  # fields may be inconsistent
-                visited[name] = dataclasses.replace(value, **nested)
+            nested = _replace(type(value), vars(value), values, flag, dashes)
+            with naming(flag.removesuffix(".")) if flag else contextlib.nullcontext():  # fields may be inconsistent
+                replaced[name] = dataclasses.replace(value, **nested)
+        elif flag in values:
+            replaced[name] = read_value(values[flag], annotation, dashes + flag)
+    return replaced
+
+
+def _flags(config: type, fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield flag, annotation and value of all fields of a dataclass and of the configurations in it."""
+    for _, flag, annotation, value in _named_flags(config, fields, prefix):
+        if is_config(type(value)):
+            yield from _flags(type(value), vars(value), flag)
         else:
-            visited[name] = visit(flag, annotation, value)
-    return visited
+            yield flag, annotation, value
+
+
+def _named_flags(config: type, fields: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, str, Any, Any]]:
+    """Yield name, flag, annotation and value of each field. The flag of a configuration is the prefix of its flags."""
+    for name, annotation in field_types(config).items():
+        flag = prefix + name.replace("_", "-")
+        if is_config(type(fields[name])):
+            flag = prefix if _is_flat(annotation) else f"{flag}."
+        yield name, flag, annotation, fields[name]
 
 
 def _is_flat(annotation: Any) -> bool:

@@ -51,8 +51,8 @@ def convert(command: ConvertCommand) -> None:
         copied = tuple(name for name in by_name(params.weights) if not name.startswith("place_head/"))
     save(params, command.out)
     sizes = {name: leaf.size for name, leaf in by_name(params.weights).items()}
-    taken, whole = sum(sizes[name] for name in copied), sum(sizes.values())
-    share = f"{taken / 1e6:.1f} of {whole / 1e6:.1f} million numbers ({taken / whole:.0%})"
+    taken, total = sum(sizes[name] for name in copied), sum(sizes.values())
+    share = f"{taken / 1e6:.1f} of {total / 1e6:.1f} million numbers ({taken / total:.0%})"
     print(f"{command.out}: {share} of {command.checkpoint.name}, the rest random (seed {command.seed})")
     if unused:
         print(f"not used by {command.preset}: {', '.join(unused[:5])}{', ...' if len(unused) > 5 else ''}")

@@ -1,15 +1,17 @@
 """Recordings of a command: those of a dataset, or simulated ones. They are described on stderr."""
 
 import contextlib
+import functools
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sglpr_jax.cli.runtime import cache_folder, progress_bar
+from sglpr_jax.cli.runtime import cache_folder
 from sglpr_jax.data import training_recordings as split
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import readable
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     from sglpr_jax.sim.dataset import Simulated
@@ -74,15 +76,15 @@ def all_recordings(root: Path, *, title: str = "also training on", **options: An
 def without_bad_scans(
     recordings: Sequence[Recording], *, on_bad_scan: Callable[[str, Exception], None]
 ) -> list[Recording]:
-    """Read all scans and return the recordings without the unreadable ones. `on_bad_scan` is called for each unreadable
-    scan."""
+    """Read all scans and return the recordings without the unreadable ones. `on_bad_scan` is called for each of
+    these."""
     with progress_bar("read all scans", sum(map(len, recordings))) as show:
-        found, done = [], 0
+        good, done = [], 0
         for recording in recordings:
-            before = done
-            found.append(readable(recording, on_bad_scan=on_bad_scan, on_progress=lambda i, n=before: show(n + i)))
+            show_from = functools.partial(lambda start, scans: show(start + scans), done)
+            good.append(readable(recording, on_bad_scan=on_bad_scan, on_progress=show_from))
             done += len(recording)
-    return found
+    return good
 
 
 def _describe(recordings: Sequence[Recording]) -> None:

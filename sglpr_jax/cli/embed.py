@@ -1,21 +1,20 @@
 """bin/embed: write the descriptors of a sequence or of a folder of scans."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
 from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions, report_bad_scan, resolved_scale
-from sglpr_jax.cli.runtime import progress_bar
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import CountOrNone, Size
-from sglpr_jax.methods.names import LEARNED_NAMES, NETWORK, AnyMethodName
+from sglpr_jax.methods.names import NETWORK, AnyMethodName
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
-    from sglpr_jax.data.recording import Recording
     from sglpr_jax.methods.method import Method
+    from sglpr_jax.models.params import Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,22 +68,22 @@ def embed_recording(command: EmbedCommand) -> None:
     """Run the command."""
     from sglpr_jax.data.corruption import ROTATION, corrupted, corruption_named  # slow imports, not needed for --help
     from sglpr_jax.data.scaled import scaled
+    from sglpr_jax.methods.registry import method_named
     from sglpr_jax.retrieval.embed import embed
     from sglpr_jax.retrieval.parquet import embed_to_store
 
-    _check_weights(command)
     corruption = None if command.corruption is None else corruption_named(command.corruption)
     in_store = "://" in command.out or command.out.endswith("/")
     if not in_store:
         _check_file(command)
     elif corruption is not None:
         raise ValueError(f"{command.out}: expected a descriptor file with --corruption, found a store")
-    make = _method(command)
+    trained, params = _load_weights(command)
     recording = command.submap.open(command.source, command.data)
     if corruption not in (None, ROTATION):
         recording = corrupted(recording, corruption, seed=command.seed)
     recording = scaled(recording, resolved_scale(command.scale, recording))
-    method = make(recording)
+    method = method_named(command.method, params, ready_made=recording.has_images) if trained is None else trained
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         options = {
             "rotation_seed": command.seed if command.rotate or corruption == ROTATION else None,
@@ -105,30 +104,26 @@ def embed_recording(command: EmbedCommand) -> None:
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
 
 
-def _check_weights(command: EmbedCommand) -> None:
-    """Raise ValueError if a handcrafted method has weights, or a learned method has none."""
-    if command.method in LEARNED_NAMES and command.weights is None:
-        raise ValueError(
-            f"{command.method}: expected --weights with a folder of bin/peers train, or random:0 for an untrained "
-            "network, found none"
-        )
-    if command.weights is not None and command.method not in (NETWORK, *LEARNED_NAMES):
+def _load_weights(command: EmbedCommand) -> "tuple[Method | None, Params | None]":
+    """Load a learned method or the weights of the network. Raises ValueError if the weights do not fit the method."""
+    from sglpr_jax.methods.learned import LEARNED
+    from sglpr_jax.methods.registry import trained_method
+    from sglpr_jax.models.weights_file import load
+
+    if command.method in LEARNED:
+        if command.weights is None:
+            raise ValueError(
+                f"{command.method}: expected --weights with a folder of bin/peers train, or random:0 for an untrained "
+                "network, found none"
+            )
+        return trained_method(LEARNED[command.method], command.weights), None
+    if command.weights is None:
+        return None, None
+    if command.method != NETWORK:
         raise ValueError(
             f"{command.weights}: expected --method sglpr or one of bin/peers with --weights, found {command.method}"
         )
-
-
-def _method(command: EmbedCommand) -> "Callable[[Recording], Method]":
-    """Load the weights. Returns a function that makes the method for a recording."""
-    from sglpr_jax.methods.learned import LEARNED
-    from sglpr_jax.methods.registry import method_named, trained_method
-    from sglpr_jax.models.weights_file import load
-
-    if command.weights is not None and command.method in LEARNED:
-        trained = trained_method(LEARNED[command.method], command.weights)
-        return lambda recording: trained
-    params = None if command.weights is None else load(command.weights)
-    return lambda recording: method_named(command.method, params, ready_made=recording.has_images)
+    return None, load(command.weights)
 
 
 def _check_file(command: EmbedCommand) -> None:

@@ -4,10 +4,10 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from sglpr_jax.cli.runtime import progress_bar
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.models.config import WHITENING_POWER
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.progress import progress_bar
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -16,15 +16,13 @@ from sglpr_jax.cli.recording import (
     open_with_odometry,
     report_bad_scan,
 )
-from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
+from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
-
-if TYPE_CHECKING:
-    pass
+from sglpr_jax.progress import progress_bar
 
 UNFINISHED = "unfinished"
 """Checkpoint directory of a running command, inside the output folder."""
@@ -149,54 +147,53 @@ def _search(command: LoopsCommand) -> int:
     from sglpr_jax.pose_graph.folder import write_found
     from sglpr_jax.pose_graph.optimize import optimize_trajectory
 
-    params, config, kept_in = load(command.weights), command.detector, command.out / UNFINISHED
-    odometry = AUTO if command.odometry == AUTO else command.odometry_files
-    options = {"format": command.odometry_format, "kept_in": lambda number: _odometry_kept_in(command.out, number)}
-    effective, recordings, odometry = open_with_odometry(command, command.recordings, odometry, **options)
-    register = command.register and all(map(can_register, recordings))
-    if command.register and not register:
-        left_out = next(one for one in recordings if not can_register(one))
+    params, detector, out, checkpoint = load(command.weights), command.detector, command.out, command.out / UNFINISHED
+    odometry_checkpoints = [out / f"unfinished-{number}.odometry.log" for number in range(len(command.recordings))]
+    effective, recordings, odometry = open_with_odometry(
+        command,
+        command.recordings,
+        AUTO if command.odometry == AUTO else command.odometry_files,
+        format=command.odometry_format,
+        checkpoint=odometry_checkpoints.__getitem__,
+    )
+    unregistrable = next((recording for recording in recordings if not can_register(recording)), None)
+    if command.register and unregistrable is not None:
         missing = "small-gicp is not installed: pip install 'sglpr-jax[slam]'"
-        reason = "they are ready-made images" if left_out.has_images else missing
-        print(f"{left_out.name}: loops are not registered, because {reason}", file=sys.stderr)
+        reason = "they are ready-made images" if unregistrable.has_images else missing
+        print(f"{unregistrable.name}: loops are not registered, because {reason}", file=sys.stderr)
     name = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"
     steps = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
     with stop_on_signal() as stop, progress_bar(f"loops {name}", steps) as show:
-        found = find_loops(
+        result = find_loops(
             recordings,
             params,
             odometry=odometry or None,
-            config=config,
-            registered=register,
+            config=detector,
+            registered=command.register and unregistrable is None,
             scale=effective.scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
-            kept_in=kept_in,
+            kept_in=checkpoint,
             should_stop=stop,
             on_progress=show,
         )
     if command.degenerate == "drop":
-        found = found.without_degenerate()
-    corrected = optimize_trajectory(found) if command.optimize else None
-    page = {PAGE: loops_page(found, optimized=corrected)}
-    paths = write_found(found, command.out, optimized=corrected, texts=page)
-    paths.append(record_command(effective, command.out))
+        result = result.without_degenerate()
+    optimized = optimize_trajectory(result) if command.optimize else None
+    paths = write_found(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
+    paths.append(record_command(effective, out))
     if command.rerun is not None:
-        write_rerun(found, command.rerun, optimized=corrected)
-    print(found, *diagnose_no_loops(found), *why_rejected(found.rejected), sep="\n")
-    if corrected is not None:
-        print(corrected)
-    print(f"{command.out}: {', '.join(path.name for path in paths)}")
-    if not found.whole:
+        write_rerun(result, command.rerun, optimized=optimized)
+    print(result, *diagnose_no_loops(result), *why_rejected(result.rejected), sep="\n")
+    if optimized is not None:
+        print(optimized)
+    print(f"{out}: {', '.join(path.name for path in paths)}")
+    if not result.whole:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
-    for number in range(len(recordings)):
-        if len(recordings) > 1:
-            remove(kept_in / f"{number}")
-        _odometry_kept_in(command.out, number).unlink(missing_ok=True)
-    remove(kept_in)
+    if len(recordings) > 1:
+        for number in range(len(recordings)):
+            remove(checkpoint / f"{number}")
+    remove(checkpoint)
+    for path in odometry_checkpoints:
+        path.unlink(missing_ok=True)
     return 0
-
-
-def _odometry_kept_in(out: Path, number: int) -> Path:
-    """Checkpoint file of --odometry auto of a recording."""
-    return out / f"unfinished-{number}.odometry.log"

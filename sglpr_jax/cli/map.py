@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
-from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
+from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.files import exclusive_lock, naming
 from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -100,8 +101,14 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     files = AUTO if command.poses == AUTO else (command.poses,)
-    options = {"format": command.pose_format, "kept_in": lambda _: command.out.with_suffix(ODOMETRY)}
-    effective, (recording,), (poses,) = open_with_odometry(command, (command.recording,), files, **options)
+    odometry_checkpoint = command.out.with_suffix(ODOMETRY)
+    effective, (recording,), (poses,) = open_with_odometry(
+        command,
+        (command.recording,),
+        files,
+        format=command.pose_format,
+        checkpoint=lambda number: odometry_checkpoint,
+    )
     if command.poses == AUTO:
         times = recording.numbers.astype(float) if recording.times is None else recording.times
         write_tum(command.out.with_suffix(TRAJECTORY), poses, times)
@@ -125,20 +132,21 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if stopped and before is not None and command.frame == "align":
         print("the new map is not aligned and added before it is complete")
     elif len(places):
-        whole = places if before is None else _added(command, before, places, poses_by_id(recording, poses))
-        if stopped and _holds_more(command.out, len(whole)):
-            print(f"{command.out}: unchanged, because it has more places than the {len(whole)} found until now")
+        place_map = places if before is None else _added(command, before, places, poses_by_id(recording, poses))
+        if stopped and _holds_more(command.out, len(place_map)):
+            print(f"{command.out}: unchanged, because it has more places than the {len(place_map)} found until now")
         else:
-            whole.save(command.out)
-            new = len(whole) - (0 if before is None else len(before))
+            place_map.save(command.out)
+            new = len(place_map) - (0 if before is None else len(before))
             left_out = f", {len(skipped)} scans skipped" if skipped else ""
-            of = f"{scans} of {len(recording)}" if stopped else f"{scans}"
-            print(f"{command.out}: {len(whole)} places, {new} of them from {of} scans of {recording.name}{left_out}")
+            count = f"{scans} of {len(recording)}" if stopped else f"{scans}"
+            new_places = f"{new} of them from {count} scans of {recording.name}{left_out}"
+            print(f"{command.out}: {len(place_map)} places, {new_places}")
     if stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     remove(unfinished)
-    command.out.with_suffix(ODOMETRY).unlink(missing_ok=True)
+    odometry_checkpoint.unlink(missing_ok=True)
     return 0
 
 
@@ -153,14 +161,14 @@ def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict
     new = without_known_places(before, new)
     if not len(new):
         return before
-    found = align_maps(before, new)
-    if found is None:
+    alignment = align_maps(before, new)
+    if alignment is None:
         raise ValueError(
             f"{command.add_to}: expected places in common with {command.recording} to align the two world frames, "
             "found too few"
         )
-    print(f"{command.recording}: {found}")
-    world_from_new = found.old_from_new
+    print(f"{command.recording}: {alignment}")
+    world_from_new = alignment.old_from_new
     return before.merged(new.moved(world_from_new), drive={id: world_from_new @ pose for id, pose in drive.items()})
 
 

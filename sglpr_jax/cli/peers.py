@@ -9,9 +9,10 @@ import tyro
 from rich.table import Table
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import StopRequest, cache_folder, console, print_error, progress_bar, stop_on_signal
+from sglpr_jax.cli.runtime import StopRequest, cache_folder, console, print_error, stop_on_signal
 from sglpr_jax.fields import CountOrNone, NotNegative, Positive
 from sglpr_jax.methods.names import LearnedName
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     from sglpr_jax.methods.learned.method import LearnedMethod
@@ -84,8 +85,8 @@ def run_peers(command: PeersCommand) -> None:
         settings = RunSettings(rate, seed=command.seed, seconds=command.seconds, images=command.images)
         record_command(dataclasses.replace(command, learning_rate=rate), out)
         options = {"stopped": stopped, "report": print_error, "progress": progress_bar, "resume": resume}
-        found = train_learned(method, data, settings, out, score=score, **options)
-    print(f"{out}: {found.images} images in {found.seconds:.0f} s", file=sys.stderr)
+        run = train_learned(method, data, settings, out, score=score, **options)
+    print(f"{out}: {run.images} images in {run.seconds:.0f} s", file=sys.stderr)
     if stopped():
         stopped.exit("stopped; continue with --resume")
     print(f"run: {out}")
@@ -107,20 +108,20 @@ def _has_run(out: Path, *, resume: bool) -> bool:
 def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
     """Prepare the training recordings and the held-out ones. Raises ValueError if one of them does not fit."""
     from sglpr_jax.cli.datasets import all_recordings
-    from sglpr_jax.training.peer_inputs import prepared
+    from sglpr_jax.training.peer_inputs import prepare_inputs
     from sglpr_jax.training.peers import held_out_score
     from sglpr_jax.training.validation import require_revisits
 
     cache = command.cache or cache_folder() / "peers"
     if command.held_out is not None and command.held_out.resolve() in {path.resolve() for path in command.data}:
         raise ValueError(f"--held-out {command.held_out}: expected a dataset other than DATA, found one of them")
-    recordings = [one for root in command.data for one in all_recordings(root, title="training on")]
+    recordings = [recording for root in command.data for recording in all_recordings(root, title="training on")]
     if command.held_out is None:
-        return prepared(method, recordings, cache, progress=progress_bar), None
+        return prepare_inputs(method, recordings, cache, progress=progress_bar), None
     held_out = all_recordings(command.held_out, title="held out")
     require_revisits(held_out)
-    tested = prepared(method, held_out, cache, progress=progress_bar)
-    return prepared(method, recordings, cache, progress=progress_bar), held_out_score(method, tested)
+    tested = prepare_inputs(method, held_out, cache, progress=progress_bar)
+    return prepare_inputs(method, recordings, cache, progress=progress_bar), held_out_score(method, tested)
 
 
 def _learning_rate(

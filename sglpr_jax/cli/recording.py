@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
+from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import (
     Gravity,
     PoseChoice,
@@ -22,9 +22,9 @@ from sglpr_jax.odometry.config import (
     DRIFT_DEG_PER_100M,
     DRIFT_PERCENT,
     DriftModel,
-    OdometryConfig,
     OdometryFormat,
 )
+from sglpr_jax.progress import progress_bar
 from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
@@ -100,11 +100,11 @@ class SubmapOptions:
 
     @property
     def flag(self) -> str | None:
-        """Name of a given flag that needs poses, or None."""
+        """Name of the selected flag that needs poses, or None."""
         return "--submap-m" if self.submap_m else "--deskew" if self.deskew else None
 
     def prepared(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
-        """Return the recording deskewed and with submaps, as selected, by the poses or else by the poses of its bag."""
+        """Return the recording deskewed and with submaps, as selected, with these poses or those of its bag."""
         if self.flag is None:
             return recording
         from sglpr_jax.data.deskew import deskewed  # slow imports, not needed for --help
@@ -116,10 +116,10 @@ class SubmapOptions:
                 f"{recording.name}: expected poses with rotations for {self.flag}, found none; state a file with "
                 "--odometry"
             )
-        still = deskewed(recording, poses) if self.deskew else recording
-        found = submaps(still, poses, length_m=self.submap_m)
-        print(*found.found[len(recording.found) :], sep="\n", file=sys.stderr)
-        return found
+        scans = deskewed(recording, poses) if self.deskew else recording
+        prepared = submaps(scans, poses, length_m=self.submap_m)
+        print(*prepared.found[len(recording.found) :], sep="\n", file=sys.stderr)
+        return prepared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,7 +197,7 @@ def resolved_scale(choice: ScaleChoice, *recordings: "Recording") -> Scale:
 
     if choice != "auto":
         return choice
-    scale: Scale = min(chosen_scale(one) for one in recordings)
+    scale: Scale = min(chosen_scale(recording) for recording in recordings)
     print(f"scale: {scale}, chosen by the ranges of the scans", file=sys.stderr)
     return scale
 
@@ -213,7 +213,7 @@ def open_with_odometry(
     odometry: "Literal['auto'] | Sequence[Path]",
     *,
     format: OdometryFormat,
-    kept_in: "Callable[[int], Path]",
+    checkpoint: "Callable[[int], Path]",
 ) -> "tuple[Any, list[Recording], list[Float[np.ndarray, 'n 4 4']]]":
     """Open the recordings of a `LoopsCommand` or `MapCommand`, deskewed and with submaps, with odometry.
 
@@ -222,7 +222,7 @@ def open_with_odometry(
       paths: Recordings.
       odometry: `auto`, a file for each recording, or none.
       format: Format of the files.
-      kept_in: Checkpoint file of the odometry of a recording, given its number.
+      checkpoint: Returns the checkpoint file of the odometry of a recording, given its number.
 
     Returns:
       The command with the settings in effect, the recordings, and their odometry (or none).
@@ -233,39 +233,38 @@ def open_with_odometry(
     poses = []
     if odometry == AUTO:
         check_installed()
-        opened = [command.source.open(path) for path in paths]
-        scale, config = resolved_scale(command.scale, *opened), command.scan_odometry
-        options = {"scale": scale, "skip_bad": command.skip_bad}
-        poses = [_odometry_of(one, config, kept_in=kept_in(number), **options) for number, one in enumerate(opened)]
-        deskew = command.submap.deskew or all(map(has_point_times, opened))
+        recordings = [command.source.open(path) for path in paths]
+        command = dataclasses.replace(command, scale=resolved_scale(command.scale, *recordings))
+        poses = [_odometry_of(recording, command, checkpoint(number)) for number, recording in enumerate(recordings)]
+        deskew = command.submap.deskew or all(map(has_point_times, recordings))
         submap = dataclasses.replace(command.submap, deskew=deskew)
-        command = dataclasses.replace(command, scale=scale, submap=submap, scan_odometry=config.effective)
+        command = dataclasses.replace(command, submap=submap, scan_odometry=command.scan_odometry.effective)
     elif odometry:
         files = zip(paths, odometry, strict=True)
-        both = [open_with_poses(command.source, path, file, format=format) for path, file in files]
-        opened, poses = map(list, zip(*both, strict=True))
+        opened = [open_with_poses(command.source, path, file, format=format) for path, file in files]
+        recordings, poses = map(list, zip(*opened, strict=True))
     else:
-        opened = [command.source.open(path) for path in paths]
-    recordings = [command.submap.prepared(*one) for one in zip(opened, poses or [None] * len(opened), strict=True)]
-    scale = resolved_scale(command.scale, *recordings)
-    return dataclasses.replace(command, scale=scale), recordings, poses
+        recordings = [command.source.open(path) for path in paths]
+    recordings = [
+        command.submap.prepared(recording, poses[number] if poses else None)
+        for number, recording in enumerate(recordings)
+    ]
+    return dataclasses.replace(command, scale=resolved_scale(command.scale, *recordings)), recordings, poses
 
 
-def _odometry_of(
-    recording: "Recording", config: OdometryConfig, *, scale: Scale, kept_in: Path, skip_bad: bool
-) -> "Float[np.ndarray, 'n 4 4']":
+def _odometry_of(recording: "Recording", command: Any, checkpoint: Path) -> "Float[np.ndarray, 'n 4 4']":
     """Compute the odometry of a recording, with progress on stderr. If it is interrupted, the command ends."""
     from sglpr_jax.odometry.kiss_icp import about, scan_odometry
 
     if not recording.has_images:
-        print(about(recording, config, scale=scale), file=sys.stderr)
+        print(about(recording, command.scan_odometry, scale=command.scale), file=sys.stderr)
     with stop_on_signal() as stop, progress_bar(f"odometry {recording.name}", len(recording)) as show:
         poses = scan_odometry(
             recording,
-            config=config,
-            scale=scale,
-            kept_in=kept_in,
-            on_bad_scan=report_bad_scan if skip_bad else None,
+            config=command.scan_odometry,
+            scale=command.scale,
+            kept_in=checkpoint,
+            on_bad_scan=report_bad_scan if command.skip_bad else None,
             should_stop=stop,
             on_progress=show,
         )

@@ -84,31 +84,31 @@ def relocalize(command: RelocalizeCommand) -> None:
         options = RecordingOptions(command.seq, format=command.format, sensor_height=command.sensor_height)
         recording = command.submap.open(options, command.scan)
         scan, name = query_of(recording, command.frame), f"frame {command.frame} of {name}"
-    found = places.relocate(params, scan, candidates=command.candidates)
-    if not found:
+    answers = places.relocate(params, scan, candidates=command.candidates)
+    if not answers:
         raise ValueError(f"{name}: expected a scan that shows a place, found an almost empty one")
     if command.out is not None:
-        answers = [
+        values = [
             {
-                "place": one.place,
-                "probability": one.probability,
-                "world_from_query": one.world_from_query.tolist(),
-                "covariance": one.loop.covariance.tolist(),
+                "place": answer.place,
+                "probability": answer.probability,
+                "world_from_query": answer.world_from_query.tolist(),
+                "covariance": answer.loop.covariance.tolist(),
             }
-            for one in found
+            for answer in answers
         ]
-        write_json(command.out, answers)
-    console().print(_table(name, found))
+        write_json(command.out, values)
+    console().print(_table(name, answers))
 
 
-def _table(name: str, found: "list[Relocalization]") -> Table:
+def _table(name: str, answers: "list[Relocalization]") -> Table:
     title = escape(f"{name} in the map")  # rich interprets brackets as styles
     shared = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
-    caption = shared if len(found) > 1 else None
+    caption = shared if len(answers) > 1 else None
     table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)
-    for one in found:
-        pose = one.world_from_query
-        yaw = math.degrees(math.atan2(pose[1, 0], pose[0, 0]))
-        place = escape(one.place)
-        table.add_row(place, f"{one.probability:.4f}", *(f"{value:.2f}" for value in pose[:3, 3]), f"{yaw:.1f}")
+    for answer in answers:
+        pose = answer.world_from_query
+        position = (f"{value:.2f}" for value in pose[:3, 3])
+        yaw_deg = math.degrees(math.atan2(pose[1, 0], pose[0, 0]))
+        table.add_row(escape(answer.place), f"{answer.probability:.4f}", *position, f"{yaw_deg:.1f}")
     return table

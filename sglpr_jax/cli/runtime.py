@@ -21,7 +21,6 @@ from typing import Annotated, TypeVar
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, with_defaults
 from sglpr_jax.data.warning import DataWarning
@@ -86,13 +85,13 @@ def parse_command(command: type[T], name: str, arguments: list[str] | None = Non
         [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
     )
     about = inspect.getdoc(command) or ""
-    made, arguments = with_defaults(command, arguments)
-    if hasattr(made, "config"):
+    defaults, arguments = with_defaults(command, arguments)
+    if hasattr(defaults, "config"):
         from sglpr_jax.training.presets import preset_names  # slow import, not needed by most commands
 
         about += f"\nPresets: {', '.join(preset_names())}"
-    hide_nested(made)
-    default = line_type(made, ConfigFlags())
+    hide_nested(defaults)
+    default = line_type(defaults, ConfigFlags())
     line = tyro.cli(
         line_type, args=arguments, prog=own_names(f"bin/{name}"), description=own_names(about), default=default
     )
@@ -155,8 +154,8 @@ def _one_line(error: Exception) -> str:
 
 def _check_devices() -> None:
     """Exit with one line if JAX does not find the devices of JAX_PLATFORMS."""
-    asked = os.environ.get("JAX_PLATFORMS")
-    if not asked:
+    platforms = os.environ.get("JAX_PLATFORMS")
+    if not platforms:
         return
     import jax  # slow import, not needed for --help
 
@@ -164,7 +163,7 @@ def _check_devices() -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:
         reason = f"expected a device that JAX finds, found none ({in_short(error)})"
-        sys.exit(_one_line(ValueError(f"JAX_PLATFORMS={asked}: {reason}")))
+        sys.exit(_one_line(ValueError(f"JAX_PLATFORMS={platforms}: {reason}")))
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
@@ -228,16 +227,3 @@ def stop_on_signal() -> Iterator[StopRequest]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def progress_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Context manager that shows a progress bar on stderr, or nothing without a terminal.
-
-    It yields a function; call it with the number of items finished so far.
-    """
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(printable(title), total=total)
-        yield lambda done: progress.update(task, completed=done)

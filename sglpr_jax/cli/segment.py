@@ -8,9 +8,10 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
-from sglpr_jax.cli.runtime import console, progress_bar
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     from sglpr_jax.data.scan import Scan
@@ -58,11 +59,11 @@ def segment(command: SegmentCommand) -> None:
     command.out.mkdir(parents=True, exist_ok=True)
     labelled = cells = 0
 
-    def save(row: int, scan: "Scan", found: "SemanticMap") -> None:
+    def save(row: int, scan: "Scan", semantic_map: "SemanticMap") -> None:
         nonlocal labelled, cells
         path = command.out / f"{file_name(recording.ids[row])}.png"
-        save_map(path, found, scan, categories=params.config.categories)
-        labelled, cells = labelled + found.seen.sum(), cells + (found.counts > 0).sum()
+        save_map(path, semantic_map, scan, categories=params.config.categories)
+        labelled, cells = labelled + semantic_map.seen.sum(), cells + (semantic_map.counts > 0).sum()
 
     scores = segment_recording(params, recording, command.out, on_map=save, min_confidence=least, progress=progress_bar)
     print(f"{command.out}: {len(recording)} semantic maps of {labelled / max(cells, 1):.0%} of the cells with points")

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.recording import report_bad_scan
-from sglpr_jax.cli.runtime import StopRequest, console, progress_bar, stop_on_signal
+from sglpr_jax.cli.runtime import StopRequest, console, stop_on_signal
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.files import file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
+from sglpr_jax.progress import progress_bar
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 
 if TYPE_CHECKING:
@@ -98,8 +99,7 @@ def train_and_test(command: TrainCommand, *, go_on: str = "continue with --resum
         result = _train(command, recordings, also, test, go_on=go_on)
     if is_first_host():
         out, seed = folder / "test", command.config.seed
-        found = final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar)
-        console().print(found)
+        console().print(final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar))
         print(f"written to {out}")
     print(f"run: {folder}")
 
@@ -130,7 +130,7 @@ def _train(
     from sglpr_jax.training.recipe import train
 
     folder = run_folder(command)
-    watched = [EventFiles(folder / EVENTS)] if command.tensorboard else []
+    event_files = [EventFiles(folder / EVENTS)] if command.tensorboard else []
     with stop_on_signal() as stopped:
         result = train(
             command.config,
@@ -141,7 +141,7 @@ def _train(
             weights=command.weights,
             resume=command.resume,
             cache=command.cache,
-            callback=Callbacks(ProgressBar(), LearningCurves(folder), *watched),
+            callback=Callbacks(ProgressBar(), LearningCurves(folder), *event_files),
             stopped=stopped,
             settings=settings(command),
         )
@@ -171,8 +171,8 @@ def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[R
             f"--also {root}: expected a dataset other than --data, whose recording {command.seq} is tested"
         )
     if command.skip_bad:
-        *read, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
-        recordings, also = read[: len(recordings)], read[len(recordings) :]
+        *readable, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
+        recordings, also = readable[: len(recordings)], readable[len(recordings) :]
     if command.pseudo_labels is not None:
         recordings = _pseudo_labelled(recordings, command.pseudo_labels, without_untrained_head(command.config))
     return recordings, also, test

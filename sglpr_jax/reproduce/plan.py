@@ -15,7 +15,8 @@ from sglpr_jax.methods.registry import method_with_weights
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
 from sglpr_jax.reproduce.reproduction import Reproduction, content_of
 from sglpr_jax.revisits import revisits
-from sglpr_jax.training.batches import batches_of, tuple_pool
+from sglpr_jax.training.batch_source import batches_of
+from sglpr_jax.training.batches import tuple_pool
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.step import train_step
 

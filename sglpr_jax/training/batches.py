@@ -1,4 +1,4 @@
-"""Batches of training tuples: read from files on the host, rotated and rasterised on the device.
+"""A batch of training tuples: read from files on the host, rotated and rasterised on the device.
 
 A batch may mix two sources, such as real images without labels and simulated scans with labels. The segmentation head
 sees every n-th image of the network's order, so labelled places of a second source are put there. The head then spends
@@ -6,8 +6,7 @@ no time on images without labels.
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
@@ -20,15 +19,8 @@ from sglpr_jax.data.scan import check_cloud
 from sglpr_jax.data.views import View, check_ready_made, cloud_view, image_view, picture
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.training.batch_queue import BatchSource
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.devices import own_part
-from sglpr_jax.training.mining import Mining
-from sglpr_jax.training.step import TrainState
 from sglpr_jax.training.tuples import TuplePool
-
-Place = tuple[Any, Any]
-"""Data of one place: an image (h, w) or points (n, 3), and their classes (h, w) or (n,), or None."""
 
 
 @flax.struct.dataclass
@@ -96,34 +88,31 @@ def read_batch(
     if not share_negatives:
         negatives &= np.kron(np.eye(tuples, dtype=bool), np.arange(size) > pool.config.positives)
     has_labels = categories > 0 and any(recording.has_labels for recording in recordings)
-    images = recordings[0].has_images
-    places = [(recordings[int(pool.recording[f])], int(pool.frame[f])) for f in frames[part].reshape(-1)]
-    pictures = images or image == "density"
-
-    def read(recording: Recording, frame: int) -> Place:
-        if recording.has_images != images:
-            expected, found = ("images", "scans") if images else ("scans", "images")
+    has_images = recordings[0].has_images
+    as_pictures = has_images or image == "density"
+    contents, classes = [], []
+    rows = frames[part].reshape(-1)
+    for row in rows:
+        recording, frame = recordings[int(pool.recording[row])], int(pool.frame[row])
+        if recording.has_images != has_images:
+            expected, found = ("images", "scans") if has_images else ("scans", "images")
             raise ValueError(f"expected only {expected} in a batch, found {found} in recording {recording.name}")
-        scan = recording.scan(frame, labels=has_labels)
-        if scan.points is not None:
-            check_cloud(scan.points, name=scan.name)
-        check_ready_made(scan, image)
-        classes = scan.classes(categories) if has_labels else None
-        return picture(scan, classes) if pictures else (scan.upright_points, classes)
-
-    found = [read(*place) for place in places]
-    labelled = np.array([classes is not None for _, classes in found])
-    common = {"labelled": labelled, "negatives": negatives[part], "positives": pool.config.positives}
-    if pictures:
-        _require_one_size(places, found)
-        stacked, maps = np.stack([one for one, _ in found]), None
-        if has_labels:
-            maps = np.stack(
-                [np.full(one.shape, UNLABELLED, np.int32) if kinds is None else kinds for one, kinds in found]
+        content, place_classes = _read_place(recording, frame, categories if has_labels else 0, image)
+        if as_pictures and contents and content.shape != contents[0].shape:
+            raise ValueError(
+                f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of "
+                f"{contents[0].shape[0]} x {contents[0].shape[1]} pixels, as in "
+                f"{recordings[int(pool.recording[rows[0]])].name}, found {content.shape[0]} x {content.shape[1]}"
             )
-        return Batch(**common, images=stacked, maps=maps)
-    points, count, classes = _padded(found, max_points)
-    return Batch(**common, points=points, count=count, classes=classes if has_labels else None)
+        contents.append(content)
+        classes.append(place_classes)
+    labelled = np.array([place is not None for place in classes])
+    batch = Batch(labelled=labelled, negatives=negatives[part], positives=pool.config.positives)
+    if not as_pictures:
+        points, count, point_classes = _padded(contents, classes, max_points)
+        return dataclasses.replace(batch, points=points, count=count, classes=point_classes if has_labels else None)
+    maps = [np.full(contents[0].shape, UNLABELLED, np.int32) if place is None else place for place in classes]
+    return dataclasses.replace(batch, images=np.stack(contents), maps=np.stack(maps) if has_labels else None)
 
 
 def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
@@ -141,8 +130,8 @@ def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
         return image_view(batch.images, batch.maps, grid, angles)
     if batch.also is None:
         return cloud_view(batch.points, batch.classes, batch.count, grid, angles)
-    own, others = (None, None) if angles is None else (angles[: batch.places], angles[batch.places :])
-    parts = [views(dataclasses.replace(batch, also=None), own, grid), views(batch.also, others, grid)]
+    first, second = (None, None) if angles is None else (angles[: batch.places], angles[batch.places :])
+    parts = [views(dataclasses.replace(batch, also=None), first, grid), views(batch.also, second, grid)]
     images = jnp.concatenate([image for image, _ in parts])
     if all(maps is None for _, maps in parts):
         return View(images)
@@ -150,28 +139,32 @@ def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
     return View(images, jnp.concatenate(unlabelled))
 
 
-def _require_one_size(places: list[tuple[Recording, int]], pictures: list[Place]) -> None:
-    expected = pictures[0][0].shape
-    for (recording, frame), (image, _) in zip(places, pictures, strict=True):
-        if image.shape != expected:
-            raise ValueError(
-                f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of {expected[0]} x"
-                f" {expected[1]} pixels, as in {places[0][0].name}, found {image.shape[0]} x {image.shape[1]}"
-            )
+def _read_place(
+    recording: Recording, frame: int, categories: int, image: ImageKind
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read an image (h, w) or points (n, 3), and their classes (h, w) or (n,), or None without labels."""
+    scan = recording.scan(frame, labels=categories > 0)
+    if scan.points is not None:
+        check_cloud(scan.points, name=scan.name)
+    check_ready_made(scan, image)
+    classes = scan.classes(categories) if categories else None
+    return picture(scan, classes) if scan.points is None or image == "density" else (scan.upright_points, classes)
 
 
-def _padded(scans: list[Place], max_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _padded(
+    clouds: Sequence[np.ndarray], classes: Sequence[np.ndarray | None], max_points: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pad clouds to one size. Returns points, numbers of valid points, and classes (0 without labels)."""
-    points = np.zeros((len(scans), max_points, 3), np.float32)
-    classes = np.zeros((len(scans), max_points), np.int32)
-    count = np.zeros(len(scans), np.int32)
-    for row, (cloud, cloud_classes) in enumerate(scans):
-        kept = slice(None) if len(cloud) <= max_points else np.linspace(0, len(cloud) - 1, max_points).astype(int)
-        count[row] = len(cloud[kept])
-        points[row, : count[row]] = cloud[kept]
-        if cloud_classes is not None:
-            classes[row, : count[row]] = cloud_classes[kept]
-    return points, count, classes
+    points = np.zeros((len(clouds), max_points, 3), np.float32)
+    point_classes = np.zeros((len(clouds), max_points), np.int32)
+    count = np.zeros(len(clouds), np.int32)
+    for row, (cloud, labels) in enumerate(zip(clouds, classes, strict=True)):
+        rows = slice(None) if len(cloud) <= max_points else np.linspace(0, len(cloud) - 1, max_points).astype(int)
+        count[row] = len(cloud[rows])
+        points[row, : count[row]] = cloud[rows]
+        if labels is not None:
+            point_classes[row, : count[row]] = labels[rows]
+    return points, count, point_classes
 
 
 def mix(main: Batch, also: Batch, *, triplets: bool, share_negatives: bool) -> Batch:
@@ -186,9 +179,9 @@ def mix(main: Batch, also: Batch, *, triplets: bool, share_negatives: bool) -> B
     """
     negatives = main.negatives
     if triplets:
-        other = np.full((len(main.negatives), also.negatives.shape[1]), share_negatives)
-        back = np.full((len(also.negatives), main.negatives.shape[1]), share_negatives)
-        negatives = np.block([[main.negatives, other], [back, also.negatives]])
+        main_to_also = np.full((len(main.negatives), also.negatives.shape[1]), share_negatives)
+        also_to_main = np.full((len(also.negatives), main.negatives.shape[1]), share_negatives)
+        negatives = np.block([[main.negatives, main_to_also], [also_to_main, also.negatives]])
     labelled = np.concatenate([main.labelled, also.labelled])
     return dataclasses.replace(main, labelled=labelled, negatives=negatives, also=also)
 
@@ -221,91 +214,5 @@ def tuple_pool(
 def positions_of(recording: Recording) -> Float[np.ndarray, "n 3"]:
     """Return the positions of a recording, in metres. Raises ValueError if it has none."""
     if recording.positions is None:
-        raise ValueError(f"sequence {recording.name} has no poses; training and testing need them")
+        raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
     return recording.positions
-
-
-class TupleBatches(BatchSource):
-    """Batches of the tuples that `pool` draws, which depend only on the seed, the step and the mined descriptors."""
-
-    def __init__(
-        self,
-        recordings: Sequence[Recording],
-        pool: TuplePool,
-        read: Callable[[Int[np.ndarray, "t k"]], Any],
-        *,
-        seed: int,
-        tuples: int,
-        mining: Mining | None = None,
-        random_places: bool = False,
-    ):
-        """Draw `tuples` tuples a step, or any places with `random_places`, and read the batch of their frames."""
-        self._recordings, self._pool, self._read, self._mining = recordings, pool, read, mining
-        self._draw = pool.draw_places if random_places else pool.draw
-        self._options = {"seed": seed, "tuples": tuples}
-        self.refresh_steps = pool.config.refresh_steps if mining else 0
-
-    def batch(self, step: int) -> Any:
-        """Return this host's part of the batch of a step."""
-        return self._read(self._frames(step))
-
-    def refresh(self, step: int, state: TrainState) -> None:
-        """Recompute the descriptors that mining compares, if negatives are mined."""
-        if self._mining is not None:
-            self._mining.refresh(step, state)
-
-    def places(self, step: int) -> str:
-        """Name the recordings and scans in the batch of a step."""
-        places, named = np.unique(self._frames(step)), []
-        for number, recording in enumerate(self._recordings):
-            ids = [recording.ids[self._pool.frame[f]] for f in places[self._pool.recording[places] == number]]
-            named += [f"recording {recording.name} frames {' '.join(ids)}"] if ids else []
-        return "; ".join(named)
-
-    def _frames(self, step: int) -> Int[np.ndarray, "t k"]:
-        mined: dict[str, Any] = {} if self._mining is None else {"cache": self._mining.cache}
-        return self._draw(step=step, **self._options, **mined)
-
-
-class MixedBatches(BatchSource):
-    """Batches with tuples of two datasets. `mixed` is `mix` with its options."""
-
-    def __init__(self, main: TupleBatches, also: TupleBatches, mixed: Callable[[Batch, Batch], Batch]):
-        self._main, self._also, self._mixed = main, also, mixed
-        self.refresh_steps, self.refresh = main.refresh_steps, main.refresh
-
-    def batch(self, step: int) -> Batch:
-        """Return the batch of a step."""
-        return self._mixed(self._main.batch(step), self._also.batch(step))
-
-    def places(self, step: int) -> str:
-        """Name the recordings and scans of both datasets in the batch of a step."""
-        return "; ".join(filter(None, (self._main.places(step), self._also.places(step))))
-
-
-def batches_of(
-    recordings: Sequence[Recording],
-    pool: TuplePool,
-    config: TrainConfig,
-    *,
-    also: Sequence[Recording] = (),
-    mining: Mining | None = None,
-) -> BatchSource:
-    """Return the batches of a configuration, with `config.also_tuples` tuples of each step from `also`."""
-    share, options = config.share_negatives, {"max_points": config.max_points, "image": config.model.image}
-    read = functools.partial(read_batch, share_negatives=share, categories=config.model.categories, **options)
-    tuples = config.tuples - config.also_tuples
-    main_read = functools.partial(read, recordings, pool, part=own_part(tuples))
-    main = TupleBatches(recordings, pool, main_read, seed=config.seed, tuples=tuples, mining=mining)
-    if not also:
-        return main
-    other = tuple_pool(also, config)
-    second = TupleBatches(
-        also,
-        other,
-        functools.partial(read, also, other),
-        seed=config.seed,
-        tuples=config.also_tuples,
-        random_places=not config.also_triplets,
-    )
-    return MixedBatches(main, second, functools.partial(mix, triplets=config.also_triplets, share_negatives=share))

@@ -4,18 +4,18 @@ import contextlib
 import functools
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sglpr_jax.files import writing
-from sglpr_jax.training.loss import MEASURES, TERM_NAMES
+from sglpr_jax.progress import progress_bar
+from sglpr_jax.training.loss import TERM_NAMES
 
 EVENTS = "tensorboard"
-_SHOWN = ("loss", *TERM_NAMES, *MEASURES, "steps_per_second")
+_SHOWN = ("loss", *TERM_NAMES, "violations", "steps_per_second")
 
 
 class Callback:
@@ -77,46 +77,38 @@ class ProgressBar(Callback):
     """
 
     def __init__(self):
-        self._progress: Progress | None = None
-        self._tasks: dict[str, TaskID] = {}
-        self._steps = 0
+        self._bars = contextlib.ExitStack()
+        self._title, self._steps = "", 0
+        self._show: Callable[..., None] = lambda done, text="": None
 
     def on_pack(self, recording: str, done: int, scans: int) -> None:
         """Show how many scans of the recording are packed."""
-        self._show(f"pack {recording}", done, scans)
+        self._open(f"pack {recording}", scans)
+        self._show(done)
 
     def on_start(self, step: int, steps: int) -> None:
         """Show the number of finished steps."""
         self._steps = steps
-        self._show("train", step, steps)
+        self._open("train", steps)
+        self._show(step)
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
         """Show the step and its measurements."""
-        terms = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
-        self._show("train", step, None, terms=terms)
-        if self._progress is not None and self._progress.disable:
-            print(f"step {step} of {self._steps}: {terms}", file=sys.stderr, flush=True)
+        text = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
+        self._show(step, text)
+        if not Console(stderr=True).is_terminal:
+            print(f"step {step} of {self._steps}: {text}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Stop the bar and leave it on the screen."""
-        if self._progress is not None:
-            self._progress.stop()
-            self._progress = None
-            self._tasks.clear()  # the next training run gets new bars
+        self._bars.close()
+        self._title = ""
 
-    def _show(self, title: str, done: int, total: int | None, *, terms: str = "") -> None:
-        if self._progress is None:
-            self._progress = _progress()
-            self._progress.start()
-        if title not in self._tasks:
-            self._tasks[title] = self._progress.add_task(title, total=total, terms="")
-        self._progress.update(self._tasks[title], completed=done, terms=terms)
-
-
-def _progress() -> Progress:
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, TextColumn("{task.fields[terms]}"), console=console, disable=not console.is_terminal)
+    def _open(self, title: str, total: int) -> None:
+        """Replace the bar, unless it has this title."""
+        if title != self._title:
+            self._bars.close()
+            self._title, self._show = title, self._bars.enter_context(progress_bar(title, total))
 
 
 class EventFiles(Callback):
@@ -147,8 +139,7 @@ class EventFiles(Callback):
 
         scalars = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
         with writing(self._folder):
-            if self._writer is None:
-                self._writer = _new_writer(self._folder, step)
+            self._writer = self._writer or _new_writer(self._folder, step)
             self._writer.write_event(Event(wall_time=time.time(), step=step, summary=Summary(value=scalars)))
             self._writer.flush()
 

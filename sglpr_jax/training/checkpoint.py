@@ -24,6 +24,8 @@ from sglpr_jax.models.weights_file import check_leaves
 from sglpr_jax.training.devices import is_first_host, on_all_hosts
 from sglpr_jax.training.step import TrainState
 
+CHECKPOINTS = "checkpoints"
+"""Folder of the checkpoints, in the folder of a run."""
 _KEPT = 2
 _STATE, _ABOUT = "state", "about.json"
 _MOST_OF_AN_ERROR = 500
@@ -82,18 +84,17 @@ def set_damaged_aside(folder: Path) -> None:
 
     If all checkpoints are damaged, the function renames none and raises ValueError.
     """
-    for left in folder.glob(".*.old"):
-        shutil.rmtree(left)
+    for removed in folder.glob(".*.old"):
+        shutil.rmtree(removed)
     paths = [folder / f"{step}" for step in checkpoint_steps(folder)]
-    damaged = {path: found for path in paths if (found := _damage(path)) is not None}
-    if damaged and len(damaged) == len(paths):
-        newest = max(damaged, key=lambda path: int(path.name))
-        raise ValueError(f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[newest]}")
-    for path, found in damaged.items():
+    damages = {path: damage for path in paths if (damage := _damage(path)) is not None}
+    if damages and len(damages) == len(paths):
+        raise ValueError(f"{folder}: expected a whole checkpoint, found {len(paths)} damaged: {damages[paths[-1]]}")
+    for path, damage in damages.items():
         names = (path.with_name(f"damaged-{path.name}{suffix}") for suffix in ("", *map("-{}".format, range(2, 100))))
         aside = next(name for name in names if not name.exists())
         path.rename(aside)
-        print(f"damaged checkpoint set aside as {aside.name}: {found}", file=sys.stderr)
+        print(f"damaged checkpoint set aside as {aside.name}: {damage}", file=sys.stderr)
 
 
 def _damage(path: Path) -> str | None:
@@ -101,31 +102,34 @@ def _damage(path: Path) -> str | None:
     file = path / _ABOUT
     try:
         content = read_json(file)
-        expected, found = content["sha256"], _checksums(path, content["about"])
+        expected, actual = content["sha256"], _checksums(path, content["about"])
+        different = {name for name in {*expected, *actual} if expected.get(name) != actual.get(name)}
     except (ValueError, OSError) as error:
         return str(error)
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, AttributeError):
         return f"{file}: expected a description with checksums, found another"
-    if not isinstance(expected, dict):
-        return f"{file}: expected a checksum for each file, found {expected!r:.60}"
-    for name in sorted(expected.keys() | found.keys()):
-        if expected.get(name) != found.get(name):
-            return f"{path / name}: expected SHA-256 {expected.get(name)}, found {found.get(name, 'no such file')}"
-    return None
+    if not different:
+        return None
+    name = min(different)
+    return f"{path / name}: expected SHA-256 {expected.get(name)}, found {actual.get(name, 'no such file')}"
 
 
 def _checksums(path: Path, about: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 of every file of the state, and of the JSON values about it."""
-    files = sorted(one for one in (path / _STATE).rglob("*") if one.is_file())
-    found = {one.relative_to(path).as_posix(): hashlib.sha256(one.read_bytes()).hexdigest() for one in files}
-    return {**found, _ABOUT: hashlib.sha256(json.dumps(about).encode()).hexdigest()}
+    """Return the SHA-256 of every file of the state, and of the JSON values about it."""
+    contents = {
+        file.relative_to(path).as_posix(): file.read_bytes()
+        for file in sorted((path / _STATE).rglob("*"))
+        if file.is_file()
+    }
+    contents[_ABOUT] = json.dumps(about).encode()
+    return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
 
 
 def _read(path: Path, like: TrainState) -> TrainState:
     expected = _by_path(like)
     with _orbax() as orbax:
-        there: Any = orbax.metadata(path / _STATE).item_metadata
-        check_leaves(there.tree, expected, source=path)
+        stored: Any = orbax.metadata(path / _STATE).item_metadata
+        check_leaves(stored.tree, expected, source=path)
         empty = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
         values = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
     check_leaves(values, expected, source=path)

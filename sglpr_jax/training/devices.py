@@ -34,17 +34,16 @@ def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh
     by_host: dict[int, list[Any]] = {}
     for device in jax.devices() if devices is None else devices:
         by_host.setdefault(device.process_index, []).append(device)
-    there = min(map(len, by_host.values()))
+    available, hosts = min(map(len, by_host.values())), len(by_host)
     shared = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
-    hosts, common = len(by_host), math.gcd(config.tuples, config.images_at_once)
-    divisors = [n for n in range(1, there + 1) if common % (n * hosts) == 0]
+    divided = math.gcd(config.tuples, config.images_at_once)
     if config.also_tuples:  # mixed batches of two datasets are never split
-        divisors = [1] if hosts == 1 else []
-    if not divisors:
+        divided = 1
+    used = max((n for n in range(1, available + 1) if divided % (n * hosts) == 0), default=0)
+    if not used:
         raise ValueError(f"expected {shared} to be divisible by the number of hosts, found {hosts} hosts")
-    used = divisors[-1]
-    if used < there and is_first_host():
-        print(f"using {used} of {there} devices of each host: their number must divide {shared}", file=sys.stderr)
+    if used < available and is_first_host():
+        print(f"using {used} of {available} devices of each host: their number must divide {shared}", file=sys.stderr)
     row = [device for host in sorted(by_host) for device in by_host[host][:used]]
     return Mesh(np.array(row), (AXIS,), axis_types=(AxisType.Auto,))
 
@@ -127,8 +126,8 @@ def is_first_host() -> bool:
 
 def own_part(tuples: int) -> slice:
     """Return the slice of a step's tuples that this host reads: equal parts, in the order of the hosts."""
-    each = tuples // jax.process_count()
-    return slice(jax.process_index() * each, (jax.process_index() + 1) * each)
+    host_tuples = tuples // jax.process_count()
+    return slice(jax.process_index() * host_tuples, (jax.process_index() + 1) * host_tuples)
 
 
 def on_any_host(flag: bool) -> bool:
@@ -141,12 +140,12 @@ def on_all_hosts(work: Callable[[], T]) -> T:
 
     If `work` fails on a host, that host raises its error and the others raise ConnectionError.
     """
-    done: Any = None
+    result: Any = None
     error: Exception | None = None
     try:
-        done = work()
+        result = work()
     except Exception as raised:
         error = raised
     if on_any_host(error is not None):
         raise error or ConnectionError("another host ended with an error; see the message that it printed")
-    return done
+    return result

@@ -22,7 +22,7 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward, init
 from sglpr_jax.models.weights import freeze_descriptor_layers
 from sglpr_jax.training.batches import Batch, in_network_order, views
-from sglpr_jax.training.config import LossConfig, OcclusionConfig, OptimizerConfig, TrainConfig
+from sglpr_jax.training.config import LossConfig, OcclusionConfig, TrainConfig
 from sglpr_jax.training.devices import keep_placed, on_own_rows
 from sglpr_jax.training.loss import Summary, joint_loss, segmentation_sums
 from sglpr_jax.training.step import Gradient, Metrics, TrainState
@@ -46,11 +46,21 @@ class ImageNetwork:
 
     @property
     def optimizer(self) -> optax.GradientTransformation:
-        """Adam of the configuration."""
-        return optimizer(self.config.optimizer)
+        """Adam with linear warm-up and exponential decay of the learning rate (section 5.1.2)."""
+        config = self.config.optimizer
+        schedule = optax.warmup_exponential_decay_schedule(
+            init_value=config.learning_rate if config.warmup_steps == 0 else 0.0,
+            peak_value=config.learning_rate,
+            warmup_steps=config.warmup_steps,
+            transition_steps=config.decay_steps,
+            decay_rate=config.decay_rate,
+            staircase=config.staircase,
+        )
+        clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
+        return optax.chain(clip, optax.adamw(schedule, weight_decay=config.weight_decay))
 
     def new_state(self, params: Params | None = None) -> TrainState:
-        """Return the state before the first step, with the given weights or random ones."""
+        """Return the state before the first step, with these weights or random ones."""
         weights: Any = params
         if params is None:
             weights = init(jax.random.key(self.config.seed), config=self.config.model)
@@ -62,20 +72,6 @@ class ImageNetwork:
         chunks = _chunks(batch, angle_key, model_key, self.config)
         weights, metrics = gradients(state.params, chunks, batch, self.config.loss)
         return Gradient(dataclasses.replace(state.params, weights=weights), {}, metrics)
-
-
-def optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
-    """Return Adam with linear warm-up and exponential decay of the learning rate (section 5.1.2)."""
-    schedule = optax.warmup_exponential_decay_schedule(
-        init_value=config.learning_rate if config.warmup_steps == 0 else 0.0,
-        peak_value=config.learning_rate,
-        warmup_steps=config.warmup_steps,
-        transition_steps=config.decay_steps,
-        decay_rate=config.decay_rate,
-        staircase=config.staircase,
-    )
-    clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
-    return optax.chain(clip, optax.adamw(schedule, weight_decay=config.weight_decay))
 
 
 class Chunk(NamedTuple):
@@ -133,21 +129,23 @@ def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
     """Return the batch as the network sees it, cut into chunks along a new leading axis."""
     angles = _angles(angle_key, config) if config.rotate else None
-    see = functools.partial(views, grid=config.model.grid)
-    images, maps = (see if batch.also is not None else on_own_rows(see))(
-        batch, angles
-    )  # a mixed batch is on one device
-    seen = field_of_view(config.model)
+    make_views = functools.partial(views, grid=config.model.grid)
+    make_views = make_views if batch.also is not None else on_own_rows(make_views)  # a mixed batch is on one device
+    images, maps = make_views(batch, angles)
+    visible_cells = field_of_view(config.model)
     if config.occlusion.share:
         key = jax.random.fold_in(angle_key, 1)
-        shown = visible(key, config.images, config.model.grid, config.occlusion)
-        seen, images = seen & shown, jnp.where(shown, images, 0)
-    maps = None if maps is None else jnp.where(seen, maps, UNLABELLED)
+        unoccluded = visible(key, config.images, config.model.grid, config.occlusion)
+        visible_cells, images = visible_cells & unoccluded, jnp.where(unoccluded, images, 0)
+    maps = None if maps is None else jnp.where(visible_cells, maps, UNLABELLED)
     keys = jax.random.split(model_key, config.images // config.images_at_once)
-    whole = (images, maps, jnp.asarray(batch.labelled))
-    whole = jax.tree.map(lambda x: in_network_order(x, batch, every=config.loss.segment_every), whole)
-    cut = jax.tree.map(lambda x: x.reshape(-1, config.images_at_once, *x.shape[1:]), whole)
-    return Chunk(*keep_placed(cut, axis=1), key=keys)  # otherwise each chunk would be on one device
+
+    def cut(x: Array) -> Array:
+        ordered = in_network_order(x, batch, every=config.loss.segment_every)
+        return ordered.reshape(-1, config.images_at_once, *x.shape[1:])
+
+    chunks = jax.tree.map(cut, (images, maps, jnp.asarray(batch.labelled)))
+    return Chunk(*keep_placed(chunks, axis=1), key=keys)  # otherwise each chunk would be on one device
 
 
 def _angles(key: Array, config: TrainConfig) -> Array:

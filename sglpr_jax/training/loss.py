@@ -49,11 +49,11 @@ def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) 
     """Equation 5, averaged over the tuples of `batch.negatives`."""
     distances = _tuple_distances(descriptors, batch, config)
     options: dict[str, Any] = _options(batch, config) | {"temperature": config.temperature}
-    own = losses.lazy_triplet(*distances, **options).mean()
+    loss = losses.lazy_triplet(*distances, **options).mean()
     if not config.one_threshold:
-        return own
-    shared = losses.one_threshold(*distances, **options).mean()
-    return (1 - config.one_threshold) * own + config.one_threshold * shared
+        return loss
+    shared_threshold = losses.one_threshold(*distances, **options).mean()
+    return (1 - config.one_threshold) * loss + config.one_threshold * shared_threshold
 
 
 def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
@@ -62,29 +62,23 @@ def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfi
     return (lazy > 0).mean()  # without a temperature, because the smooth loss is never zero
 
 
-def _cross_entropy_sum(logits: Array, classes: Array, counted: Array, config: LossConfig) -> Float[Array, ""]:
-    return losses.cross_entropy(logits, classes, where=counted, balance=config.class_balance).sum()
-
-
-def _dice_sums(logits: Array, classes: Array, counted: Array, config: LossConfig) -> Float[Array, "3 k"]:
-    return losses.dice_sums(logits, classes, counted)
-
-
 DESCRIPTOR_TERMS = {"triplet": DescriptorTerm(lambda config: 0.0 if config.segmentation_alone else 1.0, triplet)}
 SEGMENTATION_TERMS = {
     "cross_entropy": SegmentationTerm(  # equation 6, averaged over the labelled images
-        lambda config: config.ce_weight, _cross_entropy_sum, lambda total, images: total / jnp.maximum(images, 1)
+        weight=lambda config: config.ce_weight,
+        sums=lambda logits, classes, counted, config: losses.cross_entropy(
+            logits, classes, where=counted, balance=config.class_balance
+        ).sum(),
+        value=lambda total, images: total / jnp.maximum(images, 1),
     ),
     "dice": SegmentationTerm(  # equation 7 over the pixels of all labelled images; 0 without labelled images
-        lambda config: config.dice_weight,
-        _dice_sums,
-        lambda sums, images: jnp.where(images > 0, losses.dice_from_sums(sums), 0.0),
+        weight=lambda config: config.dice_weight,
+        sums=lambda logits, classes, counted, config: losses.dice_sums(logits, classes, counted),
+        value=lambda sums, images: jnp.where(images > 0, losses.dice_from_sums(sums), 0.0),
     ),
 }
 """Equation 8 is the weighted sum of all terms. Metrics and learning curves use their names."""
 TERM_NAMES = (*DESCRIPTOR_TERMS, *SEGMENTATION_TERMS)
-MEASURES = {"violations": violations}
-"""Measurements beside the terms. They have the arguments of `DescriptorTerm.value`."""
 
 
 def segmentation_sums(
@@ -99,19 +93,18 @@ def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Floa
     """Compute equation 8 for a whole batch.
 
     Returns:
-      The loss, and the metrics by name: its terms, the `MEASURES` and the loss itself.
+      The loss, and the metrics by name: its terms, the fraction of `violations` and the loss itself.
     """
     descriptors = in_batch_order(summary.descriptors, batch, every=config.segment_every)
     labelled = in_network_order(jnp.asarray(batch.labelled), batch, every=config.segment_every)
     images = labelled[:: config.segment_every].sum()
-    of_descriptors = _weighted(DESCRIPTOR_TERMS, config)
-    of_classes = {name: term for name, term in SEGMENTATION_TERMS.items() if name in summary.sums}
-    terms = {name: term.value(descriptors, batch, config) for name, term in of_descriptors.items()}
-    terms |= {name: term.value(summary.sums[name], images) for name, term in of_classes.items()}
-    weights = {name: term.weight(config) for name, term in (of_descriptors | of_classes).items()}
-    total = losses.joint(terms, weights)
-    measured = {name: measure(descriptors, batch, config) for name, measure in MEASURES.items()}
-    return total, terms | measured | {"loss": total}
+    descriptor_terms = _weighted(DESCRIPTOR_TERMS, config)
+    segmentation_terms = {name: SEGMENTATION_TERMS[name] for name in summary.sums}
+    values = {name: term.value(descriptors, batch, config) for name, term in descriptor_terms.items()}
+    values |= {name: term.value(summary.sums[name], images) for name, term in segmentation_terms.items()}
+    weights = {name: term.weight(config) for name, term in (descriptor_terms | segmentation_terms).items()}
+    total = losses.joint(values, weights)
+    return total, values | {"violations": violations(descriptors, batch, config), "loss": total}
 
 
 def _weighted(terms: dict[str, Any], config: LossConfig) -> dict[str, Any]:

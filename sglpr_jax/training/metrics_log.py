@@ -19,18 +19,19 @@ class MetricsLog:
     """
 
     def __init__(self, path: Path, *, start_step: int = 0):
-        kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
-        write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
+        lines = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
+        write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
         self._path = path
         self._file = path.open("ab", buffering=0)  # unbuffered, so that closing has nothing left to write
 
     def append(self, step: int, values: Mapping[str, Any]) -> None:
         """Write the measurements of one step. Values that are not finite become null."""
-        line = {"step": step, **{name: _plain(value) for name, value in values.items()}}
-        left = json.dumps(line).encode() + b"\n"
+        numbers = {name: float(value) for name, value in values.items()}
+        line = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        unwritten = json.dumps({"step": step, **line}).encode() + b"\n"
         with writing(self._path):
-            while left:  # a nearly full disk may accept only a part
-                left = left[self._file.write(left) :]
+            while unwritten:  # a nearly full disk may accept only a part
+                unwritten = unwritten[self._file.write(unwritten) :]
 
     def sync(self) -> None:
         """Flush the lines to disk. Called before a checkpoint, which must not be ahead of the log."""
@@ -47,8 +48,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
     Raises ValueError, with the file and the line, if any other line is invalid.
     """
-    *whole, last = path.read_bytes().split(b"\n")
-    lines = [_read_line(text, source=f"{path}, line {i}") for i, text in enumerate(whole, start=1)]
+    *texts, last = path.read_bytes().split(b"\n")
+    lines = [_read_line(text, source=f"{path}, line {i}") for i, text in enumerate(texts, start=1)]
     with contextlib.suppress(ValueError):
         lines += [_read_line(last, source=path)]
     for i, (before, line) in enumerate(itertools.pairwise(lines), start=2):
@@ -59,19 +60,10 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 def _read_line(text: bytes, *, source: Path | str) -> dict[str, Any]:
     line = parse_json(text, source=source)
-    measured = line if isinstance(line, dict) else {}
-    if type(measured.get("step")) is not int or not all(_is_measured(value) for value in measured.values()):
+    fits = isinstance(line, dict) and type(line.get("step")) is int
+    if not fits or not all(value is None or type(value) in (int, float) for value in line.values()):
         raise ValueError(f"{source}: expected a step and its measurements, found {text[:80].decode(errors='replace')}")
-    return measured
-
-
-def _is_measured(value: Any) -> bool:
-    return value is None or (isinstance(value, int | float) and type(value) is not bool)
-
-
-def _plain(value: Any) -> float | None:
-    value = float(value)
-    return value if math.isfinite(value) else None
+    return line
 
 
 class Throughput(NamedTuple):
@@ -87,10 +79,13 @@ def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
 
     The first line after a start or a resume has no speed, because the step is compiled then.
     """
-    timed = [(line, line["step"] - before["step"]) for before, line in itertools.pairwise(lines)]
-    timed = [(line, steps) for line, steps in timed if "steps_per_second" in line]
+    timed = [
+        (line["step"] - before["step"], line)
+        for before, line in itertools.pairwise(lines)
+        if "steps_per_second" in line
+    ]
     if not timed:
         return None
-    seconds = [steps / line["steps_per_second"] for line, steps in timed]
-    waited = [line["data_wait"] * spent for (line, _), spent in zip(timed, seconds, strict=True)]
-    return Throughput(sum(steps for _, steps in timed) / sum(seconds), sum(waited) / sum(seconds))
+    seconds = sum(steps / line["steps_per_second"] for steps, line in timed)
+    waited = sum(line["data_wait"] * steps / line["steps_per_second"] for steps, line in timed)
+    return Throughput(sum(steps for steps, _ in timed) / seconds, waited / seconds)

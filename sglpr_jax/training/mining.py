@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,10 @@ from jaxtyping import Float32, Int
 from sglpr_jax.files import replacing
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.numpy_files import read_arrays
-from sglpr_jax.training.step import TrainState
+from sglpr_jax.training.checkpoint import CHECKPOINTS, checkpoint_steps
 
-FOLDER = "mining"
-
-DescribeFn = Callable[[TrainState, Int[np.ndarray, "n"]], Float32[np.ndarray, "n d"]]
-"""Describes places, given as frame numbers of the pool."""
+MINING = "mining"
+"""Folder of the descriptor caches, in the folder of a run."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,62 +49,49 @@ class DescriptorCache:
     @classmethod
     def load(cls, path: Path) -> "DescriptorCache":
         """Read a file written by `save`. Raises FileNotFoundError, or ValueError if the file is damaged."""
-        found = read_arrays(path, expected="descriptors of places")
-        places, descriptors = found.get("places"), found.get("descriptors")
+        arrays = read_arrays(path, expected="descriptors of places")
+        places, descriptors = arrays.get("places"), arrays.get("descriptors")
         if places is None or descriptors is None or places.shape != descriptors.shape[:1] or descriptors.ndim != 2:
-            shapes = ", ".join(f"{name} {array.shape}" for name, array in found.items())
+            shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
             raise ValueError(f"{path}: expected places (n,) and descriptors (n, d), found {shapes or 'no array'}")
         return cls(places, descriptors)
 
 
-class Mining:
-    """Descriptor cache of a run. A refresh at step r runs before that step and writes `folder`/r.npz.
+def refresh_cache(
+    step: int,
+    describe: Callable[[Int[np.ndarray, "n"]], Float32[np.ndarray, "n d"]],
+    pool_size: int,
+    config: TupleConfig,
+    run: Path,
+    *,
+    seed: int,
+) -> DescriptorCache:
+    """Load or compute the descriptors for the steps from the last multiple of `config.refresh_steps` to `step` on.
 
-    A run that is resumed between two refreshes reads that file, so its batches are those of an uninterrupted run.
+    The cache is stored in the folder of the run. A run that is resumed between two refreshes reads it, so its batches
+    are those of an uninterrupted run. Caches that no checkpoint needs are deleted.
+
+    Arguments:
+      step: Next step of the run.
+      describe: Describes places, given as frame numbers of the pool, with the weights before `step`.
+      pool_size: Number of frames of the pool.
+      config: Number of described places, and steps between two refreshes.
+      run: Folder of the run.
+      seed: Seed of the selection of places.
+
+    Raises FileNotFoundError if the cache of an earlier step is needed but missing.
     """
-
-    def __init__(
-        self,
-        describe: DescribeFn,
-        places: int,
-        config: TupleConfig,
-        folder: Path,
-        *,
-        seed: int,
-        checkpoints: Callable[[], Collection[int]],
-    ):
-        """`places` is the size of the pool, `folder` has the caches, and `seed` draws the places that are described.
-        `checkpoints` returns the steps of the complete checkpoints of the run."""
-        self._describe, self._places, self._config, self._folder = describe, places, config, folder
-        self._seed, self._checkpoints = seed, checkpoints
-        self.cache: DescriptorCache | None = None
-
-    def refresh(self, step: int, state: TrainState) -> None:
-        """Load or compute the cache that `step` uses. `state` is the one before that step.
-
-        Raises FileNotFoundError if the cache of an earlier step is needed but missing.
-        """
-        every = self._config.refresh_steps
-        path = self._folder / f"{step - step % every}.npz"
-        if path.is_file() or step % every:
-            self.cache = DescriptorCache.load(path)
-            return
-        places = self._chosen(step)
-        self.cache = DescriptorCache(places, self._describe(state, places))
-        self.cache.save(path)
-        self._drop_unneeded()
-
-    def _chosen(self, step: int) -> Int[np.ndarray, "n"]:
-        wanted = self._config.mined_places
-        if not 0 < wanted < self._places:
-            return np.arange(self._places)
-        rng = np.random.default_rng([self._seed, step])
-        return np.sort(rng.choice(self._places, wanted, replace=False))
-
-    def _drop_unneeded(self) -> None:
-        """Delete the caches that no kept checkpoint needs. A resumed run reads the cache of its next step."""
-        every = self._config.refresh_steps
-        asked = {step - step % every for step in self._checkpoints()}
-        for path in self._folder.glob("*.npz"):
-            if path.stem.isdecimal() and int(path.stem) not in asked and int(path.stem) < max(asked, default=0):
-                path.unlink()
+    every, folder = config.refresh_steps, run / MINING
+    path = folder / f"{step - step % every}.npz"
+    if path.is_file() or step % every:
+        return DescriptorCache.load(path)
+    places = np.arange(pool_size)
+    if 0 < config.mined_places < pool_size:
+        places = np.sort(np.random.default_rng([seed, step]).choice(pool_size, config.mined_places, replace=False))
+    cache = DescriptorCache(places, describe(places))
+    cache.save(path)
+    needed = {saved - saved % every for saved in checkpoint_steps(run / CHECKPOINTS)}
+    for old in folder.glob("*.npz"):
+        if old.stem.isdecimal() and int(old.stem) not in needed and int(old.stem) < max(needed, default=0):
+            old.unlink()
+    return cache

@@ -16,6 +16,7 @@ from sglpr_jax.files import file_name, in_short, replacing
 from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.method import LABELLED
 from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.training.batches import positions_of
 from sglpr_jax.training.tuples import TuplePool
 
 SCANS_AHEAD = 8
@@ -35,7 +36,7 @@ class TrainingInputs:
         return np.stack([self.inputs[pool.recording[place]][pool.frame[place]] for place in places])
 
 
-def prepared(
+def prepare_inputs(
     method: LearnedMethod, recordings: Sequence[Recording], cache: Path, *, progress: Progress = no_progress
 ) -> TrainingInputs:
     """Compute the inputs of all scans, or read them from the cache.
@@ -50,8 +51,7 @@ def prepared(
     """
     for recording in recordings:
         require_content(method.name, method.takes, recording, every_label=True)
-        if recording.positions is None:
-            raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
+        positions_of(recording)
     inputs = tuple(_inputs(method, recording, cache, progress) for recording in recordings)
     for recording, array in zip(recordings, inputs, strict=True):
         _require_alike(array[0], inputs[0][0], name=f"sequence {recording.name}")
@@ -64,36 +64,36 @@ def _inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: 
         with progress(f"prepare {recording.name}", len(recording)) as show:
             _write(path, method, recording, show)
     try:
-        found = np.load(path, mmap_mode="r", allow_pickle=False)
+        inputs = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, EOFError) as error:
         raise ValueError(f"{path}: expected inputs, found a damaged file ({in_short(error)}); delete it") from error
-    if len(found) != len(recording):
-        raise ValueError(f"{path}: expected {len(recording)} inputs, found {len(found)}; delete the file")
-    return found
+    if len(inputs) != len(recording):
+        raise ValueError(f"{path}: expected {len(recording)} inputs, found {len(inputs)}; delete the file")
+    return inputs
 
 
 def _write(path: Path, method: LearnedMethod, recording: Recording, show) -> None:
     """Write the inputs of a recording, completely or not at all."""
     check_readable(recording, len(recording))
     options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD, "on_progress": show}
-    made = scan_stream(recording, lambda row, scan: method.prepare(scan), **options)
+    stream = scan_stream(recording, lambda row, scan: method.prepare(scan), **options)
     with replacing(path) as temporary:
         file = None
-        for row, one in made:
-            assert one is not None  # without `on_bad_scan`, a bad scan is an error
+        for row, inputs in stream:
+            assert inputs is not None  # without `on_bad_scan`, a bad scan is an error
             if file is None:
-                shape = (len(recording), *one.shape)
-                file = np.lib.format.open_memmap(temporary, mode="w+", dtype=one.dtype, shape=shape)
-            _require_alike(one, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
-            file[row] = one
+                shape = (len(recording), *inputs.shape)
+                file = np.lib.format.open_memmap(temporary, mode="w+", dtype=inputs.dtype, shape=shape)
+            _require_alike(inputs, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
+            file[row] = inputs
         del file  # flushes it
 
 
-def _require_alike(found: np.ndarray, expected: np.ndarray, *, name: str) -> None:
-    if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+def _require_alike(inputs: np.ndarray, expected: np.ndarray, *, name: str) -> None:
+    if (inputs.shape, inputs.dtype) != (expected.shape, expected.dtype):
         raise ValueError(
             f"{name}: expected an input {expected.dtype} {expected.shape} as for the other scans, found "
-            f"{found.dtype} {found.shape}"
+            f"{inputs.dtype} {inputs.shape}"
         )
 
 

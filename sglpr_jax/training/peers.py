@@ -21,20 +21,17 @@ from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
 from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
 from sglpr_jax.models.weights_file import LAST
 from sglpr_jax.progress import Progress, no_progress
-from sglpr_jax.training.batches import TupleBatches
+from sglpr_jax.training.batch_source import TupleBatches
+from sglpr_jax.training.batches import positions_of
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.checkpoint import checkpoint_steps
 from sglpr_jax.training.devices import AXIS
-from sglpr_jax.training.mining import FOLDER as MINING
-from sglpr_jax.training.mining import Mining
 from sglpr_jax.training.peer_inputs import TrainingInputs
 from sglpr_jax.training.run_folder import CONFIG_FILE, lock_run
 from sglpr_jax.training.step import Gradient, TrainState
-from sglpr_jax.training.trainer import CHECKPOINTS, Schedule, Trained, run_steps
+from sglpr_jax.training.trainer import Schedule, Trained, Trainer
 from sglpr_jax.training.tuples import TuplePool
 from sglpr_jax.training.validation import RECALL, recall_at_1, require_revisits
 
-SCORES_FILE = "scores.jsonl"
 RATES_FILE = "rates.json"
 LIMITS = ("settings.seconds", "settings.images")
 """Settings that may differ when a run is resumed."""
@@ -108,14 +105,14 @@ class PeerNetwork:
         inputs = self.method.rotate_inputs(key, batch.inputs)
 
         def loss_of(params):
-            variables, kept = {"params": params, **state.statistics}, [*state.statistics]
-            described, updated = self.method.network.apply(variables, inputs, train=True, mutable=kept)
-            descriptors = described.reshape(*batch.apart_m.shape, -1)
+            variables = {"params": params, **state.statistics}
+            outputs, statistics = self.method.network.apply(variables, inputs, train=True, mutable=[*state.statistics])
+            descriptors = outputs.reshape(*batch.apart_m.shape, -1)
             tuples = Tuples(descriptors, batch.apart_m, self.method.recipe.sampling.positives)
-            return self.method.loss({"params": params, **updated}, tuples), updated
+            return self.method.loss({"params": params, **statistics}, tuples), statistics
 
-        (loss, updated), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
-        return Gradient(gradient, {**state.statistics, **updated}, {"loss": loss})
+        (loss, statistics), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+        return Gradient(gradient, {**state.statistics, **statistics}, {"loss": loss})
 
     def _adam(self, learning_rate: float) -> optax.GradientTransformation:
         decay = optax.add_decayed_weights(self.method.recipe.weight_decay)
@@ -162,47 +159,39 @@ def train_learned(
       ValueError: The recordings give no tuples, or the run to resume has other settings.
       OSError: The folder cannot be written, has a run already, or has none to resume.
     """
-    network = PeerNetwork(method, settings.seed)
-    schedule = Schedule(
-        LOG_EVERY,
-        first_snapshot=FIRST_SNAPSHOT,
-        save_every_s=SAVE_EVERY_S,
-        images=settings.images or Schedule.images,
-        seconds=settings.seconds,
-        costs=True,
-        scores_file=SCORES_FILE,
-    )
+    network, chosen = PeerNetwork(method, settings.seed), dataclasses.asdict(settings)
 
     def save(run: Trained, name: str) -> None:
-        about = {"images": run.images, "seconds": round(run.seconds, 3), "settings": dataclasses.asdict(settings)}
+        about = {"images": run.images, "seconds": round(run.seconds, 3), "settings": chosen}
         save_variables(out / name, method, variables_of(run.state), about)
-
-    def keep(run: Trained, snapshots: list[int]) -> Mapping[str, float]:
-        for snapshot in snapshots:
-            save(run, f"{LAST}-{snapshot}")
-        return {} if score is None else score(variables_of(run.state))
 
     recipe = dataclasses.asdict(method.recipe)
     del recipe["learning_rates"]  # the settings have the chosen one
-    recordings = [{"name": one.name, "scans": len(one)} for one in data.recordings]
-    config = {"method": method.name, "settings": dataclasses.asdict(settings), "recipe": recipe}
-    claim = lock_run(out, config | {"recordings": recordings}, seed=settings.seed, resume=resume, limits=LIMITS)
-    with claim, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
-        pool = TuplePool(
-            [one.positions for one in data.recordings if one.positions is not None], method.recipe.sampling
-        )
-        run = run_steps(
+    recordings = [{"name": recording.name, "scans": len(recording)} for recording in data.recordings]
+    config = {"method": method.name, "settings": chosen, "recipe": recipe, "recordings": recordings}
+    lock = lock_run(out, config, seed=settings.seed, resume=resume, limits=LIMITS)
+    with lock, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
+        pool = TuplePool([positions_of(recording) for recording in data.recordings], method.recipe.sampling)
+        trainer = Trainer(
             network,
             _batches(network, data, pool, out),
             out,
-            schedule,
+            Schedule(
+                LOG_EVERY,
+                first_snapshot=FIRST_SNAPSHOT,
+                save_every_s=SAVE_EVERY_S,
+                images=settings.images or Schedule.images,
+                seconds=settings.seconds,
+                costs=True,
+            ),
             mesh=Mesh(np.array(jax.devices()[:1]), (AXIS,), axis_types=(AxisType.Auto,)),
-            keep=keep,
             begin=functools.partial(_first_state, network, data, pool, settings.learning_rate),
+            score=lambda state: {} if score is None else score(variables_of(state)),
+            save_snapshot=lambda run, images: save(run, f"{LAST}-{images}"),
             resume=resume,
             callback=_Report(report, show),
-            stopped=stopped,
         )
+        run = trainer.train(stopped)
         save(run, LAST)
         return run
 
@@ -229,7 +218,7 @@ class _Report(Callback):
 
 
 def _first_state(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, learning_rate: float) -> TrainState:
-    """Return random weights, changed by the method's `start`, which sees the inputs of random places."""
+    """Return random weights, changed by the method's `start`, which receives the inputs of random places."""
     state = network.new_state(learning_rate)
     if network.method.start is None:
         return state
@@ -239,21 +228,18 @@ def _first_state(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, le
 
 
 def _batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, out: Path) -> TupleBatches:
-    """Return the batches of a run, with hard negatives if its recipe mines them."""
-    recipe, seed, mining = network.method.recipe, network.seed, None
+    """Return the batches of a run."""
 
     def read(frames: Int[np.ndarray, "t k"]) -> PeerBatch:
         return PeerBatch(data.of(pool, frames.reshape(-1)), pool.distances_from_anchors(frames))
 
-    def described(state: TrainState, places: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
+    def describe(state: TrainState, places: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
         blocks = np.array_split(places, math.ceil(len(places) / DESCRIBED))
-        inputs = (data.of(pool, block) for block in blocks)
-        return np.concatenate([describe_inputs(network.method, variables_of(state), one) for one in inputs])
+        variables = variables_of(state)
+        return np.concatenate([describe_inputs(network.method, variables, data.of(pool, block)) for block in blocks])
 
-    if recipe.sampling.mining == "hardest":
-        checkpoints = functools.partial(checkpoint_steps, out / CHECKPOINTS)
-        mining = Mining(described, len(pool), recipe.sampling, out / MINING, seed=seed, checkpoints=checkpoints)
-    return TupleBatches(data.recordings, pool, read, seed=seed, tuples=recipe.tuples, mining=mining)
+    tuples = network.method.recipe.tuples
+    return TupleBatches(data.recordings, pool, read, seed=network.seed, tuples=tuples, describe=describe, run=out)
 
 
 def held_out_score(method: LearnedMethod, held_out: TrainingInputs) -> ScoreFn:
@@ -265,13 +251,12 @@ def held_out_score(method: LearnedMethod, held_out: TrainingInputs) -> ScoreFn:
     require_revisits(held_out.recordings)
 
     def score(variables: Variables) -> dict[str, float]:
-        distance, found = learned_distance(method, variables), {}
+        distance, recalls = learned_distance(method, variables), {}
         for recording, inputs in zip(held_out.recordings, held_out.inputs, strict=True):
             descriptors = describe_inputs(method, variables, inputs)
-            assert recording.positions is not None
-            recall = recall_at_1(descriptors, recording.positions, recording.times, distance)
-            found[f"{RECALL} {recording.name}"] = recall
-        return {RECALL: float(np.mean(list(found.values()))), **found}
+            recall = recall_at_1(descriptors, positions_of(recording), recording.times, distance)
+            recalls[f"{RECALL} {recording.name}"] = recall
+        return {RECALL: float(np.mean(list(recalls.values()))), **recalls}
 
     return score
 
@@ -294,25 +279,25 @@ def best_rate(
     """Train with each of the three learning rates and return the one with the highest Recall@1.
 
     The folder gets the trainings and `rates.json` with all scores. Finished trainings are not repeated. A rate whose
-    loss is not finite has no score. Of equal scores, the smaller rate wins.
+    loss is not finite has no score. If scores are equal, the smaller rate is returned.
 
     Each rate is trained for `seconds` with the options of `train_learned`.
 
     Raises:
-      FloatingPointError: If the loss is not finite with any rate.
-      Stopped: If the search was asked to stop.
+      FloatingPointError: The loss is not finite with any rate.
+      Stopped: The search was asked to stop.
     """
     recalls: dict[float, float | None] = {}
     for rate in method.recipe.learning_rates:
         settings, folder = RunSettings(rate, seed=seed, seconds=seconds), out / f"rate-{rate:g}"
-        resume, kept = (folder / CONFIG_FILE).is_file(), folder / "score.json"
+        resume, score_file = (folder / CONFIG_FILE).is_file(), folder / "score.json"
         try:
-            found = train_learned(method, data, settings, folder, resume=resume, report=report, **options)
-            if found.seconds < seconds:
+            run = train_learned(method, data, settings, folder, resume=resume, report=report, **options)
+            if run.seconds < seconds:
                 raise Stopped
-            if not kept.is_file():
-                write_json(kept, score(variables_of(found.state)))
-            recalls[rate] = float(read_json(kept)[RECALL])
+            if not score_file.is_file():
+                write_json(score_file, score(variables_of(run.state)))
+            recalls[rate] = float(read_json(score_file)[RECALL])
         except FloatingPointError:
             recalls[rate] = None
         report(f"learning rate {rate:g}: {RECALL} {recalls[rate]}")
@@ -321,6 +306,6 @@ def best_rate(
         raise FloatingPointError(f"{out}: the loss of {method.name} is not finite with any of its learning rates")
     best = max(finite, key=lambda rate: finite[rate])
     about = {"method": method.name, "seconds": seconds, "seed": seed}
-    named = {f"{rate:g}": recall for rate, recall in recalls.items()}
-    write_json(out / RATES_FILE, {**about, RECALL: named, "best": best})
+    recall_of_rate = {f"{rate:g}": recall for rate, recall in recalls.items()}
+    write_json(out / RATES_FILE, {**about, RECALL: recall_of_rate, "best": best})
     return best

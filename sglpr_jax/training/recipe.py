@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float32, Int
 
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
@@ -16,20 +17,18 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import graft, without_whitening
 from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.training.batch_queue import BatchSource
-from sglpr_jax.training.batches import batches_of, positions_of, tuple_pool
+from sglpr_jax.training.batch_source import TupleBatches, batches_of
+from sglpr_jax.training.batches import positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.checkpoint import checkpoint_steps
+from sglpr_jax.training.checkpoint import CHECKPOINTS, checkpoint_steps
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.devices import data_mesh, is_first_host, on_all_hosts, own_copy
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
-from sglpr_jax.training.mining import FOLDER as MINING
-from sglpr_jax.training.mining import Mining
 from sglpr_jax.training.run_folder import lock_run
 from sglpr_jax.training.step import TrainState
-from sglpr_jax.training.trainer import CHECKPOINTS, METRICS_FILE, Schedule, Trained, run_steps
-from sglpr_jax.training.tuples import TuplePool, hold_out
+from sglpr_jax.training.trainer import METRICS_FILE, Schedule, Trained, Trainer
+from sglpr_jax.training.tuples import hold_out
 from sglpr_jax.training.validation import describe_places, training_recall, validation_score
 
 WEIGHTS = "weights"
@@ -123,36 +122,33 @@ def train(
     _require_usable(config, recordings, also, test)
     if config.loss.segmentation_alone and weights is None and not resume:
         raise ValueError("loss.segmentation_alone trains no descriptors: expected weights to begin with, found none")
-    settings = _names(recordings, also, test) if settings is None else settings
+    if settings is None:
+        names = {
+            key: [recording.name for recording in group] for key, group in (("recordings", recordings), ("also", also))
+        }
+        settings = {**names, "test": None if test is None else test.name}
     with contextlib.ExitStack() as opened:
-        followed = opened.enter_context(
-            contextlib.closing(callback if callback is not None and is_first_host() else Callback())
+        follower = opened.enter_context(contextlib.closing(callback if callback and is_first_host() else Callback()))
+        recordings, also = on_all_hosts(
+            lambda: (_packed(recordings, cache, follower, stopped), _packed(also, cache, follower, stopped))
         )
-        pack = functools.partial(_packed, cache=cache, callback=followed, stopped=stopped)
-        recordings, also = on_all_hosts(lambda: (pack(recordings), pack(also)))
         source, score = _source_and_score(recordings, also, config, folder)
-        made = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
-        start_from = None if weights is None or made else _grafted(weights, config)
-        if config.steps < made:
+        last_step = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
+        start_from = None if weights is None or last_step else _grafted(weights, config)
+        if config.steps < last_step:
             raise ValueError(
-                f"{folder}: expected at least the {made} steps that are already done, found {config.steps}"
+                f"{folder}: expected at least the {last_step} steps that are already done, found {config.steps}"
             )
-        noted = run_settings(config, settings)
-        claim = lock_run(folder, noted, seed=config.seed, resume=resume, limits=LIMITS)
-        on_all_hosts(lambda: is_first_host() and opened.enter_context(claim))
-        run = run_network(
-            config,
-            source,
-            folder,
-            score=score,
-            start_from=start_from,
-            resume=resume,
-            callback=followed,
-            stopped=stopped,
-        )
-        result = _finish(run.state, folder, config)
-        followed.on_end(result.steps)
-    return result
+        lock = lock_run(folder, run_settings(config, settings), seed=config.seed, resume=resume, limits=LIMITS)
+        on_all_hosts(lambda: is_first_host() and opened.enter_context(lock))
+        options = {"start_from": start_from, "resume": resume, "callback": follower, "stopped": stopped}
+        state = run_network(config, source, folder, score=score, **options).state
+        steps, params, speed = int(state.step), own_copy(state.params), None
+        if is_first_host():
+            save(params, folder / WEIGHTS)
+            speed = throughput(read_metrics(folder / METRICS_FILE))
+        follower.on_end(steps)
+    return TrainResult(params, folder, steps, config, speed)
 
 
 def run_settings(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -162,50 +158,49 @@ def run_settings(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, 
 
 def run_network(
     config: TrainConfig,
-    source: BatchSource,
+    source: TupleBatches,
     folder: Path,
     *,
     score: ScoreFn,
     start_from: Params | None = None,
-    **options: Any,
+    resume: bool = False,
+    callback: Callback | None = None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Trained:
-    """Train the network of a configuration with ready-made batches. The options are those of `run_steps`.
+    """Train the network of a configuration with ready-made batches.
 
-    Raises the errors of `run_steps`, and ValueError if the devices cannot share a step (`data_mesh`).
+    Raises the errors of `Trainer`, and ValueError if the devices cannot share a step (`data_mesh`).
     """
-
-    def score_once(run: Trained, snapshots: list[int]) -> dict[str, float]:
-        """Compute the scores on the first host. The other hosts have none."""
-        params = run.state.params
-        return on_all_hosts(lambda: score(own_copy(params)) if is_first_host() else {})
-
     network = ImageNetwork(config)
-    schedule = Schedule(config.log_every, config.score_every, steps=config.steps)
-    begin = functools.partial(network.new_state, start_from)
-    return run_steps(network, source, folder, schedule, mesh=data_mesh(config), keep=score_once, begin=begin, **options)
+    trainer = Trainer(
+        network,
+        source,
+        folder,
+        Schedule(config.log_every, config.score_every, steps=config.steps),
+        mesh=data_mesh(config),
+        begin=functools.partial(network.new_state, start_from),
+        score=lambda state: score(state.params),
+        resume=resume,
+        callback=callback,
+    )
+    return trainer.train(stopped)
 
 
 def _source_and_score(
     recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
-) -> tuple[BatchSource, ScoreFn]:
+) -> tuple[TupleBatches, ScoreFn]:
     """Return the batches of the training places, and the score: on held-out places, if there are any."""
     splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
     pool = tuple_pool(recordings, config, frames=[training for training, _ in splits])
-    mining = _mining(recordings, pool, config, folder) if config.sampling.mining == "hardest" else None
+
+    def describe(state: TrainState, places: Int[np.ndarray, "n"]) -> Float32[np.ndarray, "n d"]:
+        return describe_places(state.params, recordings, pool, places, np.zeros(len(places)), config)
+
     if config.validation.share:
         score = validation_score(recordings, [held_out for _, held_out in splits], config)
     else:
         score = training_recall(recordings, pool, config)
-    return batches_of(recordings, pool, config, also=also, mining=mining), score
-
-
-def _finish(last: TrainState, folder: Path, config: TrainConfig) -> TrainResult:
-    """Save and return the final weights."""
-    steps, params, measured = int(last.step), own_copy(last.params), None
-    if is_first_host():
-        save(params, folder / WEIGHTS)
-        measured = throughput(read_metrics(folder / METRICS_FILE))
-    return TrainResult(params, folder, steps, config, measured)
+    return batches_of(recordings, pool, config, also=also, describe=describe, run=folder), score
 
 
 def _require_usable(
@@ -222,37 +217,24 @@ def _require_usable(
             "also_tuples is the number of tuples per step from the second dataset: expected both or neither, "
             f"found {len(also)} of its recordings and {config.also_tuples} tuples"
         )
-    tested = [] if test is None else [test]
-    if any(recording.name == test.name for test in tested for recording in recordings):
-        raise ValueError(f"expected recordings to train on other than the one tested, found {tested[0].name} in both")
+    if test is not None and test.name in {recording.name for recording in recordings}:
+        raise ValueError(f"expected recordings to train on other than the one tested, found {test.name} in both")
     if config.loss.segmentation_alone and not any(any(recording.labelled) for recording in (*recordings, *also)):
         raise ValueError(
             "loss.segmentation_alone trains on labels alone: expected labels beside some scans, "
             f"found none in {len(recordings) + len(also)} recording(s)"
         )
-    if config.model.categories_read:
-        for recording in (*recordings, *also, *tested):
-            _require_labels(recording)
-
-
-def _require_labels(recording: Recording) -> None:
-    labelled = sum(recording.labelled)
-    if labelled < len(recording):
-        raise ValueError(
-            f"model.head.input reads labels: expected labels beside every scan of sequence {recording.name}, "
-            f"found {labelled} of {len(recording)}"
-        )
-
-
-def _names(
-    recordings: Sequence[Recording], also: Sequence[Recording], test: Recording | None
-) -> dict[str, str | list[str] | None]:
-    names = {what: [recording.name for recording in of] for what, of in (("recordings", recordings), ("also", also))}
-    return {**names, "test": None if test is None else test.name}
+    for recording in (*recordings, *also, *filter(None, (test,))) if config.model.categories_read else ():
+        labelled = sum(recording.labelled)
+        if labelled < len(recording):
+            raise ValueError(
+                f"model.head.input reads labels: expected labels beside every scan of sequence {recording.name}, "
+                f"found {labelled} of {len(recording)}"
+            )
 
 
 def _packed(
-    recordings: Sequence[Recording], *, cache: Path | None, callback: Callback, stopped: Callable[[], bool]
+    recordings: Sequence[Recording], cache: Path | None, callback: Callback, stopped: Callable[[], bool]
 ) -> Sequence[Recording]:
     """Return the same recordings, read from packs in the folder `cache`. Missing packs are written first."""
     if cache is None:
@@ -266,22 +248,13 @@ def _packed(
     return [packed(recording, cache, on_progress=functools.partial(show, recording)) for recording in recordings]
 
 
-def _mining(recordings: Sequence[Recording], pool: TuplePool, config: TrainConfig, folder: Path) -> Mining:
-    def describe(state: TrainState, places: np.ndarray) -> np.ndarray:
-        return describe_places(state.params, recordings, pool, places, np.zeros(len(places)), config)
-
-    checkpoints = functools.partial(checkpoint_steps, folder / CHECKPOINTS)
-    return Mining(describe, len(pool), config.sampling, folder / MINING, seed=config.seed, checkpoints=checkpoints)
-
-
 def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:
-    """Return the given weights with random values for missing ones, without the whitening layer if the model has
-    none."""
-    given = weights if isinstance(weights, Params) else load(weights)
-    if config.loss.segmentation_alone and given.config.head.whiten and not config.model.head.whiten:
+    """Return the weights with random values for missing ones, and with a whitening layer only if the model has one."""
+    params = weights if isinstance(weights, Params) else load(weights)
+    if config.loss.segmentation_alone and params.config.head.whiten and not config.model.head.whiten:
         raise ValueError(
             "loss.segmentation_alone trains no descriptors, found weights with a whitening layer: "
             "expected model.head.whiten True"
         )
-    given = given if config.model.head.whiten else without_whitening(given)
-    return graft(given, init(jax.random.key(config.seed), config=config.model))
+    params = params if config.model.head.whiten else without_whitening(params)
+    return graft(params, init(jax.random.key(config.seed), config=config.model))

@@ -86,17 +86,17 @@ def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
 
 
 def note_environment(folder: Path, *, seed: int) -> None:
-    """Write the environment of a run into its folder. A resumed run appends its environment under `resumes`.
-
-    Raises ValueError if the existing file is damaged.
-    """
+    """Write the environment of a run into its folder. A resumed run appends its environment under `resumes`."""
     path = folder / ENVIRONMENT_FILE
     now = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": shlex.join(sys.argv),
         "git": git_commit(_CHECKOUT),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        "packages": {
+            name: next((package.version for package in importlib.metadata.distributions(name=name)), None)
+            for name in PACKAGES
+        },
         "platform": platform.platform(),
         "cores": os.cpu_count(),
         "backend": jax.default_backend(),
@@ -107,18 +107,10 @@ def note_environment(folder: Path, *, seed: int) -> None:
     if not path.exists():
         write_json(path, now | {"resumes": []})
         return
-    first = read_json(path)
-    resumes = first.get("resumes") if isinstance(first, dict) else None
-    if not isinstance(resumes, list):
-        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {first!r:.60}")
-    write_json(path, first | {"resumes": [*resumes, now]})
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:  # the package runs from a checkout without installation
-        return None
+    begun = read_json(path)
+    if not isinstance(begun, dict) or not isinstance(begun.get("resumes"), list):
+        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {begun!r:.60}")
+    write_json(path, begun | {"resumes": [*begun["resumes"], now]})
 
 
 def git_commit(checkout: Path) -> dict[str, Any] | None:

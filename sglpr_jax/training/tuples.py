@@ -53,8 +53,8 @@ class TuplePool:
         """
         self.config = config
         frames = [np.arange(len(p)) for p in positions] if frames is None else frames
-        self.positions = np.concatenate([p[kept] for p, kept in zip(positions, frames, strict=True)])
-        self.recording = np.repeat(np.arange(len(positions)), [len(kept) for kept in frames])
+        self.positions = np.concatenate([places[rows] for places, rows in zip(positions, frames, strict=True)])
+        self.recording = np.repeat(np.arange(len(positions)), [len(rows) for rows in frames])
         self.frame = np.concatenate(frames)
         pairs = np.concatenate([self._pairs_within(d) for d in range(len(positions))])
         same_visit = np.abs(self.frame[pairs[:, 0]] - self.frame[pairs[:, 1]]) <= config.revisit_gap
@@ -78,11 +78,11 @@ class TuplePool:
           ValueError: If an anchor has no negatives.
         """
         rng = np.random.default_rng([seed, step])
-        anchored: list[list[int]] = []
+        rows: list[list[int]] = []
         for i in range(tuples):
-            row = anchored[i - i % self.config.cluster :]
-            anchored.append(self._draw_anchored(rng, [anchor for anchor, *_ in row], cache))
-        return np.array([[*row, *self._draw_negatives(rng, row[0], cache)] for row in anchored])
+            cluster = [anchor for anchor, *_ in rows[i - i % self.config.cluster :]]
+            rows.append(self._draw_anchored(rng, cluster, cache))
+        return np.array([[*row, *self._draw_negatives(rng, row[0], cache)] for row in rows])
 
     def draw_places(self, *, seed: int, step: int, tuples: int) -> Int[np.ndarray, "{tuples} k"]:
         """Draw the same number of frames as `draw`, but at any places, and without repetition if there are enough."""
@@ -170,5 +170,8 @@ def hold_out(
     return np.flatnonzero(~near), np.flatnonzero(validation)
 
 
-def _within(places: Float[np.ndarray, "n 2"], some: Float[np.ndarray, "m 2"], metres: float) -> Bool[np.ndarray, "n"]:
-    return KDTree(some).query(places)[0] <= metres
+def _within(
+    places: Float[np.ndarray, "n 2"], centres: Float[np.ndarray, "m 2"], radius_m: float
+) -> Bool[np.ndarray, "n"]:
+    """Whether each place is at most this distance from one of the centres, in metres."""
+    return KDTree(centres).query(places)[0] <= radius_m

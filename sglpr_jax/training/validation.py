@@ -14,7 +14,7 @@ from sglpr_jax.metrics import decision_curve
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.revisits import database_end, revisits
-from sglpr_jax.training.batches import Batch, read_batch, tuple_pool, views
+from sglpr_jax.training.batches import Batch, positions_of, read_batch, tuple_pool, views
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.tuples import TuplePool
 
@@ -47,10 +47,9 @@ def training_recall(
     angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, frames.shape).astype(np.float32)
 
     def score(params: Params) -> dict[str, float]:
-        described = describe_places(
-            params, recordings, pool, frames.reshape(-1), angles.reshape(-1) * config.rotate, config
-        )
-        anchors, positives = described.reshape(PLACES, 2, -1).transpose(1, 0, 2)
+        places, rotations = frames.reshape(-1), angles.reshape(-1) * config.rotate
+        descriptors = describe_places(params, recordings, pool, places, rotations, config)
+        anchors, positives = descriptors.reshape(PLACES, 2, -1).transpose(1, 0, 2)
         nearest = (anchors @ positives.T).argmax(1)
         return {"score": float(same_place[np.arange(PLACES), nearest].mean())}
 
@@ -93,21 +92,21 @@ def retrieval(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: 
     nearest frame is accepted up to a threshold on the descriptor distance. It is right within the positive distance of
     places and wrong beyond the negative one.
     """
-    every = np.arange(len(pool))
+    queries = np.arange(len(pool))
     same_recording = pool.recording[:, None] == pool.recording[None]
-    own_visit = same_recording & (np.abs(pool.frame[:, None] - pool.frame[None]) <= gap)
-    apart = cdist(pool.positions[:, :2], pool.positions[:, :2])
-    findable = same_recording & ~own_visit & (apart < pool.config.positive_m)
-    distance = np.where(own_visit, np.inf, cdist(descriptors, descriptors))
-    nearest = distance.argmin(1)
-    found, searched = findable[every, nearest], findable.any(1)
+    same_visit = same_recording & (np.abs(pool.frame[:, None] - pool.frame[None]) <= gap)
+    distance_m = cdist(pool.positions[:, :2], pool.positions[:, :2])
+    matches = same_recording & ~same_visit & (distance_m < pool.config.positive_m)
+    descriptor_distance = np.where(same_visit, np.inf, cdist(descriptors, descriptors))
+    nearest = descriptor_distance.argmin(1)
+    is_match, has_match = matches[queries, nearest], matches.any(1)
     curve = decision_curve(
-        -distance[every, nearest],
-        true_if_accepted=found,
-        false_if_accepted=pool.far_apart(every, nearest),
-        missed_if_rejected=searched,
+        -descriptor_distance[queries, nearest],
+        true_if_accepted=is_match,
+        false_if_accepted=pool.far_apart(queries, nearest),
+        missed_if_rejected=has_match,
     )
-    return float(found[searched].mean()), curve.f1_max
+    return float(is_match[has_match].mean()), curve.f1_max
 
 
 def describe_places(
@@ -120,7 +119,7 @@ def describe_places(
 ) -> Float32[np.ndarray, "n d"]:
     """Describe places of the training recordings, given as frame numbers of the pool, each rotated about z by its
     angle in radians. Raises the errors of reading a scan."""
-    described = []
+    descriptors = []
     for start in range(0, len(places), CHUNK):
         rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)  # the last batch is padded with its last place
         batch = read_batch(
@@ -132,8 +131,8 @@ def describe_places(
             categories=config.model.categories_read,
             image=config.model.image,
         )
-        described.append(np.asarray(_describe(params, batch, jnp.asarray(angles[rows], jnp.float32))))
-    return np.concatenate(described)[: len(places)].astype(np.float32)
+        descriptors.append(np.asarray(_describe(params, batch, jnp.asarray(angles[rows], jnp.float32))))
+    return np.concatenate(descriptors)[: len(places)].astype(np.float32)
 
 
 @jax.jit
@@ -144,9 +143,7 @@ def _describe(params: Params, batch: Batch, angles: Float[Array, "b"]) -> Float[
 def require_revisits(recordings: Sequence[Recording]) -> None:
     """Raise ValueError if a recording has no poses or no revisits."""
     for recording in recordings:
-        if recording.positions is None:
-            raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
-        if not revisits(recording.positions[:, :2], times=recording.times, radius_m=FOUND_M).any():
+        if not revisits(positions_of(recording)[:, :2], times=recording.times, radius_m=FOUND_M).any():
             raise ValueError(
                 f"sequence {recording.name}: expected revisits within {FOUND_M:g} m to score on, found none"
             )
@@ -171,8 +168,8 @@ def recall_at_1(
     ends = database_end(len(places), times=times)[queries]
     hits = 0
     for start in range(0, len(queries), QUERIES):
-        rows, last = queries[start : start + QUERIES], ends[start : start + QUERIES]
-        apart = distance(descriptors[rows], descriptors[: last.max()])
-        nearest = np.where(np.arange(last.max())[None] < last[:, None], apart, np.inf).argmin(axis=1)
+        rows, end = queries[start : start + QUERIES], ends[start : start + QUERIES]
+        distances = distance(descriptors[rows], descriptors[: end.max()])
+        nearest = np.where(np.arange(end.max())[None] < end[:, None], distances, np.inf).argmin(axis=1)
         hits += int((np.linalg.norm(places[rows] - places[nearest], axis=1) <= FOUND_M).sum())
     return hits / len(queries)

@@ -12,7 +12,6 @@ from sglpr_jax.cli.train import TrainCommand
 from sglpr_jax.evaluation import final_test, learning_curves
 from sglpr_jax.training import recipe
 from sglpr_jax.training.config import without_untrained_head
-from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import assert_one_line_error, run_command
 
@@ -36,19 +35,6 @@ def run(town, preset, tmp_path, monkeypatch):
         return tmp_path / "run"
 
     return run
-
-
-@pytest.mark.slow
-def test_a_setting_trains_and_says_what_it_is(run):
-    folder = run(WITHOUT)
-    params = sglpr_jax.load(folder)
-    assert set(params.weights) == {"backbone", "expand", "place_head", "segmentation_head"}
-    lines = read_metrics(folder / "metrics.jsonl")
-    assert [line["step"] for line in lines if "loss" in line] == [1, 2]
-    assert lines[0].keys() & {"cross_entropy", "dice"} == {"dice"}
-    told = json.loads((folder / "config.json").read_text())["config"]["model"]
-    assert told == json.loads((folder / "weights" / "config.json").read_text()) and told["categories"] == 25
-    assert not {"cbam", "netvlad"} & params.weights["place_head"].keys()
 
 
 def test_no_categories_are_the_triplet_alone():

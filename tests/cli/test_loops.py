@@ -1,5 +1,4 @@
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -78,20 +77,6 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
     assert "run the same command again to continue" in ended.error
 
 
-@pytest.mark.parametrize(("unregistered", "status"), [(0, 0), (2, 130)])
-def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
-    command, town, tmp_path, monkeypatch, unregistered, status
-):
-    def ended_meanwhile(recordings, params, *, should_stop, **options):
-        should_stop.signal = 2
-        return search.LoopSearchResult((search.Session(recordings[0], SCANS, unregistered=unregistered),))
-
-    monkeypatch.setattr(search, "find_loops", ended_meanwhile)
-    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
-    assert ended.status == status, ended.error
-    assert ("run the same command again to continue" in ended.error) == bool(status)
-
-
 @pytest.mark.slow
 def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path, monkeypatch):
     """And a degenerate loop is kept, or rejected with `--degenerate drop`."""
@@ -121,14 +106,6 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
     assert [row["reason"] for row in rows] == ["repeats", "degenerate"]
 
 
-def test_a_missing_extra_is_said_before_the_search(command, town, odometry, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "gtsam", None)
-    write_tum(tmp_path / "odometry.tum", odometry, np.arange(float(SCANS)))
-    options = ("--odometry", tmp_path / "odometry.tum", "--out", tmp_path / "found", "--optimize")
-    assert_one_line_error(command("loops", town, "--seq", "08", *options), "pip install 'sglpr-jax[")
-    assert not (tmp_path / "found").exists()
-
-
 def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_path):
     path = tmp_path / "found" / "trajectory-optimized.tum"
     write_tum(path, odometry, np.arange(float(SCANS)))
@@ -141,7 +118,6 @@ def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_
     ("layout", "installed", "flags", "registered", "said"),
     [
         ("town", True, [], True, None),
-        ("town", True, ["--no-register"], False, None),
         ("town", False, [], False, "because small-gicp is not installed: pip install 'sglpr-jax[slam]'"),
         ("images", True, [], False, "because they are ready-made images"),
     ],

@@ -1,7 +1,5 @@
 """The table of commands agrees with `bin/` and with the names that `pip install` makes."""
 
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -17,9 +15,3 @@ def test_every_command_has_a_script_and_an_entry_point():
         assert scripts[name].splitlines()[-1].endswith(f'/_command" {name} "$@"') and all(load_command(name))
     installed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert installed == {f"sglpr-{name}": "sglpr_jax.cli.__main__:main" for name in COMMANDS}
-
-
-def test_a_name_that_is_no_command_lists_them():
-    ended = subprocess.run([sys.executable, "-m", "sglpr_jax.cli", "lops"], capture_output=True, text=True)
-    assert ended.returncode == 1 and ended.stderr.startswith("error: expected a command, one of convert, demo, ")
-    assert ended.stderr.endswith(", train, found lops\n")

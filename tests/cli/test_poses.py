@@ -10,7 +10,7 @@ import sglpr_jax
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.pose_graph.files import write_tum
 
-from .conftest import SCANS, assert_one_line_error
+from .conftest import assert_one_line_error
 
 load = sglpr_jax.DescriptorFile.load
 METHOD = ("--method", "polar-fft")
@@ -62,20 +62,3 @@ def test_poses_of_other_times_serve_embedding_and_scoring_alike(command, scans, 
         assert_one_line_error(
             command(*run, "--poses", late), "late.tum", "expected 40 poses, one for each", "found 40 from"
         )
-
-
-@pytest.mark.slow
-def test_poses_of_all_scans_can_be_named_after_bad_ones_were_skipped(command, scans, tmp_path):
-    folder, positions, times = scans
-    poses = write(tmp_path / "poses.tum", positions, times)
-    np.savetxt(folder / "times.txt", times)
-    for row in (0, 7, 39):
-        (folder / f"{row:06d}.bin").write_bytes(b"half")
-    ended = command("embed", "--data", folder, *METHOD, "--skip-bad", "--out", tmp_path / "mine.npz")
-    assert ended.status == 0 and "3 scans skipped" in ended.out, ended.error
-    ended = command("evaluate", tmp_path / "mine.npz", "--poses", poses, *PROTOCOL)
-    assert ended.status == 0, ended.error
-    report = json.loads((tmp_path / "mine" / "results.json").read_text())
-    assert report["results"][0]["poses"].endswith("poses.tum (TUM)")
-    file = load(tmp_path / "mine.npz")
-    assert file.config["skipped"] == [0, 7, 39] and file.positions is None and len(file) == SCANS - 3

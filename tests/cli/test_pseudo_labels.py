@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation import final_test
-from sglpr_jax.training import batches as training_batches
+from sglpr_jax.training import batch_source
 from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import assert_one_line_error
@@ -20,14 +20,14 @@ def _no_final_test(monkeypatch):
 @pytest.fixture
 def labelled_places(monkeypatch):
     """For every batch read, which of its places have labels."""
-    seen, read_batch = [], training_batches.read_batch
+    seen, read_batch = [], batch_source.read_batch
 
     def noted(*arguments, **options):
         batch = read_batch(*arguments, **options)
         seen.append(batch.labelled)
         return batch
 
-    monkeypatch.setattr(training_batches, "read_batch", noted)
+    monkeypatch.setattr(batch_source, "read_batch", noted)
     return seen
 
 

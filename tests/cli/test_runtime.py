@@ -51,49 +51,26 @@ def test_numbers_that_no_flag_can_have_are_told(flags, error):
     assert str(raised.value) == error
 
 
-PRINTS = """
-import sys
-from sglpr_jax.cli.runtime import run
-
-def work(command):
-    for number in range(100_000):
-        print(number)
-
-run(lambda: None, work)
-"""
-ALWAYS = {"PYTHONPATH": str(Path(sglpr_jax.__file__).parents[1]), "PYTHONUNBUFFERED": ""}
-
-
-def python(program: str, *, shell: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in a Python of its own, whose environment is that of the test unless another is given."""
-    surroundings = environment or dict(os.environ)
+def python(work: str, *, shell: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a command whose work is an expression, in a Python of its own."""
+    program = f"from sglpr_jax.cli.runtime import run; run(lambda: None, lambda command: {work})"
+    path = {"PYTHONPATH": str(Path(sglpr_jax.__file__).parents[1]), "PYTHONUNBUFFERED": ""}
     code = ["bash", "-c", f'"$0" -c "$1" {shell}; echo status ${{PIPESTATUS[0]}} >&2', sys.executable, program]
-    return subprocess.run(code, capture_output=True, text=True, env={**surroundings, **ALWAYS}, timeout=120)
+    return subprocess.run(code, capture_output=True, text=True, env=os.environ | path | environment, timeout=120)
 
 
 def test_a_reader_that_ends_early_ends_the_command_without_a_message():
-    ended = python(PRINTS, shell="| head -1")
+    ended = python("[print(number) for number in range(100_000)]", shell="| head -1")
     assert ended.stdout == "0\n" and ended.stderr == "status 141\n"
 
 
 def test_output_that_is_not_utf_8_is_escaped():
-    program = "from sglpr_jax.cli.runtime import run; run(lambda: None, lambda command: print('n\\udcff'))"
-    assert python(program, PATH=os.environ["PATH"], LANG="C.UTF-8", HOME="/tmp").stdout == "n\\udcff\n"
+    assert python("print('n\\udcff')", LANG="C.UTF-8").stdout == "n\\udcff\n"
 
 
 @pytest.mark.slow
 def test_a_device_that_is_absent_is_one_line():
-    program = """
-import sys
-from sglpr_jax.cli.runtime import run
-
-def work(command):
-    import jax
-    jax.devices()
-
-run(lambda: None, work)
-"""
-    ended = python(program, **{**os.environ, "JAX_PLATFORMS": "nosuch"})
+    ended = python("[].append(__import__('jax').devices())", JAX_PLATFORMS="nosuch")
     assert ended.stderr.startswith("error: JAX_PLATFORMS=nosuch: expected a device that JAX finds, found none (")
     assert ended.stderr.endswith("\nstatus 1\n") and ended.stderr.count("\n") == 2
 

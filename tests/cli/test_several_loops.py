@@ -4,7 +4,6 @@ import shutil
 import numpy as np
 import pytest
 
-from sglpr_jax.cli import loops
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.data.formats.pose_files import read_tum
@@ -38,18 +37,13 @@ def test_two_recordings_of_one_drive_get_one_frame(command, walk, tmp_path):
     assert not (out / "unfinished").exists()
 
 
-def test_one_path_or_several_are_recordings_with_their_odometry(command, tmp_path):
-    flags = ["a", "b", "--odometry", "a.tum", "b.tum", "--out", "found"]
-    parsed = parse_command(LoopsCommand, "loops", flags)
+def test_several_recordings_need_an_odometry_file_each(command, tmp_path):
+    flags = ("a", "b", "--odometry", "a.tum", "b.tum", "--out", "found")
+    parsed = parse_command(LoopsCommand, "loops", list(flags))
     assert [str(path) for path in (*parsed.recordings, *parsed.odometry_files)] == ["a", "b", "a.tum", "b.tum"]
-    one = parse_command(LoopsCommand, "loops", ["a", "--out", "found"])
-    assert len(one.recordings) == 1 and one.odometry_files == ()
-    loops._check(parsed)
-    run = ("loops", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "found")
-    ended = command(*run, "--odometry", tmp_path / "a.tum")
-    assert_one_line_error(ended, "--odometry: expected a file for each of 2 recordings, found 1")
-    ended = command(*run, "--poses", tmp_path / "a.tum")
-    assert_one_line_error(ended, "--poses and --times are those of one recording")
-    assert_one_line_error(command("loops", "--out", tmp_path / "found"), "expected a recording, found none")
-    inside = (tmp_path / "found" / "trajectory-a.tum", tmp_path / "b.tum")
-    assert_one_line_error(command(*run, "--odometry", *inside), "trajectory-a.tum: expected inputs that this run")
+    for more, words in (
+        (("--odometry", "a.tum"), "--odometry: expected a file for each of 2 recordings, found 1"),
+        (("--poses", "a.tum"), "--poses and --times are those of one recording"),
+        (("--odometry", tmp_path / "trajectory-a.tum", "b.tum"), "trajectory-a.tum: expected inputs that this run"),
+    ):
+        assert_one_line_error(command("loops", "a", "b", "--out", tmp_path, *more), words)

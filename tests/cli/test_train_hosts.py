@@ -12,7 +12,7 @@ import safetensors.numpy
 
 from sglpr_jax.training.metrics_log import read_metrics
 
-from .conftest import Ended, assert_one_line_error
+from .conftest import Ended
 
 TIMES = {"steps_per_second", "data_wait"}
 SECONDS = 300
@@ -70,10 +70,3 @@ def test_two_hosts_make_the_run_of_one(trained, town, preset, tmp_path):
             np.testing.assert_allclose(
                 weights[name], of_one[name], rtol=0, atol=5e-5
             )  # sums of floats in another order
-
-
-@pytest.mark.slow
-def test_an_error_of_one_host_ends_both(trained, town, preset):
-    first, second = on_two_hosts("--seq", "08", "--data", town, "--preset", preset, "--out", trained.folder)
-    assert_one_line_error(first, trained.folder, "--resume", "--out")
-    assert_one_line_error(second, "another host")

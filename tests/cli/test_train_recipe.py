@@ -9,7 +9,7 @@ import pytest
 import safetensors.numpy
 
 from sglpr_jax.evaluation import final_test
-from sglpr_jax.training import batches as training_batches
+from sglpr_jax.training import batch_source
 from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import run_command
@@ -64,7 +64,7 @@ def test_a_stopped_run_of_the_recipe_goes_on_to_the_same_weights(mixed, command,
     whole, options, _ = mixed
     out = tmp_path / "run"
     options = (*options[:-1], out, *RECIPE, *LABELLED)
-    mix, mixed_batches = training_batches.mix, []
+    mix, mixed_batches = batch_source.mix, []
 
     def interrupted(*arguments, **named):
         mixed_batches.append(1)
@@ -72,7 +72,7 @@ def test_a_stopped_run_of_the_recipe_goes_on_to_the_same_weights(mixed, command,
             os.kill(os.getpid(), signal.SIGINT)
         return mix(*arguments, **named)
 
-    monkeypatch.setattr(training_batches, "mix", interrupted)
+    monkeypatch.setattr(batch_source, "mix", interrupted)
     handler = signal.getsignal(signal.SIGINT)
     stopped = command("train", *options)
     assert stopped.status == 130 and "stopped at step 4 of 6; continue with --resume" in stopped.error

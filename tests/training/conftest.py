@@ -12,7 +12,7 @@ from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.backbone_config import CircularConfig, SwinConfig
 from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.training.batch_queue import BatchSource
+from sglpr_jax.training.batch_source import TupleBatches
 from sglpr_jax.training.batches import Batch
 from sglpr_jax.training.config import OptimizerConfig, TrainConfig
 from sglpr_jax.training.step import train_step
@@ -25,7 +25,7 @@ FAST_STEP = jax.jit(
 """The real step, compiled in a third of the time."""
 
 
-class Made(BatchSource):
+class Made(TupleBatches):
     """Batches that a function of the step makes."""
 
     def __init__(self, make: Callable[[int], Batch], *, places: Callable[[int], str] = lambda step: ""):

@@ -52,13 +52,11 @@ def assert_same_weights(found, expected):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["everything", "images"])
-def test_eight_devices_make_the_steps_of_one(config, params, random_params, make_batch, kind):
-    batches = [make_batch(step, labels=kind != "images", images=kind == "images") for step in range(3)]
-    if kind == "everything":  # stochastic depth, chunks, shared negatives
-        loss = dataclasses.replace(config.loss, segment_every=2)
-        config, params = dataclasses.replace(config, model=SWIN, chunk=16, loss=loss), random_params(SWIN)
-        batches = [shared(batch) for batch in batches]
+def test_eight_devices_make_the_steps_of_one(config, random_params, make_batch):
+    """With stochastic depth, chunks and shared negatives."""
+    loss = dataclasses.replace(config.loss, segment_every=2)
+    config, params = dataclasses.replace(config, model=SWIN, chunk=16, loss=loss), random_params(SWIN)
+    batches = [shared(make_batch(step)) for step in range(3)]
     one = make_steps(config, params, batches, jax.devices()[:1])
     eight = make_steps(config, params, batches, jax.devices())
     for found, expected in zip(eight[1], one[1], strict=True):

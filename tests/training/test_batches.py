@@ -17,7 +17,8 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.recipe import TupleConfig
-from sglpr_jax.training.batches import Batch, batches_of, mix, read_batch, tuple_pool, views
+from sglpr_jax.training.batch_source import batches_of
+from sglpr_jax.training.batches import Batch, mix, read_batch, tuple_pool, views
 from sglpr_jax.training.tuples import TuplePool
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
@@ -94,14 +95,6 @@ def test_large_clouds_are_thinned_evenly_with_their_labels(recordings, pool):
     np.testing.assert_array_equal(batch.classes[1], to_classes(labels_of(clouds(0)[1]).astype(np.int32))[kept])
 
 
-def test_without_any_labels_there_are_no_classes(recordings, pool, tmp_path):
-    bare = [scan_sequence(tmp_path / name, clouds(0), labelled=False) for name in ("06", "07")]
-    batch = read(bare, pool)
-    assert batch.classes is None
-    assert not batch.labelled.any()
-    assert views(batch, jnp.zeros(8), GRID)[1] is None
-
-
 @pytest.mark.parametrize("share_negatives", [False, True])
 def test_the_negatives_of_each_anchor_are_those_of_brute_force(recordings, pool, share_negatives):
     frames = np.array([[0, 1, 12, 5], [3, 4, 15, 31], [18, 17, 5, 30]])  # frame 5 is too near to the first anchor
@@ -145,27 +138,6 @@ def test_views_are_the_rasterised_turned_points(recordings, pool):
         np.testing.assert_array_equal(images[row], rasterize(turned, grid=GRID))
         np.testing.assert_array_equal(maps[row], rasterize_labels(turned, classes, grid=GRID))
     assert images.sum() > 0 and maps.sum() > 0
-
-
-def test_images_are_turned_whole_and_then_cropped():
-    pictures = np.random.default_rng(0).uniform(0, 10, (len(SIZES), 20, 20)).astype(np.float32)
-    by_path = {Path(f"{i:06d}.png"): picture for i, picture in enumerate(pictures)}
-    recording = of_images(by_path, name="06", positions=positions())
-    frames = np.array([[0, 1, 12, 13]])
-    pool = TuplePool([positions()], TupleConfig(negatives=2))
-    batch = read([recording], pool, frames)
-    assert batch.points is None and not batch.labelled.any()
-    np.testing.assert_array_equal(batch.images, pictures[frames[0]])
-
-    still, maps = views(batch, jnp.zeros(4), GRID)
-    assert maps is None
-    np.testing.assert_allclose(still, pictures[frames[0], 2:18, 2:18], atol=1e-5)
-    quarter, _ = views(batch, jnp.full(4, np.pi / 2), GRID)
-    np.testing.assert_allclose(quarter, np.rot90(pictures[frames[0], 2:18, 2:18], axes=(1, 2)), atol=1e-4)
-    # A cell that a turn brings into the crop from outside it comes from the whole image, not from zero.
-    turned, _ = views(batch, jnp.full(4, 0.7), GRID)
-    whole = rotate_image(jnp.asarray(batch.images), jnp.full(4, 0.7))
-    np.testing.assert_allclose(turned, whole[:, 2:18, 2:18], atol=1e-5)
 
 
 def image_drive(folder: Path, *, labelled: range) -> Recording:
@@ -229,8 +201,6 @@ def test_scans_become_density_images_of_all_their_points(recordings, pool):
         if labelled.labelled[row]:
             classes = to_classes(recording.labels(number))
             np.testing.assert_array_equal(labelled.maps[row], density_label_bev(recording.points(number), classes))
-    unread = read_batch(recordings, pool, FRAMES, max_points=9, share_negatives=False, categories=0, image="density")
-    assert unread.images.shape == (8, 151, 151)
 
 
 def test_images_of_two_sizes_are_refused(pool):
@@ -257,20 +227,16 @@ SCANS = Batch(
 )
 
 
-@pytest.mark.parametrize(("first", "second"), [(SCANS, IMAGES), (IMAGES, IMAGES)])
-def test_the_views_are_those_of_each_source_one_after_the_other(first, second):
-    mixed = mix(first, second, triplets=False, share_negatives=True)
-    angles = jnp.asarray(RNG.uniform(0, 6, first.places + second.places).astype(np.float32))
+def test_the_views_are_those_of_each_source_one_after_the_other():
+    mixed = mix(SCANS, IMAGES, triplets=False, share_negatives=True)
+    angles = jnp.asarray(RNG.uniform(0, 6, SCANS.places + IMAGES.places).astype(np.float32))
     images, maps = views(mixed, angles, GRID)
-    parts = views(first, angles[: first.places], GRID), views(second, angles[first.places :], GRID)
+    parts = views(SCANS, angles[: SCANS.places], GRID), views(IMAGES, angles[SCANS.places :], GRID)
     np.testing.assert_array_equal(images, np.concatenate([image for image, _ in parts]))
-    if first is second is IMAGES:
-        assert maps is None
-        return
     expected = [np.zeros(image.shape) if part is None else part for image, part in parts]
     np.testing.assert_array_equal(maps, np.concatenate(expected))
     assert np.asarray(maps).max() > 0
-    np.testing.assert_array_equal(mixed.labelled, np.r_[first.labelled, second.labelled])
+    np.testing.assert_array_equal(mixed.labelled, np.r_[SCANS.labelled, IMAGES.labelled])
 
 
 @pytest.mark.parametrize("share_negatives", [False, True])

@@ -14,7 +14,7 @@ from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.sglpr import forward
 from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
-from sglpr_jax.training.config import LossConfig, OcclusionConfig, without_untrained_head
+from sglpr_jax.training.config import LossConfig, OcclusionConfig
 from sglpr_jax.training.image_network import ImageNetwork, _angles, _chunks, gradients, summarize, visible
 from sglpr_jax.training.loss import Summary, joint_loss
 from sglpr_jax.training.step import train_step
@@ -84,13 +84,6 @@ def test_the_metrics_are_those_of_numpy(config, params, make_batch, ignore):
     np.testing.assert_allclose(metrics["loss"], expected, rtol=1e-6)
 
 
-def test_what_lies_under_unlabelled_places_does_not_matter(config, params, make_batch, whole):
-    batch = make_batch(0)
-    scrambled = np.where(batch.labelled[:, None], batch.classes, (batch.classes + 3) % 20)
-    assert (scrambled != batch.classes).any()
-    chex.assert_trees_all_equal(gradients_of(params, batch.replace(classes=scrambled), config), whole)
-
-
 def test_a_batch_without_one_labelled_place_has_no_segmentation_loss(config, params, make_batch):
     batch = make_batch(0).replace(labelled=np.zeros(config.images, bool))
     gradient, metrics = gradients_of(params, batch, config)
@@ -108,14 +101,6 @@ def test_segmenting_every_second_image_is_as_if_the_others_had_no_labels(config,
     found = gradients_of(params, batch, sparse)
     assert_same(found[1], expected[1])
     assert_same(found[0], expected[0])
-
-
-def test_a_term_without_weight_is_not_computed(config, params, make_batch, whole):
-    loss = dataclasses.replace(config.loss, ce_weight=0.0)
-    _, metrics = gradients_of(params, make_batch(0), dataclasses.replace(config, loss=loss))
-    assert set(metrics) == {"loss", "triplet", "violations", "dice"}
-    np.testing.assert_allclose(metrics["dice"], whole[1]["dice"], rtol=1e-5)
-    np.testing.assert_allclose(metrics["loss"], metrics["triplet"] + 0.6 * metrics["dice"], rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -144,32 +129,6 @@ def test_a_segmentation_that_learns_alone_needs_a_loss_of_its_own_and_moves_noth
         dataclasses.replace(config, loss=loss, optimizer=decaying)
     with pytest.raises(ValueError, match="expected a model with a segmentation head, found one without"):
         dataclasses.replace(config, loss=loss, model=dataclasses.replace(config.model, categories=0))
-
-
-def test_where_nothing_reads_labels_there_are_no_categories(config):
-    no_terms = dataclasses.replace(config.loss, ce_weight=0.0, dice_weight=0.0)
-    assert config.model.categories == 20
-    assert without_untrained_head(config) == config
-    assert without_untrained_head(dataclasses.replace(config, loss=no_terms)).model.categories == 0
-    reads = {what: dataclasses.replace(config.model.head, input=what) for what in ("counts", "labels")}
-    for what, categories in (("counts", 0), ("labels", 20)):
-        model = dataclasses.replace(config.model, head=reads[what])
-        settled = without_untrained_head(dataclasses.replace(config, model=model, loss=no_terms))
-        assert settled.model.categories == categories
-
-
-@pytest.mark.slow
-def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, random_params, make_batch):
-    head = dataclasses.replace(config.model.head, input="counts+labels")
-    config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
-    params, batch = random_params(config.model), make_batch(0)
-    gradient, metrics = gradients_of(params, batch, config)
-    assert set(metrics) == {"loss", "triplet", "violations"} and set(gradient) == {"patch_embed", "place_head"}
-    assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
-    relabelled = batch.replace(classes=(batch.classes + 1) % 20)
-    assert gradients_of(params, relabelled, config)[1]["triplet"] != metrics["triplet"]
-    with pytest.raises(ValueError, match="expected class maps"):
-        gradients_of(params, batch.replace(classes=None), config)
 
 
 @pytest.mark.slow
@@ -222,21 +181,6 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     assert run(steps=1, start=1)[1][0]["loss"] != losses[0]  # each step has its own rotations
 
 
-def test_rotations_follow_the_key_and_can_be_turned_off(config, make_batch):
-    batch = make_batch(0)
-    angle_key, other_key = jax.random.split(jax.random.key(0))
-    turned, again, other = (
-        _chunks(batch, key, other_key, config).images for key in (angle_key, angle_key, jax.random.key(5))
-    )
-    np.testing.assert_array_equal(turned, again)
-    assert (turned != other).any(axis=(0, 2, 3)).all()
-    still = [
-        _chunks(batch, key, other_key, dataclasses.replace(config, rotate=False)).images
-        for key in (angle_key, jax.random.key(5))
-    ]
-    np.testing.assert_array_equal(*still)
-
-
 def test_of_a_share_of_the_places_the_rotation_is_a_quarter_turn_or_more(config, make_batch):
     config = dataclasses.replace(config, quarter_turns=0.5)
     keys = jax.random.split(jax.random.key(0), 60)
@@ -245,10 +189,6 @@ def test_of_a_share_of_the_places_the_rotation_is_a_quarter_turn_or_more(config,
     assert 0.4 < whole.mean() < 0.6
     assert np.bincount(np.round(quarters[whole]).astype(int), minlength=4).min() > whole.sum() / 6
     assert np.ptp(np.histogram(quarters[~whole], bins=4, range=(0, 4))[0]) < (~whole).sum() / 6
-    batch = make_batch(0, images=True)
-    all_quarters = dataclasses.replace(config, quarter_turns=1.0)
-    for image, turned in zip(batch.images, chunks_of(batch, all_quarters).images[0], strict=True):
-        assert any(np.allclose(np.rot90(image, k), turned, atol=1e-4) for k in range(4))
 
 
 GRID = Grid(resolution_m=1.0, height=64, width=48)
@@ -315,26 +255,3 @@ def test_labelled_places_come_where_the_segmentation_head_looks_and_go_back(mixe
     assert (seen >= 4).sum() == min(len(seen), 4)
     alone = mixed.replace(also=None)
     np.testing.assert_array_equal(in_network_order(places, alone, every=every), places)
-
-
-@pytest.mark.slow
-def test_the_segmentation_learns_from_labelled_places_alone_and_the_triplet_loss_from_its_own(mixed, config, params):
-    assert mixed.labelled.sum() == 3
-    gradient, metrics = gradients_of(params, mixed, config)
-    assert np.abs(gradient["segmentation_head"]["kernel"]).max() > 1e-3
-    assert metrics["cross_entropy"] > 0 and metrics["triplet"] > 0
-
-    def segmentation_gradient(batch):
-        return gradients_of(params, batch, config)[0]["segmentation_head"]["kernel"]
-
-    other_images = mixed.replace(images=mixed.images[::-1].copy())
-    np.testing.assert_array_equal(segmentation_gradient(other_images), gradient["segmentation_head"]["kernel"])
-    unlabelled = np.flatnonzero(~mixed.labelled[4:])
-    points = mixed.also.points.copy()
-    points[unlabelled] += 3
-    other_scan = mixed.replace(also=mixed.also.replace(points=points))
-    np.testing.assert_array_equal(segmentation_gradient(other_scan), gradient["segmentation_head"]["kernel"])
-    classes = (mixed.also.classes + 1) % 20
-    relabelled = mixed.replace(also=mixed.also.replace(classes=classes))
-    assert np.abs(segmentation_gradient(relabelled) - gradient["segmentation_head"]["kernel"]).max() > 1e-4
-    assert gradients_of(params, relabelled, config)[1]["triplet"] == metrics["triplet"]

@@ -32,10 +32,3 @@ def test_an_entry_of_classes_is_summed_over_chunks_and_left_out_without_weight(m
     assert float(measured["pixels"]) == pytest.approx(float(counted.sum()) / 6)
     weights = {"triplet": 1.0, "cross_entropy": 0.4, "dice": 0.6, "pixels": 2.0}
     assert float(total) == pytest.approx(sum(weight * float(measured[name]) for name, weight in weights.items()))
-
-
-@pytest.mark.parametrize("config", [LossConfig(), LossConfig(ce_weight=0.0), LossConfig(dice_weight=0.0)])
-def test_every_term_of_classes_counts_when_asked_whether_there_is_one(config):
-    assert config.segments
-    without = dataclasses.replace(config, ce_weight=0.0, dice_weight=0.0)
-    assert not without.segments and not any(term.weight(without) for term in loss.SEGMENTATION_TERMS.values())

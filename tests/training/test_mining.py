@@ -1,6 +1,6 @@
-"""A descriptor cache is made when it is due, kept as long as a checkpoint may ask for it, and read back to the bit."""
+"""A descriptor cache is computed when it is due, kept while a checkpoint needs it, and read back to the bit."""
 
-import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -8,62 +8,47 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.methods.recipe import TupleConfig
-from sglpr_jax.training.mining import DescriptorCache, Mining
-from sglpr_jax.training.step import TrainState
+from sglpr_jax.training.mining import DescriptorCache, refresh_cache
 
 PLACES = 30
 
 
-MINED = TupleConfig(negatives=2, mining="hardest", refresh_steps=4)
-"""Every 4 steps, with a checkpoint every 2."""
+def refreshed(folder, step: int, weight: float, *, mined_places: int = 0) -> DescriptorCache:
+    """The cache of a step, refreshed every 4 steps, of descriptors that depend on one weight."""
+    config = TupleConfig(negatives=2, mining="hardest", refresh_steps=4, mined_places=mined_places)
+    return refresh_cache(step, functools.partial(describe, weight), PLACES, config, folder, seed=0)
 
 
-def described_by(state: TrainState, places: np.ndarray) -> np.ndarray:
-    """Descriptors that differ with the weights, here a number."""
-    return np.outer(places + 1, [state.params, 1]).astype(np.float32)
+def describe(weight: float, places: np.ndarray) -> np.ndarray:
+    return np.outer(places + 1, [weight, 1]).astype(np.float32)
 
 
-def weights(number: float) -> TrainState:
-    return TrainState(0, number, {})
-
-
-def mining_in(folder, *, config: TupleConfig = MINED, checkpoints=list) -> Mining:
-    return Mining(described_by, PLACES, config, folder, seed=0, checkpoints=checkpoints)
-
-
-def test_the_cache_is_that_of_the_weights_at_the_last_refresh(tmp_path):
-    mining = mining_in(tmp_path)
-    assert mining.cache is None
-    mining.refresh(8, weights(0.5))
-    np.testing.assert_array_equal(mining.cache.places, np.arange(PLACES))
-    np.testing.assert_array_equal(mining.cache.descriptors, described_by(weights(0.5), np.arange(PLACES)))
-
-    resumed = mining_in(tmp_path)
-    resumed.refresh(11, weights(7.0))  # of a later step: what counts are the weights of step 8
-    np.testing.assert_array_equal(resumed.cache.descriptors, mining.cache.descriptors)
+def test_the_cache_has_the_descriptors_of_the_last_refresh(tmp_path):
+    cache = refreshed(tmp_path, 8, 0.5)
+    np.testing.assert_array_equal(cache.places, np.arange(PLACES))
+    np.testing.assert_array_equal(cache.descriptors, describe(0.5, np.arange(PLACES)))
+    resumed = refreshed(tmp_path, 11, 7.0)  # with later weights
+    np.testing.assert_array_equal(resumed.descriptors, cache.descriptors)
     with pytest.raises(FileNotFoundError, match=r"12\.npz: expected descriptors of places"):
-        resumed.refresh(13, weights(7.0))
+        refreshed(tmp_path, 13, 7.0)
 
 
-def test_some_places_are_others_each_time_and_the_same_for_the_same_step(tmp_path):
-    some = dataclasses.replace(MINED, mined_places=10)
-    places = []
-    for folder, step in (("a", 4), ("b", 4), ("a", 8)):
-        mining = mining_in(tmp_path / folder, config=some)
-        mining.refresh(step, weights(1.0))
-        places.append(mining.cache.places.tolist())
+def test_the_selected_places_depend_on_the_step_alone(tmp_path):
+    runs = (("a", 4), ("b", 4), ("a", 8))
+    places = [refreshed(tmp_path / run, step, 1.0, mined_places=10).places.tolist() for run, step in runs]
     assert places[0] == places[1] != places[2]
-    assert all(len(set(each)) == 10 and each == sorted(each) for each in places)
+    assert all(len(set(rows)) == 10 and rows == sorted(rows) for rows in places)
 
 
-def test_caches_that_no_checkpoint_can_need_are_removed(tmp_path):
-    kept: list[int] = []
-    mining = mining_in(tmp_path, checkpoints=lambda: kept)
+def test_caches_that_no_checkpoint_needs_are_removed(tmp_path):
     for step in range(0, 29, 4):
-        kept[:] = [step - 6, step - 4] if step > 8 else []  # newer ones are on their way
-        mining.refresh(step, weights(step))
-    # At step 28 the checkpoints are those of steps 22 and 24.
-    assert sorted(int(path.stem) for path in tmp_path.iterdir()) == [20, 24, 28]
+        if step > 8:  # checkpoints every 2 steps, of which two are kept
+            for saved in (step - 6, step - 4):
+                (tmp_path / f"checkpoints/{saved}").mkdir(parents=True, exist_ok=True)
+            for saved in (step - 10, step - 8):
+                (tmp_path / f"checkpoints/{saved}").rmdir() if step > 12 else None
+        refreshed(tmp_path, step, step)
+    assert sorted(int(path.stem) for path in (tmp_path / "mining").iterdir()) == [20, 24, 28]
 
 
 def cache_of(places: np.ndarray, seed: int = 0) -> DescriptorCache:
@@ -83,10 +68,8 @@ def test_the_nearest_are_those_of_brute_force(seed, size):
     np.testing.assert_array_equal(cache.nearest(anchor, candidates, size), expected)
 
 
-def test_nothing_is_near_a_place_that_was_not_described():
-    cache = cache_of(np.array([1, 4, 6]))
-    assert cache.nearest(5, np.array([1, 4]), 2).tolist() == []
-    assert set(cache.nearest(4, np.array([0, 1, 6]), 5).tolist()) == {1, 6}
+def test_a_place_that_was_not_described_has_no_nearest_place():
+    assert cache_of(np.array([1, 4, 6])).nearest(5, np.array([1, 4]), 2).tolist() == []
 
 
 def test_a_file_comes_back_whole_or_is_refused(tmp_path):

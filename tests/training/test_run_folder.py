@@ -17,26 +17,18 @@ def git(folder, *arguments):
     return subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
-def test_versions_machine_and_command_line_are_noted(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["train", "--out", "a folder"])
+def test_environment_and_command_line_are_noted_at_each_start(tmp_path, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
-    note_environment(tmp_path, seed=3)
+    for arguments in (["train", "--out", "a folder"], ["train", "--resume"], ["train", "--resume", "--steps", "9"]):
+        monkeypatch.setattr(sys, "argv", arguments)
+        note_environment(tmp_path, seed=3)
     noted = json.loads((tmp_path / "environment.json").read_text())
-    assert noted["command"] == "train --out 'a folder'"
+    assert noted["command"] == "train --out 'a folder'" and noted["seed"] == 3
     assert noted["packages"].keys() == {"sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy"}
     assert (noted["packages"]["jax"], noted["packages"]["numpy"]) == (jax.__version__, np.__version__)
     assert noted["python"] == ".".join(map(str, sys.version_info[:3]))
     assert noted["backend"] == jax.default_backend() and len(noted["devices"]) == jax.device_count()
-    assert noted["cores"] >= 1 and noted["seed"] == 3 and noted["resumes"] == []
     assert noted["variables"]["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
-
-
-def test_a_resumed_run_keeps_what_it_began_with(tmp_path, monkeypatch):
-    for arguments in (["train"], ["train", "--resume"], ["train", "--resume", "--steps", "9"]):
-        monkeypatch.setattr(sys, "argv", arguments)
-        note_environment(tmp_path, seed=0)
-    noted = json.loads((tmp_path / "environment.json").read_text())
-    assert noted["command"] == "train"
     assert [start["command"] for start in noted["resumes"]] == ["train --resume", "train --resume --steps 9"]
     assert all(start["packages"] == noted["packages"] for start in noted["resumes"])
 

@@ -87,14 +87,6 @@ def test_a_batch_is_a_pure_function_of_seed_and_step():
         assert (pool.draw(seed=other[0], step=other[1], tuples=4) != rows).any()
 
 
-def test_half_of_the_tuples_come_from_another_visit():
-    config = TupleConfig(revisit_fraction=0.5, revisit_gap=LAP // 2)
-    pool = TuplePool([circuit(3)], config)
-    anchors, near, _ = columns(pool.draw(seed=0, step=0, tuples=400), config)
-    share = (np.abs(pool.frame[anchors] - pool.frame[near]) > config.revisit_gap).mean()
-    assert 0.4 < share < 0.6
-
-
 def test_without_a_revisit_the_positives_are_neighbours_and_the_other_way_round():
     config = TupleConfig(revisit_fraction=1.0)
     once = TuplePool([circuit(1)], config)
@@ -103,15 +95,6 @@ def test_without_a_revisit_the_positives_are_neighbours_and_the_other_way_round(
     only_revisits = TuplePool([sparse], TupleConfig(revisit_fraction=0.0, revisit_gap=1))
     assert len(only_revisits.neighbours.anchors) == 0
     assert len(only_revisits.draw(seed=0, step=0, tuples=5)) == 5
-
-
-def test_positives_and_negatives_repeat_only_where_there_are_too_few():
-    recording = np.zeros((4, 3))
-    recording[:, 0] = [0, 1, 50, 100]
-    config = TupleConfig(positives=3, negatives=2)
-    anchors, near, far = columns(TuplePool([recording], config).draw(seed=0, step=0, tuples=8), config)
-    assert all(set(row) == {1 - anchor} for anchor, row in zip(anchors[:, 0], near.tolist(), strict=True))
-    assert all(set(row) == {2, 3} for row in far.tolist())
 
 
 def test_drives_without_positives_or_negatives_are_refused():
@@ -154,18 +137,6 @@ def test_mined_negatives_are_the_nearest_far_frames_of_brute_force():
         assert set(row.tolist()) == set(expected.tolist())
 
 
-def test_negatives_are_drawn_from_more_of_the_hardest_than_are_needed():
-    config = TupleConfig(negatives=2, mining="hardest", hardest=6, revisit_gap=LAP // 2)
-    pool = TuplePool([circuit(3)], config)
-    cache = described(pool)
-    rows = np.concatenate([pool.draw(seed=0, step=step, tuples=40, cache=cache) for step in range(30)])
-    of_one = rows[rows[:, 0] == np.bincount(rows[:, 0]).argmax()]
-    far = np.flatnonzero(pool.far_apart(of_one[0, :1], np.arange(len(pool))))
-    hardest = set(cache.nearest(int(of_one[0, 0]), far, 6).tolist())
-    drawn = set(of_one[:, 2:].ravel().tolist())
-    assert len(of_one) > 8 and len(drawn) > 2 and drawn <= hardest
-
-
 def test_mined_clusters_look_alike_and_lie_far_apart():
     config = TupleConfig(negatives=0, cluster=4, mining="hardest", hardest=5, revisit_gap=LAP // 2)
     pool = TuplePool([circuit(3), circuit(2, seed=1)], config)
@@ -186,13 +157,6 @@ def test_where_only_some_places_are_described_the_anchors_and_negatives_are_amon
     some = np.arange(0, 3 * LAP, 4)
     rows = pool.draw(seed=0, step=0, tuples=20, cache=described(pool, some))
     assert np.isin(rows[:, [0, 2, 3]], some).all() and not np.isin(rows[:, 1], some).all()
-
-
-def test_mining_without_anything_to_choose_is_refused():
-    with pytest.raises(ValueError, match=r"sampling\.negatives above 0 or sampling\.cluster"):
-        TupleConfig(negatives=0, mining="hardest")
-    with pytest.raises(ValueError, match=r"refresh_steps of 1 or more, found 10 and 0"):
-        TupleConfig(mining="hardest", refresh_steps=0)
 
 
 def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
@@ -256,9 +220,3 @@ def test_a_drive_without_revisits_gives_its_first_frames_and_share_0_nothing():
     np.testing.assert_array_equal(training, np.arange(61, 200))
     training, validation = hold_out(positions, ValidationConfig(), SAMPLING)
     assert len(validation) == 0 and len(training) == 200
-
-
-@pytest.mark.parametrize("share", [-0.1, 0.6])
-def test_a_share_out_of_range_is_refused(share):
-    with pytest.raises(ValueError, match=r"ValidationConfig\.share: expected a number from 0 up to 0\.5, found"):
-        ValidationConfig(share=share)

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from sglpr_jax.training.batch_queue import BatchQueue, read_ahead
+from sglpr_jax.training.batch_source import batches_in_order, read_ahead
 from sglpr_jax.training.batches import Batch
 from sglpr_jax.training.step import TrainState
 
@@ -60,12 +60,7 @@ def test_batches_are_never_read_past_a_refresh():
 
     source = Made(make)
     source.refresh_steps, source.refresh = 4, lambda step, params: refreshed.append(step)
-    batches = BatchQueue(source, start=3, stop=11)
-    found = []
-    for _ in range(3, 11):
-        batches.prepare(lambda: STATE)
-        batch = next(batches)
-        found.append((batch.labelled, batch.negatives))
-    batches.close()
+    batches = batches_in_order(source, lambda: STATE, start=3, stop=11)
+    found = [(batch.labelled, batch.negatives) for batch in batches]
     assert refreshed == [3, 4, 8] and made == list(range(3, 11))
     assert found == [(3, 3), (4, 4), (5, 4), (6, 4), (7, 4), (8, 8), (9, 8), (10, 8)]
