@@ -56,6 +56,9 @@ class Stacked:
             self._file = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._rows = np.frombuffer(self._file, dtype).reshape(shape)
 
+    def __len__(self) -> int:
+        return len(self._offsets) - 1
+
     def __getitem__(self, i: int) -> np.ndarray:
         array = self._rows[slice(*self._offsets[i : i + 2])]
         if len(array):  # request the bytes at once: by default, the system reads 128 KiB at each first access

@@ -11,6 +11,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from sglpr_jax.models import initial
@@ -141,7 +142,7 @@ def _(axes: tuple[int, ...], primals: tuple[Array], tangents: tuple[Array]):
 
 
 def residual_sums(
-    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[Array, "d k"]
+    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[ArrayLike, "d k"]
 ) -> Float[Array, "b d k"]:
     """Sum the residuals of local features per cluster, as in NetVLAD, each sum L2-normalised over d, in float32.
 

@@ -36,5 +36,5 @@ def test_a_killed_search_ends_with_the_files_of_one_that_was_not_killed(walk, tm
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(os, "replace", killed)
         run_command(*line, "--out", tmp_path / "out")
-    monkeypatch.setattr(candidates, "described", lambda *_: pytest.fail("a stored scan was described again"))
+    monkeypatch.setattr(candidates, "describe_scan", lambda *_: pytest.fail("a stored scan was described again"))
     assert contents(tmp_path / "out", *line) == whole

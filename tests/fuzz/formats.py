@@ -106,7 +106,7 @@ def pack() -> dict[str, bytes]:
 def read_pack(path: Path) -> list[np.ndarray]:
     """All arrays of the pack that a file belongs to."""
     points = open_pack(path.parent)["points"]
-    return [points[i] for i in range(len(points.offsets) - 1)]
+    return [points[i] for i in range(len(points))]
 
 
 def nuscenes() -> dict[str, bytes]:
