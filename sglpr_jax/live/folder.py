@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
-from sglpr_jax.data.formats.bin_records import unusual_record
+from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, quaternion_poses
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_of_file
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
@@ -105,7 +105,7 @@ class FolderSource:
         """Read a scan and wait for its pose. A scan that cannot be read is reported."""
         try:
             if self._records is None and self._options.format == "auto" and named_format(path) is None:
-                self._records = unusual_record([path]) or "kitti"
+                self._records = detect_format_unless_kitti([path]) or "kitti"
             scan = scan_of_file(path, format=self._options.format, records=self._records or "kitti")
             stamp, written = _time_in_name(path), path.stat().st_mtime
         except (ValueError, OSError, ImportError) as error:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import is_record, read_records, unusual_record
+from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti, is_headerless, read_records
 from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_scan
 from sglpr_jax.data.formats.las import las_blocks, las_scan
 from sglpr_jax.data.formats.pcd_ply import parse_pcd, parse_ply, table_blocks, table_scan
@@ -99,7 +99,7 @@ def named_format(path: Path) -> ScanFormat | None:
 
 def detect_format(path: Path) -> ScanFormat:
     """Return the format of one scan by its name or its content."""
-    return named_format(path) or unusual_record([path]) or "kitti"
+    return named_format(path) or detect_format_unless_kitti([path]) or "kitti"
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
@@ -136,7 +136,7 @@ def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFo
         raise FileNotFoundError(f"{path}: expected a scan, found none")
     check_value(format, ScanFormat, f"{path}, format")
     known = (named_format(path) or records) if format == "auto" else format
-    if is_record(known):
+    if is_headerless(known):
         return read_records(path, known)
     with _naming(path, known):
         check_bytes(path.stat().st_size)

@@ -41,7 +41,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Return an 8-bit image in the orientation of eq. 1, in counts 0..10."""
+    """Return an 8-bit density image as counts 0..10 in the orientation of eq. 1: x to the right, y up."""
     return as_counts(read_grey_png(path, bits=8))
 
 

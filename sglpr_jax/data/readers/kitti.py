@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
-from sglpr_jax.data.formats.bin_records import describe_format, unusual_record
+from sglpr_jax.data.formats.bin_records import describe_format, detect_format_unless_kitti
 from sglpr_jax.data.formats.pose_files import frame_rows, read_poses, read_times
 from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
@@ -79,7 +79,7 @@ def _format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, st
         return partial(scan_of_file, format=format), f"{format}, as given"
     unusual = None
     with contextlib.suppress(ValueError):  # scans that fit no format are read as KITTI's
-        unusual = unusual_record(paths)
+        unusual = detect_format_unless_kitti(paths)
     if unusual is None:
         return scan_of_file, describe_format("kitti")
     return partial(scan_of_file, format=unusual), f"{describe_format(unusual)}, not KITTI's"

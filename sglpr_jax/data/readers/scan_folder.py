@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import check_record, describe_format, detect_point_format, is_record
+from sglpr_jax.data.formats.bin_records import describe_format, detect_point_format, is_headerless, warn_of_other_format
 from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_at_scans, poses_of
@@ -96,8 +96,8 @@ def _trajectory(
 def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
     """Record of the .bin files whose name does not define it, and a description of all formats."""
     if format != "auto":
-        if is_record(format):
-            check_record(paths, format)
+        if is_headerless(format):
+            warn_of_other_format(paths, format)
         return "kitti", describe_format(format)
     names = [named_format(path) for path in paths]
     unnamed = [path for path, name in zip(paths, names, strict=True) if name is None]
