@@ -90,11 +90,9 @@ def table_blocks(path: Path, *, parse: Parser) -> Iterator[Float64[np.ndarray, "
 
 def _binary_records(table: PointTable, names: Sequence[str]) -> np.ndarray:
     """Return the points of a binary file as a structured array with the fields `names`."""
-    offsets = np.cumsum([0, *(field.width for field in table.fields)]).tolist()
-    type_and_offset = {
-        field.name: (field.number_type, offset) for field, offset in zip(table.fields, offsets[:-1], strict=True)
-    }
-    formats, offsets = zip(*(type_and_offset[name] for name in names), strict=True)
+    starts = itertools.accumulate((field.width for field in table.fields), initial=0)
+    columns = {field.name: (field.number_type, start) for field, start in zip(table.fields, starts, strict=False)}
+    formats, offsets = zip(*(columns[name] for name in names), strict=True)
     record = np.dtype({"names": list(names), "formats": formats, "offsets": offsets, "itemsize": table.row_bytes})
     end = table.points * record.itemsize
     if len(table.body) < end or _has_data(table.body[end:]):
@@ -103,7 +101,7 @@ def _binary_records(table: PointTable, names: Sequence[str]) -> np.ndarray:
 
 
 def _has_data(rest: Content) -> bool:
-    """Whether the bytes after the points are more than blanks and zeros. Some programs fill the last page with zeros."""
+    """Whether the bytes after the points are more than blanks or zeros. Some programs fill the last page with zeros."""
     return bool(bytes(rest).strip(b"\0\r\n\t "))
 
 
