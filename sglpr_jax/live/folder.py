@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti
-from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, quaternion_poses
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers, quaternion_poses
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_of_file
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
@@ -202,11 +202,11 @@ class GrowingPoses:
         self._times.append(self._times[-1] if self._times else 0.0)
         self._poses.append(None)  # also if the line is invalid: the next line is that of the next scan
         if self._format in ("auto", "tum"):
-            numbers = numbers_of(words, columns=8, where=where)
+            numbers = parse_numbers(words, columns=8, where=where)
             pose = quaternion_poses(self._path, numbers[None, 1:4], numbers[None, 4:])[0]
             self._times[-1] = float(numbers[0] / self._unit)
         else:
-            matrix = numbers_of(words, columns=12, where=where).reshape(1, 3, 4)
+            matrix = parse_numbers(words, columns=12, where=where).reshape(1, 3, 4)
             pose = poses_of(matrix[:, :, 3], matrix[:, :, :3])[0]
             pose = CAMERA_FROM_LIDAR.T @ pose @ CAMERA_FROM_LIDAR if self._format == "kitti" else pose
         self._poses[-1] = pose

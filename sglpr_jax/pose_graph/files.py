@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.drift import step_deviations
@@ -85,14 +85,14 @@ def read_g2o(path: Path | str) -> Graph:
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         words, where = line.split(), f"{path}, line {number}"
         if words and words[0] == VERTEX:
-            values = numbers_of(words[1:], columns=8, where=where)
+            values = parse_numbers(words[1:], columns=8, where=where)
             (frame,) = _frames(values[:1], where)
             if frame in graph.poses:
                 raise ValueError(f"{where}: expected each vertex once, found vertex {frame} again")
             graph.poses[frame] = _pose(values[1:], where)
         elif words and words[0] == EDGE:
             columns = columns or (9 if len(words) == 10 else 30)  # the same for all: another line is cut
-            values = numbers_of(words[1:], columns=columns, where=where)
+            values = parse_numbers(words[1:], columns=columns, where=where)
             information = np.eye(6)
             if columns == 30:
                 information[UPPER] = values[9:]

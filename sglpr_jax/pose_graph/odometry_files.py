@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import TimeUnit
-from sglpr_jax.data.formats.pose_files import FORMATS, format_of
+from sglpr_jax.data.formats.pose_files import FORMATS, detect_pose_format
 from sglpr_jax.data.poses import poses_at_scans
 from sglpr_jax.data.readers.ros import ENDINGS
 from sglpr_jax.data.recording import Recording
@@ -45,7 +45,7 @@ def read_stamped(
         raise ValueError(f"{path}: expected a file of odometry, or the bag of the scans, found another bag")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected odometry, found {'a folder' if path.is_dir() else 'no file'}")
-    file_format = format if format != "auto" else "g2o" if path.suffix == ".g2o" else format_of(path)
+    file_format = format if format != "auto" else "g2o" if path.suffix == ".g2o" else detect_pose_format(path)
     if file_format == "csv":
         raise ValueError(f"{path}: expected odometry with rotations, as tum, found csv")
     if file_format != "g2o":

@@ -153,9 +153,8 @@ def _nonblank_lines(body: Content) -> list[bytes]:
 def decompress_lzf(data: bytes, *, size: int) -> bytes:
     """Decompress LZF data to `size` bytes.
 
-    A control byte below 32 is followed by control + 1 literal bytes. Otherwise its upper 3 bits are the length of a
-    copied run minus 2 (7: a byte with the rest follows), and its lower 5 bits and the next byte the distance minus 1
-    back to the start of the run.
+    A control byte below 32 is followed by control + 1 literal bytes. Any other one stands for a copy of earlier output.
+    Its upper 3 bits are the length - 2, where 7 adds the next byte. The other 5 bits and a byte are the distance - 1.
     """
     output, position = bytearray(), 0
     try:

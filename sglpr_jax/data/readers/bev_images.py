@@ -13,7 +13,7 @@ from jaxtyping import Float32
 
 from sglpr_jax.data.density_image import as_counts
 from sglpr_jax.data.formats.png import image_scan, read_grey_png
-from sglpr_jax.data.formats.pose_files import frame_rows, read_poses
+from sglpr_jax.data.formats.pose_files import read_poses, rows_of_frames
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
@@ -33,7 +33,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         ids=ids,
         paths=paths,
         read=partial(image_scan, read=read_image),
-        positions=frame_rows(read_poses(pose_file), ids, path=pose_file)[:, :, 3] if has_poses else None,
+        positions=rows_of_frames(read_poses(pose_file), ids, path=pose_file)[:, :, 3] if has_poses else None,
         pose_source=f"{name}/pose.txt" if has_poses else None,
         label_paths=tuple(labels.get(image) for image in ids),
         resolution_m=DENSITY_RESOLUTION_M,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import describe_format, detect_format_unless_kitti
-from sglpr_jax.data.formats.pose_files import frame_rows, read_poses, read_times
+from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of_frames
 from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
@@ -40,7 +40,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     positions = None
     if pose_file is not None:
         poses = read_poses(root / pose_file)
-        positions = frame_rows(positions_from_camera(poses), ids, path=root / pose_file)
+        positions = rows_of_frames(positions_from_camera(poses), ids, path=root / pose_file)
     times = read_times(times_file, unit=options.time_unit) if times_file.is_file() else None
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
     (read, format), mounting = _format(paths, options.format), _mounting(root)
@@ -50,7 +50,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         paths=paths,
         read=read,
         positions=positions,
-        times=None if times is None else frame_rows(times, ids, path=times_file),
+        times=None if times is None else rows_of_frames(times, ids, path=times_file),
         pose_source=pose_file,
         label_paths=tuple(labels.get(scan) for scan in ids),
         mounting=mounting,

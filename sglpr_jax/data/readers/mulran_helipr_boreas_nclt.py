@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, describe_format, read_record_file, read_records
-from sglpr_jax.data.formats.pose_files import read_stamped_rows
+from sglpr_jax.data.formats.pose_files import read_timed_rows
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -65,7 +65,7 @@ def read_nclt_poses(path: Path) -> StampedPositions:
 
     Rows with NaN are dropped. Raises ValueError if all rows have NaN or the times decrease.
     """
-    times, poses = read_stamped_rows(path, columns=7, finite=False)
+    times, poses = read_timed_rows(path, columns=7, finite=False)
     is_known = np.isfinite(poses).all(axis=1)
     if not is_known.any():
         raise ValueError(f"{path}: expected poses, found NaN in all {len(poses)} rows")
@@ -75,14 +75,14 @@ def read_nclt_poses(path: Path) -> StampedPositions:
 
 def read_mulran_poses(path: Path) -> StampedPositions:
     """Read the poses of MulRan's car (time and 12 numbers), and return the positions of its Ouster."""
-    times, rows = read_stamped_rows(path, columns=13)
+    times, rows = read_timed_rows(path, columns=13)
     world_from_base = rows.reshape(-1, 3, 4)
     return times, world_from_base[:, :, :3] @ OUSTER_IN_BASE_M + world_from_base[:, :, 3]
 
 
 def read_positions(path: Path, *, columns: int, header_lines: int = 0) -> StampedPositions:
     """Return the times (first column) and positions (second to fourth column) of a table of LiDAR poses."""
-    times, rows = read_stamped_rows(path, columns=columns, header_lines=header_lines)
+    times, rows = read_timed_rows(path, columns=columns, header_lines=header_lines)
     return times, np.ascontiguousarray(rows[:, :3])
 
 

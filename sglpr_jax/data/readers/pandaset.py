@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.json_tables import poses_in_table, read_table
-from sglpr_jax.data.formats.pose_files import frame_rows
+from sglpr_jax.data.formats.pose_files import rows_of_frames
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers.listing import files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -50,8 +50,8 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     ids = tuple(path.stem for path in paths)
     pose_file, times_file = folder / "poses.json", folder / "timestamps.json"
     poses = poses_in_table(pose_file, read_table(pose_file), position="position", rotation="heading")
-    poses = frame_rows(poses, ids, path=pose_file)
-    times = frame_rows(_times(times_file), ids, path=times_file)
+    poses = rows_of_frames(poses, ids, path=pose_file)
+    times = rows_of_frames(_times(times_file), ids, path=times_file)
     check_order(times, source=times_file)
     missing = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
     digest = hashlib.sha256(pose_file.read_bytes()).hexdigest()

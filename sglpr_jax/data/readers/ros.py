@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import check_height, check_order
+from sglpr_jax.data.formats.pose_files import warn_of_heights, warn_of_jumps
 from sglpr_jax.data.formats.ros_bag import CLOUDS, COMPRESSED, METADATA, RosBag
 from sglpr_jax.data.formats.ros_messages import (
     IMU,
@@ -147,8 +147,8 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
         found = f"{track.dropped} of {len(track) + track.dropped} without finite position or without rotation"
         warn(f"{bag.paths[0]}: expected valid poses on {used}, found {found}; these are dropped")
     poses = interpolate_poses(stamps, track.poses, times[rows])
-    check_height(poses[:, :3, 3], path=bag.paths[0])
-    check_order(poses[:, :3, 3], [recording.ids[i] for i in rows], path=bag.paths[0])
+    warn_of_heights(poses[:, :3, 3], path=bag.paths[0])
+    warn_of_jumps(poses[:, :3, 3], [recording.ids[i] for i in rows], path=bag.paths[0])
     child_from_lidar, how = _child_from_lidar(track, transforms, lidar)
     poses = poses @ child_from_lidar
     return dataclasses.replace(

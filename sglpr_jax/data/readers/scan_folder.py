@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.bin_records import describe_format, detect_point_format, is_headerless, warn_of_other_format
-from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
+from sglpr_jax.data.formats.pose_files import read_times, read_trajectory, warn_of_jumps
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.readers.listing import files_in, other_contents, scans_in
@@ -47,7 +47,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     records, format = _formats(paths, options.format)
     aside = other_contents(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
     if positions is not None:
-        check_order(positions, ids, path=options.poses or root / str(source))
+        warn_of_jumps(positions, ids, path=options.poses or root / str(source))
     return Recording(
         name=root.resolve().name,
         ids=ids,
