@@ -12,9 +12,9 @@ from sglpr_jax.data.formats.ros_messages import (
     RosMessage,
     StampedPose,
     Track,
-    fixed_transform,
     read_transforms,
-    tracks_of,
+    static_transform,
+    tracks_of_transforms,
 )
 from sglpr_jax.data.poses import pose_at
 from sglpr_jax.live.messages import Report
@@ -102,10 +102,10 @@ class LiveOdometry:
         """Choose the poses to use, if tf states how the LiDAR is mounted in their child frame."""
         if self._used is not None:
             return
-        static = tracks_of((0, pose) for pose in self._static.values())
+        static = tracks_of_transforms((0, pose) for pose in self._static.values())
         for frames in self._poses:
             child = frames[1]
-            child_from_lidar = np.eye(4) if child in ("", lidar) else fixed_transform(static, child, lidar)
+            child_from_lidar = np.eye(4) if child in ("", lidar) else static_transform(static, child, lidar)
             if child_from_lidar is not None:
                 self._used = frames, child_from_lidar
                 return
@@ -141,4 +141,4 @@ def _interpolate(poses: list[StampedPose], time: float) -> Float[np.ndarray, "4 
     before = [pose for pose in nearest if pose.time <= time][:1]
     after = [pose for pose in nearest if pose.time > time][:1]
     track = Track.of((0, pose) for pose in (before + after if before and after else nearest[:2]))
-    return pose_at(track.stamps.own, track.poses, time)
+    return pose_at(track.stamps.header_s, track.poses, time)
