@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers, quaternion_poses
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_of_file
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_name, scan_of_file
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.times import EPOCH, PER_SECOND
@@ -104,7 +104,7 @@ class FolderSource:
     def _frame(self, path: Path, received: float) -> Iterator[LiveFrame | None]:
         """Read a scan and wait for its pose. A scan that cannot be read is reported."""
         try:
-            if self._records is None and self._options.format == "auto" and named_format(path) is None:
+            if self._records is None and self._options.format == "auto" and format_by_name(path) is None:
                 self._records = detect_format_unless_kitti([path]) or "kitti"
             scan = scan_of_file(path, format=self._options.format, records=self._records or "kitti")
             stamp, written = _time_in_name(path), path.stat().st_mtime

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.bin_records import describe_format, detect_point_format, is_headerless, warn_of_other_format
 from sglpr_jax.data.formats.pose_files import read_times, read_trajectory, warn_of_jumps
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id, scan_of_file
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_name, scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.readers.listing import files_in, other_contents, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -99,7 +99,7 @@ def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat,
         if is_headerless(format):
             warn_of_other_format(paths, format)
         return "kitti", describe_format(format)
-    names = [named_format(path) for path in paths]
+    names = [format_by_name(path) for path in paths]
     unnamed = [path for path, name in zip(paths, names, strict=True) if name is None]
     detected, how = detect_point_format(unnamed) if unnamed else (None, "")
     records: RecordFormat = detected or "kitti"
