@@ -11,7 +11,7 @@ from pathlib import Path
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
-from sglpr_jax.data.readers.listing import other_contents
+from sglpr_jax.data.readers.listing import describe_contents
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
@@ -110,7 +110,7 @@ def open_recording(
 
 
 def _find_reader(root: Path) -> tuple[Reader, tuple[str, ...]]:
-    """Return the first reader that finds recordings in `root`, and their names. Without one, raises FileNotFoundError."""
+    """Return the first reader that finds recordings in `root`, and their names, or raise FileNotFoundError."""
     for reader in readers():
         if names := reader.recording_names(root):
             return reader, names
@@ -121,5 +121,5 @@ def _find_reader(root: Path) -> tuple[Reader, tuple[str, ...]]:
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: expected the folder of a recording, or a bag, found no such folder")
     *layouts, last = (reader.layout for reader in readers() if reader.layout)
-    contents = other_contents(root, ()) or "no files"
+    contents = describe_contents(root) or "no files"
     raise FileNotFoundError(f"{root}: found no known layout: {contents}; expected {', '.join(layouts)} or {last}")

@@ -21,21 +21,26 @@ from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open `root/<name>`. Raises FileNotFoundError without images, and ValueError if an image has no valid pose."""
+    """Open the sequence `root/<name>`. Raises FileNotFoundError without images.
+
+    Raises ValueError if `pose.txt` exists and lacks the row of an image (`rows_of_frames`).
+    """
     folder = root / name
     paths = scans_in(folder / "imgs", ".png", kind="images")
     ids = tuple(path.stem for path in paths)
     labels = {path.stem: path for path in files_in(folder / "labels", ".png")}
     pose_file = folder / "pose.txt"
-    has_poses = pose_file.is_file()
+    positions = None
+    if pose_file.is_file():
+        positions = rows_of_frames(read_poses(pose_file), ids, path=pose_file)[:, :, 3]
     return Recording(
         name=name,
         ids=ids,
         paths=paths,
         read=partial(image_scan, read=read_image),
-        positions=rows_of_frames(read_poses(pose_file), ids, path=pose_file)[:, :, 3] if has_poses else None,
-        pose_source=f"{name}/pose.txt" if has_poses else None,
-        label_paths=tuple(labels.get(image) for image in ids),
+        positions=positions,
+        pose_source=None if positions is None else f"{name}/pose.txt",
+        label_paths=tuple(labels.get(image_id) for image_id in ids),
         resolution_m=DENSITY_RESOLUTION_M,
     )
 
