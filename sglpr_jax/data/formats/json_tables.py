@@ -51,10 +51,7 @@ def texts_of(path: Path, rows: Rows, name: str) -> list[str]:
 
 
 def vectors_of(path: Path, rows: Rows, name: str, axes: str) -> Float[np.ndarray, "n {len(axes)}"]:
-    """Return a column of vectors with the axes `axes`, such as "wxyz".
-
-    A vector is a list of finite numbers, or an object such as {"x": 1.0, "y": 2.0, "z": 0.5}.
-    """
+    """Return a column of finite vectors. Each is a list in the order of `axes`, or an object by axis."""
     values = column_of(path, rows, name)
     try:
         lists = [[value[axis] for axis in axes] if isinstance(value, dict) else value for value in values]

@@ -281,13 +281,11 @@ class _Element(NamedTuple):
 
     def fields(self, byte_order: str) -> list[Field]:
         """Return the fields of a row. Raises ValueError if a column has lists."""
-        fields = []
         for name, ply_type in self.properties:
             if ply_type not in PLY_TYPES:
                 raise ValueError(f"expected numbers for {name} of {self.name}, found {ply_type}")
-            numpy_type = PLY_TYPES[ply_type]
-            fields.append(Field(name, byte_order + numpy_type, width=int(numpy_type[1])))
-        return fields
+        types = [(name, PLY_TYPES[ply_type]) for name, ply_type in self.properties]
+        return [Field(name, byte_order + numpy_type, width=int(numpy_type[1])) for name, numpy_type in types]
 
     def size(self, *, binary: bool) -> int:
         """Return the size of all rows: bytes in a binary file, lines in a text file."""
@@ -295,10 +293,7 @@ class _Element(NamedTuple):
 
 
 def parse_ply(content: Content) -> PointTable:
-    """Parse the header of a .ply file, and cut the vertices out of the body, which may contain other elements.
-
-    Raises ValueError if the header is invalid or the body is longer than the header declares.
-    """
+    """Parse the header of a .ply file, and cut the vertices out of the body, which may contain other elements."""
     lines, body = _split_header(content, b"end_header")
     if lines[0].strip() != "ply":
         raise ValueError("expected a header from ply to end_header, found none")

@@ -45,22 +45,16 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
 def image_scan(
     path: Path, labels: Path | None = None, lasers: bool = False, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]
 ) -> Scan:
-    """Read a ready-made image with `read`, and its label image if `labels` is given.
-
-    This is the `Recording.read` of ready-made images. `lasers` is ignored, because images have no lasers.
-    """
+    """Read a ready-made image with `read`, and its label image if any, for a `Recording`. `lasers` is ignored."""
     image = read(path)
     return Scan(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
 
 
 def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
-    """Return the SemanticKITTI ids (h, w) of a 16-bit label image in the orientation of eq. 1.
-
-    Raises ValueError if the shape is not `shape`, that of the density image, or an id is unknown.
-    """
+    """Return the SemanticKITTI ids (h, w) of a 16-bit label image in the orientation of eq. 1: x to the right, y up."""
     ids = read_grey_png(path, bits=16).astype(np.int32)
     if ids.shape != shape:
-        # The image was rotated by 90 degrees: columns of the file are the first axis.
+        # The columns of the file are the first axis, since the image was rotated by 90 degrees.
         expected, found = (f"{rows} rows of {columns} pixels" for columns, rows in (shape, ids.shape))
         raise ValueError(f"{path}: expected {expected}, the size of the image, found {found}")
     with naming(path):

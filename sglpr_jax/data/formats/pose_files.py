@@ -55,26 +55,20 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
 def quaternion_poses(
     path: Path, positions: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return poses from positions in metres and quaternions x, y, z, w.
-
-    Raises ValueError, with the row in `path`, for a position beyond `FARTHEST_M` or a quaternion without length 1.
-    """
+    """Return poses from positions in metres and quaternions x, y, z, w. Errors name the invalid row in `path`."""
     check_positions(path, positions)
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         lengths = np.linalg.norm(quaternions, axis=1)
     invalid_rows = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
     if invalid_rows.size:
-        row = invalid_rows[0]
-        found = " ".join(f"{value:g}" for value in quaternions[row])
-        raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {row + 1}, found {found}")
+        found = f"{' '.join(f'{value:g}' for value in quaternions[invalid_rows[0]])}"
+        row = f"row {invalid_rows[0] + 1}"
+        raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in {row}, found {found}")
     return from_quaternions(positions, quaternions)
 
 
 def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
-    """Return the times in seconds of a file with one number a line.
-
-    If the numbers merely count the rows (0, 1, 2, ...), warns and returns None.
-    """
+    """Return the times in seconds of a file with one number a line. Warns and returns None for 0, 1, 2, ... (rows)."""
     times = times_of(read_rows(path, columns=1)[:, 0], source=path, unit=unit)
     if times is None:
         warn(f"{path}: expected times, found row numbers (0, 1, 2, ...), not used; {ADVICE}")
@@ -117,8 +111,7 @@ def read_rows(
 ) -> Float[np.ndarray, "n {columns}"]:
     """Return the finite numbers of a text file with one row a line. Lines that start with # are skipped.
 
-    Columns are separated by white space or by `separator`. Raises FileNotFoundError without the file, and ValueError,
-    with the line, for other words or another number of columns.
+    Columns are separated by white space or by `separator`. A ValueError names the line.
     """
     lines = _lines(path, expected=f"a file with {columns} numbers a line, one line per frame", skip=header_lines)
     rows = [parse_numbers(line.split(separator), columns=columns, where=where) for where, line in lines]
@@ -143,10 +136,7 @@ def read_timed_rows(
 
 
 def _lines(path: Path, *, expected: str, skip: int) -> Iterator[tuple[str, str]]:
-    """Yield the lines of a file after `skip` header lines, each after its location "FILE, line 3" for messages.
-
-    Lines that start with # are left out. Raises FileNotFoundError, with what was `expected`, without the file.
-    """
+    """Yield location ("FILE, line 3") and content of the lines after `skip` header lines, without lines with #."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected {expected}, found none")
     for number, line in enumerate(path.read_text(errors="replace").rstrip().splitlines(), start=1):
@@ -166,10 +156,7 @@ def _parse_integer_time(word: str, *, where: str) -> np.int64:
 def parse_numbers(
     words: Sequence[str], *, columns: int, where: str, finite: bool = True
 ) -> Float[np.ndarray, " {columns}"]:
-    """Convert the words of a line to `columns` numbers, by default finite ones.
-
-    Raises ValueError, which begins with the location `where`, for other words or another number of words.
-    """
+    """Convert the words of a line to `columns` numbers, by default finite ones. Errors begin with `where`."""
     if len(words) != columns:
         raise ValueError(f"{where}: expected {columns} numbers, found {len(words)}")
     text = " ".join(words)
@@ -293,10 +280,7 @@ def warn_of_jumps(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, pa
 
 
 def detect_pose_format(path: Path, *, twelve_numbers: Literal["kitti", "lidar"] | None = None) -> PoseFormat:
-    """Return the format of a pose file by its ending or its first line: csv, tum, or `twelve_numbers` for 12 numbers.
-
-    Raises ValueError for another number of columns, and for 12 numbers without `twelve_numbers`.
-    """
+    """Return the format of a pose file: csv by its ending, tum by 8 numbers a line, `twelve_numbers` by 12."""
     if path.suffix == ".csv":
         return "csv"
     lines = path.read_text(errors="replace").splitlines()
@@ -314,10 +298,7 @@ def detect_pose_format(path: Path, *, twelve_numbers: Literal["kitti", "lidar"] 
 
 
 def _read_csv(path: Path, unit: TimeUnit) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
-    """Read the columns x, y, z and times (if any) of a csv file, whose first line names the columns.
-
-    Returns poses with identity rotations, and the times in seconds or None.
-    """
+    """Read poses (with identity rotations) and times in seconds, if any, from the named columns of a csv file."""
     header = path.read_text(errors="replace").partition("\n")[0]
     names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt writes the #
     time_names = [name for name in names if name in TIME_COLUMNS] or [name for name in names if name in TIME_COLUMNS_S]

@@ -22,17 +22,14 @@ T = TypeVar("T")
 
 
 class RosBag:
-    """One or more bags (files, or folders of ROS 2) that are read as one, until the object is garbage-collected.
-
-    Each method that reads messages raises ValueError if a bag is broken.
-    """
+    """One or more bags that are read as one. Each method that reads messages raises ValueError if a bag is broken."""
 
     def __init__(self, paths: Sequence[Path]):
         self.paths = tuple(paths)
         self.name = self.paths[0].name
         self._reader = _open_reader(self.paths)
         self._lock = threading.Lock()
-        weakref.finalize(self, self._reader.close)
+        weakref.finalize(self, self._reader.close)  # closes the bags when the object is garbage-collected
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -91,10 +88,7 @@ class RosBag:
     def read(
         self, topic: str, decode: Callable[[Iterator[tuple[int, RosMessage]]], T], recorder_ns: int | None = None
     ) -> T:
-        """Return the result of `decode` for the messages of a topic, each with its recorder time in nanoseconds.
-
-        If `recorder_ns` is given, only messages recorded at this time are passed to `decode`.
-        """
+        """Call `decode` with the messages of a topic (recorded at `recorder_ns`) and the recorder time (ns) of each."""
         with self._lock, _bag_errors(self.paths[0]):
             return decode(self._messages(topic, recorder_ns))
 

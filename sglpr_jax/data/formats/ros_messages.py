@@ -45,10 +45,7 @@ class Header(NamedTuple):
 
 
 class RosMessage:
-    """A serialised message of ROS 1 or (with `cdr`) ROS 2, and a read position.
-
-    Each method reads the next part and moves the position. Reading beyond the end raises ValueError.
-    """
+    """A serialised message of ROS 1 or (`cdr`) ROS 2. Its methods read part after part; ValueError beyond the end."""
 
     def __init__(self, raw: bytes, *, cdr: bool):
         self.raw = raw
@@ -74,13 +71,10 @@ class RosMessage:
         return Header(seconds + nanoseconds / 1e9, self.text())
 
     def records(self, fields: dict[str, str]) -> np.ndarray:
-        """Read the next sequence of records, with a numpy type for each field, as a structured array.
-
-        Fields of 4 bytes must precede fields of 1 byte. CDR then pads each record but the last to 4 bytes.
-        """
+        """Read the next sequence of records as a structured array. Fields of 4 bytes must precede fields of 1 byte."""
         count = int(self.numbers("u4")[0])
         layout = [(name, f"{self._byte_order}{number_type}") for name, number_type in fields.items()]
-        padding = -np.dtype(layout).itemsize % 4 if self._cdr else 0
+        padding = -np.dtype(layout).itemsize % 4 if self._cdr else 0  # to 4 bytes after each record but the last
         padded = np.dtype([*layout, ("padding", f"V{padding}")])
         content = self._bytes(4, max(count * padded.itemsize - padding, 0))
         return np.frombuffer(content + bytes(padding if count else 0), padded)
@@ -153,9 +147,8 @@ def _point_type(message: Any, byte_order: str) -> np.dtype:
 def read_custom_msg(message: RosMessage) -> Scan:
     """Return the points of a Livox message in its axes, with their line numbers and times."""
     message.header()
-    message.numbers("u8")  # time base
-    message.numbers("u4")  # number of points
-    message.numbers("u1", 4)  # number of the LiDAR, and reserved bytes
+    for number_type, count in (("u8", 1), ("u4", 1), ("u1", 4)):  # skip time base, point count, LiDAR and reserved
+        message.numbers(number_type, count)
     points = message.records(LIVOX_FIELDS)
     if not len(points):
         raise ValueError("expected at least one point, found none")
@@ -247,15 +240,11 @@ class Track:
         numbers = np.array([pose.numbers for _, pose in pairs], np.float64).reshape(-1, 7)
         has_position = np.isfinite(numbers[:, :3]).all(axis=1)
         has_rotation = has_position & _have_length_1(numbers[:, 3:])
-        keep = has_rotation if 2 * has_rotation.sum() > has_position.sum() else has_position
-        kept = [pair for pair, is_kept in zip(pairs, keep, strict=True) if is_kept]
-        return cls(
-            stamps=Stamps.of((recorder_ns, pose.time) for recorder_ns, pose in kept),
-            numbers=numbers[keep],
-            child=kept[0][1].child if kept else "",
-            frame=kept[0][1].frame if kept else "",
-            dropped=len(pairs) - len(kept),
-        )
+        rows = np.flatnonzero(has_rotation if 2 * has_rotation.sum() > has_position.sum() else has_position)
+        kept = [pairs[row] for row in rows]
+        stamps = Stamps.of((recorder_ns, pose.time) for recorder_ns, pose in kept)
+        child, frame = (kept[0][1].child, kept[0][1].frame) if kept else ("", "")
+        return cls(stamps, numbers[rows], child, frame, dropped=len(pairs) - len(rows))
 
     def __len__(self) -> int:
         return len(self.numbers)

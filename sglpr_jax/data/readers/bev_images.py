@@ -21,10 +21,7 @@ from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open the sequence `root/<name>`. Raises FileNotFoundError without images.
-
-    Raises ValueError if `pose.txt` exists and lacks the row of an image (`rows_of_frames`).
-    """
+    """Open the sequence `root/<name>`. Raises FileNotFoundError without images."""
     folder = root / name
     paths = scans_in(folder / "imgs", ".png", kind="images")
     ids = tuple(path.stem for path in paths)

@@ -29,11 +29,7 @@ SIMULATION = "simulation.json"
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open the sequence `root/sequences/<name>`. If its scans do not fit KITTI's format, the format is detected.
-
-    Raises FileNotFoundError without scans or the chosen pose file, and ValueError if a scan has no row (by its name)
-    in the pose file or `times.txt`.
-    """
+    """Open the sequence `root/sequences/<name>`. If its scans do not fit KITTI's format, the format is detected."""
     folder = root / "sequences" / name
     paths = scans_in(folder / "velodyne", ".bin")
     ids = tuple(path.stem for path in paths)
@@ -89,10 +85,7 @@ def _scan_reader(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecor
 
 
 def _choose_pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
-    """Return the path of the chosen pose file in `root`. "auto" prefers SemanticKITTI's; without any, returns None.
-
-    Raises FileNotFoundError if another choice does not exist.
-    """
+    """Return the path of the chosen pose file in `root`. "auto" prefers SemanticKITTI's; without any, returns None."""
     files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
     candidates = list(files.values()) if choice == "auto" else [files[choice]]
     pose_file = next((file for file in candidates if (root / file).is_file()), None)

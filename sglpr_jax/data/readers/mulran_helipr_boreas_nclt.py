@@ -61,10 +61,7 @@ AEVA_CHANGED = 1691936557946849179
 
 
 def read_nclt_poses(path: Path) -> StampedPositions:
-    """Read utime, x, y, z, roll, pitch, yaw of an NCLT session, and return times (us) and positions with z up.
-
-    Rows with NaN are dropped. Raises ValueError if all rows have NaN or the times decrease.
-    """
+    """Return times (us) and positions of an NCLT session: utime, x, y, z, roll, pitch, yaw. Drops rows with NaN."""
     times, poses = read_timed_rows(path, columns=7, finite=False)
     is_known = np.isfinite(poses).all(axis=1)
     if not is_known.any():
@@ -120,10 +117,7 @@ class Layout(NamedTuple):
         return next((path for path in candidates if path.is_file()), None)
 
     def sequences(self, root: Path) -> tuple[Path, ...]:
-        """Return the folders of the sequences in `root`, which may be a sequence itself.
-
-        A sequence has the folder `scans` and, if any folder name is allowed (`folders` is "*"), a pose file.
-        """
+        """Return the folders of the sequences in `root`, which may be a sequence itself."""
         folders = [folder for folder in (root, *sorted(root.glob(self.folders))) if (folder / self.scans).is_dir()]
         if self.folders == "*":
             folders = [folder for folder in folders if self.pose_file(folder) is not None]
@@ -193,10 +187,7 @@ def recording_names(root: Path, *, layouts: tuple[Layout, ...]) -> tuple[str, ..
 
 
 def open_recording(root: Path, name: str, options: ReadOptions, *, layouts: tuple[Layout, ...]) -> Recording:
-    """Open the scans with a pose within `Layout.max_gap_s`, each with the position of the nearest pose in time.
-
-    Raises FileNotFoundError without a pose file, and ValueError if no scan has a pose or a name is not a time.
-    """
+    """Open the scans with a pose within `Layout.max_gap_s`, each with the position of the nearest pose in time."""
     folder, layout = _recordings(root, layouts)[name]
     scan_folder, pose_file = folder / layout.scans, layout.pose_file(folder)
     if pose_file is None:

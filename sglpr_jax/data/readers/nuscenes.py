@@ -31,10 +31,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open a scene: its key frames and sweeps in order of time. Scans that are listed but have no file are skipped.
-
-    Raises FileNotFoundError if no scan has a file, and ValueError if a table is malformed.
-    """
+    """Open a scene: its key frames and sweeps in order of time. Scans that are listed but have no file are skipped."""
     tables = next(folder for folder in _table_folders(root) if name in _scene_tokens(folder))
     scene_token = _scene_tokens(tables)[name]
     sample_table, scan_table = tables / "sample.json", tables / "sample_data.json"

@@ -82,11 +82,8 @@ def _read_times(path: Path) -> Float[np.ndarray, " n"]:
 def _read(
     path: Path, labels: Path | None, lasers: bool, *, poses: dict[Path, Float[np.ndarray, "4 4"]], poses_hash: str
 ) -> Scan:
-    """Read a scan for a `Recording`, and transform its points from the world to the LiDAR frame with x forward.
-
-    `poses_hash` is not used here: a cache of the scan is renewed if an option of this function changes.
-    """
-    world_from_lidar = poses[path]
+    """Read a scan for a `Recording`, transformed from the world to the LiDAR frame with x forward."""
+    world_from_lidar = poses[path]  # `poses_hash` is not used: caches of the scan compare the options of this function
     in_lidar = (read_scan(path, format="npy") - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]
     right, forward, up = in_lidar.T
     return Scan(points=np.stack([forward, -right, up], axis=1).astype(np.float32))

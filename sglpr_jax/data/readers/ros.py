@@ -79,8 +79,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     if imu_topic is None:
         return recording
     scans = Stamps(stamps.recorder_ns[recording.numbers], stamps.header_s[recording.numbers])  # without skipped scans
-    required = options.imu_topic is not None
-    read_ups = partial(_read_ups, bag, imu_topic, scans=scans, lidar_frame=lidar_frame, required=required)
+    read_ups = partial(_read_ups, bag, imu_topic, scans, lidar_frame, required=options.imu_topic is not None)
     return dataclasses.replace(recording, read_ups=read_ups)
 
 
@@ -94,10 +93,7 @@ def _read(
 
 
 def bag_files(root: Path) -> tuple[Path, ...]:
-    """Return the paths that rosbags opens together, or an empty tuple if `root` is not a bag.
-
-    A bag is a file, a folder of ROS 2 with metadata, or a folder of bag files with one of the endings.
-    """
+    """Return the bags at `root` (a file, a folder with metadata, or a folder of files), or () if there are none."""
     endings = (*ENDINGS, *COMPRESSED)
     if root.is_file():
         return (root,) if root.name.endswith(endings) else ()
@@ -107,22 +103,16 @@ def bag_files(root: Path) -> tuple[Path, ...]:
 
 
 def _recordings(root: Path) -> dict[str, tuple[RosBag, str]]:
-    """Return the bag and the point cloud topic of each recording, by the name of the recording.
-
-    A recording is named after its bag if `root` has several drives, and after its topic if the bag has several, or
-    else after `root`.
-    """
+    """Return the bag and topic of each recording, by name: of the bag and topic if there are several, or of `root`."""
     all_bags = RosBag(bag_files(root))
     drives = [drive for drive in _split_into_drives(all_bags) if drive.topics_of(CLOUDS)] or [all_bags]
     recordings = {}
     for drive in drives:
         for topic in drive.cloud_topics:
             name_parts = [drive.paths[0].stem] if len(drives) > 1 else []
-            if len(drive.cloud_topics) > 1:
-                name_parts.append(topic.strip("/").replace("/", "_"))
-            if not name_parts:
-                name_parts = [root.resolve().stem if root.is_file() else root.resolve().name]
-            recordings["_".join(name_parts)] = drive, topic
+            name_parts += [topic.strip("/").replace("/", "_")] if len(drive.cloud_topics) > 1 else []
+            name_of_root = root.resolve().stem if root.is_file() else root.resolve().name
+            recordings["_".join(name_parts or [name_of_root])] = drive, topic
     return recordings
 
 
@@ -191,10 +181,7 @@ def _read_tf_tracks(bag: RosBag) -> list[Track]:
 
 
 def _pose_topic(shares: dict[str, float], topic: str | None, bag: Path) -> str:
-    """Return `topic`, or by default the topic with the largest share of scans with a pose, "" if none has half.
-
-    Raises ValueError if `topic` does not exist or has poses for less than half of the scans.
-    """
+    """Return `topic`, or by default the topic with the largest share of scans with a pose, "" if none has half."""
     if topic is None:
         best = max(shares, key=lambda name: shares[name], default="")
         return best if best and shares[best] >= LEAST_SHARE else ""
@@ -206,10 +193,7 @@ def _pose_topic(shares: dict[str, float], topic: str | None, bag: Path) -> str:
 
 
 def _child_from_lidar(track: Track, transforms: list[Track], lidar_frame: str) -> tuple[Float[np.ndarray, "4 4"], str]:
-    """Return the transform from the LiDAR to the child frame of a track, and how the poses of the LiDAR are computed.
-
-    The transform is the identity if the track has no rotations, or if tf does not connect the two frames.
-    """
+    """Return the transform child_from_lidar by tf, or else the identity, and how the LiDAR's poses are computed."""
     if not track.rotates:
         return np.eye(4), "interpolated; its rotations are constant or missing"
     child = track.child.strip("/")
@@ -223,10 +207,7 @@ def _child_from_lidar(track: Track, transforms: list[Track], lidar_frame: str) -
 
 
 def _imu_topic(bag: RosBag, lidar_topic: str, imu_topic: str | None) -> str | None:
-    """Return `imu_topic`, or by default the IMU topic with most leading names in common with the LiDAR's topic.
-
-    For /livox/lidar, this is /livox/imu. Returns None without an IMU. Raises ValueError if `imu_topic` does not exist.
-    """
+    """Return `imu_topic`, or by default the IMU topic nearest in name: /livox/imu for /livox/lidar."""
     topics = bag.topics_of((IMU,))
     if imu_topic is None:
         lidar = lidar_topic.strip("/")
@@ -255,9 +236,8 @@ def _read_ups(
             raise
         warn(f"{error}; the ground of the scans is used")
         return None
-    lidar_from_imu = np.eye(4)
-    if imu_frame != lidar_frame:
-        lidar_from_imu = static_transform(_read_tf_tracks(bag), lidar_frame, imu_frame)
+    same_frame = imu_frame == lidar_frame
+    lidar_from_imu = np.eye(4) if same_frame else static_transform(_read_tf_tracks(bag), lidar_frame, imu_frame)
     if lidar_from_imu is None:
         expected = f"a static transform from {imu_frame} to {lidar_frame}"
         warn(f"{source}: expected {expected}, found none; their axes are taken as parallel")

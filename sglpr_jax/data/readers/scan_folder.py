@@ -70,8 +70,7 @@ def _read_trajectory(
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
     """Return a position (metres) and time (s) for each of `scans` scans, and the source of the poses, None if unknown.
 
-    The files are those in `options`, or else `POSE_FILES` and `TIMES_FILE` in the folder `root`. Raises ValueError if
-    `root` has several pose files, or if a scan has no time or pose.
+    The files are those in `options`, or else `POSE_FILES` and `TIMES_FILE` in the folder `root`.
     """
     files_in_root = [root / name for name in POSE_FILES if (root / name).is_file()]
     if options.poses is None and len(files_in_root) > 1:
@@ -101,10 +100,7 @@ def _read_trajectory(
 
 
 def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
-    """Return the format of .bin files whose name does not define it, and a description of the formats of all files.
-
-    With another `format` than "auto", all files have this format. Warns if they do not look so.
-    """
+    """Return the format of .bin files whose name does not define it, and a description of the formats of all files."""
     if format != "auto":
         if is_headerless(format):
             warn_of_other_format(paths, format)
