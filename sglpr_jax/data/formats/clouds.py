@@ -27,10 +27,7 @@ def cloud_scan(
 
 
 def check_points(points: int, *, bytes_each: int = 1) -> None:
-    """Raise ValueError, before memory is allocated, if the declared size is 0 or exceeds `MOST_POINTS` or `MOST_BYTES`.
-
-    A header declares `points` points of `bytes_each` bytes.
-    """
+    """Raise ValueError if a header declares no points, or more than `MOST_POINTS` points or `MOST_BYTES` bytes."""
     if points < 1:
         raise ValueError(f"expected at least one point, found {points or 'none'}")
     if points > MOST_POINTS:

@@ -39,7 +39,7 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
 
 
 def _checked_laspy(path: Path, *, one_scan: bool) -> ModuleType:
-    """Check the sizes in the header of a .las file, and return the module laspy, which would not check them.
+    """Return the module laspy after a check of the sizes in the header, which laspy would believe.
 
     Raises ValueError if the file is shorter than its header declares or, with `one_scan`, has too many points.
     """
@@ -57,16 +57,16 @@ def _checked_laspy(path: Path, *, one_scan: bool) -> ModuleType:
     extended_start = extended = 0  # offset and number of the extended records
     if minor_version >= 4:
         extended_start, extended, points = struct.unpack_from("<QIQ", header, 235)
-    records_fit = header_size + records * _RECORD_HEADER <= points_start
-    extended_fit = extended == 0 or extended_start + extended * _EXTENDED_RECORD_HEADER <= size
-    if not (records_fit and extended_fit):
+    records_end = header_size + records * _RECORD_HEADER
+    extended_end = extended_start + extended * _EXTENDED_RECORD_HEADER
+    if records_end > points_start or (extended and extended_end > size):
         raise ValueError(f"expected {records} and {extended} records by the header, found {size} bytes in total")
     if one_scan:
         check_points(points, bytes_each=width)
     if point_format & _COMPRESSED:
         return laspy  # the size of compressed points is not known
     available = max(size - points_start, 0) // max(width, 1)
-    has_rest = points < available and minor_version < 3  # later versions may have records after the points
-    if points > available or has_rest:
+    # Versions from 1.3 on may have records after the points.
+    if points > available or (points < available and minor_version < 3):
         raise ValueError(f"expected {points} points by the header, found {available}")
     return laspy

@@ -320,10 +320,7 @@ def parse_ply(content: Content) -> PointTable:
 
 
 def _ply_elements(lines: Sequence[str]) -> tuple[str, list[_Element]]:
-    """Return the byte order ("<", ">", or "" for text) and the elements of the header of a .ply file.
-
-    Raises ValueError for an unknown line: it may be a damaged property, without which later fields would be shifted.
-    """
+    """Return the byte order ("<", ">", or "" for text) and the elements of the header of a .ply file."""
     formats, elements = [], []
     for line in lines:
         match line.split():
@@ -337,7 +334,7 @@ def _ply_elements(lines: Sequence[str]) -> tuple[str, list[_Element]]:
                 elements[-1].properties.append((name, f"list {length_type} {item_type}"))
             case ["property", number_type, *name_words] if elements and name_words:
                 elements[-1].properties.append((" ".join(name_words), number_type))
-            case _:
+            case _:  # perhaps a damaged property, without which the next fields would be shifted
                 raise ValueError(f"expected format, element, property or comment in the header, found {line[:80]!r}")
     if len(formats) != 1 or formats[0] not in PLY_BYTE_ORDERS:
         expected, found = ", ".join(PLY_BYTE_ORDERS), " and ".join(formats)[:80] or "none"

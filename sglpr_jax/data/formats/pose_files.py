@@ -31,10 +31,7 @@ TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
-    """Return the poses (n, 3, 4) of a file with 12 numbers a line: rotation and translation in metres, row-major.
-
-    Raises FileNotFoundError without the file, and ValueError, with the line or row, for numbers that are no pose.
-    """
+    """Return the poses (n, 3, 4) of a file with 12 numbers a line: rotation and translation in metres, row-major."""
     poses = read_rows(path, columns=12).reshape(-1, 3, 4)
     invalid_rows = np.flatnonzero(~are_rotations(poses[:, :, :3]))
     if invalid_rows.size:
@@ -61,7 +58,7 @@ def quaternion_poses(
         lengths = np.linalg.norm(quaternions, axis=1)
     invalid_rows = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
     if invalid_rows.size:
-        found = f"{' '.join(f'{value:g}' for value in quaternions[invalid_rows[0]])}"
+        found = " ".join(f"{value:g}" for value in quaternions[invalid_rows[0]])
         row = f"row {invalid_rows[0] + 1}"
         raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in {row}, found {found}")
     return from_quaternions(positions, quaternions)
@@ -92,10 +89,7 @@ def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]
 
 
 def rows_of_frames(rows: Float[np.ndarray, "m ..."], ids: Sequence[str], *, path: Path) -> Float[np.ndarray, "n ..."]:
-    """Select the row of each frame from all rows of the file `path`. Frame "000052" has row 52, counted from 0.
-
-    Raises ValueError if an id is not a number, or the file has too few rows.
-    """
+    """Select the row of each frame from all rows of the file `path`. Frame "000052" has row 52, counted from 0."""
     misnamed = next((name for name in ids if not name.isdecimal()), None)
     if misnamed is not None:
         raise ValueError(f"{path}: expected frames named by their row, such as 000052, found {misnamed!r}")
@@ -235,13 +229,9 @@ def read_trajectory(
         seconds = read_times(times, unit=time_unit)
         if seconds is not None and len(seconds) != len(positions):
             raise ValueError(f"{times}: expected {len(positions)} times, one per pose, found {len(seconds)}")
-    return Trajectory(
-        positions,
-        seconds,
-        source=f"{Path(*path.parts[-2:])} ({description})",
-        by_row=times is not None,
-        rotations=None if file_format == "csv" else poses[:, :3, :3],
-    )
+    rotations = None if file_format == "csv" else poses[:, :3, :3]
+    source = f"{Path(*path.parts[-2:])} ({description})"
+    return Trajectory(positions, seconds, source, by_row=times is not None, rotations=rotations)
 
 
 def warn_of_heights(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
@@ -255,11 +245,7 @@ def warn_of_heights(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
 
 
 def warn_of_jumps(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path: Path) -> None:
-    """Warn if consecutive scans `ids` are far apart: the scans may have another order than the poses in `path`.
-
-    A step is far if it exceeds `JUMP_M` metres and `JUMP_STEPS` times the median step. If the median step itself
-    exceeds the same limits for the distance to the nearest pose, the whole order is wrong.
-    """
+    """Warn if some or most consecutive scans `ids` are far apart: the poses in `path` may have another order."""
     from scipy.spatial import KDTree  # imported here because the import is slow
 
     if len(positions) < 3:
@@ -267,6 +253,7 @@ def warn_of_jumps(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, pa
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     median_step_m = float(np.median(steps_m))
     jumps = np.count_nonzero(steps_m > max(JUMP_M, JUMP_STEPS * median_step_m))
+    # If the whole order is wrong, most steps are long, but each pose has another one near it.
     nearest_m = KDTree(positions).query(positions, k=2)[0][:, 1]  # column 0 is each pose itself
     median_nearest_m = float(np.median(nearest_m))
     if not jumps and median_step_m <= max(JUMP_M, JUMP_STEPS * median_nearest_m):

@@ -288,10 +288,7 @@ def tracks_of_transforms(transforms: Iterable[tuple[int, StampedPose]]) -> list[
 
 
 def times_on_one_clock(messages: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
-    """Return the times of messages and of scans in seconds, both from headers or both from the recorder.
-
-    Header times are used if they are valid and at least `LEAST_SHARE` of the scans are between two messages.
-    """
+    """Return the times of messages and of scans in seconds: header times, or recorder times if those do not overlap."""
     valid = scans.headers_are_valid and messages.headers_are_valid
     if valid and have_poses(messages.header_s, scans.header_s).mean() >= LEAST_SHARE:
         return messages.header_s, scans.header_s

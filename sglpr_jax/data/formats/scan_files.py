@@ -25,10 +25,7 @@ ARRAY_NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 
 
 def array_scan(path: Path) -> Scan:
-    """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with these fields.
-
-    Raises ValueError for pickled objects and arrays of another type or shape.
-    """
+    """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields."""
     if path.suffix.lower() == ".npz":
         array = _read_npz(path)
     else:

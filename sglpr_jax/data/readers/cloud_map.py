@@ -41,8 +41,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Read a map, and open the scans that its LiDAR would measure at each pose.
 
-    Warns if some poses have no points around them or are on the ground. Raises ValueError without `options.poses`, if
-    no pose has points around it (`_have_points`), or if the map is too large (`tiled_cloud`).
+    Raises ValueError without `options.poses`, if no pose has points around it, or if the map is too large.
     """
     poses = options.poses
     if poses is None:
@@ -88,17 +87,13 @@ def _points_at(cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "4 4"]) ->
 def _have_points(
     cloud: TiledCloud, positions: Float[np.ndarray, "n 3"], root: Path, poses: Path
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the map `root` has points around each position of the file `poses`.
-
-    Warns if some positions have no points. Raises ValueError if all have none: the poses are in another frame.
-    """
+    """Whether the map has points around each position. Warns if some have none, raises ValueError if all have none."""
     from scipy.spatial import KDTree  # imported here because the import is slow
 
     occupied_cells = np.unique(np.round(cloud.points / AROUND_M).astype(np.int32), axis=0)
     has_points = np.zeros(len(positions), bool)
     if len(occupied_cells):
-        cell_centres = KDTree(occupied_cells * AROUND_M)
-        has_points = cell_centres.query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
+        has_points = KDTree(occupied_cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
     map_extent = _describe_extent(cloud.lowest, cloud.highest)
     if not has_points.any():
         pose_extent = _describe_extent(positions.min(axis=0), positions.max(axis=0))
@@ -123,10 +118,7 @@ def _describe_extent(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, 
 def _raise_poses_on_ground(
     cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"], rows: np.ndarray, poses: Path
 ) -> Float[np.ndarray, "n 4 4"]:
-    """If the poses of the file `poses` are on the ground, warn and return them at the height of a LiDAR (1.73 m).
-
-    Other poses are returned unchanged. The height above the ground is estimated from the map at some of the `rows`.
-    """
+    """If the poses (by those in some `rows`) are on the ground, warn and raise them to the height of a LiDAR."""
     sample = rows[np.unique(np.linspace(0, len(rows) - 1, POSES_CHECKED).astype(int))]
     mounting = common_mounting(estimate_mounting(_points_at(cloud, world_from_lidar[row])) for row in sample)
     if mounting is None or abs(mounting.height_m) > LOWEST_M:

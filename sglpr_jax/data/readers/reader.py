@@ -11,10 +11,7 @@ from sglpr_jax.fields import check_value, field_types
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options of `open_recording` that are passed to a reader. A reader ignores options that do not apply to it.
-
-    Raises ValueError if a choice such as `format` is unknown.
-    """
+    """Options of `open_recording` that are passed to a reader. A reader ignores options that do not apply to it."""
 
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"

@@ -45,8 +45,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the point clouds of one topic. If the bag has poses of at least half of the scans, other scans are skipped.
 
-    The bag is read once for the times and once for each topic of poses and of tf. Raises ValueError if the bag is
-    broken, the topic has no messages, or a topic in `options` does not exist or has poses of fewer scans.
+    Raises ValueError if the bag is broken, or if a topic has no messages, does not exist or has poses of fewer scans.
     """
     bag, topic = _recordings(root)[name]
     stamps = bag.read(topic, lambda messages: Stamps.of((time, message.header().time) for time, message in messages))
@@ -129,10 +128,7 @@ def _split_into_drives(bag: RosBag) -> list[RosBag]:
 
 
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar_frame: str) -> Recording:
-    """Add the poses of `topic`, or of the topic that covers most scans, interpolated at the times `scans`.
-
-    Scans without a pose are skipped. If no topic covers half of the scans, the recording has no poses.
-    """
+    """Add the poses of `topic`, or of the topic that covers most scans (at least half), and drop the other scans."""
     transforms = _read_tf_tracks(bag)
     tracks = {name: _read_track(bag, name) for name in bag.topics_of(POSES)}
     for track in transforms:  # tf has poses of the LiDAR if a moving frame is connected with the LiDAR's frame

@@ -68,10 +68,7 @@ def _scan_files(root: Path) -> tuple[Path, ...]:
 def _read_trajectory(
     root: Path, scans: int, options: ReadOptions
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
-    """Return a position (metres) and time (s) for each of `scans` scans, and the source of the poses, None if unknown.
-
-    The files are those in `options`, or else `POSE_FILES` and `TIMES_FILE` in the folder `root`.
-    """
+    """Return positions (m) and times (s) of the scans and the source of the poses, each None if there is no file."""
     files_in_root = [root / name for name in POSE_FILES if (root / name).is_file()]
     if options.poses is None and len(files_in_root) > 1:
         raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in files_in_root)}")
