@@ -39,7 +39,7 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
 
 
 def _checked_laspy(path: Path, *, one_scan: bool) -> ModuleType:
-    """Return the module laspy after a check of the sizes in the header, which laspy would believe.
+    """Check the sizes in the header of a .las file, which laspy does not check, and return the module laspy.
 
     Raises ValueError if the file is shorter than its header declares or, with `one_scan`, has too many points.
     """
