@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, reading of JSON, and errors that name their file."""
+"""Atomic writing of files and folders, reading of JSON, and errors and warnings that name their file."""
 
 import contextlib
 import errno
@@ -9,6 +9,7 @@ import re
 import shutil
 import tempfile
 import uuid
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,15 @@ class WriteError(OSError):
     def __init__(self, path: Path, reason: str):
         super().__init__(f"{path}: cannot be written: {reason}")
         self.path, self.reason = path, reason
+
+
+class DataWarning(UserWarning):
+    """Data can be read but looks wrong. The message names the file, what was expected and what was found."""
+
+
+def warn(message: str) -> None:
+    """Issue a `DataWarning` at the line that called the function which calls `warn`."""
+    warnings.warn(message, DataWarning, stacklevel=3)
 
 
 @contextlib.contextmanager

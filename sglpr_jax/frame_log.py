@@ -13,8 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.data.warning import warn
-from sglpr_jax.files import parse_json, writing
+from sglpr_jax.files import parse_json, warn, writing
 
 HEAD = struct.Struct("<4sIII")
 """Bytes before a record: `MARK`, number, length, and CRC-32 of the record that begins with the CRC of its number."""

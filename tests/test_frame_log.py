@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.files import WriteError
+from sglpr_jax.files import DataWarning, WriteError
 from sglpr_jax.frame_log import HEAD, FrameLog, RunLog
 
 RECORDS = [(0, b"first"), (1, b"second" * 9), (2, b"\0third")]

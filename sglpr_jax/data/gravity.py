@@ -22,8 +22,8 @@ from sglpr_jax.data.mounting import (
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import sampled_points, scan_stream
-from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value, require
+from sglpr_jax.files import warn
 from sglpr_jax.se3 import inverse, travelled
 
 SCANS, SCANS_CHECKED = 11, 3

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Int, UInt64
 from sglpr_jax.data.poses import poses_of_scans, turned_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, check_cloud
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 
 LENGTH_M, KEYFRAME_M = 10.0, 1.0
 """Default travelled distance that a submap covers, and default distance between its scans, in metres."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from sglpr_jax.data.choices import TimeUnit
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 
 PER_SECOND = {"auto": 1.0, "s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """Ticks of each unit in a second. "auto" expects seconds."""

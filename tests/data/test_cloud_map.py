@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, TILE_M, on_trail, remove_hidden_points, tiled_cloud
 from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 
 def plane(x, y, step=0.1):

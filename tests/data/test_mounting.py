@@ -14,7 +14,7 @@ from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting, upright_from_lidar
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.methods.registry import handcrafted

@@ -21,7 +21,7 @@ from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 
 REACH_M = 36.0
 """Maximum distance of a point from the sensor, in metres: the corner of an image of 50 m."""

@@ -29,8 +29,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.times import time_unit_problem
-from sglpr_jax.data.warning import warn
-from sglpr_jax.files import naming
+from sglpr_jax.files import naming, warn
 
 ENDINGS = (".bag", ".mcap", ".db3")
 PAUSE_NS = 60 * 10**9
