@@ -148,7 +148,7 @@ def test_a_tiled_cloud_has_one_point_per_voxel_near_the_trajectory(tmp_path):
     cloud = rng.uniform([-150, -150, -3], [150, 150, 3], (40_000, 3))
     positions = np.array([[0.0, 0, 0], [60, 0, 0]])
     found = tiled_cloud(np.array_split(cloud, 7), positions=positions, reach_m=30.0, source=tmp_path)
-    assert found.read == len(cloud)
+    assert found.total == len(cloud)
     np.testing.assert_array_equal((found.lowest, found.highest), (cloud.min(axis=0), cloud.max(axis=0)))
     everything = {tuple(row) for row in cloud.astype(np.float32).tolist()}
     assert {tuple(row) for row in found.points.tolist()} <= everything

@@ -15,7 +15,7 @@ from sglpr_jax.data.corruption import (
     Corruption,
     corrupt,
     corruption_named,
-    keep_rings,
+    is_on_kept_ring,
     ring_numbers,
 )
 from sglpr_jax.data.corruption import corrupted as corrupted_recording
@@ -112,7 +112,7 @@ def test_points_without_rings_are_refused():
 @pytest.mark.parametrize(("found", "beams", "every"), [(64, 32, 2), (61, 16, 4), (16, 16, 1)])
 def test_every_second_or_fourth_ring_is_kept(found, beams, every):
     rings = np.random.default_rng(0).permutation(np.repeat(np.arange(found), 5))
-    kept = keep_rings(rings, beams)
+    kept = is_on_kept_ring(rings, beams)
     assert sorted(set(rings[kept])) == list(range(0, found, every))
     assert set(rings[~kept]) == set(range(found)) - set(range(0, found, every))
 

@@ -54,7 +54,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     has_points = _have_points(cloud, track.positions, root, poses)
     world_from_lidar = _raise_poses(cloud, track.poses, np.flatnonzero(has_points), poses)
     ids = tuple(f"{row:06d}" for row in range(len(has_points)))
-    used = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
+    used = f"{cloud.total} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
     recording = Recording(
         name=root.stem,
         ids=ids,
