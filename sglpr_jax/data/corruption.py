@@ -229,4 +229,4 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
             points, remaining = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
             return dataclasses.replace(finite.only(remaining), points=points)
 
-    return recording.derived(read)
+    return recording.with_reader(read)

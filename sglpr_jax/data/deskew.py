@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.data.poses import poses_of_scans
+from sglpr_jax.data.poses import checked_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 
@@ -97,7 +97,7 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
     Example:
       recording = sglpr_jax.deskewed(recording, sglpr_jax.read_odometry("odometry.tum"))
     """
-    poses, times = poses_of_scans(recording, world_from_lidar, use=DESKEWED), recording.times
+    poses, times = checked_scan_poses(recording, world_from_lidar, use=DESKEWED), recording.times
     if times is None:
         raise ValueError(f"sequence {recording.name}: expected times of the scans to remove their motion, found none")
     first = _first_readable(recording)
@@ -125,7 +125,7 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
     )
     digest = hashlib.sha256(times.tobytes() + poses.tobytes()).hexdigest()[:16]
     note = f"deskewed: the motion within each scan is removed by its poses{except_for}"
-    return recording.derived(read, options={DESKEWED: digest}).noting(note)
+    return recording.with_reader(read, options={DESKEWED: digest}).with_note(note)
 
 
 def _rows_near(times: Float[np.ndarray, " n"], row: int) -> list[int]:

@@ -83,7 +83,7 @@ def mounted(recording: Recording, height: SensorHeight, *, gravity: Gravity = "a
     else:
         require(height, not isinstance(height, str), "metres above the ground, 'auto' or 'estimate'", "sensor_height")
         mounting = Mounting(float(height))
-        recording = recording.noting(f"sensor: {mounting}, as given", mounting=mounting)
+        recording = recording.with_note(f"sensor: {mounting}, as given", mounting=mounting)
     return with_gravity(recording, recording.mounting or Mounting(MODEL_HEIGHT_M)) if gravity == "scan" else recording
 
 
@@ -104,7 +104,7 @@ def _with_estimated_mounting(recording: Recording, gravity: Gravity) -> Recordin
                 f"the ground is below the sensor in {upright} of {len(estimates)} scans and above it in {upside_down}"
             )
         note = f"sensor: {problem}, assumed {MODEL_HEIGHT_M} m above the ground; set --sensor-height"
-    recording = recording.noting(note, mounting=common)
+    recording = recording.with_note(note, mounting=common)
     mean = common or Mounting(MODEL_HEIGHT_M)
     ups = np.array([mounting.up for mounting in valid if np.dot(mounting.up, mean.up) > 0])
     tilts = common is not None and len(ups) > 0 and _spread_deg(ups, np.array(mean.up)) > FIXED_DEG
@@ -141,7 +141,7 @@ class GroundFilter:
     """
 
     def __init__(self, mean: Mounting, *, spread_deg: float = SPREAD_DEG, spread_m: float = SPREAD_M):
-        """Start at the mean mounting. The spreads are standard deviations of up about each horizontal axis, and height."""
+        """Start at the mean mounting, with standard deviations of up about each horizontal axis and of the height."""
         self.mean = mean
         self.ground_used = 0
         """Number of scans whose ground was used."""
@@ -202,7 +202,7 @@ def with_gravity(recording: Recording, common: Mounting) -> Recording:
         f"gravity: the sensor tilts by {spread_deg:.0f} degrees about its mean; height and tilt of each scan from the "
         f"ground in {ground_filter.ground_used} of {len(estimates)} scans{imu_note}"
     )
-    return recording.noting(note, mountings=mountings, read_ups=None)
+    return recording.with_note(note, mountings=mountings, read_ups=None)
 
 
 def _ups_by_imu(
@@ -245,14 +245,14 @@ def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4
     median = np.median(ups, axis=0)
     angle_deg = _spread_deg(world_ups, mean_world_ups)
     if angle_deg > MOST_UNEXPLAINED * _spread_deg(ups, median / np.linalg.norm(median)):
-        return recording.noting("gravity: the odometry does not show the tilt of the scans; their ground is used")
+        return recording.with_note("gravity: the odometry does not show the tilt of the scans; their ground is used")
     mean_ups = np.einsum("nji,nj->ni", rotations, mean_world_ups).tolist()
     mountings = tuple(
         dataclasses.replace(mounting, up=tuple(up), tilt_deviation_deg=ODOMETRY_TILT_DEG)
         for mounting, up in zip(recording.mountings, mean_ups, strict=True)
     )
     note = f"gravity: tilt of each scan from the odometry and the ground, {angle_deg:.1f} degrees apart"
-    return recording.noting(note, mountings=mountings)
+    return recording.with_note(note, mountings=mountings)
 
 
 def _check_climb(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> None:

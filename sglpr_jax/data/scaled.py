@@ -38,7 +38,7 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans to scale by {scale}, found ready-made images")
     mountings = recording.mountings
-    return recording.derived(
+    return recording.with_reader(
         lambda row, label_path, lasers: scaled_scan(recording.read_row(row, label_path, lasers), scale),
         options={SCALE: str(scale)},
         mounting=_scaled_mounting(recording.mounting, scale),

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt64
 
-from sglpr_jax.data.poses import poses_of_scans, turned_poses
+from sglpr_jax.data.poses import checked_poses, checked_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.files import warn
@@ -68,7 +68,7 @@ class SubmapBuilder:
         Raises ValueError if the scan shows no place (`check_cloud`), or if the pose has no rotation.
         """
         check_cloud(points)
-        pose = turned_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
+        pose = checked_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
         newest, *older = self._window.add(pose)
         self._scans = {newest: (_thinned(Scan(points=points)), pose), **{row: self._scans[row] for row in older}}
         return _merged(*zip(*self._scans.values(), strict=True)).cloud
@@ -99,7 +99,7 @@ def submaps(
     if length_m == 0:
         return recording
     window = _Window(length_m, keyframe_m)
-    poses = poses_of_scans(recording, world_from_lidar, use=SUBMAPS)
+    poses = checked_scan_poses(recording, world_from_lidar, use=SUBMAPS)
     members = [window.add(pose) for pose in poses]
 
     @lru_cache(maxsize=max(map(len, members), default=1))
@@ -124,7 +124,7 @@ def submaps(
 
     digest = hashlib.sha256(poses.tobytes()).hexdigest()[:16]
     note = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
-    return recording.derived(read, options={SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}).noting(note)
+    return recording.with_reader(read, options={SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}).with_note(note)
 
 
 class _Window:

@@ -22,7 +22,7 @@ from sglpr_jax.data.formats.ros_messages import (
     times_on_one_clock,
     tracks_of,
 )
-from sglpr_jax.data.poses import LEAST_SHARE, have_poses, interpolate_poses, left_out
+from sglpr_jax.data.poses import LEAST_SHARE, have_poses, interpolate_poses, missing_poses_note
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
@@ -153,7 +153,7 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     return dataclasses.replace(
         recording if len(rows) == len(recording) else only(recording, rows.tolist()),
         positions=poses[:, :3, 3],
-        pose_source=f"{used} ({track}, {how}{left_out(covered[used])})",
+        pose_source=f"{used} ({track}, {how}{missing_poses_note(covered[used])})",
         world_from_lidar=poses if track.turned else None,
     )
 
@@ -222,7 +222,7 @@ def _ups(
     stamps, times = times_on_one_clock(recorded, scans)
     try:
         with naming(source):
-            ups, how = imu.at(stamps).ups(times)
+            ups, how = imu.with_times(stamps).ups(times)
     except ValueError as error:
         if required:
             raise
