@@ -17,7 +17,7 @@ from sglpr_jax.bev import (
     rotate_image,
     rotate_labels,
     rotate_points,
-    uncropped,
+    uncrop_labels,
 )
 from sglpr_jax.grid import Grid
 
@@ -221,11 +221,11 @@ def test_labels_turn_to_the_nearest_cell(labels, turns):
 def test_what_was_cropped_lies_where_it_was(shape, kept):
     labels = np.random.default_rng(0).integers(1, 20, shape).astype(np.int32)
     crop = np.array(centre_crop(even_cells(jnp.asarray(labels)), height=4, width=4))
-    whole = uncropped(crop, shape=shape)
+    whole = uncrop_labels(crop, shape=shape)
     assert whole.shape == shape and (whole > 0).sum() == kept
     np.testing.assert_array_equal(whole, np.where(whole > 0, labels, 0))
     crop[1], crop[2] = 0, 7
-    assert (uncropped(crop, shape=shape)[shape[0] // 2] == 7).sum() == (shape[1] % 2 == 0) + 3
+    assert (uncrop_labels(crop, shape=shape)[shape[0] // 2] == 7).sum() == (shape[1] % 2 == 0) + 3
 
 
 def test_the_centre_is_cropped():

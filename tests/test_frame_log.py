@@ -24,7 +24,7 @@ def read(path) -> tuple[list[tuple[int, bytes]], int]:
     log = FrameLog(path)
     found = list(log.records())
     log.close()
-    return found, log.cut
+    return found, log.removed_bytes
 
 
 def test_wherever_it_was_cut_whole_records_stay_and_more_can_follow(path):
@@ -34,7 +34,7 @@ def test_wherever_it_was_cut_whole_records_stay_and_more_can_follow(path):
         whole = [record for record, end in zip(RECORDS, ENDS, strict=True) if end <= size]
         assert read(path) == (whole, size - ([0, *ENDS][len(whole)]))
         log = FrameLog(path)
-        assert list(log.records()) == whole and log.cut == 0
+        assert list(log.records()) == whole and log.removed_bytes == 0
         log.append(7, b"more")
         assert read(path) == ([*whole, (7, b"more")], 0)
 
