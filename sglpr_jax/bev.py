@@ -67,11 +67,7 @@ def rasterize(
 
 @functools.partial(jax.jit, static_argnames="grid")
 def rasterize_labels(
-    points: Float[Array, "*b n 3"],
-    labels: Int[Array, "*b n"],
-    *,
-    grid: Grid,
-    count: Int[Array, "*b"] | None = None,
+    points: Float[Array, "*b n 3"], labels: Int[Array, "*b n"], *, grid: Grid, count: Int[Array, "*b"] | None = None
 ) -> Int[Array, "*b {grid.height} {grid.width}"]:
     """Return the label of the last point in each cell, or 0 for empty cells: the map B^S of equation 1."""
     cells = _cell_of_point(points, grid, count)

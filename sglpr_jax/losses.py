@@ -58,11 +58,7 @@ def lazy_triplet(
 
 
 def one_threshold(
-    positive: Float[Array, "t p"],
-    negative: Float[Array, "t n"],
-    *,
-    where: Bool[Array, "t n"],
-    **options: Any,
+    positive: Float[Array, "t p"], negative: Float[Array, "t n"], *, where: Bool[Array, "t n"], **options: Any
 ) -> Float[Array, "t"]:
     """Lazy triplet loss, with the options of `lazy_triplet`, in which every anchor has the negatives of all anchors.
 

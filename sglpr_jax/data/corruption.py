@@ -190,11 +190,7 @@ def corruption_named(name: str) -> Corruption:
 
 
 def corrupt(
-    points: Cloud,
-    corruption: Corruption,
-    *,
-    rng: np.random.Generator,
-    lasers: Int[np.ndarray, " n"] | None = None,
+    points: Cloud, corruption: Corruption, *, rng: np.random.Generator, lasers: Int[np.ndarray, " n"] | None = None
 ) -> tuple[Float32[np.ndarray, "m 3"], Bool[np.ndarray, " n"]]:
     """Corrupt the finite points of a scan, in metres in the LiDAR frame. `lasers` are their laser numbers, if known.
 

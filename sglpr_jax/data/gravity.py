@@ -12,13 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import Gravity, SensorHeight
-from sglpr_jax.data.mounting import (
-    MODEL_HEIGHT_M,
-    Mounting,
-    common_mounting,
-    estimate_mounting,
-    upright_from_lidar,
-)
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting, upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import sampled_points, scan_stream
