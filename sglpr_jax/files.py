@@ -58,9 +58,7 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
 def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> list[Path]:
     """Write several files of a folder, and return their paths. All are complete before the first one is replaced.
 
-    Arguments:
-      folder: Folder of the files.
-      files: For each file name, a function that writes the content to the path that it receives.
+    `files` has, for each file name, a function that writes the content to the path that it receives.
 
     Raises WriteError if a file cannot be written. All files in the folder then stay as they were.
     """

@@ -40,7 +40,7 @@ class FrameLog:
         self._size = os.fstat(self._file).st_size
 
     def records(self) -> Iterator[tuple[int, bytes]]:
-        """Yield number and content of each whole record, then remove the rest of the file after the last one.
+        """Yield number and content of each whole record, then remove the bytes after the last one.
 
         Raises ValueError if the file is no log.
         """
@@ -109,13 +109,10 @@ class RunLog:
     """
 
     def __init__(self, path: Path | None, settings: Mapping[str, Any]):
-        """Open or create a log. If the log has other settings, issue a `DataWarning` and delete its records.
+        """Open or create a log. `settings` are the JSON values that determine the steps. `path` None stores nothing.
 
-        Arguments:
-          path: File of the log, or None to store nothing.
-          settings: JSON values that determine the steps.
-
-        Raises ValueError if the file is no log, WriteError if it cannot be written.
+        Records of other settings are deleted, with a `DataWarning`. Raises ValueError if the file is no log, WriteError
+        if it cannot be written.
         """
         self.records: list[bytes] = []
         """Steps of an earlier process."""

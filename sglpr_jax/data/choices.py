@@ -3,21 +3,9 @@ readers."""
 
 from typing import Literal
 
-RecordFormat = Literal[
-    "kitti",
-    "nuscenes",
-    "nclt",
-    "float32x3",
-    "float32x4",
-    "float32x5",
-    "float32x6",
-    "float32x7",
-    "float32x8",
-    "float64x3",
-    "float64x4",
-    "float64x5",
-    "float64x6",
-]
+_Float32 = Literal["float32x3", "float32x4", "float32x5", "float32x6", "float32x7", "float32x8"]
+_Float64 = Literal["float64x3", "float64x4", "float64x5", "float64x6"]
+RecordFormat = Literal["kitti", "nuscenes", "nclt", _Float32, _Float64]
 """Format of a point in a .bin file. `kitti` is `float32x4`. `nuscenes` is `float32x5` with other axes and the laser
 number in the last column."""
 ScanFormat = Literal["auto", "pcd", "ply", "npy", "npz", "las", RecordFormat]

@@ -55,22 +55,16 @@ def ring_numbers(
 
 
 def is_on_kept_ring(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
-    """Whether each point remains if the sensor has only `beams` lasers: of 64 rings, every 2nd for 32 lasers.
+    """Whether each point remains if only `beams` lasers are kept: every 2nd of 64 for 32 lasers, every 4th for 16.
 
-    Arguments:
-      rings: Ring of each point (`ring_numbers`). As some lasers may have no returns, the number of lasers is the number
-        of rings rounded up to a power of two.
-      beams: Number of lasers to keep.
+    The number of rings is rounded up to a power of two, because some lasers may have no returns.
     """
     lasers = 2 ** math.ceil(math.log2(int(rings.max(initial=0)) + 1))
     return rings % max(lasers // beams, 1) == 0
 
 
 def _groups_by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | None:
-    """Group of each point, from 0 at the lowest elevation, in degrees. Gaps above `GAP_DEG` separate the groups.
-
-    Returns None if a group is wider than `GAP_DEG`, so that gaps do not separate the rings.
-    """
+    """Group of each point between gaps of elevation, in degrees, or None if a group is wider than `GAP_DEG`."""
     order = np.argsort(elevation)
     sorted_elevation = elevation[order]
     starts = np.flatnonzero(np.diff(sorted_elevation, prepend=-np.inf) > GAP_DEG)
@@ -207,9 +201,8 @@ def corrupt(
 def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:
     """Return the recording with every scan corrupted when it is read. Equal seeds and rows give equal scans.
 
-    Labels and lasers stay with their points. Points that are not finite and the times of points are removed.
-
-    Raises ValueError for a recording of images.
+    Labels and lasers stay with their points. Points that are not finite and the times of points are removed. Raises
+    ValueError for a recording of images.
     """
     if recording.has_images:
         raise ValueError(

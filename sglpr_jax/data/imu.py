@@ -50,12 +50,11 @@ class Imu:
         """Return the direction of up in the frame of the IMU at some times, and a description of its source.
 
         The orientations are used if they exist and agree with the accelerations. Rows are NaN at times without samples.
-
         Raises ValueError if there are no orientations and the accelerations do not contain gravity.
         """
         norms = np.linalg.norm(self.accelerations, axis=1)
-        median = float(np.median(norms[np.isfinite(norms)])) if np.isfinite(norms).any() else 0.0
-        has_gravity = any(abs(median / unit - 1) <= SAME_GRAVITY for unit in (STANDARD_GRAVITY, 1.0))
+        norm = float(np.median(norms[np.isfinite(norms)])) if np.isfinite(norms).any() else 0.0
+        has_gravity = any(abs(norm / unit - 1) <= SAME_GRAVITY for unit in (STANDARD_GRAVITY, 1.0))
         ups_by_gravity = self._ups_by_gravity(times) if has_gravity else None
         if self.quaternions is not None:
             ups_by_orientation = self._ups_by_orientation(times)
@@ -66,9 +65,7 @@ class Imu:
             if not len(angles) or np.degrees(np.median(angles)) <= SAME_UP_DEG:
                 return ups_by_orientation, "its orientation"
         if ups_by_gravity is None:
-            raise ValueError(
-                f"expected accelerations with gravity, of 9.8 m/s^2 or 1 g, found a median of {median:.3g}"
-            )
+            raise ValueError(f"expected accelerations with gravity, of 9.8 m/s^2 or 1 g, found a median of {norm:.3g}")
         return ups_by_gravity, "its accelerometer and gyroscope"
 
     def _ups_by_orientation(self, times: Float[np.ndarray, " q"]) -> Float[np.ndarray, "q 3"]:
@@ -102,15 +99,10 @@ def _ups_by_averaging(
     *,
     times: Float[np.ndarray, " q"],
 ) -> Float[np.ndarray, "q 3"]:
-    """Up at some times, by averaging accelerations in a frame that does not turn: that of the first sample.
+    """Up at `times`, from samples at `stamps` with angular velocities `rates` (rad/s). Both times are in seconds.
 
-    A line is fitted to the accelerations of `AVERAGED_S`, so that a constant bias of the gyroscope cancels.
-
-    Arguments:
-      stamps: Times of the samples without a gap, in seconds.
-      rates: Angular velocities of the samples, in radians per second.
-      accelerations: Accelerations of the samples, in any unit.
-      times: Times of the result, in seconds.
+    Accelerations are averaged in a frame that does not turn: that of the first sample. A line is fitted to those of
+    `AVERAGED_S`, so that a constant bias of the gyroscope cancels.
     """
     from scipy.signal import savgol_filter  # imported here because the imports are slow
     from scipy.spatial.transform import Rotation

@@ -39,7 +39,7 @@ MOST_POINTS = 6000
 TRIALS = 400
 """Number of point triples that RANSAC samples if nothing is known about the mounting."""
 NEAR_TRIALS, NEAR_POINTS = 150, 2000
-"""Numbers of point triples and of points in RANSAC if the mounting is known approximately."""
+"""Numbers of point triples and of points in RANSAC if the mounting is approximately known."""
 UPSIDE_DOWN = 2.0
 """Minimum ratio of ground points above a sensor to those below if it hangs upside down. It exceeds 1 because rooms have
 ceilings."""
@@ -204,10 +204,7 @@ def _sampled_planes(
 def _fitted_mounting(
     points: Float[np.ndarray, "n 3"], is_ground: Bool[np.ndarray, " n"], up: Float[np.ndarray, "3"]
 ) -> Mounting | None:
-    """Fit a plane to the ground points by least squares and select the ground points again, four times.
-
-    Returns None if the ground has too few points, is too steep, or is at an impossible height.
-    """
+    """Fit a plane to the ground points and select the ground points again, four times. None if it is no ground."""
     normal, centre = up, np.zeros(3)
     for _ in range(4):
         if is_ground.sum() < LEAST_POINTS or is_ground.mean() < LEAST_SHARE:

@@ -28,18 +28,11 @@ class Stacked:
     """Arrays in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`."""
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        dtype: str,
-        row: Sequence[int],
-        offsets: Sequence[int],
-        checksums: Sequence[int] | None = None,
+        self, path: Path, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int] | None = None
     ):
-        """Map a file that `_write_arrays` wrote, with the layout that it returned: type, shape of a row, offsets.
+        """Map a file and its layout as returned by `_write_arrays`. Packs of older versions have no checksums.
 
-        Packs of older versions have no checksums. Raises ValueError if the layout is invalid or contradicts the size of
-        the file, because access beyond its end would kill the process.
+        Raises ValueError if the layout contradicts the file. Access beyond the end of the file would kill the process.
         """
         if any(type(n) is not int for n in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
             raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
@@ -81,12 +74,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     """Return the same recording, read from its pack in `folder`. If there is no pack, it is created first.
 
     Points, labels and images are bitwise equal to those of the files, and read-only. Lasers, and the labels of images,
-    still come from the files.
-
-    Arguments:
-      recording: Recording as opened by a reader.
-      folder: Folder of the packs.
-      on_progress: Called with the number of packed scans.
+    still come from the files. `on_progress` is called with the number of packed scans.
 
     Raises ValueError if the pack is damaged, or if `recording` does not return the content of its files (`on_disk`).
     """
@@ -138,11 +126,10 @@ def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int
     with contextlib.ExitStack() as opened:
         for i in range(len(recording)):
             for name, array in _arrays(recording, i).items():
-                path = folder / f"{name}.bin"
-                dtype, row_shape = array.dtype.str, array.shape[1:]
-                new = {"dtype": dtype, "row": row_shape, "offsets": [0], "checksums": []}
-                layout = layouts.setdefault(name, new)
-                if (layout["dtype"], layout["row"]) != (dtype, row_shape):
+                path, row_shape = folder / f"{name}.bin", array.shape[1:]
+                layout = {"dtype": array.dtype.str, "row": row_shape, "offsets": [0], "checksums": []}
+                layout = layouts.setdefault(name, layout)
+                if (layout["dtype"], layout["row"]) != (array.dtype.str, row_shape):
                     raise ValueError(
                         f"scan {recording.ids[i]} of sequence {recording.name}: expected {layout['dtype']} with rows "
                         f"of shape {layout['row']}, like the first array of the pack, found {array.dtype} {row_shape}"
@@ -169,7 +156,7 @@ def _close(stream: IO) -> None:
 
 
 def _sync(stream: IO) -> None:
-    """Write a file to disk. If its folder were renamed before, a power failure could leave an incomplete pack."""
+    """Flush a file to disk. If its folder were renamed before, a power failure could leave an incomplete pack."""
     stream.flush()
     os.fsync(stream.fileno())
 
@@ -186,10 +173,7 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
 
 
 def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
-    """Return the arrays of a pack by name.
-
-    Raises ValueError, with the folder, if the pack is damaged or has another number of `scans`.
-    """
+    """Return the arrays of a pack by name. Raises ValueError if the pack is damaged or has not this number of scans."""
     try:
         layouts = read_json(folder / ABOUT_FILE)["arrays"]
         for name, layout in layouts.items():

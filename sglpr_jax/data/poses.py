@@ -65,11 +65,9 @@ def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
 
 
 def have_poses(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
-    """Whether a pose can be interpolated at each of `times`: the poses before and after it are near in time.
+    """Whether a pose can be interpolated at each of `times`: the poses around it are at most `widest_gap_s` apart.
 
-    Arguments:
-      stamps: Times of the poses in seconds, in any order. Their maximum step is `widest_gap_s`.
-      times: Times in seconds, up to `BEYOND_S` before the first or after the last pose.
+    `stamps` are the times of the poses in seconds, in any order. A time may be up to `BEYOND_S` before or after them.
     """
     stamps = np.unique(stamps)
     if len(stamps) < 2:
@@ -166,10 +164,7 @@ def missing_poses_note(has_pose: Bool[np.ndarray, " n"]) -> str:
 
 
 def _row_by_row_note(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
-    """Describe the match of pose i and scan i by their times `stamps` and `times`. None if they contradict the match.
-
-    The description is empty if the times are equal or unknown.
-    """
+    """Describe how pose i fits scan i by their times, or return None if it does not. "" for equal or unknown times."""
     if stamps is None or times is None:
         return ""
     offsets = times - stamps

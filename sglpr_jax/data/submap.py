@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt64
@@ -36,8 +35,7 @@ AZIMUTHS = round(360 / DIRECTION_DEG)
 ROW_BITS = 22
 """Number of bits for the row of a point in a sorted key. A submap has at most 4 million points before it is thinned."""
 VOXEL_OFFSET = 2**13
-"""Number added to voxel numbers to make them positive. Points more than this number of voxels from the sensor are
-dropped."""
+"""Number added to voxel numbers to make them positive. Points farther away than this number of voxels are dropped."""
 DISTANCE_BITS = 20
 """Number of bits for a distance in steps of 2 mm, up to 2 km."""
 SUBMAPS = "submaps"
@@ -89,8 +87,7 @@ def submaps(
 ) -> Recording:
     """Return a recording whose scan i is the submap that ends at scan i, in the frame of scan i.
 
-    A submap is built when it is read, without laser numbers. If an older scan cannot be read, it is left out, with a
-    `DataWarning`.
+    Submaps are built when they are read. An older scan that cannot be read is left out, with a `DataWarning`.
 
     Arguments:
       recording: Recording of scans.
@@ -130,9 +127,8 @@ def submaps(
 
     digest = hashlib.sha256(poses.tobytes()).hexdigest()[:16]
     note = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
-    return recording.with_reader(read_submap, options={SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}).with_note(
-        note
-    )
+    options = {SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}
+    return recording.with_reader(read_submap, options=options).with_note(note)
 
 
 class _KeyframeWindow:
@@ -144,7 +140,9 @@ class _KeyframeWindow:
                 raise ValueError(f"submaps: expected {name} in metres, more than 0, found {value}")
         self._length_m, self._keyframe_m = length_m, keyframe_m
         self._frames = 0
-        self._keyframes: deque[_Keyframe] = deque(maxlen=math.ceil(length_m / keyframe_m) + KEYFRAMES_PER_TURN)
+        most = math.ceil(length_m / keyframe_m) + KEYFRAMES_PER_TURN
+        self._keyframes: deque[tuple[int, float, Float[np.ndarray, "4 4"]]] = deque(maxlen=most)
+        """Frame number, travelled distance in metres and pose of each keyframe."""
 
     def add(self, pose: Float[np.ndarray, "4 4"]) -> tuple[int, ...]:
         """Add the next frame. Returns its number, then those of the keyframes in the window, the newest first."""
@@ -152,22 +150,13 @@ class _KeyframeWindow:
         self._frames += 1
         step_m, turn_deg, path_m = math.inf, 0.0, 0.0  # the first frame is a keyframe
         if self._keyframes:
-            last = self._keyframes[-1]
-            step_m, turn_deg = _distance_and_angle(last.pose, pose)
-            path_m = last.path_m + step_m
-        in_window = [key.frame for key in reversed(self._keyframes) if path_m - key.path_m <= self._length_m]
+            _, last_path_m, last_pose = self._keyframes[-1]
+            step_m, turn_deg = _distance_and_angle(last_pose, pose)
+            path_m = last_path_m + step_m
+        in_window = [row for row, row_path_m, _ in reversed(self._keyframes) if path_m - row_path_m <= self._length_m]
         if step_m >= self._keyframe_m or turn_deg >= KEYFRAME_DEG:
-            self._keyframes.append(_Keyframe(frame, path_m, pose))
+            self._keyframes.append((frame, path_m, pose))
         return (frame, *in_window)
-
-
-class _Keyframe(NamedTuple):
-    """Keyframe of a `_KeyframeWindow`."""
-
-    frame: int
-    path_m: float
-    """Travelled distance up to the keyframe, in metres."""
-    pose: Float[np.ndarray, "4 4"]
 
 
 def _distance_and_angle(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> tuple[float, float]:

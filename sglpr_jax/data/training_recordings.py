@@ -13,7 +13,7 @@ from sglpr_jax.files import file_name
 def leave_one_out(
     root: Path, test: str, *, train: Sequence[str] = (), **options: Any
 ) -> tuple[list[Recording], Recording]:
-    """Open the training recordings and the test recording of a dataset.
+    """Open the training recordings and the test recording of a dataset. All must have positions.
 
     Arguments:
       root: Folder of the dataset.
@@ -21,8 +21,7 @@ def leave_one_out(
       train: Names of the training recordings, by default all except `test`.
       options: Options of `open_recording`.
 
-    Raises FileNotFoundError, or ValueError if a recording has no positions, if `test` is among the training recordings,
-    or if no training recording remains.
+    Raises FileNotFoundError, or ValueError if `test` is among the training recordings or no training recording remains.
     """
     test_recording = open_recording(root, test, **options)
     names = tuple(train) or tuple(name for name in recording_names(root) if name != test)
@@ -36,10 +35,7 @@ def leave_one_out(
 
 
 def all_recordings(root: Path, **options: Any) -> list[Recording]:
-    """Open every recording of a dataset with the options of `open_recording`.
-
-    Raises ValueError if a recording has no positions.
-    """
+    """Open every recording of a dataset with the options of `open_recording`. All must have positions."""
     recordings = [open_recording(root, name, **options) for name in recording_names(root)]
     _check_positions(root, recordings)
     return recordings
@@ -55,9 +51,8 @@ def _check_positions(root: Path, recordings: Sequence[Recording]) -> None:
 def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:
     """Return the recordings, with label images from `folder` added to recordings of images without labels.
 
-    The folder has a label image `06/000000.png` for image 000000 of recording 06, as written by `bin/segment`.
-
-    Raises FileNotFoundError if the folder has no label image for any of them.
+    The folder has a label image `06/000000.png` for image 000000 of recording 06, as written by `bin/segment`. Raises
+    FileNotFoundError if it has no label image for any of them.
     """
     names = []  # of the recordings of images without labels
     results, has_added = [], False
