@@ -176,9 +176,9 @@ def _shortened(text: str, *, most: int) -> str:
 
 @contextlib.contextmanager
 def writing(path: Path, *replaced: Path) -> Iterator[None]:
-    """Context manager that converts an OSError to a WriteError which names `path`.
+    """Context manager that raises WriteError with `path` for an OSError that names no file, as of a full disk.
 
-    It converts errors that name no file, as of a full disk, or one of the paths `replaced`. Other errors are unchanged.
+    An error that names one of the paths `replaced` is converted, too. Other errors are unchanged.
     """
     try:
         yield
@@ -224,10 +224,7 @@ def _hidden_path(path: Path) -> Path:
 
 
 def _rename(source: Path, target: Path, *, keep: bool) -> None:
-    """Rename `source` to `target`. A folder with files at `target` is replaced, or stays with `keep`.
-
-    Other processes may rename to the same target at the same time.
-    """
+    """Rename `source` to `target`, as others may do at once. A folder at `target` is replaced, or stays with `keep`."""
     while True:
         try:
             return os.replace(source, target)

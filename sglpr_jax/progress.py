@@ -26,14 +26,8 @@ def progress_bar(title: str, total: int) -> Iterator[Callable[..., None]]:
     from rich.console import Console  # slow imports, not needed without a bar
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    console, text_column = Console(stderr=True), TextColumn("{task.fields[text]}")
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, text_column, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(printable(title), total=total, text="")
         yield lambda done, text="": progress.update(task, completed=done, text=text)

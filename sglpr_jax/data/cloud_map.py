@@ -28,7 +28,7 @@ _NEIGHBOUR_STEPS = tuple(row * _CELLS_PER_ROW + column for row in (-1, 0, 1) for
 def on_trail(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Return whether each point of a map (in metres, z up) belongs to the trail of a moving object.
 
-    A trail is above a cell of flat ground whose eight neighbours are ground, too, and contain no tall object.
+    A trail is `LOWEST_M` to `HIGHEST_M` above a cell of flat ground. Its neighbours are ground without a tall object.
     """
     if not len(points):
         return np.zeros(0, bool)
@@ -93,7 +93,7 @@ def _are_hidden(
 ) -> Bool[np.ndarray, " n"]:
     """Whether a nearer point hides each point in a z-buffer. The angles are in degrees, from 0.
 
-    Each point hides others in cells of one size: the smallest ones in which it has neighbours, or the largest ones.
+    Each point hides others in cells of one size, the smallest that span `SPACINGS` times the angle to its neighbours.
     """
     least_edge_deg = np.degrees(SPACINGS * spacing_m / ranges)
     is_hidden = np.zeros(len(ranges), bool)
@@ -201,7 +201,7 @@ def tiled_cloud(
         points -= origin
         near_points = points[np.isin(_tile_numbers(points[:, :2]), near_tiles)].astype(np.float32)
         pending.append(_one_per_voxel(near_points))
-        if sum(map(len, pending)) > len(stored):  # not for each block: merging sorts all stored points
+        if sum(map(len, pending)) > len(stored):  # not for each block: this sorts all points
             stored, pending = _merged([stored, *pending], source), []
     stored = _merged([stored, *pending], source)
     stored = stored[~on_trail(stored)]

@@ -77,7 +77,8 @@ def _groups_by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, 
 
 
 Cloud = Float32[np.ndarray, "n 3"]
-Corrupt = Callable[[Cloud, float, np.random.Generator, Int[np.ndarray, " n"] | None], Cloud | Bool[np.ndarray, " n"]]
+Lasers = Int[np.ndarray, " n"] | None
+Corrupt = Callable[[Cloud, float, np.random.Generator, Lasers], Cloud | Bool[np.ndarray, " n"]]
 """Function of finite points (n, 3), strength, random generator and laser numbers, if known. It returns either a mask of
 the points that remain, or all points at new positions."""
 
@@ -99,9 +100,7 @@ def occlude(points: Cloud, degrees: float, rng: np.random.Generator, lasers: obj
     return np.abs(wrap_angle(azimuth - heading)) >= np.radians(degrees) / 2
 
 
-def remove_beams(
-    points: Cloud, beams: float, rng: np.random.Generator, lasers: Int[np.ndarray, " n"] | None
-) -> Bool[np.ndarray, " n"]:
+def remove_beams(points: Cloud, beams: float, rng: np.random.Generator, lasers: Lasers) -> Bool[np.ndarray, " n"]:
     """Return a mask of the points of evenly spaced lasers, `beams` in number."""
     return is_on_kept_ring(ring_numbers(points, lasers=lasers), int(beams))
 
@@ -184,7 +183,7 @@ def corruption_named(name: str) -> Corruption:
 
 
 def corrupt(
-    points: Cloud, corruption: Corruption, *, rng: np.random.Generator, lasers: Int[np.ndarray, " n"] | None = None
+    points: Cloud, corruption: Corruption, *, rng: np.random.Generator, lasers: Lasers = None
 ) -> tuple[Float32[np.ndarray, "m 3"], Bool[np.ndarray, " n"]]:
     """Corrupt the finite points of a scan, in metres in the LiDAR frame. `lasers` are their laser numbers, if known.
 

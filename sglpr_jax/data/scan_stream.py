@@ -69,13 +69,9 @@ def check_readable(recording: Recording, readable: int) -> None:
 
 
 def require_content(method: str, takes: str, recording: Recording, *, every_label: bool = False) -> None:
-    """Raise ValueError if a recording lacks the points or labels that a method needs.
+    """Raise ValueError if a recording lacks the points or labels that a method needs: `takes`, e.g. "labelled points".
 
-    Arguments:
-      method: Name of the method, for messages.
-      takes: Input of the method (`Method.takes`): "images", "points" or the same after "labelled ".
-      recording: Scans or images to read.
-      every_label: Whether every scan must have labels. Otherwise one label file suffices.
+    With `every_label`, every scan must have labels. Otherwise one label file suffices.
     """
     if takes.endswith("points") and recording.has_images:
         raise ValueError(f"{method} needs points, found only images in sequence {recording.name}; use polar-fft")
@@ -96,8 +92,7 @@ def _pending_results(
 ) -> Iterator[tuple[int, Callable[[], T]]]:
     """Yield each row and a function that returns the result of `compute` for the row, or raises the error.
 
-    This thread reads the files, because not every file can be read in parallel. If `ahead` is not 0, other threads call
-    `compute`.
+    This thread reads the files, because not every file can be read in parallel. With `ahead`, other threads compute.
     """
 
     def check_and_compute(row: int, scan: Scan) -> T:

@@ -123,9 +123,8 @@ def image_view(
         rotated = uncropped if angle is None else rotate(jnp.asarray(uncropped), angle)
         return rotated if grid is None else centre_crop(rotated, height=grid.height, width=grid.width)
 
-    return View(
-        rotate_and_crop(image, rotate_image), None if classes is None else rotate_and_crop(classes, rotate_labels)
-    )
+    classes = None if classes is None else rotate_and_crop(classes, rotate_labels)
+    return View(rotate_and_crop(image, rotate_image), classes)
 
 
 def cloud_view(
