@@ -27,7 +27,7 @@ def read(path) -> tuple[list[tuple[int, bytes]], int]:
     return found, log.removed_bytes
 
 
-def test_wherever_it_was_cut_whole_records_stay_and_more_can_follow(path):
+def test_a_log_cut_at_any_byte_keeps_whole_records_and_continues(path):
     content = path.read_bytes()
     for size in range(4, len(content) + 1):
         path.write_bytes(content[:size])
@@ -39,7 +39,7 @@ def test_wherever_it_was_cut_whole_records_stay_and_more_can_follow(path):
         assert read(path) == ([*whole, (7, b"more")], 0)
 
 
-def test_wherever_a_byte_is_damaged_the_other_records_stay(path):
+def test_a_damaged_byte_loses_one_record_only(path):
     content = path.read_bytes()
     for at in range(len(content)):
         path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
@@ -47,14 +47,14 @@ def test_wherever_a_byte_is_damaged_the_other_records_stay(path):
         assert read(path)[0] == [record for record in RECORDS if record[0] != damaged]
 
 
-def test_another_file_is_refused_and_stays(path):
+def test_a_file_that_is_no_log_is_refused_and_unchanged(path):
     path.write_bytes(b"something else")
     with pytest.raises(ValueError, match=r"frames\.log: expected a log of frames, found another file"):
         read(path)
     assert path.read_bytes() == b"something else"
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_an_unwritable_log_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(WriteError, match="file"):
         FrameLog(tmp_path / "file" / "frames.log")

@@ -40,7 +40,7 @@ STREET = plane((-5, 5), (-5, 5))
         (STREET[np.abs(STREET).max(axis=1) > 1], sheet((-0.9, 0.9), (0.2, 1.5)), False),  # it stayed
     ],
 )
-def test_low_things_on_ground_that_was_seen_are_removed(ground, thing, moved):
+def test_low_objects_on_visible_ground_are_removed(ground, thing, moved):
     points = np.concatenate([ground, thing]).astype(np.float32)
     found = on_trail(points)
     assert not found[: len(ground)].any()
@@ -59,7 +59,7 @@ def as_rows(points):
     return {tuple(row) for row in points.tolist()}
 
 
-def test_agreement_with_a_plain_loop():
+def test_hidden_points_agree_with_a_plain_loop():
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(400, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]

@@ -88,13 +88,13 @@ def turn(elevations_deg, *, azimuths=90, wobble_deg=0.0, seed=0):
 @pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 64))
-def test_elevations_that_stand_apart_tell_the_ring_in_any_order(seed, rings):
+def test_separate_elevations_give_the_rings_in_any_order(seed, rings):
     points, expected = turn(HDL64E_DEG[:rings], seed=seed)
     order = np.random.default_rng(seed).permutation(len(points))
     np.testing.assert_array_equal(ring_numbers(points[order]), expected[order])
 
 
-def test_rings_that_waver_are_told_by_the_order_of_the_points_or_by_laser_numbers_in_any_order():
+def test_overlapping_rings_are_separated_by_the_order_of_points_or_laser_numbers():
     points, expected = turn(HDL64E_DEG, wobble_deg=0.5)
     sample = np.random.default_rng(0).random(len(points)) < 0.7
     np.testing.assert_array_equal(ring_numbers(points[sample]), expected[sample])

@@ -98,7 +98,7 @@ def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
 
 @settings(max_examples=25, deadline=None)
 @given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda up: np.linalg.norm(up) > 0.1), st.floats(0, 4))
-def test_levelling_is_rigid_and_turns_up_to_z(up, height):
+def test_level_is_rigid_and_rotates_up_to_z(up, height):
     unit = np.array(up) / np.linalg.norm(up)
     mounting = Mounting(height, tuple(unit.tolist()))
     rotation = upright_from_lidar(mounting)[:3, :3]
