@@ -183,7 +183,7 @@ def with_gravity(recording: Recording, common: Mounting) -> Recording:
     deviations = np.array([_deviation(mounting, common) for mounting in valid])
     median = np.median(deviations, axis=0)
     mean = _mounting_at(common, median, 0.0, 0.0)
-    spread = 1.4826 * np.median(np.abs(deviations - median), axis=0)  # the standard deviation of a normal distribution
+    spread = 1.4826 * np.median(np.abs(deviations - median), axis=0)  # a robust standard deviation
     ground_filter = GroundFilter(
         mean,
         spread_deg=max(float(np.degrees(spread[:2].max())), LEAST_SPREAD_DEG),

@@ -120,7 +120,7 @@ def poses_at_scans(
     times: Float[np.ndarray, " n"] | None,
     *,
     scans: int,
-    of: str,
+    item: str,
 ) -> ScanPoses:
     """Assign poses to scans: pose i to scan i, or poses interpolated at the times of the scans (`have_poses`).
 
@@ -133,13 +133,13 @@ def poses_at_scans(
       stamps: Times of the poses in seconds, or None.
       times: Times of the scans in seconds, or None.
       scans: Number of scans.
-      of: Name of what each pose belongs to, for messages: "scan of 08".
+      item: Name of what each pose belongs to, for messages: "scan of 08".
 
     Raises ValueError if fewer than half of the scans have a pose, or if interpolation is needed and times are missing.
     """
     if len(poses) == scans and (note := _row_by_row_note(stamps, times)) is not None:
         return ScanPoses(np.ones(scans, bool), poses, note)
-    expected, found = f"expected {scans} poses, one for each {of}", f"found {len(poses)}"
+    expected, found = f"expected {scans} poses, one for each {item}", f"found {len(poses)}"
     if stamps is None or times is None:
         why = "the file has no times" if stamps is None else "the scans have no times"
         raise ValueError(

@@ -80,7 +80,7 @@ def at_scans(
     Raises ValueError if most scans have no pose, or if the numbers of poses and scans differ and times are missing.
     """
     matched = poses_at_scans(
-        str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
+        str(path), odometry, stamps, recording.times, scans=len(recording), item=f"scan of {recording.name}"
     )
     if recording.times is None and stamps is not None:
         message = f"times: from {path.name}"

@@ -81,8 +81,8 @@ def _trajectory(
         return None, times, None
     twelve = "lidar" if options.poses is None else None
     track = read_trajectory(path, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve)
-    of = f"scan of {root.resolve().name}"
-    kept, poses, how = poses_at_scans(str(path), poses_of(track.positions), track.times, times, scans=scans, of=of)
+    item = f"scan of {root.resolve().name}"
+    kept, poses, how = poses_at_scans(str(path), poses_of(track.positions), track.times, times, scans=scans, item=item)
     if times is not None and not kept.all():
         late = times[~kept]
         raise ValueError(
