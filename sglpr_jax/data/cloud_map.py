@@ -248,7 +248,7 @@ def _one_per_voxel(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m
     return points[np.sort(first_rows)]
 
 
-def _spacing_m(points: Float32[np.ndarray, "n 3"], starts: Int64[np.ndarray, " t+1"]) -> float:
+def _spacing_m(points: Float32[np.ndarray, "n 3"], starts: Int64[np.ndarray, " t"]) -> float:
     """Median distance of a point to its fourth neighbour in the tiles with the most points, at least `VOXEL_M`."""
     from scipy.spatial import KDTree  # imported here because the import is slow
 
