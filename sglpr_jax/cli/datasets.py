@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from sglpr_jax.cli.runtime import cache_folder
 from sglpr_jax.data import training_recordings as split
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan_stream import readable
+from sglpr_jax.data.scan_stream import only_readable
 from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def without_bad_scans(
         good, done = [], 0
         for recording in recordings:
             show_from = functools.partial(lambda start, scans: show(start + scans), done)
-            good.append(readable(recording, on_bad_scan=on_bad_scan, on_progress=show_from))
+            good.append(only_readable(recording, on_bad_scan=on_bad_scan, on_progress=show_from))
             done += len(recording)
     return good
 

@@ -147,8 +147,8 @@ class LiveMap:
             self._add(scan._replace(compared=None) if damaged else scan)
         if damaged:
             self._report("lost", f"{self._log.path}: {damaged} damaged scans are left out")
-        if self._log.cut:
-            self._report("cut", f"{self._log.path}: {self._log.cut} bytes of an unfinished scan were removed")
+        if self._log.removed_bytes:
+            self._report("cut", f"{self._log.path}: {self._log.removed_bytes} bytes of an unfinished scan were removed")
         if scan is not None:
             assert scan.keyframe is not None
             passed = min(max(time.time() - scan.wall, 0.0), MOST_WALL_S)

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.mounting import upright_from_lidar
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, LoopClosure, Reason, RejectedClosure, frames_of
 from sglpr_jax.loops.consistency import are_consistent, largest_consistent_set
 from sglpr_jax.loops.drift import deviations

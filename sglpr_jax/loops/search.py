@@ -20,7 +20,7 @@ from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.loops.acceptance import AXES, accept_loops, check_odometry, register_loops
 from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.loops.candidates import CandidateSearch

@@ -18,7 +18,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.frame_log import RunLog
 from sglpr_jax.odometry.config import OdometryConfig
 from sglpr_jax.retrieval.descriptor_cache import fingerprint

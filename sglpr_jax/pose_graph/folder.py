@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.warning import warn
-from sglpr_jax.files import file_name, text_bytes, write_all, write_json
+from sglpr_jax.files import file_name, text_bytes, warn, write_all, write_json
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, renumbered
 from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.result import LoopSearchResult

@@ -80,15 +80,15 @@ def at_scans(
     Raises ValueError if most scans have no pose, or if the numbers of poses and scans differ and times are missing.
     """
     matched = poses_at_scans(
-        str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
+        str(path), odometry, stamps, recording.times, scans=len(recording), item=f"scan of {recording.name}"
     )
     if recording.times is None and stamps is not None:
         message = f"times: from {path.name}"
         return dataclasses.replace(recording, times=stamps, found=(*recording.found, message)), matched.poses
-    if not matched.said:
+    if not matched.note:
         return recording, matched.poses
-    recording = only(recording, np.flatnonzero(matched.kept).tolist())
-    message = f"odometry: {len(odometry)} poses of {path.name}, {matched.said}"
+    recording = only(recording, np.flatnonzero(matched.has_pose).tolist())
+    message = f"odometry: {len(odometry)} poses of {path.name}, {matched.note}"
     return dataclasses.replace(recording, found=(*recording.found, message)), matched.poses
 
 

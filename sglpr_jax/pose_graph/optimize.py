@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.mounting import is_tilted
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.loops.closure import LoopClosure, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
 from sglpr_jax.loops.result import LoopSearchResult, Session

@@ -15,8 +15,8 @@ from sglpr_jax.data.scaled import SCALE, scale_of
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, require_content, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
-from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import Size, check_value
+from sglpr_jax.files import warn
 from sglpr_jax.methods.method import LABELLED, Method, check_descriptors
 from sglpr_jax.methods.registry import checked_view, network
 from sglpr_jax.models.config import WHITENING_POWER, ModelConfig

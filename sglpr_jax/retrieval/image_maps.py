@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 from PIL import Image
 
-from sglpr_jax.bev import uncropped
+from sglpr_jax.bev import uncrop_labels
 from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import view
@@ -64,7 +64,7 @@ def save_map(path: Path, found: SemanticMap, scan: Scan, *, categories: int) -> 
         pixels = found.predicted.astype(np.uint8)
     else:
         raw = to_raw(found.predicted, categories=categories)
-        pixels = label_image_pixels(uncropped(raw, shape=scan.image.shape))
+        pixels = label_image_pixels(uncrop_labels(raw, shape=scan.image.shape))
     with replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
 

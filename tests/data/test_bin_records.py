@@ -6,7 +6,7 @@ import pytest
 from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti, detect_point_format
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers import open_recording as open_any
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))
 FIRING = np.arange(16).reshape(2, 8).T.reshape(-1)

@@ -5,7 +5,7 @@ import pytest
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_rows, read_times, read_trajectory, rows_of_frames
 from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, time_unit_problem, times_of, unit_change
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n"
 SECONDS = np.arange(280) / 10

@@ -9,7 +9,7 @@ import pytest
 from drives import along, drifted, rooms, town, true_loops, wrong_loops
 from recordings import of_scans
 
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import acceptance
 from sglpr_jax.loops.acceptance import accept_loops, check_odometry, count_revisit_segments
 from sglpr_jax.loops.closure import LoopClosure

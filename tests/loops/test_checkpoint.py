@@ -12,7 +12,7 @@ from recordings import with_points
 
 import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import acceptance, checkpoint, search
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig

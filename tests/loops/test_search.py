@@ -16,7 +16,7 @@ from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import search
 from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure
 from sglpr_jax.loops.comparison import NO_FITS

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, TimeField
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.odometry import kiss_icp
 from sglpr_jax.odometry.config import OdometryConfig

@@ -10,7 +10,7 @@ from session_pairs import found_pair
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl

@@ -12,7 +12,7 @@ from recordings import of_images
 from scipy.spatial.transform import Rotation
 from session_pairs import found_pair, two_drives
 
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o

@@ -16,8 +16,7 @@ from jaxtyping import Float, Num
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.clouds import check_points
 from sglpr_jax.data.scan import Scan, TimeField, time_field_of
-from sglpr_jax.data.warning import warn
-from sglpr_jax.files import naming
+from sglpr_jax.files import naming, warn
 
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
 NCLT_UNIT_M = 0.005

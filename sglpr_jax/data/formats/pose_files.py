@@ -11,8 +11,8 @@ from jaxtyping import Float, Int64
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.times import ADVICE, times_of
-from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value
+from sglpr_jax.files import warn
 from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations, from_quaternions
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])

@@ -18,7 +18,7 @@ from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
 from sglpr_jax.data.scan import TIME_FIELDS, Scan, time_field_of
 from sglpr_jax.data.times import time_unit_problem
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.se3 import from_quaternions
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

@@ -21,7 +21,7 @@ from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 
 REACH_M = 36.0
 """Maximum distance of a point from the sensor, in metres: the corner of an image of 50 m."""
@@ -54,7 +54,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     has_points = _have_points(cloud, trajectory.positions, root, poses)
     world_from_lidar = _raise_poses_on_ground(cloud, trajectory.poses, np.flatnonzero(has_points), poses)
     ids = tuple(f"{row:06d}" for row in range(len(has_points)))
-    used = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
+    used = f"{cloud.total} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
     recording = Recording(
         name=root.stem,
         ids=ids,

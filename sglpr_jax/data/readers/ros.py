@@ -22,15 +22,14 @@ from sglpr_jax.data.formats.ros_messages import (
     times_on_one_clock,
     tracks_of_transforms,
 )
-from sglpr_jax.data.poses import LEAST_SHARE, have_poses, interpolate_poses, left_out
+from sglpr_jax.data.poses import LEAST_SHARE, have_poses, interpolate_poses, missing_poses_note
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.times import time_unit_problem
-from sglpr_jax.data.warning import warn
-from sglpr_jax.files import naming
+from sglpr_jax.files import naming, warn
 
 ENDINGS = (".bag", ".mcap", ".db3")
 PAUSE_NS = 60 * 10**9
@@ -156,7 +155,7 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     return dataclasses.replace(
         recording if len(rows) == len(recording) else only(recording, rows.tolist()),
         positions=world_from_lidar[:, :3, 3],
-        pose_source=f"{used} ({track}, {how}{left_out(has_pose[used])})",
+        pose_source=f"{used} ({track}, {how}{missing_poses_note(has_pose[used])})",
         world_from_lidar=world_from_lidar if track.rotates else None,
     )
 
@@ -226,7 +225,7 @@ def _read_ups(
     source = f"{bag.paths[0]}, {topic}"
     try:
         with naming(source):
-            ups_in_imu, how = imu.at(imu_times).ups(scan_times)
+            ups_in_imu, how = imu.with_times(imu_times).ups(scan_times)
     except ValueError as error:
         if required:
             raise

@@ -83,8 +83,8 @@ def _read_trajectory(
     trajectory = read_trajectory(
         pose_file, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve_numbers
     )
-    poses, of = poses_of(trajectory.positions), f"scan of {root.resolve().name}"
-    has_pose, poses, how = poses_at_scans(str(pose_file), poses, trajectory.times, times, scans=scans, of=of)
+    poses, item = poses_of(trajectory.positions), f"scan of {root.resolve().name}"
+    has_pose, poses, how = poses_at_scans(str(pose_file), poses, trajectory.times, times, scans=scans, item=item)
     if times is not None and not has_pose.all():
         uncovered = times[~has_pose]
         raise ValueError(
