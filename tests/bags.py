@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sglpr_jax.live.ros_messages import LIVOX, LIVOX_POINT
+from sglpr_jax.live.ros_encoding import LIVOX, LIVOX_POINT
 
 LIVOX_DRIVERS = ("livox_ros_driver", "livox_ros_driver2")
 CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7, "f8": 8}

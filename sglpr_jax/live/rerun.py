@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import check_writable, writing
-from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.node_messages import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 os.environ.setdefault("RUST_LOG", "off")  # read by the import; the node has its own line for a lost viewer
@@ -27,7 +27,7 @@ LINE = (60, 180, 75)
 
 
 class RerunSink:
-    """Draws loops and plots the status. See `endpoints.Sink`.
+    """Draws loops and plots the status. See `sources_and_sinks.Sink`.
 
     A loop with odometry of both scans is a line between their positions. Every loop is a line of text with its
     probability. The time lines are `frame` and, if scans have times, `time`.

@@ -17,8 +17,8 @@ from sglpr_jax.data.formats.ros_messages import (
     tracks_of,
 )
 from sglpr_jax.data.poses import pose_at
-from sglpr_jax.live.messages import Report
-from sglpr_jax.live.ros_messages import TRANSFORMS, Received
+from sglpr_jax.live.node_messages import Report
+from sglpr_jax.live.ros_encoding import TRANSFORMS, Received
 
 KINDS = (*POSES, TRANSFORMS)
 """Types of messages with odometry."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.live import folder
-from sglpr_jax.live.endpoints import open_source
 from sglpr_jax.live.folder import GrowingPoses
 from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.sources_and_sinks import open_source
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import transform
 

@@ -12,7 +12,7 @@ from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.live.live_map import FRAMES, LOOPS, OLD, SETTINGS, LiveMap
-from sglpr_jax.live.results import write_results
+from sglpr_jax.live.result_files import write_results
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector

@@ -6,10 +6,10 @@ import time as clock
 import numpy as np
 import pytest
 
-from sglpr_jax.live.messages import FrameStatus, LoopEdge
+from sglpr_jax.live.node_messages import FrameStatus, LoopEdge
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros import TAKEN_OVER_S, RosSink, RosSource, domain_of
-from sglpr_jax.live.ros_messages import CLOUD, MARKERS, TRANSFORMS
+from sglpr_jax.live.ros_encoding import CLOUD, MARKERS, TRANSFORMS
 from tests.live.messages import LIVOX, ODOMETRY, POINTS, cloud, decoded, odometry, received
 
 

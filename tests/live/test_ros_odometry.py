@@ -6,7 +6,7 @@ import time as clock
 import numpy as np
 import pytest
 
-from sglpr_jax.live.ros_messages import TRANSFORMS
+from sglpr_jax.live.ros_encoding import TRANSFORMS
 from sglpr_jax.live.ros_odometry import STATIC_S, LiveOdometry
 from tests.live.messages import ODOMETRY, odometry, received, transforms
 

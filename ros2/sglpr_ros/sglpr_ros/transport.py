@@ -8,9 +8,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rosidl_runtime_py.utilities import get_message
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.messages import Report
+from sglpr_jax.live.node_messages import Report
 from sglpr_jax.live.ros import Receive
-from sglpr_jax.live.ros_messages import Received
+from sglpr_jax.live.ros_encoding import Received
 
 
 class RclpyTransport:

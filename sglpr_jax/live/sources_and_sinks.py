@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
-from sglpr_jax.live.messages import FrameStatus, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.node_messages import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
