@@ -267,7 +267,7 @@ class PlaceMap(Keyframes):
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
         """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
-        index, arrays = Index.load_with(path, weights_hash=weights_hash)
+        index, arrays = Index.load_with_arrays(path, weights_hash=weights_hash)
         missing = [name for name, column in ARRAYS.items() if name not in arrays and not column.optional]
         if missing:
             raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(missing)}")
