@@ -21,7 +21,7 @@ from sglpr_jax.pose_graph.optimize import (
     OptimizedTrajectory,
     optimize_trajectory,
     placements,
-    solved_graph,
+    solve_pose_graph,
     trajectory_error,
 )
 from sglpr_jax.se3 import from_quaternions, inverse, transform
@@ -30,7 +30,7 @@ from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
 
 
 def optimized(odometry: np.ndarray, loops: Sequence[LoopClosure]) -> OptimizedTrajectory:
-    return solved_graph({0: odometry}, loops)
+    return solve_pose_graph({0: odometry}, loops)
 
 
 def test_the_error_of_a_drifted_drive_falls(two_laps, two_laps_odometry, second_lap_loops):
