@@ -36,7 +36,7 @@ class FactorGraph:
     def add_step(
         self, before: int, after: int, step: Float[np.ndarray, "4 4"], *, metres: float, radians: float
     ) -> None:
-        """Connect two nodes by odometry: pose of the later in the earlier node, and standard deviations of each axis."""
+        """Connect two nodes by odometry: pose of the later in the earlier node, and standard deviations by axis."""
         self._connect(before, after, step, self._gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3)))
 
     def add_loop(
