@@ -94,7 +94,7 @@ def run_node(
     with exclusive_lock(command.out), contextlib.ExitStack() as opened:
         live_map = _open_map(command, report)
         opened.callback(live_map.close)
-        missed = live_map.recall()
+        missed = live_map.restore()
         sinks = []
         for sink in open_sinks():
             opened.callback(_close, sink, report)
@@ -115,11 +115,11 @@ def run_node(
 def _check(command: LiveCommand) -> None:
     """Raises ValueError before any work for an unknown source or sink, or if an input would be overwritten."""
     from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
-    from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, check_name
+    from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, split_known_name
 
-    check_name(command.source, SOURCES, kind="sources")
+    split_known_name(command.source, SOURCES, kind="sources")
     for text in command.sinks:
-        check_name(text, SINKS, kind="sinks")
+        split_known_name(text, SINKS, kind="sinks")
     written = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
     if command.poses is not None and command.poses.resolve() in written:
         raise ValueError(
