@@ -57,10 +57,8 @@ class DdsTransport:
     """Participant of a DDS domain. A thread takes the messages. See `ros.Transport`."""
 
     def __init__(self, domain: int, report: Report):
-        """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2.
-
-        Raises ValueError if cyclonedds cannot use the network or this configuration.
-        """
+        """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2. Raises ValueError if
+        cyclonedds cannot use the network or this configuration."""
         self._report = report
         _configure(domain)
         try:
@@ -168,10 +166,8 @@ class DdsTransport:
 
 @functools.cache
 def _configure(domain: int) -> Domain | None:
-    """Configure a domain, once in a process, with `RECEIVE_BUFFER`. CYCLONEDDS_URI overrides it.
-
-    Returns None if another part of the process uses the domain already.
-    """
+    """Configure a domain, once in a process, with `RECEIVE_BUFFER`. CYCLONEDDS_URI overrides it. Returns None if
+    another part of the process uses the domain already."""
     try:
         return Domain(domain, ",".join(filter(None, (RECEIVE_BUFFER, os.environ.get("CYCLONEDDS_URI")))))
     except DDSException:
@@ -196,10 +192,8 @@ def _qos_text(reliable: bool, latched: bool) -> str:
 
 @functools.cache
 def _raw_type(kind: str) -> Any:
-    """Return the type of a ROS 2 message for cyclonedds, whose objects hold only the encoded message, as `cdr`.
-
-    Other participants see the type with its fields. cyclonedds calls the four methods that are replaced here.
-    """
+    """Return the type of a ROS 2 message for cyclonedds, whose objects hold only the encoded message, as `cdr`. Other
+    participants see the type with its fields. cyclonedds calls the four methods that are replaced here."""
 
     def init(self: Any, cdr: bytes) -> None:
         self.cdr = cdr

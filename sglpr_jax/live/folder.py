@@ -41,12 +41,9 @@ class FolderSource:
         self._root, self._options, self._report = root, options, report
         self._bin_layout: RecordFormat | None = None
         """Format of .bin files whose names do not state it, detected in the content of the first one."""
-        self._sizes: dict[Path, int] = {}
-        """Size of each waiting file at the last look, in bytes."""
-        self._waiting: list[Path] = []
-        """Files that were not taken, in order."""
-        self._listed_change_ns = 0
-        """Modification time of the folder when it was listed last, in nanoseconds."""
+        self._sizes: dict[Path, int] = {}  # size of each waiting file at the last look, in bytes
+        self._waiting: list[Path] = []  # files that were not taken, in order
+        self._listed_change_ns = 0  # modification time of the folder when it was listed last, in nanoseconds
         self._closed = False
         paths = self._list()
         last_taken = max((row for row, path in enumerate(paths) if taken(_scan_name(path))), default=-1)
@@ -105,9 +102,7 @@ class FolderSource:
 
     def _read_frame(self, path: Path, received: float) -> Iterator[LiveFrame | None]:
         """Yield None while the scan's pose is missing, at most until the file is `MAX_POSE_WAIT_S` old, then the scan.
-
-        A scan that cannot be read is reported instead.
-        """
+        A scan that cannot be read is reported instead."""
         try:
             if self._bin_layout is None and self._options.format == "auto" and named_format(path) is None:
                 self._bin_layout = unusual_record([path]) or "kitti"
@@ -156,16 +151,12 @@ class GrowingPoses:
             raise ValueError(f"{path}: expected poses as tum, kitti or lidar, found csv")
         self._path, self._format, self._unit = path, format, PER_SECOND[time_unit]
         self._bytes_read = self._lines_read = 0
-        self._times: list[float] = []
-        """Time of each pose, in seconds, in order. 0 in files without times."""
-        self._poses: list[np.ndarray | None] = []
-        """Pose (4, 4) of each line. None for an invalid line."""
+        self._times: list[float] = []  # time of each pose, in seconds, in order. 0 in files without times.
+        self._poses: list[np.ndarray | None] = []  # pose (4, 4) of each line. None for an invalid line.
 
     def read_appended(self) -> None:
-        """Read the whole lines that were added since the last call.
-
-        Raises ValueError for the first invalid line, after reading all. The scan of an invalid line has no pose.
-        """
+        """Read the whole lines that were added since the last call. Raises ValueError for the first invalid line, after
+        reading all. The scan of an invalid line has no pose."""
         if not self._path.is_file():
             return
         with self._path.open("rb") as file:
@@ -185,11 +176,8 @@ class GrowingPoses:
             raise first_error
 
     def of(self, row: int, time: float | None) -> Float[np.ndarray, "4 4"] | None:
-        """Return the pose of a scan, or None if the file does not have it yet.
-
-        Scans and files with times are matched by `time`, in seconds, with interpolation. Others are matched by `row`,
-        the number of the scan.
-        """
+        """Return the pose of a scan, or None if the file does not have it yet. Scans and files with times are matched
+        by `time`, in seconds, with interpolation. Others are matched by `row`, the number of the scan."""
         if time is None or self._format not in ("auto", "tum"):
             return self._poses[row] if row < len(self._poses) else None
         middle = bisect.bisect_left(self._times, time)

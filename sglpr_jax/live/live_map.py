@@ -125,10 +125,8 @@ class LiveMap:
 
     @property
     def map_from_world(self) -> Float[np.ndarray, "4 4"] | None:
-        """Transform from the odometry's frame to the map at the last scan.
-
-        None without odometry, without gtsam, and after a restart until a loop connects the odometry with that before.
-        """
+        """Transform from the odometry's frame to the map at the last scan. None without odometry, without gtsam, and
+        after a restart until a loop connects the odometry with that before."""
         return None if self.trajectory is None or not len(self.trajectory) else self.trajectory.map_from_world
 
     def restore(self) -> list[LoopEdge]:
@@ -173,10 +171,8 @@ class LiveMap:
         return missed
 
     def add(self, frame: LiveFrame) -> list[LoopEdge] | None:
-        """Add a scan and return its loops, or None if the scan is left out, which is reported.
-
-        Raises ValueError if the scan or its odometry is invalid.
-        """
+        """Add a scan and return its loops, or None if the scan is left out, which is reported. Raises ValueError if the
+        scan or its odometry is invalid."""
         scan, pose = frame.scan, as_pose(frame.odometry)
         if scan.points is None or not np.isfinite(scan.points).all(axis=1).any():
             raise ValueError(f"{scan.name or 'scan'}: expected points, found none")
@@ -249,11 +245,8 @@ class LiveMap:
             self._log.close()
 
     def _loop_edge(self, loop: LoopClosure, received: float) -> LoopEdge:
-        """Return a loop with the times and the odometry of its scans.
-
-        Odometry is given only for scans in the odometry frame of the latest scan. `received` is the time at which the
-        latest scan arrived.
-        """
+        """Return a loop with the times and the odometry of its scans. Odometry is given only for scans in the odometry
+        frame of the latest scan. `received` is the time at which the latest scan arrived."""
         frames = np.array([loop.query, loop.match])
         in_latest_frame = self.detector.finder.motion.same(-1, frames) & (len(self.odometry) > 0)
         query_pose, match_pose = (

@@ -105,9 +105,7 @@ class LatestScan(Generic[T]):
 
 class Reports:
     """Prints the first event of each kind at once. Later ones are counted, and one is printed every `AGAIN_S` seconds.
-
-    An instance is a `Report`. It may be called from several threads.
-    """
+    An instance is a `Report`. It may be called from several threads."""
 
     def __init__(self, write: Callable[[str], object] | None = None, *, clock: Callable[[], float] = time.monotonic):
         self._write = write or (lambda text: print(text, file=sys.stderr, flush=True))

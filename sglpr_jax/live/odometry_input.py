@@ -41,24 +41,17 @@ class OdometryContinuity:
     def __init__(self, report: Report, *, expected: bool):
         """Begin a map. `expected` says that odometry was asked for, so that the first scans wait for it."""
         self._report, self._expected = report, expected
-        self._has_odometry: bool | None = None
-        """None until the first scan decides."""
-        self._began: float | None = None
-        """Time of the first scan, in seconds."""
-        self._last: Float[np.ndarray, "4 4"] | None = None
-        """Last pose by odometry."""
-        self._last_time = 0.0
-        """Time of `_last`, in seconds."""
+        self._has_odometry: bool | None = None  # None until the first scan decides
+        self._began: float | None = None  # time of the first scan, in seconds
+        self._last: Float[np.ndarray, "4 4"] | None = None  # last pose by odometry
+        self._last_time = 0.0  # time of `_last`, in seconds
         self._last_scan_has_pose = True
         """Whether `_last` is the pose of the last scan, so that the motion since then is known."""
-        self._resumed = False
-        """Whether the next scan is the first one after a restart."""
+        self._resumed = False  # whether the next scan is the first one after a restart
 
     def resume(self, pose: Float[np.ndarray, "4 4"] | None, time: float, *, known: bool = True) -> None:
-        """Continue a map of an earlier process, whose last scan had this pose at this time.
-
-        With `known=False`, the motion up to that scan was unknown, and its pose may be that of an earlier scan.
-        """
+        """Continue a map of an earlier process, whose last scan had this pose at this time. With `known=False`, the
+        motion up to that scan was unknown, and its pose may be that of an earlier scan."""
         self._has_odometry, self._last, self._last_time = pose is not None, pose, time
         self._last_scan_has_pose, self._resumed = known, True
 
@@ -98,10 +91,8 @@ class OdometryContinuity:
         return False
 
     def _without_pose(self, time: float, resumed: bool) -> OdometryState | None:
-        """Return the odometry of a scan without a pose in a map with odometry, or None to skip it (see `HOLD_S`).
-
-        The last pose is repeated, with unknown motion.
-        """
+        """Return the odometry of a scan without a pose in a map with odometry, or None to skip it (see `HOLD_S`). The
+        last pose is repeated, with unknown motion."""
         passed_s = time - self._last_time
         if not resumed and self._last_scan_has_pose and passed_s < HOLD_S:
             return self._report("hold", "expected odometry at a scan, found none; the scan is left out")
@@ -121,17 +112,13 @@ class OdometryContinuity:
 
 class ScanClock:
     """Times of scans that never decrease: header times plus an offset, which changes when the sensor's clock changes.
-
-    Scans without a header time, and the first scan after a change, get a time by their arrival.
-    """
+    Scans without a header time, and the first scan after a change, get a time by their arrival."""
 
     def __init__(self, report: Report):
         self._report = report
         self._offset = 0.0
-        self._last: float | None = None
-        """Time of the last scan by this clock, in seconds."""
-        self._received = 0.0
-        """Time of arrival of the last scan, in seconds."""
+        self._last: float | None = None  # time of the last scan by this clock, in seconds
+        self._received = 0.0  # time of arrival of the last scan, in seconds
 
     def resume(self, time: float, stamp: float, *, received: float) -> None:
         """Continue after a scan of an earlier process: time by this clock, by its header, and of its arrival."""

@@ -28,9 +28,7 @@ LOOP_COLOUR = (60, 180, 75)
 
 class RerunSink:
     """Shows each loop as text and, if both scans have odometry, as a line on the map. Plots the status of each scan.
-
-    The viewer's time lines are `frame` and, if scans have times, `time`.
-    """
+    The viewer's time lines are `frame` and, if scans have times, `time`."""
 
     def __init__(self, stream: Any):
         """Take a `rerun.RecordingStream`. `close` disconnects it."""

@@ -48,17 +48,13 @@ class Transport(Protocol):
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """Call `receive` with each message of a topic that has one of the types `kinds`.
-
-        At most `depth` messages wait. `reliable` requests lost messages again, `latched` requests earlier messages.
-        """
+        """Call `receive` with each message of a topic that has one of the types `kinds`. At most `depth` messages wait.
+        `reliable` requests lost messages again, `latched` requests earlier messages."""
         ...
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
-        """Return a function that publishes encoded messages (CDR) of one type.
-
-        With `latched`, later subscribers receive the last `depth` messages.
-        """
+        """Return a function that publishes encoded messages (CDR) of one type. With `latched`, later subscribers
+        receive the last `depth` messages."""
         ...
 
     def published(self) -> dict[str, set[str]]:
@@ -185,10 +181,8 @@ def absolute_topic(topic: str) -> str:
 
 
 def domain_of(where: str, *, source: str) -> int:
-    """Return the number of a ROS 2 domain: `where`, or else the environment variable ROS_DOMAIN_ID, or else 0.
-
-    Raises ValueError, naming the `source`, if it is not from 0 to 232.
-    """
+    """Return the number of a ROS 2 domain: `where`, or else the environment variable ROS_DOMAIN_ID, or else 0. Raises
+    ValueError, naming the `source`, if it is not from 0 to 232."""
     text = where or os.environ.get("ROS_DOMAIN_ID") or "0"
     if not (text.isdecimal() and int(text) <= 232):
         raise ValueError(f"{source}: expected a ROS 2 domain from 0 to 232, found {text}")

@@ -57,10 +57,8 @@ def typestore() -> Any:
 
 
 def encode(kind: str, fields: Mapping[str, Any]) -> bytes:
-    """Encode a message of a type, with the four bytes of the encapsulation header. Missing fields are zero or empty.
-
-    A field that is a message is a mapping of its fields.
-    """
+    """Encode a message of a type, with the four bytes of the encapsulation header. Missing fields are zero or empty. A
+    field that is a message is a mapping of its fields."""
     return bytes(typestore().serialize_cdr(_message(kind, fields), kind))
 
 
@@ -84,10 +82,8 @@ def _message(kind: str, fields: Mapping[str, Any]) -> Any:
 
 
 def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Scan]:
-    """Decode a scan from a message of type `kind`, one of `CLOUD_TYPES`.
-
-    Raises ValueError if the message is damaged, or the cloud has no x, y and z.
-    """
+    """Decode a scan from a message of type `kind`, one of `CLOUD_TYPES`. Raises ValueError if the message is damaged,
+    or the cloud has no x, y and z."""
     try:
         header = RosMessage(raw, cdr=True).header()
         if kind == CLOUD:

@@ -100,10 +100,8 @@ class LiveOdometry:
         return world_from_child @ child_from_lidar
 
     def _choose_frames(self, lidar: str) -> None:
-        """Choose the first frames whose child frame has a known pose of the LiDAR, by its name or /tf_static.
-
-        After `MOUNTING_WAIT_S`, poses of a single pair of frames are used as those of the LiDAR, which is reported.
-        """
+        """Choose the first frames whose child frame has a known pose of the LiDAR, by its name or /tf_static. After
+        `MOUNTING_WAIT_S`, poses of a single pair of frames are used as those of the LiDAR, which is reported."""
         if self._chosen is not None:
             return
         static = tracks_of((0, pose) for pose in self._static.values())
@@ -141,9 +139,7 @@ def _with_frame_names(pose: StampedPose) -> tuple[FrameNames, StampedPose]:
 
 def _interpolate(poses: list[StampedPose], time: float) -> Float[np.ndarray, "4 4"] | None:
     """Interpolate between the poses before and after a time. Without one of them, the two nearest poses are used.
-
-    Returns None if no poses are near enough in time (`pose_at`).
-    """
+    Returns None if no poses are near enough in time (`pose_at`)."""
     nearest = sorted(poses, key=lambda pose: abs(pose.time - time))
     before = [pose for pose in nearest if pose.time <= time][:1]
     after = [pose for pose in nearest if pose.time > time][:1]

@@ -47,11 +47,9 @@ class ZenohTransport:
     """Connection by a zenoh session. See `ros.Transport` for the methods."""
 
     def __init__(self, endpoint: str, domain: int, report: Report):
-        """Open a session. Raises ValueError if the endpoint or the configuration is invalid.
-
-        `endpoint` is that of a router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that
-        ZENOH_SESSION_CONFIG_URI names configures the session, or else it uses rmw_zenoh's router on this computer.
-        """
+        """Open a session. Raises ValueError if the endpoint or the configuration is invalid. `endpoint` is that of a
+        router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that ZENOH_SESSION_CONFIG_URI names
+        configures the session, or else it uses rmw_zenoh's router on this computer."""
         self._domain, self._report = domain, report
         try:
             self._session = zenoh.open(_session_config(endpoint))
@@ -131,11 +129,8 @@ class ZenohTransport:
 
 
 def _session_config(endpoint: str) -> zenoh.Config:
-    """Return the configuration of a session.
-
-    It is the file that ZENOH_SESSION_CONFIG_URI names. With an endpoint, or without a file, it is that of a peer that
-    finds others by a router, as rmw_zenoh's.
-    """
+    """Return the configuration of a session. It is the file that ZENOH_SESSION_CONFIG_URI names. With an endpoint, or
+    without a file, it is that of a peer that finds others by a router, as rmw_zenoh's."""
     file = "" if endpoint else os.environ.get("ZENOH_SESSION_CONFIG_URI")
     config = zenoh.Config.from_file(file) if file else zenoh.Config()
     settings: dict[str, Any] = {"timestamping/enabled": True}  # publishers with a cache need timestamps

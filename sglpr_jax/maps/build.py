@@ -70,14 +70,10 @@ def map_recording(
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
     recording = with_odometry(recording, poses)
     finder = CandidateSearch(params)  # describes the scans; each scan that is read becomes one of its frames
-    keyframes: list[Keyframe | None] = []
-    """Keyframe of each frame. None for an unreadable scan."""
-    frame_rows: list[int] = []
-    """Row in the recording of each frame."""
-    places: list[tuple[int, int]] = []
-    """Frame and row of each place."""
-    done = 0
-    """Number of processed rows of the recording."""
+    keyframes: list[Keyframe | None] = []  # keyframe of each frame. None for an unreadable scan.
+    frame_rows: list[int] = []  # row in the recording of each frame
+    places: list[tuple[int, int]] = []  # frame and row of each place
+    done = 0  # number of processed rows of the recording
 
     def rows_to_read() -> Iterator[int]:
         """Yield the rows at least `spacing_m` from the last place. The caller adds each to `finder` before the next."""

@@ -207,10 +207,8 @@ class PlaceMap(Keyframes):
         model: LoopModel | None = None,
         candidates: int = CANDIDATES,
     ) -> list[Relocalization]:
-        """Locate a described scan in the map. Arguments, result and errors are those of `relocate`.
-
-        `keyframe` must be described at the map's scale by weights with the hash `weights_hash`. None skips the check.
-        """
+        """Locate a described scan in the map. Arguments, result and errors are those of `relocate`. `keyframe` must be
+        described at the map's scale by weights with the hash `weights_hash`. None skips the check."""
         self.index.check(weights=weights_hash)
         image = keyframe.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
@@ -328,10 +326,8 @@ def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict
 
 def _unused_ids(ids: Sequence[str], drive: Mapping[str, Content], *, existing: Mapping[str, Content]) -> list[str]:
     """Return the ids of new places (RECORDING/SCAN), with a suffix of the recording if another place has one of them.
-
     The suffix is the first of "", ~2, ~3, ... that no scan of the `drive` shares with a different place of the map
-    (`existing`). All scans count, because the suffix must not depend on how much of the drive is mapped.
-    """
+    (`existing`). All scans count, because the suffix must not depend on how much of the drive is mapped."""
     recordings = {name.rpartition("/")[0] for name in ids}
     drive = {name: content for name, content in drive.items() if name.rpartition("/")[0] in recordings}
 

@@ -133,10 +133,8 @@ def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
 
 
 def write_loops_csv(path: Path | str, loops: Sequence[LoopClosure], recordings: Ids | None = None) -> None:
-    """Write a csv table with the columns `CSV_COLUMNS`. The overlap is empty if it is unknown.
-
-    If the `recordings` of the frames are given, the table also has the columns `CSV_RECORDING_COLUMNS`.
-    """
+    """Write a csv table with the columns `CSV_COLUMNS`. The overlap is empty if it is unknown. If the `recordings` of
+    the frames are given, the table also has the columns `CSV_RECORDING_COLUMNS`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(CSV_COLUMNS if recordings is None else (*CSV_COLUMNS, *CSV_RECORDING_COLUMNS))
@@ -160,10 +158,8 @@ def write_loops_jsonl(
 def loop_lines(
     loops: Sequence[LoopClosure | RejectedClosure], ids: Ids | None = None, recordings: Ids | None = None
 ) -> str:
-    """Return a line of JSON for each loop or rejected pair, with ids and recordings of its frames if they are given.
-
-    A rejected pair has a reason but no covariance.
-    """
+    """Return a line of JSON for each loop or rejected pair, with ids and recordings of its frames if they are given. A
+    rejected pair has a reason but no covariance."""
     lines = []
     for closure in loops:
         loop = closure.loop if isinstance(closure, RejectedClosure) else closure
@@ -182,10 +178,8 @@ def loop_lines(
 
 
 def read_loops_jsonl(path: Path | str) -> list[LoopClosure]:
-    """Read the loops of a file of `write_loops_jsonl`.
-
-    Raises FileNotFoundError, or ValueError, which names the line, if a line is not a valid loop.
-    """
+    """Read the loops of a file of `write_loops_jsonl`. Raises FileNotFoundError, or ValueError, which names the line,
+    if a line is not a valid loop."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")

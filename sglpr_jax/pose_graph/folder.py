@@ -95,10 +95,8 @@ def graph_files(
     ids: Ids | None = None,
     recordings: Ids | None = None,
 ) -> Writers:
-    """Return writers of the graph (g2o), the table of loops (csv) and the rejected pairs (JSON lines).
-
-    `chains`, `drift` and `comments` are arguments of `write_g2o`, `ids` and `recordings` of `loop_lines`.
-    """
+    """Return writers of the graph (g2o), the table of loops (csv) and the rejected pairs (JSON lines). `chains`,
+    `drift` and `comments` are arguments of `write_g2o`, `ids` and `recordings` of `loop_lines`."""
     return {
         LOOPS_G2O: partial(write_g2o, loops=loops, chains=chains, drift=drift, comments=comments),
         LOOPS_CSV: partial(write_loops_csv, loops=loops, recordings=recordings),
@@ -135,9 +133,7 @@ def _frames_json(
     result: LoopSearchResult, names: Sequence[str], numbers: Sequence[Int[np.ndarray, " _"]]
 ) -> dict[str, Any]:
     """Return the content of `FRAMES`: recordings with their vertex offsets, and transforms between their frames.
-
-    `numbers` is the result of `vertex_numbers`.
-    """
+    `numbers` is the result of `vertex_numbers`."""
 
     def frame(segment: TrajectorySegment) -> dict[str, Any]:
         """Return the name of a segment's frame, and the first and the last scan with a pose in this frame."""
@@ -178,10 +174,8 @@ def _comments(result: LoopSearchResult, names: Sequence[str], numbers: Sequence[
 
 
 def _trajectory_files(result: LoopSearchResult, names: Sequence[str], optimized: OptimizedTrajectory | None) -> Writers:
-    """Return writers of the odometry and of the corrected trajectories of all sessions.
-
-    If there are several sessions, their names are part of the file names.
-    """
+    """Return writers of the odometry and of the corrected trajectories of all sessions. If there are several sessions,
+    their names are part of the file names."""
     files: Writers = {}
     corrected = [None] * len(names) if optimized is None else result.split(optimized.poses)
     for name, session, optimized_poses in zip(names, result.sessions, corrected, strict=True):

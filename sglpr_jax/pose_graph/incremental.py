@@ -51,20 +51,14 @@ class IncrementalTrajectory:
         settings.setRelinearizeThreshold(RELINEARIZE)
         settings.relinearizeSkip = 1
         self._solver = self._gtsam.ISAM2(settings)
-        self._graph = FactorGraph()
-        """Factors and nodes since the last update of the solver."""
+        self._graph = FactorGraph()  # factors and nodes since the last update of the solver
         self._odometry = GrowingArray(np.empty((0, 4, 4)))
         self._travelled = GrowingArray(np.empty(0))
-        self._node_frames: list[int] = []
-        """Frame of each node. Nodes are named by their frames, also in the graph."""
-        self._node_segments: list[int] = []
-        """Segment of each node, counted from 0."""
-        self._segments_in_graph = {0}
-        """Segments whose nodes are in the graph."""
-        self._waiting_loops: list[LoopClosure] = []
-        """Loops between two segments that are not in the graph."""
-        self._last_query_node = 0
-        """Node of the query of the last loop in the graph."""
+        self._node_frames: list[int] = []  # frame of each node. Nodes are named by their frames, also in the graph.
+        self._node_segments: list[int] = []  # segment of each node, counted from 0
+        self._segments_in_graph = {0}  # segments whose nodes are in the graph
+        self._waiting_loops: list[LoopClosure] = []  # loops between two segments that are not in the graph
+        self._last_query_node = 0  # node of the query of the last loop in the graph
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -90,10 +84,8 @@ class IncrementalTrajectory:
     def add(
         self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[LoopClosure] = (), *, continues: bool = True
     ) -> None:
-        """Add the pose of the LiDAR by odometry at the next frame, and new loops of this and of earlier frames.
-
-        With `continues=False`, the motion since the last frame is unknown, and the odometry may begin in another frame.
-        """
+        """Add the pose of the LiDAR by odometry at the next frame, and new loops of this and of earlier frames. With
+        `continues=False`, the motion since the last frame is unknown, and the odometry may begin in another frame."""
         frame = len(self)
         travelled_m = 0.0
         if frame:
@@ -135,11 +127,9 @@ class IncrementalTrajectory:
                 self._add_loop(loop)
 
     def _add_loop(self, loop: LoopClosure) -> None:
-        """Connect the nodes before query and match of a loop, of which at least one is in the graph.
-
-        If the other node is not, its segment enters the graph. A loop that adds no information is ignored. The
-        covariance stays that of the loop, because the nodes are near its frames.
-        """
+        """Connect the nodes before query and match of a loop, of which at least one is in the graph. If the other node
+        is not, its segment enters the graph. A loop that adds no information is ignored. The covariance stays that of
+        the loop, because the nodes are near its frames."""
         query, match = self._node_before(loop.query), self._node_before(loop.match)
         odometry = self._odometry.rows
         query_from_frame = inverse(odometry[query]) @ odometry[loop.query]

@@ -38,10 +38,8 @@ def read_odometry(
 def read_stamped(
     path: Path, *, format: OdometryFormat = "auto", time_unit: TimeUnit = "auto"
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
-    """Read the poses of an odometry file, and their times in seconds, or None if its format is not tum.
-
-    Arguments and errors are those of `read_odometry`.
-    """
+    """Read the poses of an odometry file, and their times in seconds, or None if its format is not tum. Arguments and
+    errors are those of `read_odometry`."""
     check_value(format, OdometryFormat, f"{path}, format")
     check_value(time_unit, TimeUnit, f"{path}, time_unit")
     if path.suffix in ENDINGS:

@@ -219,10 +219,8 @@ def _solve_with_gtsam(
     sessions: Int[np.ndarray, " n"],
     drift: DriftModel,
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " k"]]:
-    """Solve a pose graph with gtsam. Returns the solved poses, and whether each loop is an inlier.
-
-    `sessions` is the session of each pose. The motion between the last and the first pose of two sessions is unknown.
-    """
+    """Solve a pose graph with gtsam. Returns the solved poses, and whether each loop is an inlier. `sessions` is the
+    session of each pose. The motion between the last and the first pose of two sessions is unknown."""
     gtsam, graph = gtsam_library(), FactorGraph()
     for frame, pose in enumerate(odometry):
         graph.add_node(frame, pose, fixed=frame == 0)
@@ -260,11 +258,9 @@ def _deviations_at_loops(
     sessions: Int[np.ndarray, " n"],
     drift: DriftModel,
 ) -> Float[np.ndarray, " k"]:
-    """Return the deviation of the solved poses from the odometry at each loop, in standard deviations.
-
-    It is the largest one along the path between the two frames of the loop, and along the paths from each of them to
-    the next earlier and later frame of any loop. `sessions` is the session of each pose.
-    """
+    """Return the deviation of the solved poses from the odometry at each loop, in standard deviations. It is the
+    largest one along the path between the two frames of the loop, and along the paths from each of them to the next
+    earlier and later frame of any loop. `sessions` is the session of each pose."""
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
     # A solved path is written as a loop, to measure its deviation. Covariance and probability are not used.

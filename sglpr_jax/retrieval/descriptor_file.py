@@ -90,10 +90,8 @@ class DescriptorFile:
 
     @property
     def is_described(self) -> np.ndarray:
-        """Flag of each scan of the recording, skipped ones included: whether the scan is in this file.
-
-        Raises ValueError if the skipped rows in `config` are invalid.
-        """
+        """Flag of each scan of the recording, skipped ones included: whether the scan is in this file. Raises
+        ValueError if the skipped rows in `config` are invalid."""
         skipped = self.config.get(SKIPPED, [])
         n = len(self) + len(skipped) if isinstance(skipped, list) else 0
         valid_rows = {row for row in skipped if type(row) is int and 0 <= row < n} if n else set()
@@ -142,10 +140,8 @@ class DescriptorFile:
 
 
 def check_made_alike(expected: Mapping[str, Any], found: Mapping[str, Any], *, of: str = "descriptors") -> None:
-    """Raise ValueError if a property of descriptors, such as "weights", differs from the expected one.
-
-    A property that is None in `found` is not checked. `of` names the descriptors in the message.
-    """
+    """Raise ValueError if a property of descriptors, such as "weights", differs from the expected one. A property that
+    is None in `found` is not checked. `of` names the descriptors in the message."""
     for name, value in found.items():
         if value is not None and value != expected[name]:
             expected_text = json_in_short(expected[name]) or "(none)"
@@ -154,10 +150,8 @@ def check_made_alike(expected: Mapping[str, Any], found: Mapping[str, Any], *, o
 
 
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
-    """Raise ValueError unless the descriptors of two files can be compared: same method, model, weights and scale.
-
-    The recordings and the rotations may differ.
-    """
+    """Raise ValueError unless the descriptors of two files can be compared: same method, model, weights and scale. The
+    recordings and the rotations may differ."""
 
     def properties(file: DescriptorFile) -> dict[str, Any]:
         """What must be equal in both files."""

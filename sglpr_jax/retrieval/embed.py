@@ -111,11 +111,9 @@ def _stacked(method: Method, inputs: list[Any], names: list[str]) -> Any:
 def _descriptor_file(
     method: Method, recording: Recording, rows: list[int], descriptors: list[Any], *, rotation_seed: int | None
 ) -> DescriptorFile:
-    """Return the descriptor file of the scans in `rows` of a recording.
-
-    `descriptors` are batches (b, d). The last one may have additional rows at its end, which are dropped. Raises
-    ValueError if there are no rows, if batches differ in width, or if a model's descriptors are invalid.
-    """
+    """Return the descriptor file of the scans in `rows` of a recording. `descriptors` are batches (b, d). The last one
+    may have additional rows at its end, which are dropped. Raises ValueError if there are no rows, if batches differ in
+    width, or if a model's descriptors are invalid."""
     check_readable(recording, len(rows))
     widths = sorted({batch.shape[1] for batch in descriptors})
     if len(widths) > 1:

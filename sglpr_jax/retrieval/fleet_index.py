@@ -109,10 +109,8 @@ class FleetIndex:
         return answers.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
     def optimize(self, config: Any = None) -> None:
-        """Merge small files and add new places to the indexes of the columns.
-
-        If there are no indexes, or with a `config` of LanceDB for the index of descriptors, they are trained first.
-        """
+        """Merge small files and add new places to the indexes of the columns. If there are no indexes, or with a
+        `config` of LanceDB for the index of descriptors, they are trained first."""
         from lancedb.index import Bitmap, BTree, IvfSq
 
         columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}

@@ -73,11 +73,9 @@ def save_map(path: Path, found: SemanticMap, scan: Scan, *, categories: int) -> 
 def _predict(
     params: Params, counts: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
 ) -> tuple[Int[Array, "h w"], Int[Array, "h w"]]:
-    """Return the predicted classes and the truth, both `UNLABELLED` in cells that are empty or out of view.
-
-    A cell is predicted by the mean probability over the image and its mirror image, if it reaches `min_confidence`.
-    The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds more.
-    """
+    """Return the predicted classes and the truth, both `UNLABELLED` in cells that are empty or out of view. A cell is
+    predicted by the mean probability over the image and its mirror image, if it reaches `min_confidence`. The network
+    is equivariant to rotations of the scan but not to reflections, so only the mirror image adds more."""
     occupied = (counts > 0) & field_of_view(params.config)[0]
     logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
     upright, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])  # without class 0, unlabelled

@@ -224,10 +224,8 @@ class Index:
     def recent(
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
-        """Return flags of the places less than `seconds` older than the time `now`: too recent for a revisit.
-
-        Without `now`, or if the places have no times, the last `frames` places are flagged.
-        """
+        """Return flags of the places less than `seconds` older than the time `now`: too recent for a revisit. Without
+        `now`, or if the places have no times, the last `frames` places are flagged."""
         if now is not None and self.times is not None:
             return self.times > now - seconds
         return np.arange(len(self)) >= len(self) - frames
@@ -276,10 +274,8 @@ class Index:
     def _nearest(
         self, queries: Float[np.ndarray, "q d"], allowed: Bool[np.ndarray, " n"], k: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed.
-
-        L2 is exact: float32 products select a few rows more than k, and their distances are recomputed in float64.
-        """
+        """Return the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed. L2
+        is exact: float32 products select a few rows more than k, and their distances are recomputed in float64."""
         allowed_rows = np.flatnonzero(allowed)
         if self.distance != "l2":
             distances = distance_function(self.distance)(queries, self.descriptors[allowed_rows])
@@ -299,10 +295,8 @@ class Index:
         return np.take_along_axis(near_rows, order, axis=1), np.take_along_axis(distances, order, axis=1)
 
     def _relative_squared_distances(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
-        """Return squared distances to all places minus the squared length of the query, which keeps their order.
-
-        The result for the last single query is kept, because the loop search repeats a query with other exclusions.
-        """
+        """Return squared distances to all places minus the squared length of the query, which keeps their order. The
+        result for the last single query is kept, because the loop search repeats a query with other exclusions."""
         key = queries.tobytes() if len(queries) == 1 else None
         last = self._last_query  # read once, because another thread may replace it
         if last is not None and last[0] == key:

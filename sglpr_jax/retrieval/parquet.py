@@ -114,10 +114,8 @@ def about_of(stored: "pyarrow.Schema", source: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def storage_errors(address: str) -> Iterator[None]:
-    """Convert any exception of the block, which calls a storage library, to a ValueError that names the address.
-
-    An ImportError stays an ImportError, and says what to install.
-    """
+    """Convert any exception of the block, which calls a storage library, to a ValueError that names the address. An
+    ImportError stays an ImportError, and says what to install."""
     try:
         yield
     except ImportError as error:

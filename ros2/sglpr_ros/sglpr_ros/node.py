@@ -23,11 +23,8 @@ def run(
     say: Callable[[str], object],
     should_stop: Callable[[], bool],
 ) -> None:
-    """Find loops until `should_stop` is true.
-
-    `connect` opens a connection to ROS, once for the source and once for the sink. The other arguments and the errors
-    are those of `run_node`.
-    """
+    """Find loops until `should_stop` is true. `connect` opens a connection to ROS, once for the source and once for the
+    sink. The other arguments and the errors are those of `run_node`."""
     run_node(
         command,
         lambda live_map: RosSource(connect(), command, report),

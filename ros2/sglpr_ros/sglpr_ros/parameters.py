@@ -34,10 +34,8 @@ def defaults() -> dict[str, Any]:
 
 
 def command_of(values: dict[str, Any]) -> LiveCommand:
-    """Return the command of bin/live with these parameters.
-
-    Raises ValueError if the height of the sensor is neither a number nor "auto".
-    """
+    """Return the command of bin/live with these parameters. Raises ValueError if the height of the sensor is neither a
+    number nor "auto"."""
     flags = {name: None if name in EMPTY and not value else value for name, value in values.items()}
     height = flags.pop("sensor_height")
     try:

@@ -15,10 +15,8 @@ from sglpr_jax.live.ros_encoding import Received
 
 
 class RclpyTransport:
-    """Subscriptions and publishers of a node. See `sglpr_jax.live.ros.Transport` for the methods.
-
-    rclpy does not tell which publisher sent a message.
-    """
+    """Subscriptions and publishers of a node. See `sglpr_jax.live.ros.Transport` for the methods. rclpy does not tell
+    which publisher sent a message."""
 
     def __init__(self, node: Any, report: Report):
         """Use a node, which another thread spins."""
