@@ -95,9 +95,8 @@ class DdsTransport:
         qos = _qos(depth, reliable=True, latched=latched)
         writer = DataWriter(self._participant, self._topic(topic, kind), qos=qos)
         expected = f"{topic}: expected subscribers that accept the QoS {_qos_text(True, latched)}"
-        self._qos_statuses.append(
-            (f"{expected}, found one that asks for more", writer.get_offered_incompatible_qos_status)
-        )
+        mismatch = f"{expected}, found one that asks for more"
+        self._qos_statuses.append((mismatch, writer.get_offered_incompatible_qos_status))
         self._writers[topic] = writer
         del writer  # held by the dictionary alone, so that `close` deletes it
 

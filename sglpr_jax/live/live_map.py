@@ -59,11 +59,11 @@ class LiveScan(NamedTuple):
 class LiveMap:
     """Loop detector that writes each scan and its loops to disk before it returns the loops.
 
-        Example:
-          live = LiveMap(LoopDetector(params), Path("found"), report=Reports())
-    missed = live.restore()         # loops of an earlier process that were not written
-          edges = live.add(frame)         # for each LiveFrame
-          live.close()
+    Example:
+      live = LiveMap(LoopDetector(params), Path("found"), report=Reports())
+      missed = live.restore()         # loops of an earlier process that were not written
+      edges = live.add(frame)         # for each LiveFrame
+      live.close()
     """
 
     def __init__(
@@ -178,9 +178,7 @@ class LiveMap:
             raise ValueError(f"{scan.name or 'scan'}: expected points, found none")
         if scan.mounting is None:
             scan = dataclasses.replace(scan, mounting=self._mounting.add(scan.points))
-        keyframe = self.detector.finder.keyframe(
-            scan
-        )  # before clock and odometry, whose state an invalid scan must not change
+        keyframe = self.detector.finder.keyframe(scan)  # first, because an invalid scan must not change the clock
         scan_time = self._clock.time(frame.time, frame.received)
         state = self._continuity.add(pose, scan_time)
         if state is None:
@@ -249,9 +247,8 @@ class LiveMap:
         frame of the latest scan. `received` is the time at which the latest scan arrived."""
         frames = np.array([loop.query, loop.match])
         in_latest_frame = self.detector.finder.motion.same(-1, frames) & (len(self.odometry) > 0)
-        query_pose, match_pose = (
-            self.odometry[frame].copy() if known else None for frame, known in zip(frames, in_latest_frame, strict=True)
-        )
+        pairs = zip(frames, in_latest_frame, strict=True)
+        query_pose, match_pose = (self.odometry[frame].copy() if known else None for frame, known in pairs)
         return LoopEdge(
             query=loop.query,
             match=loop.match,
@@ -271,9 +268,8 @@ def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
     path = folder / SETTINGS_FILE
     wanted = json.loads(json.dumps(wanted))  # tuples become lists, as in the file
     if (folder / OLD_LOG).exists():
-        raise ValueError(
-            f"{folder}: expected a map of this version, found {OLD_LOG} of an earlier one; use another --out"
-        )
+        expected = f"{folder}: expected a map of this version"
+        raise ValueError(f"{expected}, found {OLD_LOG} of an earlier one; use another --out")
     if not (folder / FRAMES_LOG).exists():
         return write_json(path, wanted)
     stored = read_json(path)
