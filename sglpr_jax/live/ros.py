@@ -50,16 +50,13 @@ class Transport(Protocol):
     ) -> None:
         """Call `receive` with each message of a topic that has one of the types `kinds`. At most `depth` messages wait.
         `reliable` requests lost messages again, `latched` requests earlier messages."""
-        ...
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
         """Return a function that publishes encoded messages (CDR) of one type. With `latched`, later subscribers
         receive the last `depth` messages."""
-        ...
 
     def published(self) -> dict[str, set[str]]:
         """Return the types of each topic that has a publisher."""
-        ...
 
     def close(self) -> None: ...
 

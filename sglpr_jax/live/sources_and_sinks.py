@@ -29,12 +29,10 @@ class Source(Protocol):
     def frames(self) -> Iterator[LiveFrame | None]:
         """Yield scans as they arrive, and None after `WAIT_S` seconds without a scan, so that the node can react to
         signals. Ends if no more scans can come."""
-        ...
 
     @property
     def dropped(self) -> int:
         """Number of scans that were replaced by newer ones before they were taken."""
-        ...
 
     def close(self) -> None: ...
 
@@ -45,11 +43,9 @@ class Sink(Protocol):
 
     def frame(self, status: FrameStatus) -> None:
         """Publish the status after a scan."""
-        ...
 
     def loop(self, edge: LoopEdge) -> None:
         """Publish a loop."""
-        ...
 
     def close(self) -> None: ...
 

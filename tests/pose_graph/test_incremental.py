@@ -75,6 +75,6 @@ def test_a_route_driven_again_and_again_needs_few_loops():
     found = [LoopClosure(i, i - steps, np.eye(4), LOOP_COVARIANCE, 0.99) for i in range(steps, len(poses))]
     trajectory = driven(poses, found)
     np.testing.assert_allclose(trajectory.poses, poses, atol=1e-4)
-    loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._nodes)
+    loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._node_frames)
     travelled = 3 * 2 * np.pi * 40
     assert travelled / LOOP_EVERY_M - 2 <= loops <= travelled / LOOP_EVERY_M + 1
