@@ -180,12 +180,12 @@ class GrowingPoses:
         by `time`, in seconds, with interpolation. Others are matched by `row`, the number of the scan."""
         if time is None or self._format not in ("auto", "tum"):
             return self._poses[row] if row < len(self._poses) else None
-        middle = bisect.bisect_left(self._times, time)
-        near = range(max(middle - NEAR_POSES, 0), min(middle + NEAR_POSES, len(self._poses)))
-        posed = [(self._times[i], pose) for i in near if (pose := self._poses[i]) is not None]
-        if len(posed) < 2 or posed[-1][0] < time - BEYOND_S:
+        first_later = bisect.bisect_left(self._times, time)
+        near_lines = range(max(first_later - NEAR_POSES, 0), min(first_later + NEAR_POSES, len(self._poses)))
+        valid = [(self._times[i], pose) for i in near_lines if (pose := self._poses[i]) is not None]
+        if len(valid) < 2 or valid[-1][0] < time - BEYOND_S:  # the file does not reach the time yet
             return None
-        stamps, poses = zip(*posed, strict=True)
+        stamps, poses = zip(*valid, strict=True)
         return pose_at(np.array(stamps), np.stack(poses), time)
 
     def _add(self, words: list[str], where: str) -> None:

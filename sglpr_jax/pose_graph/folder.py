@@ -135,27 +135,27 @@ def _frames_json(
     """Return the content of `FRAMES`: recordings with their vertex offsets, and transforms between their frames.
     `numbers` is the result of `vertex_numbers`."""
 
-    def frame(segment: TrajectorySegment) -> dict[str, Any]:
+    def describe_frame(segment: TrajectorySegment) -> dict[str, Any]:
         """Return the name of a segment's frame, and the first and the last scan with a pose in this frame."""
         scans = result.sessions[segment.session].recording.numbers
         first, last = int(scans[segment.first]), int(scans[segment.last])
         return {"frame": "odometry" if segment.is_odometry else f"LiDAR at scan {first}", "first": first, "last": last}
 
     recordings = [
-        {"name": name, "scans": session.frames, "first_vertex": int(rows[0] - session.recording.numbers[0])}
-        for name, rows, session in zip(names, numbers, result.sessions, strict=True)
+        {"name": name, "scans": session.frames, "first_vertex": int(vertices[0] - session.recording.numbers[0])}
+        for name, vertices, session in zip(names, numbers, result.sessions, strict=True)
     ]
     transforms = [
         {
-            "match_recording": names[aligned.match.session],
-            "query_recording": names[aligned.query.session],
-            "match_frame": frame(aligned.match),
-            "query_frame": frame(aligned.query),
-            "match_from_query": aligned.match_from_query.tolist(),
-            "covariance": aligned.covariance.tolist(),
-            "loops": aligned.loops,
+            "match_recording": names[transform.match.session],
+            "query_recording": names[transform.query.session],
+            "match_frame": describe_frame(transform.match),
+            "query_frame": describe_frame(transform.query),
+            "match_from_query": transform.match_from_query.tolist(),
+            "covariance": transform.covariance.tolist(),
+            "loops": transform.loops,
         }
-        for aligned in result.transforms
+        for transform in result.transforms
     ]
     no_common_place = [
         [names[match], names[query]] for match, query in result.pairs if not result.between(match, query).transforms
@@ -166,8 +166,8 @@ def _frames_json(
 def _comments(result: LoopSearchResult, names: Sequence[str], numbers: Sequence[Int[np.ndarray, " _"]]) -> list[str]:
     """Return comment lines that state the vertex numbers and the frame of each session."""
     lines = []
-    for name, rows, (group, _), session in zip(names, numbers, placements(result), result.sessions, strict=True):
-        offset = int(rows[0] - session.recording.numbers[0])
+    for name, vertices, (group, _), session in zip(names, numbers, placements(result), result.sessions, strict=True):
+        offset = int(vertices[0] - session.recording.numbers[0])
         frame = f"; poses in the frame of {names[group]}" if session.odometry is not None else ""
         lines.append(f"{name}: vertex = {offset} + number of the scan{frame}")
     return lines
