@@ -79,9 +79,7 @@ def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
     inliers = np.zeros(len(result.loops), bool)
     solutions = []  # one for each group of connected sessions
     for group in dict.fromkeys(group for group, _ in placed):
-        members = {
-            session: group_from_session for session, (own, group_from_session) in enumerate(placed) if own == group
-        }
+        members = {session: pose for session, (its_group, pose) in enumerate(placed) if its_group == group}
         rows = [row for row, loop in enumerate(result.loops) if loop.query_session in members]
         solution, solved_poses = _solve_group(result, members, [result.loops[row] for row in rows])
         solutions.append(solution)
@@ -91,12 +89,12 @@ def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
             _warn_of_height_change(result.sessions[session], members[session], corrected)
     squared_m2 = sum(solution.moved_rms_m**2 * len(solution.poses) for solution in solutions)
     return OptimizedTrajectory(
-        np.concatenate([poses[session] for session in range(len(result.sessions))]),
-        inliers,
-        max(solution.moved_m for solution in solutions),
-        float(np.sqrt(squared_m2 / max(sum(len(solution.poses) for solution in solutions), 1))),
-        max(solution.deviation for solution in solutions),
-        solutions[0].drift,
+        poses=np.concatenate([poses[session] for session in range(len(result.sessions))]),
+        inliers=inliers,
+        moved_m=max(solution.moved_m for solution in solutions),
+        moved_rms_m=float(np.sqrt(squared_m2 / max(sum(len(solution.poses) for solution in solutions), 1))),
+        deviation=max(solution.deviation for solution in solutions),
+        drift=solutions[0].drift,
     )
 
 
@@ -200,16 +198,17 @@ def solve_pose_graph(
     for _ in range(ROUNDS):
         if not is_used.any():
             break
-        chosen = np.flatnonzero(is_used)
-        solved, fits = _solve_with_gtsam(poses, [loops[i] for i in chosen], sessions, drift)
-        members = chosen[fits]
-        loop_deviations = _deviations_at_loops(poses, solved, [loops[i] for i in members], sessions, drift)
+        used_rows = np.flatnonzero(is_used)
+        solved, is_inlier = _solve_with_gtsam(poses, [loops[i] for i in used_rows], sessions, drift)
+        inlier_rows = used_rows[is_inlier]
+        loop_deviations = _deviations_at_loops(poses, solved, [loops[i] for i in inlier_rows], sessions, drift)
         if (loop_deviations <= drift.max_deviation).all():
-            moved = np.linalg.norm(solved[:, :3, 3] - poses[:, :3, 3], axis=1)
-            rms, deviation = float(np.sqrt(np.mean(moved**2))), float(loop_deviations.max(initial=0))
-            inliers = np.isin(np.arange(len(loops)), members)
-            return OptimizedTrajectory(solved, inliers, float(moved.max()), rms, deviation, drift)
-        is_used[members[loop_deviations > drift.max_deviation]] = False
+            moved_m = np.linalg.norm(solved[:, :3, 3] - poses[:, :3, 3], axis=1)
+            moved_rms_m = float(np.sqrt(np.mean(moved_m**2)))
+            inliers = np.isin(np.arange(len(loops)), inlier_rows)
+            deviation = float(loop_deviations.max(initial=0))
+            return OptimizedTrajectory(solved, inliers, float(moved_m.max()), moved_rms_m, deviation, drift)
+        is_used[inlier_rows[loop_deviations > drift.max_deviation]] = False
     return OptimizedTrajectory(poses, np.zeros(len(loops), bool), drift=drift)
 
 
@@ -225,11 +224,11 @@ def _solve_with_gtsam(
     for frame, pose in enumerate(odometry):
         graph.add_node(frame, pose, fixed=frame == 0)
     metres, radians = step_deviations(odometry, drift)
-    # A large value keeps the graph solvable without loops between sessions.
+    # Between sessions, a large value keeps the graph solvable even without loops.
     metres, radians = (np.where(np.diff(sessions), UNKNOWN_MOTION_SIGMA, deviation) for deviation in (metres, radians))
     for frame, step in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
         graph.add_step(frame, frame + 1, step, metres=metres[frame], radians=radians[frame])
-    odometry_factors = graph.factors.size()
+    odometry_factors = graph.factors.size()  # number of the factors before those of the loops
     for loop in loops:
         graph.add_loop(loop.match, loop.query, loop.match_from_query, loop.covariance)
     options = gtsam.GncLMParams()
@@ -237,7 +236,8 @@ def _solve_with_gtsam(
     solver = gtsam.GncLMOptimizer(graph.factors, graph.estimates, options)
     solution = solver.optimize()
     poses = np.stack([solution.atPose3(frame).matrix() for frame in range(len(odometry))])
-    return poses, np.asarray(solver.getWeights())[odometry_factors:] > 0.5
+    loop_weights = np.asarray(solver.getWeights())[odometry_factors:]  # near 0 or 1
+    return poses, loop_weights > 0.5
 
 
 def _odometry_deviations(
@@ -262,7 +262,7 @@ def _deviations_at_loops(
     largest one along the path between the two frames of the loop, and along the paths from each of them to the next
     earlier and later frame of any loop. `sessions` is the session of each pose."""
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
-    ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
+    ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))  # of each path
     # A solved path is written as a loop, to measure its deviation. Covariance and probability are not used.
     paths = [LoopClosure(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
     deviation = _odometry_deviations(paths, odometry, sessions, drift)
@@ -270,7 +270,8 @@ def _deviations_at_loops(
     largest = []
     for loop, between in zip(loops, between_ends, strict=True):
         is_end = np.isin(frames, [loop.match, loop.query])
-        largest.append(max(between, *to_next_frame[is_end[:-1] | is_end[1:]], 0.0))
+        touches_loop = is_end[:-1] | is_end[1:]  # of each path between consecutive frames
+        largest.append(max(between, *to_next_frame[touches_loop], 0.0))
     return np.array(largest)
 
 
