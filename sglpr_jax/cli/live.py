@@ -16,9 +16,9 @@ from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
-    from sglpr_jax.live.endpoints import Sink, Source
     from sglpr_jax.live.live_map import LiveMap
-    from sglpr_jax.live.messages import Report
+    from sglpr_jax.live.node_messages import Report
+    from sglpr_jax.live.sources_and_sinks import Sink, Source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,8 +55,8 @@ class LiveCommand(LiveOptions, DetectorFlags):
 
 def live(command: LiveCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.live.endpoints import open_sink, open_source
-    from sglpr_jax.live.messages import Reports
+    from sglpr_jax.live.node_messages import Reports
+    from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 
     _check(command)
     report = Reports()
@@ -89,12 +89,12 @@ def run_node(
     cannot be written.
     """
     from sglpr_jax.live.node import Node
-    from sglpr_jax.live.results import write_results
+    from sglpr_jax.live.result_files import write_results
 
     with exclusive_lock(command.out), contextlib.ExitStack() as opened:
         live_map = _open_map(command, report)
         opened.callback(live_map.close)
-        missed = live_map.recall()
+        missed = live_map.restore()
         sinks = []
         for sink in open_sinks():
             opened.callback(_close, sink, report)
@@ -114,12 +114,12 @@ def run_node(
 
 def _check(command: LiveCommand) -> None:
     """Raises ValueError before any work for an unknown source or sink, or if an input would be overwritten."""
-    from sglpr_jax.live.endpoints import SINKS, SOURCES, check_name
-    from sglpr_jax.live.results import CORRECTED, TRAJECTORY
+    from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
+    from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, split_known_name
 
-    check_name(command.source, SOURCES, kind="sources")
+    split_known_name(command.source, SOURCES, kind="sources")
     for text in command.sinks:
-        check_name(text, SINKS, kind="sinks")
+        split_known_name(text, SINKS, kind="sinks")
     written = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
     if command.poses is not None and command.poses.resolve() in written:
         raise ValueError(

@@ -144,7 +144,7 @@ def _search(command: LoopsCommand) -> int:
     from sglpr_jax.loops.result import diagnose_no_loops
     from sglpr_jax.loops.search import can_register, find_loops
     from sglpr_jax.models.weights_file import load
-    from sglpr_jax.pose_graph.folder import write_found
+    from sglpr_jax.pose_graph.folder import write_loop_folder
     from sglpr_jax.pose_graph.optimize import optimize_trajectory
 
     params, detector, out, checkpoint = load(command.weights), command.detector, command.out, command.out / UNFINISHED
@@ -179,7 +179,7 @@ def _search(command: LoopsCommand) -> int:
     if command.degenerate == "drop":
         result = result.without_degenerate()
     optimized = optimize_trajectory(result) if command.optimize else None
-    paths = write_found(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
+    paths = write_loop_folder(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
     paths.append(record_command(effective, out))
     if command.rerun is not None:
         write_rerun(result, command.rerun, optimized=optimized)

@@ -177,15 +177,15 @@ def open_with_poses(
     cloud map, the scans are those that its LiDAR would measure at the poses.
     """
     from sglpr_jax.data.formats.scan_files import is_cloud_file
-    from sglpr_jax.pose_graph.odometry_files import at_scans, is_own, own_odometry, read_stamped
+    from sglpr_jax.pose_graph.odometry_files import is_bag_of_recording, match_to_scans, read_stamped, take_bag_odometry
 
     if is_cloud_file(root):
-        return own_odometry(source.open(root, poses=path, pose_format=format), root)
-    if is_own(path, root):
-        return own_odometry(source.open(root), root)
+        return take_bag_odometry(source.open(root, poses=path, pose_format=format), root)
+    if is_bag_of_recording(path, root):
+        return take_bag_odometry(source.open(root), root)
     odometry = read_stamped(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly
     opened = source.open(root)
-    recording, poses = at_scans(opened, *odometry, path)
+    recording, poses = match_to_scans(opened, *odometry, path)
     if recording is not opened:
         print(recording.found[-1], file=sys.stderr)
     return recording, poses

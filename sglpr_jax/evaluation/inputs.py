@@ -156,9 +156,9 @@ def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> De
             raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
         return file
     positions, times = trajectory.positions, trajectory.times
-    recorded = file.recorded
-    if len(positions) == len(recorded) != len(file):
-        positions, times = positions[recorded], None if times is None else times[recorded]
+    is_described = file.is_described
+    if len(positions) == len(is_described) != len(file):
+        positions, times = positions[is_described], None if times is None else times[is_described]
     with naming(path):
         scan_poses = poses_at_scans(
             trajectory.source,

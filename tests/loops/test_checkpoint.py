@@ -18,7 +18,7 @@ from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.pose_graph.folder import write_found
+from sglpr_jax.pose_graph.folder import write_loop_folder
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.registration.gicp import Registration
@@ -54,7 +54,7 @@ def whole(twice, params, tmp_path_factory):
 
 
 def contents(found, folder) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in write_found(found, folder)}
+    return {path.name: path.read_bytes() for path in write_loop_folder(found, folder)}
 
 
 def stopping_after(frames: int, asked: list):
