@@ -15,7 +15,7 @@ from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, LoopClosure, Reason, Rejec
 from sglpr_jax.loops.consistency import are_consistent, largest_consistent_set
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.frame_alignment import logarithm
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import inverse

@@ -19,7 +19,7 @@ from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import level_odometry
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.same_place import NEGATIVE_M

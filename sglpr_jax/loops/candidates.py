@@ -17,8 +17,8 @@ from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan, imag
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, BevOdometry
-from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
+from sglpr_jax.odometry.drift_model import MOTION_DRIFT, DriftModel
 from sglpr_jax.registration.background import Background
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_search import CorrelationPeak, search_near

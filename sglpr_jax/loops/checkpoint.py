@@ -24,7 +24,7 @@ from sglpr_jax.frame_log import RunLog
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.keyframes import Keyframe
-from sglpr_jax.odometry.config import MOTION_DRIFT
+from sglpr_jax.odometry.drift_model import MOTION_DRIFT
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.retrieval.descriptor_cache import fingerprint

@@ -18,7 +18,7 @@ from sglpr_jax.loops.drift import planar_covariance, planar_deviations
 from sglpr_jax.loops.keyframes import EVERY, Keyframes
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, search
 from sglpr_jax.registration.bev_spectra import query_spectra

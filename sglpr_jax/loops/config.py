@@ -4,7 +4,7 @@ import dataclasses
 from typing import Annotated, Literal
 
 from sglpr_jax.fields import Bounds, Count, NotNegative, Positive, Share, check_fields
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.config import VerificationConfig
 
 Degenerate = Literal["keep", "drop"]

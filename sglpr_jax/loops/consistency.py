@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.loops.closure import LoopClosure, Reason, RejectedClosure, frames_of, planar_measurements
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar, planar_pose
 

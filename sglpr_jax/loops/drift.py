@@ -1,4 +1,4 @@
-"""Drift model of odometry: how far a loop is from the odometry between its two frames, in standard deviations."""
+"""Deviation of loops from the odometry between their two frames, in standard deviations of its drift."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sglpr_jax.loops.closure import LoopClosure, frames_of, planar_measurements
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import PlanarPose, compose_planar, planar_pose, travelled, wrap_angle
 

@@ -11,7 +11,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.loops.closure import LoopClosure, covariance_in_metres, frames_of
 from sglpr_jax.loops.config import INDEPENDENT_M
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import adjoint, inverse, transform_covariance, yaw_of
 
 ROUNDS = 20

@@ -14,7 +14,7 @@ from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.frame_alignment import SegmentAlignment
 from sglpr_jax.loops.probability import LoopModel
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

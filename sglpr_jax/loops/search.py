@@ -43,7 +43,7 @@ from sglpr_jax.loops.result import LoopSearchResult, Session, ordered_rejections
 from sglpr_jax.loops.sequence import pair_of, probable_loops, rejection_reason
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.gicp import check_installed, is_installed
 from sglpr_jax.se3 import inverse
 

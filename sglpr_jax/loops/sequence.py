@@ -19,7 +19,7 @@ from sglpr_jax.loops.config import INDEPENDENT_M, DetectorConfig
 from sglpr_jax.loops.consistency import are_consistent
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 
 WINDOW_M = 50.0

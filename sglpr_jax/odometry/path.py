@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import inverse
 
 UPPER = np.triu_indices(3)

@@ -9,7 +9,7 @@ from scenes import place, seen_from
 from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 

@@ -12,7 +12,7 @@ from session_pairs import loops_between, two_drives
 from sglpr_jax.loops.closure import LoopClosure, planar_loop
 from sglpr_jax.loops.consistency import MIN_LOOPS, accept_between, are_consistent, largest_consistent_set
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform
