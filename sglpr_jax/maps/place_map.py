@@ -211,7 +211,7 @@ class PlaceMap(Keyframes):
         _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
         answers = []
         for row in order[np.sort(first)][:candidates].tolist():
-            candidate = comparison.verify(query, fits, row, self)
+            candidate = comparison.candidate_of_fit(query, fits, row, self)
             place, probability = candidate.match, float(model.probability(candidate.evidence))
             mountings = keyframe.mounting, self.mounting(place).scaled(self.scale)
             loop = planar_loop(*candidate[:3], probability=probability, sensors=mountings)
