@@ -239,8 +239,8 @@ class LiveMap:
 
     def _edge(self, loop: LoopClosure, received: float) -> LoopEdge:
         """The loop, with the times of its scans, and their poses if these are in the present frame of the odometry."""
-        ends = np.array([loop.query, loop.match])
-        in_frame = self.detector.finder.motion.same(-1, ends) & (len(self.odometry) > 0)
+        ends, segments = np.array([loop.query, loop.match]), self.detector.finder.motion.segments
+        in_frame = (segments[ends] == segments[-1]) & (len(self.odometry) > 0)
         query, match = (self.odometry[end].copy() if ok else None for end, ok in zip(ends, in_frame, strict=True))
         times = float(self.stamps[loop.query]), float(self.stamps[loop.match])
         closure = loop.match_from_query, loop.covariance, loop.probability

@@ -133,8 +133,8 @@ class KeyframeComparison:
     ) -> list[Candidate]:
         """Candidates of a query: the best match that the motion allows and, if it differs, the best match of all.
 
-        The latter can show that the motion is wrong. Both must have `min_correlation`. Only fits that are `possible` and
-        outside of the query's own pass count. Their scans are `searched`.
+        The latter can show that the motion is wrong. Only `possible` fits outside of the query's own pass count, of at
+        least `min_correlation`. Their scans are `searched`.
         """
         rows = self._best_consistent_with_motion(query.frame, fits, possible), self._best(query.frame, fits, possible)
         return [
