@@ -250,10 +250,10 @@ def open_with_odometry(
 
 def _odometry_of(recording: "Recording", command: Any, checkpoint: Path) -> "Float[np.ndarray, 'n 4 4']":
     """Compute the odometry of a recording, with progress on stderr. If it is interrupted, the command ends."""
-    from sglpr_jax.odometry.kiss_icp import about, scan_odometry
+    from sglpr_jax.odometry.kiss_icp import describe_odometry, scan_odometry
 
     if not recording.has_images:
-        print(about(recording, command.scan_odometry, scale=command.scale), file=sys.stderr)
+        print(describe_odometry(recording, command.scan_odometry, scale=command.scale), file=sys.stderr)
     with stop_on_signal() as stop, progress_bar(f"odometry {recording.name}", len(recording)) as show:
         poses = scan_odometry(
             recording,

@@ -6,8 +6,8 @@ from typing import Literal
 from sglpr_jax.fields import NotNegative, Positive, check_fields
 
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
-"""Format of odometry. "kitti" and "lidar" have 12 numbers a line, in KITTI's camera axes or with z up. "tum" has time,
-position and quaternion. "g2o" has the vertices of a graph."""
+"""Format of a file of odometry. "kitti" and "lidar" have 12 numbers a line, in KITTI's camera axes or with z up. "tum"
+has time, position and quaternion. "g2o" has the vertices of a graph. "auto" recognises the format."""
 
 
 @dataclasses.dataclass(frozen=True)

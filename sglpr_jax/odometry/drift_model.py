@@ -14,22 +14,22 @@ DRIFT_HEIGHT_PERCENT = 0.3
 
 @dataclasses.dataclass(frozen=True)
 class DriftModel:
-    """Standard deviations of odometry per metre of travelled distance."""
+    """Drift of odometry: standard deviations that grow with the travelled distance, and limit for contradictions."""
 
     metres_per_metre: NotNegative = DRIFT_PERCENT / 100
-    """Position drift in the direction of travel."""
+    """Position drift in the direction of travel, per metre of travelled distance."""
     degrees_per_metre: NotNegative = DRIFT_DEG_PER_100M / 100
-    """Heading drift. It rotates the rest of the path and so moves the position, too."""
+    """Heading drift, in degrees per metre. It rotates the rest of the path and so moves the position, too."""
     sideways: NotNegative = 0.25
     """Position drift across the direction of travel, as a fraction of the drift along it."""
     height_per_metre: NotNegative = DRIFT_HEIGHT_PERCENT / 100
-    """Height drift. A place on another floor of a building contradicts the odometry if this is small enough."""
+    """Height drift per metre. If it is small, loops between two floors of a building contradict the odometry."""
     position_m: Positive = 0.5
     height_m: Positive = 0.3
     yaw_deg: Positive = 1.5
-    """Standard deviations of the comparison itself, independent of the distance, in metres and degrees."""
+    """Standard deviations at any distance, in metres and degrees, from the registration of the two scans."""
     max_deviation: Positive = 4.0
-    """Maximum deviation of a loop from the odometry. Loops beyond it contradict the odometry."""
+    """Number of standard deviations beyond which a loop contradicts the odometry."""
 
     def __post_init__(self):
         """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
@@ -41,7 +41,7 @@ class DriftModel:
         return dataclasses.replace(self, **{name: factor * getattr(self, name) for name in names})
 
     def at_scale(self, scale: float) -> "DriftModel":
-        """The drift of the same odometry with all translations multiplied by `scale`."""
+        """The drift of the same odometry after all its translations were multiplied by `scale`."""
         return dataclasses.replace(self, degrees_per_metre=self.degrees_per_metre / scale)
 
     def __str__(self) -> str:
@@ -49,4 +49,4 @@ class DriftModel:
 
 
 MOTION_DRIFT = DriftModel(metres_per_metre=0.01, degrees_per_metre=0.03, yaw_deg=2.5)
-"""Drift of the motion that is used if there is no odometry (`odometry.bev_odometry`)."""
+"""Drift of the motion by images, which replaces missing odometry (`odometry.bev_odometry`)."""
