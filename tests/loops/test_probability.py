@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sglpr_jax.loops.probability import (
-    ADDED,
     ALL,
     KNOTS,
     RISING,
+    SUM_OF_SUPPORT,
     TESTED,
     AdditiveModel,
     Evidence,
@@ -72,7 +72,7 @@ FITTED = model_of(*pairs())
 def test_neighbours_add_their_support_to_what_a_pair_says_alone():
     evidence = Evidence.of(0.7, 0.1, 3.0, 2.0)
     np.testing.assert_allclose(FITTED.tested_log_odds(evidence, np.array(2.5)), FITTED.log_odds(evidence) + 2.5)
-    assert FITTED.tested is ADDED and set(default_model().tested.curves) == set(TESTED)
+    assert FITTED.tested is SUM_OF_SUPPORT and set(default_model().tested.curves) == set(TESTED)
 
 
 def test_pairs_that_can_be_told_apart_give_finite_curves():
