@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sglpr_jax.loops.probability import (
-    ALL,
     KNOTS,
     RISING,
     SUM_OF_SUPPORT,
@@ -55,10 +54,10 @@ def test_weights_are_as_good_as_pairs_that_stand_several_times():
     np.testing.assert_allclose(one(values), other(values), atol=0.02)
 
 
-@given(values=st.lists(st.floats(-1, 6), min_size=8, max_size=8), name=st.sampled_from(ALL))
+@given(values=st.lists(st.floats(-1, 6), min_size=8, max_size=8), name=st.sampled_from(Evidence._fields))
 def test_log_odds_never_fall_where_the_evidence_is_stronger(values, name):
     one, other = (Evidence.of(*half) for half in (values[:4], values[4:]))
-    better = other._replace(**{field: getattr(one, field) for field in ALL if field != name})
+    better = other._replace(**{field: getattr(one, field) for field in Evidence._fields if field != name})
     stronger = (
         getattr(better, name) >= getattr(one, name) if name in RISING else getattr(better, name) <= getattr(one, name)
     )
@@ -130,5 +129,5 @@ def test_models_go_to_a_file_and_back(tmp_path):
 def test_the_shipped_model_tells_clear_pairs():
     model = default_model()
     loop, none = Evidence.of(0.3, 0.03, 0.5, 12.0), Evidence.of(1.0, 3.0, 4.0, 0.0)
-    assert set(model.alone.curves) == set(ALL) and isinstance(model.alone, AdditiveModel)
+    assert set(model.alone.curves) == set(Evidence._fields) and isinstance(model.alone, AdditiveModel)
     assert model.probability(loop) > 0.99 and model.probability(none) < 0.01
