@@ -80,13 +80,8 @@ def check_odometry(
 ) -> None:
     """Warn if the odometry contradicts most of the frames that have a loop, because it drifts or because places repeat.
 
-    Arguments:
-      name: Name of the recording.
-      agreeing: Accepted loops.
-      against: Loops that contradict the odometry, between gravity-aligned frames.
-      path: Path by odometry.
-      drift: Drift of the odometry.
-      scale: Factor of all lengths in loops, path and drift. The message is in metres.
+    `name` is that of the recording. Loops `against` the odometry are between gravity-aligned frames. Lengths of loops,
+    path and drift are multiplied by `scale`, and those of the message are in metres.
     """
     agreeing_frames = {loop.query for loop in agreeing}
     contrary_frames = {loop.query for loop in against} - agreeing_frames
@@ -119,14 +114,9 @@ def register_loops(
 ) -> tuple[list[LoopClosure], list[RejectedClosure]]:
     """Register the scans of loops in 6 degrees of freedom, and reject loops whose scans overlap too little.
 
-    Arguments:
-      queries: Recording of the queries.
-      matches: Recording of the matches, which may be the same.
-      loops: Loops between LiDAR frames. The frames are rows of the recordings.
-      knows_height: False if the odometry does not measure height. The storey is then unknown.
-      should_stop: If it returns True, the remaining loops are accepted without registration.
-
-    Returns accepted and rejected loops.
+    The frames of the loops are rows of the recordings of queries and matches, which may be the same. If the odometry
+    does not measure height (`knows_height`), the storey is unknown. After `should_stop`, the remaining loops are
+    accepted unchanged. Returns accepted and rejected loops.
     """
     accepted, rejected = [], []
     for number, loop in enumerate(loops):

@@ -22,10 +22,7 @@ def check_is(value: Any, kind: type, *, by: str) -> None:
 
 
 def as_scan(scan: Any) -> Scan:
-    """Convert points (n, 3) or an image (h, w) to a `Scan`. A `Scan` is returned unchanged.
-
-    Raises ValueError for arrays of other shapes, and TypeError if the argument is not an array of numbers.
-    """
+    """Convert points (n, 3) or an image (h, w) to a `Scan`. A `Scan` is returned unchanged."""
     if isinstance(scan, Scan):
         return scan
     expected = "points (n, 3) or an image (h, w)"
@@ -38,16 +35,12 @@ def as_scan(scan: Any) -> Scan:
 
 
 def as_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
-    """Convert a pose to a 4 x 4 array. Returns None for None. Raises the errors of `as_poses`."""
+    """Convert a pose to a 4 x 4 array. Returns None for None."""
     return None if odometry is None else _checked_poses(odometry, "odometry (4, 4)", 2)
 
 
 def as_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
-    """Convert an array or a list of 4 x 4 arrays to poses. Errors name them by `of`, for instance "odometry".
-
-    Raises ValueError for arrays of other shapes and for matrices that are no poses, and TypeError if the argument is
-    not an array of numbers.
-    """
+    """Convert an array or a list of 4 x 4 arrays to poses. Errors name them by `of`, for instance "odometry"."""
     return _checked_poses(poses, f"{of} (n, 4, 4)", 3)
 
 

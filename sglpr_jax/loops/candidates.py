@@ -270,10 +270,7 @@ class CandidateSearch:
     def _register(
         self, query: Query, reference: Reference, prior: Float[np.ndarray, " 3"]
     ) -> tuple[BevRegistration, BevRegistration]:
-        """Best pose of a query in the frame of a reference, and best pose near the expected one (`prior`).
-
-        Both are the same if there is no expected pose (`NO_PRIOR`).
-        """
+        """Best pose of a query in the frame of a reference, and best pose near `prior`. Equal with `NO_PRIOR`."""
         spectrum = image_spectrum(reference.image, self.verification)
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
         best = self._refine(query, reference, peaks.at(0))

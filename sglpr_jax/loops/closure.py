@@ -113,8 +113,7 @@ def vertical_covariance(
     """Covariance of height, roll and pitch of a query in its own frame, relative to a match. Both are gravity-aligned.
 
     Suspension, bumps and slopes change height and tilt, the more the farther the scans are apart. If a mounting was
-    estimated from its scan, its standard deviations replace those of suspension. An error in the tilt of the match
-    changes the height of the query.
+    estimated from its scan, its standard deviations count instead. A tilted match lifts the query.
     """
     apart_m = float(np.hypot(*match_from_query[:2, 3]))
     if not any(sensor is not None and sensor.tilt_deviation_deg is not None for sensor in (query, match)):
@@ -156,13 +155,8 @@ def planar_loop(
 ) -> LoopClosure:
     """Loop closure of two registered images, between gravity-aligned frames.
 
-    Arguments:
-      query: Frame of the query.
-      match: Frame of the match.
-      registration: Pose of the query's image in the frame of the match's image.
-      probability: Probability that both frames show one place.
-      knows_height: False if the odometry does not measure height. The storey is then unknown.
-      sensors: Mountings at query and match.
+    If the odometry does not measure height (`knows_height`), the storey is unknown. `sensors` are the mountings of
+    query and match.
     """
     pose = transform(float(registration.x), float(registration.y), float(registration.yaw))
     covariance = vertical_covariance(pose, *sensors)

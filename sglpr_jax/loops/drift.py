@@ -48,15 +48,8 @@ def planar_deviations(
 ) -> Float[np.ndarray, " k"]:
     """Deviation (see `deviations`) of planar poses of queries in the frames of their matches.
 
-    Arguments:
-      path: Path of all frames.
-      query: Frames of the queries.
-      match: Frames of the matches, earlier or later than the queries.
-      match_from_query: Pose of each query in the frame of its match.
-      drift: Drift of the path.
-      covariances: Covariance of each pose, in the frame of the query.
-      heights: Height of each query in the frame of its match, in metres.
-      height_variances: Variances of these heights.
+    Frames of matches may be earlier or later than those of queries. Covariances are in the frames of the queries, and
+    heights of the queries, in metres, in the frames of the matches.
     """
     match_pose, query_pose = path.leveled(match), path.leveled(query)
     query_by_loop = compose_planar(planar_pose(match_pose), match_from_query)

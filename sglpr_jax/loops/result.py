@@ -62,9 +62,8 @@ class LoopSearchResult:
     @property
     def whole(self) -> bool:
         """Whether the search was completed, with the registration of all loops."""
-        return not self.stopped and all(
-            session.frames == len(session.recording) and not session.unregistered for session in self.sessions
-        )
+        is_whole = (session.frames == len(session.recording) and not session.unregistered for session in self.sessions)
+        return not self.stopped and all(is_whole)
 
     def split(self, poses: Float[np.ndarray, "n 4 4"]) -> list[Float[np.ndarray, "_ 4 4"]]:
         """Divide the poses of all searched frames by session."""

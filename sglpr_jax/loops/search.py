@@ -25,13 +25,7 @@ from sglpr_jax.loops.acceptance import AXES, accept_loops, check_odometry, regis
 from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import (
-    LoopClosure,
-    RejectedClosure,
-    convert_rejected,
-    in_metres,
-    to_lidar,
-)
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, in_metres, to_lidar
 from sglpr_jax.loops.comparison import Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import accept_between
@@ -121,10 +115,7 @@ def find_loops(
     for recording in all_recordings:
         check_is(recording, Recording, by="open_recording")
     registered = all(map(can_register, all_recordings)) if registered is None else registered
-    inputs = [
-        _check_input(recording, poses, registered=registered)
-        for recording, poses in zip(all_recordings, all_odometry, strict=True)
-    ]
+    inputs = [_check_input(*pair, registered=registered) for pair in zip(all_recordings, all_odometry, strict=True)]
     finished_steps, searched = 0, list[SearchedSession]()
     loops, rejected, transforms = list[LoopClosure](), list[RejectedClosure](), list[SegmentAlignment]()
 
@@ -156,10 +147,10 @@ def find_loops(
         rejected += pair_rejected
         transforms += pair_transforms
         finished_steps += len(searched[query].recording)
-    sessions = [
+    sessions = (
         _session_in_metres(recording, poses, session, scale, registered)
         for (recording, poses), session in zip(inputs, searched, strict=True)
-    ]
+    )
     return LoopSearchResult(
         tuple(sessions),
         tuple(in_metres(loop, scale) for loop in loops),
@@ -180,11 +171,7 @@ def can_register(recording: Recording) -> bool:
 def _check_input(
     recording: Recording, odometry: ArrayLike | None, *, registered: bool
 ) -> tuple[Recording, Float[np.ndarray, "n 4 4"] | None]:
-    """Check a recording and its odometry before any work. Returns the recording with its odometry, and the poses.
-
-    Raises ValueError for odometry of another length or ready-made images to register, and the errors of `as_poses` and
-    `check_installed`.
-    """
+    """Check a recording and its odometry before any work. Returns the recording with its odometry, and the poses."""
     poses = None if odometry is None else as_poses(odometry, of="odometry")
     if poses is not None and len(poses) != len(recording):
         raise ValueError(
@@ -245,8 +232,7 @@ def _search_session(
         pose = None if odometry is None else odometry[row]
         detector.add_keyframe(keyframe, time=time, odometry=pose, fits=fits)
 
-    # With a limit of places, scans with a loop are forgotten first. A checkpoint then depends on all that decides about
-    # loops: the settings of the detector and the model of the probabilities.
+    # With a limit of places, loops decide which scans are stored. A checkpoint then depends on settings and model, too.
     acceptance = None
     if config.max_places is not None:
         acceptance = hashlib.sha256(repr((config, detector.model)).encode()).hexdigest()[:16]
@@ -310,8 +296,8 @@ def _search_pair(
     mountings = [*match_finder.mountings, *query_finder.mountings]
     knows_height = match_finder.knows_height and query_finder.knows_height
     model, config, drift = sessions[0].detector.model, sessions[0].detector.config, query_finder.present_drift
-    progress = {"should_stop": should_stop, "on_progress": on_progress}
-    candidates = _candidates_between(match_finder, query_finder, motion, **progress)
+    options = {"should_stop": should_stop, "on_progress": on_progress}
+    candidates = _candidates_between(match_finder, query_finder, motion, **options)
     pairs = [pair_of(candidate, model, motion, mountings, knows_height=knows_height) for candidate in candidates]
     probable = probable_loops(pairs, model, motion.path, drift=drift, config=config)
     improbable = [
@@ -334,9 +320,8 @@ def _search_pair(
         accepted = list(map(between_sessions, consistent))
         if registered:
             options = {"knows_height": knows_height, "should_stop": should_stop}
-            accepted, without_overlap = register_loops(
-                sessions[1].recording, sessions[0].recording, accepted, **options
-            )
+            query_scans, match_scans = sessions[1].recording, sessions[0].recording
+            accepted, without_overlap = register_loops(query_scans, match_scans, accepted, **options)
             rejected += without_overlap
         if accepted:
             transforms.append(_align_segments(accepted, sessions, motion, drift))

@@ -52,14 +52,9 @@ def pair_of(
     `mountings` are those of all frames of the motion. `knows_height` is False if the odometry does not measure height.
     """
     query, match, registration, evidence = candidate
-    loop = planar_loop(
-        query,
-        match,
-        registration,
-        probability=float(model.probability(evidence)),
-        knows_height=knows_height,
-        sensors=(mountings[query], mountings[match]),
-    )
+    probability = float(model.probability(evidence))
+    options = {"knows_height": knows_height, "sensors": (mountings[query], mountings[match])}
+    loop = planar_loop(query, match, registration, probability=probability, **options)
     return Pair(loop, evidence, float(motion.travelled[query]))
 
 
@@ -114,10 +109,7 @@ def neighbour_weights(travelled_m: Float[np.ndarray, " n"], rows: Int[np.ndarray
 
 
 def rejection_reason(pair: Pair, model: LoopModel, min_probability: float) -> Reason:
-    """Reason why the sequential test rejected a pair that the motion allows.
-
-    Without neighbours, the pair was more likely a loop than not, or other places fit as well, or the images fit little.
-    """
+    """Reason why the sequential test rejected a pair that the motion allows."""
     if float(model.log_odds(pair.evidence)) > 0:
         return "too few neighbours"
     unambiguous = pair.evidence._replace(ambiguity_ratio=np.zeros(()))

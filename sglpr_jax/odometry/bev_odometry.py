@@ -138,15 +138,10 @@ class BevOdometry:
         link: BevRegistration | None = None,
         continues: bool = True,
     ) -> None:
-        """Add a frame.
+        """Add a frame by its gravity-aligned `pose` from odometry or by the registration `link` with the keyframe.
 
-        Without `pose` and `link`, the pose is extrapolated for up to `MAX_COASTING` frames, then guessed.
-
-        Arguments:
-          time: Time of the frame, in any unit.
-          pose: Gravity-aligned pose by odometry.
-          link: Registration of the image with that of the keyframe. If it is ambiguous, it drifts like a guess.
-          continues: False if the motion since the last frame is unknown.
+        An ambiguous registration drifts like a guess. Without pose and registration, the pose is extrapolated for up to
+        `MAX_COASTING` frames, then guessed. With `continues=False`, the motion since the last frame is unknown.
         """
         if len(self) and not continues:
             self._add_after_restart(time, pose)
@@ -180,10 +175,7 @@ class BevOdometry:
         self.keyframe = len(self) - 1
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
-        """Expected pose at `time` in an earlier frame, at constant velocity: x, y (metres) and yaw (radians).
-
-        Returns `NO_PRIOR` (NaN) if the velocity is unknown or the last frame is too old.
-        """
+        """Expected x, y (metres) and yaw (radians) in an earlier frame, at constant velocity. `NO_PRIOR` if unknown."""
         expected = self._extrapolated(time)
         return NO_PRIOR if expected is None else planar_pose(inverse(self.poses[frame]) @ expected)
 

@@ -57,11 +57,9 @@ class OdometryCheck:
         self._frames += 1
 
     def add(self, pose: Float[np.ndarray, "4 4"], link: BevRegistration | None) -> None:
-        """Add a compared scan. If its registration does not count, a new window starts.
+        """Add a compared scan: its gravity-aligned pose by odometry, and its registration with the last compared one.
 
-        Arguments:
-          pose: Gravity-aligned pose by odometry.
-          link: Registration of its image with that of the last compared scan.
+        If the registration does not count, a new window starts.
         """
         step = None if self._last_pose is None else inverse(self._last_pose) @ pose
         self._last_pose, self._frames = pose, 0

@@ -32,13 +32,9 @@ class PathIntegrals(NamedTuple):
 
     def rotated(self, rotation: Float[np.ndarray, "d 3"]) -> "PathIntegrals":
         """The integrals in rotated coordinates. With two rows of a rotation, in two coordinates."""
-        directions, positions = self.direction_products, self.position_products
-        return PathIntegrals(
-            self.length,
-            self.position @ rotation.T,
-            rotation @ directions @ rotation.T,
-            rotation @ positions @ rotation.T,
-        )
+        directions = rotation @ self.direction_products @ rotation.T
+        positions = rotation @ self.position_products @ rotation.T
+        return PathIntegrals(self.length, self.position @ rotation.T, directions, positions)
 
 
 class DrivenPath:
@@ -161,6 +157,5 @@ def _integrals(positions: Float[np.ndarray, "n 3"], guessed_m: Float[np.ndarray,
     guessed_products = guess_m[:, None, None] * np.diag([1.0, 1.0, 0.0])  # in any horizontal direction
     directions = products / np.maximum(measured_m, 1e-12)[:, None, None] + guessed_products
     squares = length_m[:, None, None] * (middles[:, :, None] * middles[:, None] + products / 12)
-    return np.concatenate(
-        [length_m[:, None], length_m[:, None] * middles, directions[:, *UPPER], squares[:, *UPPER]], axis=1
-    )
+    columns = [length_m[:, None], length_m[:, None] * middles, directions[:, *UPPER], squares[:, *UPPER]]
+    return np.concatenate(columns, axis=1)

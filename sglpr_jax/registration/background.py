@@ -29,14 +29,11 @@ class Background:
         self._root = root if self._root is None else self._root + (root - self._root) / min(self.added, FRAMES)
 
     def without(self, image: UInt8[np.ndarray, "n n"]) -> UInt8[np.ndarray, "n n"]:
-        """Return an image without its background: in each cell, the average or the median of its ring, if that is more.
-
-        Square roots are subtracted, because the comparison of images uses them, too.
-        """
+        """Return an image without its background: the average or, if it is more, the median of each cell's ring."""
         if not image.size:
             return image
         root = np.sqrt(image, dtype=np.float32)
-        background = ring_medians(root)
+        background = ring_medians(root)  # square roots, because the comparison of images uses them, too
         if self._root is not None and self.added >= MIN_FRAMES:
             background = np.maximum(self._root, background)
         return np.round(np.maximum(root - background, 0) ** 2).astype(np.uint8)

@@ -54,14 +54,10 @@ def _peak_covariance(
     apart_m: Float[Array, ""],
     ridge: Float[Array, "3 3"],
 ) -> Float[Array, "3 3"]:
-    """Covariance of (x, y, yaw) at a peak of the correlation.
+    """Covariance of (x, y, yaw) at a peak, from the negative Hessian and the height of the correlation there.
 
-    Arguments:
-      curvature: Negative Hessian of the correlation at the peak, in metres and radians.
-      correlation: Height of the peak.
-      occupied: Number of occupied cells, of the image that has fewer.
-      apart_m: Distance of the two scans, in metres.
-      ridge: Result of `_ridge_covariance`.
+    `occupied` is the number of occupied cells of the image that has fewer. `apart_m` is the distance of the two scans.
+    `ridge` is the result of `_ridge_covariance`.
     """
     height = jnp.clip(correlation, 0.05, 0.999)
     noise = NOISE * (1 - height) / height * (1 / jnp.maximum(occupied, 1) + 1 / NOISE_CELLS)

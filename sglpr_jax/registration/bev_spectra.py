@@ -30,10 +30,7 @@ def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAU
 
 
 def prepare_image(image: Num[AnyArray, "h w"], config: VerificationConfig) -> Float[Array, "m m"]:
-    """Square roots of the counts in the circle of radius `config.reach_m` around the centre, and zero outside.
-
-    The result has the size of `within_reach`, whose ValueError is raised.
-    """
+    """Square roots of the counts `within_reach`. Cells outside of the circle of radius `config.reach_m` are zero."""
     centre = within_reach(image, config)
     size = centre.shape[0]
     axis_m = (np.arange(size) - (size - 1) / 2) * DENSITY_RESOLUTION_M
@@ -68,10 +65,7 @@ def query_spectra(query: Num[AnyArray, "h w"], *, config: VerificationConfig = D
 
 @functools.partial(jax.jit, static_argnames="config")
 def match_spectra(matches: Num[AnyArray, "k h w"], *, config: VerificationConfig = DEFAULT) -> Complex[Array, "k s f"]:
-    """Compute the spectra of k unrotated images, for `search`. The images and the errors are as in `query_spectra`.
-
-    The axes of the result are image, row frequency and column frequency.
-    """
+    """Compute spectra of images for `search`, by image, row frequency and column frequency. See `query_spectra`."""
 
     def image_spectrum(image: Num[Array, "h w"]) -> Complex[Array, "s f"]:
         merged = merge_cells(prepare_image(image, config), config.coarse)
