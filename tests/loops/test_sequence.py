@@ -1,4 +1,4 @@
-"""Neighbours count by travelled distance: for a loop if they agree with it, and against it otherwise."""
+"""Neighbours support a loop if they are consistent with it, and oppose it otherwise, by travelled distance."""
 
 import numpy as np
 import pytest

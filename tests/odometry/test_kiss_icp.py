@@ -1,4 +1,4 @@
-"""Odometry from the scans of a simulated street, and what is said of scans that do not carry it."""
+"""Odometry from the scans of a simulated street, and warnings about scans that do not overlap or have few points."""
 
 import dataclasses
 import sys
