@@ -21,7 +21,7 @@ SECOND_M, SECOND_DEG = 3.0, 15.0
 """Minimum distance of the second peak from the best one, in metres or in degrees."""
 PRIOR_M, PRIOR_DEG = 2.0, 10.0
 """Maximum distance from an expected pose of a pose near it, in metres and degrees."""
-NO_PRIOR = np.full(3, np.nan, np.float32)
+NO_PRIOR = np.full(3, np.nan)
 """Expected pose (x, y, yaw) if there is none: NaN allows every pose."""
 
 
@@ -85,7 +85,7 @@ def search(
     rotated, matches, max_shift = quarters(jnp.asarray(query)), jnp.asarray(matches), _max_shift_cells(config)
 
     def search_row(row: Int[Array, ""], peaks: CorrelationPeak) -> CorrelationPeak:
-        peak = _highest_peak(correlations(rotated, matches[row], max_shift), jnp.asarray(NO_PRIOR), config)
+        peak = _highest_peak(correlations(rotated, matches[row], max_shift), jnp.asarray(NO_PRIOR, jnp.float32), config)
         return jax.tree.map(lambda field, value: field.at[row].set(value), peaks, peak)
 
     zeros = CorrelationPeak(*[jnp.zeros(len(matches))] * len(CorrelationPeak._fields))
@@ -108,7 +108,7 @@ def search_near(
       prior: Expected x, y (metres) and yaw (radians), or `NO_PRIOR`.
     """
     volume = correlations(quarters(jnp.asarray(query)), jnp.asarray(match), _max_shift_cells(config))
-    priors = jnp.stack([jnp.asarray(NO_PRIOR), jnp.asarray(prior, jnp.float32)])
+    priors = jnp.stack([jnp.asarray(NO_PRIOR, jnp.float32), jnp.asarray(prior, jnp.float32)])
     return jax.lax.map(lambda prior: _highest_peak(volume, prior, config), priors)
 
 
