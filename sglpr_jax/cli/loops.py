@@ -139,7 +139,7 @@ def _check(command: LoopsCommand) -> None:
 def _search(command: LoopsCommand) -> int:
     from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
-    from sglpr_jax.loops.checkpoint import remove
+    from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.loops.closure import why_rejected
     from sglpr_jax.loops.result import diagnose_no_loops
     from sglpr_jax.loops.search import can_register, find_loops
@@ -192,8 +192,8 @@ def _search(command: LoopsCommand) -> int:
         return stop.exit_status
     if len(recordings) > 1:
         for number in range(len(recordings)):
-            remove(checkpoint / f"{number}")
-    remove(checkpoint)
+            delete_checkpoint(checkpoint / f"{number}")
+    delete_checkpoint(checkpoint)
     for path in odometry_checkpoints:
         path.unlink(missing_ok=True)
     return 0

@@ -90,7 +90,7 @@ def write_map(command: MapCommand) -> int:
 
 
 def _add_places(command: MapCommand, params: "Params") -> int:
-    from sglpr_jax.loops.checkpoint import remove
+    from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
     from sglpr_jax.models.weights import weights_hash
@@ -145,7 +145,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
-    remove(unfinished)
+    delete_checkpoint(unfinished)
     odometry_checkpoint.unlink(missing_ok=True)
     return 0
 

@@ -18,12 +18,8 @@ from sglpr_jax.data.choices import (
 )
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorConfig
-from sglpr_jax.odometry.config import (
-    DRIFT_DEG_PER_100M,
-    DRIFT_PERCENT,
-    DriftModel,
-    OdometryFormat,
-)
+from sglpr_jax.odometry.config import OdometryFormat
+from sglpr_jax.odometry.drift_model import DRIFT_DEG_PER_100M, DRIFT_PERCENT, DriftModel
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.registration.config import VerificationConfig
 
@@ -254,10 +250,10 @@ def open_with_odometry(
 
 def _odometry_of(recording: "Recording", command: Any, checkpoint: Path) -> "Float[np.ndarray, 'n 4 4']":
     """Compute the odometry of a recording, with progress on stderr. If it is interrupted, the command ends."""
-    from sglpr_jax.odometry.kiss_icp import about, scan_odometry
+    from sglpr_jax.odometry.kiss_icp import describe_odometry, scan_odometry
 
     if not recording.has_images:
-        print(about(recording, command.scan_odometry, scale=command.scale), file=sys.stderr)
+        print(describe_odometry(recording, command.scan_odometry, scale=command.scale), file=sys.stderr)
     with stop_on_signal() as stop, progress_bar(f"odometry {recording.name}", len(recording)) as show:
         poses = scan_odometry(
             recording,

@@ -245,8 +245,8 @@ class LiveMap:
     def _loop_edge(self, loop: LoopClosure, received: float) -> LoopEdge:
         """Return a loop with the times and the odometry of its scans. Odometry is given only for scans in the odometry
         frame of the latest scan. `received` is the time at which the latest scan arrived."""
-        frames = np.array([loop.query, loop.match])
-        in_latest_frame = self.detector.finder.motion.same(-1, frames) & (len(self.odometry) > 0)
+        frames, segments = np.array([loop.query, loop.match]), self.detector.finder.motion.segments
+        in_latest_frame = (segments[frames] == segments[-1]) & (len(self.odometry) > 0)
         pairs = zip(frames, in_latest_frame, strict=True)
         query_pose, match_pose = (self.odometry[frame].copy() if known else None for frame, known in pairs)
         return LoopEdge(

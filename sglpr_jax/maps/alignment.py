@@ -11,7 +11,7 @@ from sglpr_jax.loops.consistency import accept_between
 from sglpr_jax.loops.frame_alignment import align_frames
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import travelled, yaw_of
 
 MAX_LOCATED = 300

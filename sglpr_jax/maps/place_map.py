@@ -28,7 +28,7 @@ from sglpr_jax.loops.keyframes import Keyframe, Keyframes
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import NEGATIVE_M
@@ -224,7 +224,7 @@ class PlaceMap(Keyframes):
         _, first = np.unique(fits.frames[best_first], return_index=True)  # a place may be compared twice
         answers = []
         for row in best_first[np.sort(first)][:candidates].tolist():
-            candidate = comparison.verify(query, fits, row, self)
+            candidate = comparison.candidate_of_fit(query, fits, row, self)
             place, probability = candidate.match, float(model.probability(candidate.evidence))
             mountings = keyframe.mounting, self.mounting(place).scaled(self.scale)
             loop = planar_loop(

@@ -18,7 +18,7 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.drift import step_deviations
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import are_rotations, from_quaternions, inverse, quaternions
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"

@@ -14,7 +14,7 @@ from sglpr_jax.files import file_name, text_bytes, warn, write_all, write_json
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, renumbered
 from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.result import LoopSearchResult
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import Ids, write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements
 

@@ -17,7 +17,7 @@ from sglpr_jax.files import warn
 from sglpr_jax.loops.closure import LoopClosure, frames_of, to_upright
 from sglpr_jax.loops.drift import deviations, step_deviations
 from sglpr_jax.loops.result import LoopSearchResult, Session
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.pose_graph.factor_graph import FactorGraph, gtsam_library
 from sglpr_jax.se3 import inverse

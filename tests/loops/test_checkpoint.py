@@ -81,7 +81,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
         assert done[0] == (reached[-2] if len(reached) > 1 else 1)
     assert reached == [3, 7, 16, 24]
     assert contents(found, tmp_path / "found") == files
-    checkpoint.remove(tmp_path / "kept")
+    checkpoint.delete_checkpoint(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
 
 
