@@ -235,7 +235,7 @@ def semantics(
         table = Table(source, "share of the cells", "IoU", "IoU of each cell's commonest class")
         for i in np.flatnonzero(ours.shares).tolist():
             table.add(CATEGORIES[i], f"{ours.shares[i]:.2%}", f"{ours.iou[i]:.3f}", f"{guess.iou[i]:.3f}")
-        table.add(f"mean of {ours.present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
+        table.add(f"mean of {ours.n_present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
         table.add(f"{CATEGORIES[ours.majority]} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
 
 

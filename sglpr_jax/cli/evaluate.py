@@ -114,7 +114,7 @@ def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures
     console().print(found)
     if not figures.can_draw():
         print("no drawings: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
-    return found, None if recording is None else take_pictures(recording, params, source, found.worst)
+    return found, None if recording is None else take_pictures(recording, params, source, found.worst_false_positives)
 
 
 def _check_options(command: EvaluateCommand) -> None:

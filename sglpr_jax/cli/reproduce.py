@@ -72,7 +72,7 @@ def reproduce(command: ReproduceCommand) -> None:
     """Run the command."""
     from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
     from sglpr_jax.data.readers import recording_names
-    from sglpr_jax.reproduce.plan import check, make_plan, time_a_step
+    from sglpr_jax.reproduce.plan import check_inputs, make_plan, time_a_step
     from sglpr_jax.reproduce.reproduction import Reproduction
 
     names = list(EXPERIMENTS if "all" in command.what else dict.fromkeys(command.what))
@@ -90,7 +90,7 @@ def reproduce(command: ReproduceCommand) -> None:
         pose_source=command.pose_source,
         progress=progress_bar,
     )
-    check(reproduction, names, command.nclt)
+    check_inputs(reproduction, names, command.nclt)
     if command.train or command.plan:
         plan = make_plan(reproduction, names if command.train else [])
         print(plan.text(time_a_step(reproduction, *plan.missing[0]) if plan.missing else None), file=sys.stderr)

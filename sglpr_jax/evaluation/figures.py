@@ -1,4 +1,4 @@
-"""Figures of evaluations and loop searches (extra `viz`), without the global state of matplotlib."""
+"""Draws the figures of evaluations and loop searches (extra `viz`), without the global state of matplotlib."""
 
 import importlib.util
 import io
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 DOTS_PER_INCH = 150
-MOST_INSIDE = 4
-"""Maximum number of lines with a legend inside the axes. A longer legend would cover the lines."""
+MOST_LEGEND_INSIDE = 4
+"""Maximum number of entries of a legend inside the axes. A longer legend would cover the curves."""
 LEGEND_CHARACTERS = 40
 """Maximum length of a name in a legend. Longer ones leave no room for the plot."""
-INSIDE: Mapping[str, Any] = {"loc": "best", "framealpha": 0.95}
+LEGEND_INSIDE: Mapping[str, Any] = {"loc": "best", "framealpha": 0.95}
 """Options of a legend inside the axes."""
 BLUE, RED = "#2b5fc4", "#d62728"
 
@@ -38,10 +38,8 @@ DECISIONS = {
     Decision.FALSE_NEGATIVE: ("false negative", "#000000", 12),
     Decision.FALSE_POSITIVE: ("false positive", "#f0a000", 12),
 }
-"""Name, colour and size (in square points) of the dots of each decision.
-
-Red, black and blue are the colours of figure 6. Decisions are drawn in this order, so mistakes are on top.
-"""
+"""Name, colour (red, black and blue as in figure 6) and size in square points of the dots of each decision, in drawing
+order: mistakes are on top."""
 
 
 def can_draw() -> bool:
@@ -55,34 +53,34 @@ def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
         write(figure, temporary, format=path.suffix[1:])
 
 
-def write(figure: "matplotlib.figure.Figure", to: Path | io.BytesIO, *, format: str = "png") -> None:
-    """Write the figure to a file or a stream. Names with `$` are drawn as they are, not as formulas."""
+def write(figure: "matplotlib.figure.Figure", file: Path | io.BytesIO, *, format: str = "png") -> None:
+    """Write the figure to a file or a stream. Texts are drawn without formulas (`$`) and shortened if they are long."""
     from matplotlib.legend import Legend
     from matplotlib.text import Text
 
     in_legends = {text for legend in figure.findobj(Legend) for text in legend.findobj(Text)}
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
-        most = LEGEND_CHARACTERS if text in in_legends else MOST_SHOWN
+        max_characters = LEGEND_CHARACTERS if text in in_legends else MOST_SHOWN
         text.set_parse_math(False)
-        text.set_text("\n".join(printable(line, most=most) for line in text.get_text().split("\n")))
-    figure.savefig(to, format=format, dpi=DOTS_PER_INCH)
+        text.set_text("\n".join(printable(line, most=max_characters) for line in text.get_text().split("\n")))
+    figure.savefig(file, format=format, dpi=DOTS_PER_INCH)
 
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":
     """Draw precision over recall: one line for each named curve, with a dot at the highest F1 (figure 5)."""
-    many = len(curves) > MOST_INSIDE
-    figure = new_figure(8.0 if many else 5.2, 4.8)
+    legend_beside = len(curves) > MOST_LEGEND_INSIDE
+    figure = new_figure(8.0 if legend_beside else 5.2, 4.8)
     axes = figure.add_subplot(title=title, xlabel="recall", ylabel="precision", xlim=(0, 1.01), ylim=(0, 1.01))
     for f1 in (0.2, 0.4, 0.6, 0.8):  # thin contour lines of equal F1
-        recall = np.linspace(f1 / (2 - f1), 1, 100)
+        recall = np.linspace(f1 / (2 - f1), 1, 100)  # from the recall that has this F1 at precision 1
         axes.plot(recall, f1 * recall / (2 * recall - f1), color="0.85", linewidth=0.8, zorder=0)
         axes.text(f1, f1, f"F1 = {f1}", color="0.6", fontsize=7, ha="center", backgroundcolor="white", zorder=0)
     for name, curve in curves.items():
         (line,) = axes.plot(curve.recall, curve.precision, linewidth=1.8, label=f"{name} {curve.f1_max:.3f}")
         axes.plot(curve.recall[curve.best], curve.precision[curve.best], "o", color=line.get_color(), markersize=6)
     axes.set_aspect("equal")
-    if many:
+    if legend_beside:
         figure.legend(title="dot: highest F1", loc="outside right upper", frameon=False)
     else:
         axes.legend(title="dot: highest F1", loc="lower left", framealpha=0.95)
@@ -106,17 +104,17 @@ def trajectory(
 def learning_curves(
     panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]]]], *, xlabel: str = "step"
 ) -> "matplotlib.figure.Figure":
-    """Draw named curves of (step, value) in stacked panels, one for each title, with a common axis of steps."""
+    """Draw curves of (step, value) points by name, in a panel for each title in `panels`."""
     figure = new_figure(6.4, 0.8 + 2.2 * len(panels))
-    rows = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
-    for axes, (title, curves) in zip(rows, panels.items(), strict=True):
+    all_axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
+    for axes, (title, curves) in zip(all_axes, panels.items(), strict=True):
         for name, points in curves.items():
             axes.plot(*np.array(points, dtype=np.float64).T, ".-", markersize=3, linewidth=1.4, label=name)
         axes.set_ylabel(title)
         axes.grid(color="0.92")
         if len(curves) > 1:
-            axes.legend(**INSIDE)
-    rows[-1].set_xlabel(xlabel)
+            axes.legend(**LEGEND_INSIDE)
+    all_axes[-1].set_xlabel(xlabel)
     return figure
 
 
@@ -142,9 +140,10 @@ def segmentation_panel(
     images["predicted classes"] = labels.colors[prediction]
     figure = new_figure(3.7 * len(images), 5.2)
     figure.suptitle(title)
-    height, width = np.array(bev.shape) * resolution_m / 2
+    half_height_m, half_width_m = np.array(bev.shape) * resolution_m / 2
+    extent = (-half_width_m, half_width_m, -half_height_m, half_height_m)
     for axes, (name, image) in zip(figure.subplots(1, len(images), sharey=True), images.items(), strict=True):
-        axes.imshow(image, extent=(-width, width, -height, height), interpolation="nearest")
+        axes.imshow(image, extent=extent, interpolation="nearest")
         axes.set(title=name, xlabel="x [m]")
     figure.axes[0].set_ylabel("y [m]")
     classes = np.unique(prediction) if truth is None else np.union1d(truth, prediction)
@@ -160,25 +159,26 @@ def heat_maps(
     figure = new_figure(2.1 * (1 + len(maps)), 2.6)
     figure.suptitle(title)
     panels = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
-    _show(panels[0], "point counts", brightness(bev), cmap="gray")
+    _show_image(panels[0], "point counts", brightness(bev), cmap="gray")
     for axes, (name, values) in zip(panels[1:], maps.items(), strict=True):
-        _show(axes, name, values, cmap="inferno")
+        _show_image(axes, name, values, cmap="inferno")
     return figure
 
 
 def overlays(images: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.figure.Figure":
-    """Draw coloured images with their titles, three in a row."""
+    """Draw RGB images (0 to 1), three in a row. The keys are the titles."""
     rows = -(-len(images) // 3)
     figure = new_figure(9.0, 3.2 * rows)
     panels = figure.subplots(rows, 3, squeeze=False).ravel()
     for axes, (title, image) in zip(panels, images.items(), strict=False):
-        _show(axes, title, image, interpolation="nearest")
-    for axes in panels:
+        _show_image(axes, title, image, interpolation="nearest")
+    for axes in panels:  # also those of the last row without an image
         axes.set_axis_off()
     return figure
 
 
-def _show(axes: "matplotlib.axes.Axes", title: str, image: Float[np.ndarray, "h w ..."], **options: str) -> None:
+def _show_image(axes: "matplotlib.axes.Axes", title: str, image: Float[np.ndarray, "h w ..."], **options: str) -> None:
+    """Draw an image with a small title and without axes. Options are those of `imshow`."""
     axes.imshow(image, **options)  # pyright: ignore[reportArgumentType]
     axes.set_title(title, fontsize=9)
     axes.set_axis_off()
@@ -187,47 +187,49 @@ def _show(axes: "matplotlib.axes.Axes", title: str, image: Float[np.ndarray, "h 
 def loops(
     positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]], *, wrong: Sequence[tuple[int, int]] = ()
 ) -> "matplotlib.figure.Figure":
-    """Draw a trajectory from above, with a line between query and match of each loop. `wrong` loops are red."""
+    """Draw a trajectory and a line for each loop (query, match), from above. `wrong` loops are red and on top."""
     figure, axes = axes_from_above(positions)
     axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
-    lines = [("loops", pairs, BLUE, 3), *([("wrong", wrong, RED, 4)] if wrong else [])]
-    for name, frames, colour, layer in lines:
-        for query, match in frames:
+    groups = [("loops", pairs, BLUE, 3)]
+    if wrong:
+        groups.append(("wrong", wrong, RED, 4))
+    for name, loop_frames, colour, layer in groups:
+        for query, match in loop_frames:
             axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
-        queries = positions[[query for query, _ in frames], :2]
-        axes.scatter(*queries.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(frames)})", zorder=layer)
-    axes.legend(**INSIDE)
+        queries = positions[[query for query, _ in loop_frames], :2]
+        axes.scatter(*queries.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(loop_frames)})", zorder=layer)
+    axes.legend(**LEGEND_INSIDE)
     return figure
 
 
-def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
-    """Draw named trajectories from above. The first trajectory is grey. A dot marks the end of each trajectory."""
-    figure, axes = axes_from_above(np.concatenate(list(named.values())))
-    for (name, positions), colour in zip(named.items(), ("0.6", BLUE, RED), strict=False):
+def trajectories(positions_by_name: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
+    """Draw up to three trajectories from above. The first one is grey. A dot marks the end of each trajectory."""
+    figure, axes = axes_from_above(np.concatenate(list(positions_by_name.values())))
+    for (name, positions), colour in zip(positions_by_name.items(), ("0.6", BLUE, RED), strict=False):
         axes.plot(*positions[:, :2].T, color=colour, linewidth=1.2, label=name)
         axes.plot(*positions[-1, :2], "o", color=colour, markersize=4)
-    axes.legend(**INSIDE)
+    axes.legend(**LEGEND_INSIDE)
     return figure
 
 
 def loops_between(
-    named: Mapping[str, Float[np.ndarray, "_ 3"]], pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+    positions_by_name: Mapping[str, Float[np.ndarray, "_ 3"]], pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> "matplotlib.figure.Figure":
-    """Draw trajectories of several recordings in one frame, with a line between the positions of each loop."""
-    figure, axes = axes_from_above(np.concatenate(list(named.values())))
-    for name, positions in named.items():
+    """Draw the trajectories of several recordings from above. A line connects the two positions of each of `pairs`."""
+    figure, axes = axes_from_above(np.concatenate(list(positions_by_name.values())))
+    for name, positions in positions_by_name.items():
         axes.plot(*positions[:, :2].T, linewidth=1.2, label=name)
-    for ends in pairs:
-        axes.plot(*np.array(ends)[:, :2].T, color="0.4", linewidth=0.8, zorder=3)
-    axes.legend(**INSIDE)
+    for query_and_match in pairs:
+        axes.plot(*np.stack(query_and_match)[:, :2].T, color="0.4", linewidth=0.8, zorder=3)
+    axes.legend(**LEGEND_INSIDE)
     return figure
 
 
 def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.Figure":
-    """Draw the share of loops over the probability. A bin has mean probability, share and number of pairs."""
+    """Draw the true share of loops over the probability. Each bin is (mean probability, share, number of pairs)."""
     figure = new_figure(5.0, 4.6)
     axes = figure.add_subplot(xlabel="predicted probability", ylabel="share of loops", xlim=(-0.03, 1.09))
-    axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)
+    axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)  # perfect calibration
     probability, share, _ = np.array(bins).T
     axes.plot(probability, share, "o-", color=BLUE, markersize=5, linewidth=1.4)
     for x, y, pairs in bins:
@@ -244,9 +246,10 @@ def loops_in_time(
     wrong: Sequence[tuple[int, int]],
     rejected: Sequence[tuple[int, int]],
 ) -> "matplotlib.figure.Figure":
-    """Plot the frame of each match over that of its query, coloured by the probability.
+    """Plot the frame of each match over the frame of its query, coloured by the probability.
 
-    Loops known to be `wrong` are red crosses, `rejected` pairs are small grey dots behind the loops.
+    `loops` are (query, match, probability), `wrong` and `rejected` (query, match). `frames` is the number of frames.
+    Wrong loops are red crosses, rejected pairs are small grey dots behind the loops.
     """
     figure = new_figure(5.0, 4.2)
     axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))
@@ -272,20 +275,23 @@ def overlaid(
     *,
     resolution_m: float = DENSITY_RESOLUTION_M,
 ) -> Float[np.ndarray, "n n 3"]:
-    """Overlay a query on its match, as RGB colours from 0 to 1.
+    """Overlay the density images of a query and its match, as RGB colours from 0 to 1.
 
     The match is red. The query, transformed to the frame of the match, is cyan. Cells occupied in both are white.
     """
-    centre, per_metre, plane = (len(match) - 1) / 2, 1 / resolution_m, np.ix_([0, 1, 3], [0, 1, 3])
-    pixel_from_metres = np.array([[0, -per_metre, centre], [per_metre, 0, centre], [0, 0, 1]])  # rows point to -y
-    query_from_match = pixel_from_metres @ inverse(match_from_query)[plane] @ np.linalg.inv(pixel_from_metres)
-    moved = affine_transform(np.asarray(query, np.float64), query_from_match, order=1, mode="grid-constant")
-    red, cyan = (np.sqrt(np.asarray(image, np.float64) / max(float(image.max()), 1e-9)) for image in (match, moved))
+    centre, pixels_per_m = (len(match) - 1) / 2, 1 / resolution_m
+    # From (x, y, 1) in metres to (row, column, 1) in pixels. Rows run towards -y, columns towards x.
+    pixel_from_metres = np.array([[0, -pixels_per_m, centre], [pixels_per_m, 0, centre], [0, 0, 1]])
+    in_plane = inverse(match_from_query)[np.ix_([0, 1, 3], [0, 1, 3])]  # without z
+    query_from_match = pixel_from_metres @ in_plane @ np.linalg.inv(pixel_from_metres)
+    moved_query = affine_transform(np.asarray(query, np.float64), query_from_match, order=1, mode="grid-constant")
+    red = np.sqrt(np.asarray(match, np.float64) / max(float(match.max()), 1e-9))
+    cyan = np.sqrt(moved_query / max(float(moved_query.max()), 1e-9))
     return np.stack([red, cyan, cyan], axis=-1)
 
 
 def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Return the logarithm of point counts as grey values from 0 to 1."""
+    """Return the logarithm of 1 + point counts as grey values from 0 to 1."""
     return np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
 
 
@@ -301,9 +307,9 @@ def new_figure(width: float, height: float) -> "matplotlib.figure.Figure":
 def axes_from_above(
     positions: Float[np.ndarray, "n 3"], *, title: str = ""
 ) -> "tuple[matplotlib.figure.Figure, matplotlib.axes.Axes]":
-    """Return an empty figure for a drive seen from above, and its axes. The figure is flat for a long street."""
-    across, along = np.ptp(positions[:, :2], axis=0)
-    figure = new_figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
+    """Return an empty figure for a drive seen from above, and its axes in metres. A flat drive gets a flat figure."""
+    extent_x_m, extent_y_m = np.ptp(positions[:, :2], axis=0)
+    figure = new_figure(7.0, float(np.clip(1.8 + 5.6 * extent_y_m / max(extent_x_m, 1e-9), 3.0, 5.6)))
     axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color="0.92")

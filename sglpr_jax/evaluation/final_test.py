@@ -1,4 +1,4 @@
-"""Test of a trained network on a held-out recording, beside other methods."""
+"""Tests a trained network on a held-out recording, and other methods for comparison."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,16 +34,17 @@ class FinalTest(report.PrintsItself):
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for `json.dump`."""
-        scores = {
-            title: {name: report.to_json(results) for name, results in methods.items()}
-            for title, methods in self.results.items()
+        scores: dict[str, Any] = {
+            scans: {name: report.to_json(results) for name, results in methods.items()}
+            for scans, methods in self.results.items()
         }
-        segmentation = {} if self.semantics is None else {"segmentation": self.semantics.to_json()}
-        return {"sequence": self.sequence, **scores, **segmentation}
+        if self.semantics is not None:
+            scores["segmentation"] = self.semantics.to_json()
+        return {"sequence": self.sequence, **scores}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
-        for name, methods in self.results.items():
-            title = f"sequence {self.sequence}, {name}"
+        for scans, methods in self.results.items():
+            title = f"sequence {self.sequence}, {scans}"
             yield report.results_table(methods[NETWORK], title=f"{title}: {NETWORK}")
             yield report.comparison(methods, title=title)
         if self.semantics is not None:
@@ -59,7 +60,7 @@ def final_test(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> FinalTest:
-    """Score a trained network on a recording, raw and with every scan rotated at random.
+    """Score a trained network on a recording, with the scans as they are (`raw`) and rotated at random (`rotated`).
 
     Arguments:
       params: Parameters of the trained network.
@@ -70,22 +71,22 @@ def final_test(
       seed: Seed of the weights of `untrained`.
       progress: Reports the progress of each embedding.
 
-    Raises:
-      ValueError: If a method does not fit the recording.
+    Raises ValueError if a method does not fit the recording.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    ready_made = recording.has_images
-    beside = {name: method_beside(params, name, ready_made=ready_made, seed=seed) for name in methods}
+    tested_methods = {NETWORK: network(params)}
+    for name in methods:
+        tested_methods[name] = method_beside(params, name, ready_made=recording.has_images, seed=seed)
     results: dict[str, dict[str, list[Result]]] = {}
-    for title, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
-        results[title] = {}
-        for name, method in {NETWORK: network(params), **beside}.items():
-            with progress(f"embed {title} {name}", len(recording)) as show:
+    for scans, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
+        results[scans] = {}
+        for name, method in tested_methods.items():
+            with progress(f"embed {scans} {name}", len(recording)) as show:
                 file = embed(method, recording, rotation_seed=rotation_seed, on_progress=show)
-            file.save(folder / f"{name}-{title}.npz")
-            results[title][name] = score(file)
+            file.save(folder / f"{name}-{scans}.npz")
+            results[scans][name] = score(file)
         if figures.can_draw():
-            _draw(results[title], recording, folder, title)
+            _draw_figures(results[scans], recording, folder, scans)
     semantics = None
     if params.config.segments and recording.has_labels:
         semantics = segment_recording(params, recording, folder, progress=progress)
@@ -94,12 +95,12 @@ def final_test(
     return test
 
 
-def _draw(results: Mapping[str, Sequence[Result]], recording: Recording, folder: Path, title: str) -> None:
-    """Draw the curves of all methods by the first protocol, top-1 F1max, and the decisions for the network."""
-    curves = {name: first.curve for name, (first, *_) in results.items() if first.curve is not None}
+def _draw_figures(results: Mapping[str, Sequence[Result]], recording: Recording, folder: Path, scans: str) -> None:
+    """Draw the curves of all methods and the decisions of the network by the first protocol, top-1 F1max."""
+    curves = {name: top1.curve for name, (top1, *_) in results.items() if top1.curve is not None}
     if curves:  # empty if the recording has no revisit
-        picture = figures.precision_recall(curves, title=f"{recording.name}, {title}: top-1")
-        figures.save(picture, folder / f"precision-recall-{title}.png")
+        picture = figures.precision_recall(curves, title=f"{recording.name}, {scans}: top-1")
+        figures.save(picture, folder / f"precision-recall-{scans}.png")
     decisions = results[NETWORK][0].decisions
     if decisions is not None and recording.positions is not None:
-        figures.save(figures.trajectory(recording.positions, decisions), folder / f"trajectory-{title}.png")
+        figures.save(figures.trajectory(recording.positions, decisions), folder / f"trajectory-{scans}.png")

@@ -1,4 +1,4 @@
-"""Learning curves of a training run, drawn when it ends."""
+"""Draws the learning curves of a training run when it ends."""
 
 from pathlib import Path
 
@@ -25,13 +25,13 @@ class LearningCurves(Callback):
 
     def on_end(self, step: int) -> None:
         """Draw loss terms, score and gradient norm of the whole run, including those of earlier processes."""
-        lines = read_metrics(self._folder / METRICS_FILE)
-        if not lines or not figures.can_draw():
+        measurements = read_metrics(self._folder / METRICS_FILE)
+        if not measurements or not figures.can_draw():
             return
-        panels = {}
+        panels = {title: {} for title in PANELS}
         for title, names in PANELS.items():
-            curves = {
-                name: [(line["step"], line[name]) for line in lines if line.get(name) is not None] for name in names
-            }
-            panels[title] = {name: points for name, points in curves.items() if points}
+            for name in names:
+                measured = [line for line in measurements if line.get(name) is not None]
+                if measured:
+                    panels[title][name] = [(line["step"], line[name]) for line in measured]
         figures.save(figures.learning_curves(panels), self._folder / PICTURE)

@@ -11,6 +11,7 @@ from sglpr_jax.evaluation.page import Picture, Section, Text, figure_picture, mi
 from sglpr_jax.evaluation.report import TextTable
 from sglpr_jax.loops.calibration import reliability_of
 from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, count_reasons, to_upright
+from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import LoopSearchResult, diagnose_no_loops
 from sglpr_jax.odometry.path import level_odometry
@@ -21,84 +22,88 @@ from sglpr_jax.se3 import yaw_of
 
 PAGE = "index.html"
 SHOWN_PAIRS = 9
+"""Maximum number of loops whose images are shown."""
 SHOWN_ROWS = 40
+"""Maximum number of rows of the table of loops."""
 NO_MATPLOTLIB = missing("The pictures need matplotlib: pip install 'sglpr-jax[viz]'.")
 
 
 def loops_page(result: LoopSearchResult, *, optimized: OptimizedTrajectory | None = None) -> str:
-    """Return the page of one or several recordings as self-contained HTML.
-
-    With `optimized` trajectories it shows them before and after the correction.
-    """
+    """Return the HTML page of one or several recordings, with `optimized` trajectories before and after correction."""
     if len(result.sessions) == 1:
         title = f"Loops of {result.sessions[0].recording.name}"
-        return render(title, _about(result), _recording_sections(result, optimized))
+        return render(title, _summary(result), _recording_sections(result, optimized))
     names = unique_names(result)
-    sections = [_transforms(result, names), *_common_frames(result, names, optimized)]
+    sections = [_transform_section(result, names), *_common_frame_sections(result, names, optimized)]
     for match, query in result.pairs:
-        pair = result.between(match, query)
-        if pair.transforms or pair.rejected:
+        between = result.between(match, query)
+        if between.transforms or between.rejected:
             recordings = result.sessions[query].recording, result.sessions[match].recording
-            blocks = [_pairs(*recordings, pair.loops, nothing="No common place found."), *_reasons(pair.rejected)]
+            overlays = _overlay_picture(*recordings, between.loops, without_loops="No common place found.")
+            blocks = [overlays, *_rejection_blocks(between.rejected)]
             sections.append(Section(f"{names[match]} and {names[query]}", blocks))
-    for number, name in enumerate(names):
-        within = result.within(number)
+    for session, name in enumerate(names):
+        within = result.within(session)
         first, *others = _recording_sections(within, None)
-        sections.append(Section(f"{name}: {first.title}", [Text(_about(within)), *first.blocks]))
+        sections.append(Section(f"{name}: {first.title}", [Text(_summary(within)), *first.blocks]))
         sections += [Section(f"{name}: {section.title}", section.blocks) for section in others]
-    between = sum(loop.match_session != loop.query_session for loop in result.loops)
-    about = f"{len(result.loops) - between} loops within and {between} loops between {len(names)} recordings."
+    loops_between = sum(loop.match_session != loop.query_session for loop in result.loops)
+    loops_within = len(result.loops) - loops_between
+    about = f"{loops_within} loops within and {loops_between} loops between {len(names)} recordings."
     return render(f"Loops of {', '.join(names)}", about, sections)
 
 
-def _about(result: LoopSearchResult) -> str:
-    return f"{result}; {'with odometry' if result.sessions[0].odometry is not None else 'without odometry'}."
+def _summary(result: LoopSearchResult) -> str:
+    """Return the line below the title: the numbers of the result, and whether there is odometry."""
+    return f"{result}; {'without' if result.sessions[0].odometry is None else 'with'} odometry."
 
 
 def _recording_sections(result: LoopSearchResult, optimized: OptimizedTrajectory | None) -> list[Section]:
-    """Sections of one recording. With an `optimized` trajectory there is one about the correction."""
+    """Return the sections about one recording. With an `optimized` trajectory, one section is about the correction."""
     session = result.sessions[0]
-    reasons = diagnose_no_loops(result)
-    return [
-        *([Section("Why no loops", [Text(reason) for reason in reasons])] if reasons else []),
-        Section("Trajectory", _trajectory(result)),
-        *([Section("Corrected", [_corrected(result, optimized)])] if optimized is not None and session.frames else []),
-        Section("Pairs", [_pairs(session.recording, session.recording, result.loops, nothing="No loops.")]),
-        Section("Loops", [_table(result)]),
-        Section("Rejected", _reasons(result.rejected)),
-        Section("Reliability", _reliability(result)),
+    overlays = _overlay_picture(session.recording, session.recording, result.loops, without_loops="No loops.")
+    sections = [
+        Section("Why no loops", [Text(reason) for reason in diagnose_no_loops(result)]),
+        Section("Trajectory", _trajectory_pictures(result)),
+        Section("Corrected", [_correction_picture(result, optimized)] if optimized and session.frames else []),
+        Section("Pairs", [overlays]),
+        Section("Loops", [_loop_table(result)]),
+        Section("Rejected", _rejection_blocks(result.rejected)),
+        Section("Reliability", _reliability_blocks(result)),
     ]
+    return [section for section in sections if section.blocks]
 
 
-def _trajectory(result: LoopSearchResult) -> list[Picture | Text]:
-    """Draw the loops on the trajectory, if positions are known, and the match of each query."""
+def _trajectory_pictures(result: LoopSearchResult) -> list[Picture | Text]:
+    """Draw the loops on the trajectory (odometry or, without it, known positions), and the match of each query."""
     session = result.sessions[0]
     if not figures.can_draw():
         return [NO_MATPLOTLIB]
     if not session.frames:
         return [missing("No scan was processed.")]
     positions, source = session.recording.positions, session.recording.pose_source
-    wrong, quality = _frames(wrong_loops(result)), "Long lines are drift, or wrong loops."
+    wrong = _frame_pairs(wrong_loops(result))
+    quality = "Long lines are drift, or wrong loops."
     if positions is not None and result.loops:
-        share = f"{len(wrong)} of {len(result.loops)} loops are wrong{' (red)' if wrong else ''}"
-        quality = f"{share}: more than {NEGATIVE_M:g} m apart by {source}."
+        wrong_share = f"{len(wrong)} of {len(result.loops)} loops are wrong{' (red)' if wrong else ''}"
+        quality = f"{wrong_share}: more than {NEGATIVE_M:g} m apart by {source}."
     if session.odometry is not None:
         positions, source = level_odometry(session.odometry, session.recording.uprights)[:, :3, 3], "the odometry"
     pictures = []
     if positions is not None:
         caption = f"The trajectory from {source}. A line connects the two frames of each loop. {quality}"
-        right = [pair for pair in _frames(result.loops) if pair not in set(wrong)]
-        plot = figures.loops(positions[: session.frames], right, wrong=wrong)
+        not_wrong = [pair for pair in _frame_pairs(result.loops) if pair not in set(wrong)]
+        plot = figures.loops(positions[: session.frames], not_wrong, wrong=wrong)
         pictures.append(figure_picture(plot, "The loops on the trajectory", caption=caption))
     probabilities = [(loop.query, loop.match, loop.probability) for loop in result.loops]
-    rejected = _frames(rejection.loop for rejection in result.rejected)
+    rejected = _frame_pairs(rejection.loop for rejection in result.rejected)
     plot = figures.loops_in_time(probabilities, session.frames, wrong=wrong, rejected=rejected)
     caption = "The match of each query. Rejected pairs are grey." if rejected else "The match of each query."
     return [*pictures, figure_picture(plot, "The loops in time", caption=caption)]
 
 
 def wrong_loops(result: LoopSearchResult) -> list[LoopClosure]:
-    """Return loops whose true positions are more than 20 m apart. Empty if true positions are not known."""
+    """Return the loops whose true positions are more than 20 m apart, or [] if true positions are not known."""
     return [loop for loop in result.loops if (_true_distance_m(result, loop) or 0) > NEGATIVE_M]
 
 
@@ -108,35 +113,38 @@ def _true_distance_m(result: LoopSearchResult, loop: LoopClosure) -> float | Non
     return None if positions is None else float(np.linalg.norm(positions[loop.query] - positions[loop.match]))
 
 
-def _frames(loops: Iterable[LoopClosure]) -> list[tuple[int, int]]:
+def _frame_pairs(loops: Iterable[LoopClosure]) -> list[tuple[int, int]]:
+    """Return the frame numbers (query, match) of each loop."""
     return [(loop.query, loop.match) for loop in loops]
 
 
-def _corrected(result: LoopSearchResult, optimized: OptimizedTrajectory) -> Picture | Text:
-    """Draw the trajectory before and after the correction. If true positions are known, the caption has both errors."""
+def _correction_picture(result: LoopSearchResult, optimized: OptimizedTrajectory) -> Picture | Text:
+    """Draw the trajectory before and after the correction, with the position errors if true positions are known."""
     session = result.sessions[0]
     assert session.odometry is not None
     trajectories = {"odometry": session.odometry[: session.frames], "optimized": optimized.poses}
-    caption = _sentence(optimized)
-    truth = session.recording.positions
-    if truth is not None and session.frames > 2:
-        errors_m = {name: trajectory_error(poses, truth[: session.frames]) for name, poses in trajectories.items()}
+    caption = _as_sentence(optimized)
+    true_positions = session.recording.positions
+    if true_positions is not None and session.frames > 2:
+        true_positions = true_positions[: session.frames]
+        errors_m = {name: trajectory_error(poses, true_positions) for name, poses in trajectories.items()}
         errors = ", ".join(f"{name} {error:.2f} m" for name, error in errors_m.items())
         caption += f" Position error (RMSE after alignment with {session.recording.pose_source}): {errors}."
     if not figures.can_draw():
         return missing(caption)
-    upright = session.recording.uprights[: session.frames]
-    level = {name: level_odometry(poses, upright)[:, :3, 3] for name, poses in trajectories.items()}
-    return figure_picture(figures.trajectories(level), "The trajectory before and after", caption=caption)
+    uprights = session.recording.uprights[: session.frames]
+    positions = {name: level_odometry(poses, uprights)[:, :3, 3] for name, poses in trajectories.items()}
+    return figure_picture(figures.trajectories(positions), "The trajectory before and after", caption=caption)
 
 
-def _sentence(optimized: OptimizedTrajectory) -> str:
-    words = str(optimized)
-    return f"{words[0].upper()}{words[1:]}."
+def _as_sentence(optimized: OptimizedTrajectory) -> str:
+    """Return the summary of the correction with a capital and a full stop."""
+    summary = str(optimized)
+    return f"{summary[0].upper()}{summary[1:]}."
 
 
-def _reliability(result: LoopSearchResult) -> list[Picture | Text | TextTable]:
-    """Plot and table of the share of loops over the predicted probability, if true positions are known."""
+def _reliability_blocks(result: LoopSearchResult) -> list[Picture | Text | TextTable]:
+    """Return plot and table of the true share of loops by predicted probability, or a text without true positions."""
     session = result.sessions[0]
     if session.recording.positions is None or result.model is None:
         return [missing("The share of loops among the pairs is not known: the recording has no poses.")]
@@ -158,33 +166,33 @@ def _reliability(result: LoopSearchResult) -> list[Picture | Text | TextTable]:
     return [figure_picture(plot, "Share of loops over probability", caption=caption), table]
 
 
-def _pairs(query: Recording, match: Recording, loops: Sequence[LoopClosure], *, nothing: str) -> Picture | Text:
-    """Images of some loops, laid over each other. `nothing` is the text without loops."""
+def _overlay_picture(
+    query: Recording, match: Recording, loops: Sequence[LoopClosure], *, without_loops: str
+) -> Picture | Text:
+    """Return the overlaid images of up to 9 loops between two recordings, or the text `without_loops`."""
     if not loops:
-        return missing(nothing)
+        return missing(without_loops)
     if not figures.can_draw():
         return NO_MATPLOTLIB
-    rows = np.unique(np.linspace(0, len(loops) - 1, SHOWN_PAIRS).astype(int))
-    images = {
-        f"query {query.numbers[loop.query]}, match {match.numbers[loop.match]}": overlay_of(query, match, loop)
-        for loop in (loops[row] for row in rows)
-    }
+    images = {}
+    for row in np.unique(np.linspace(0, len(loops) - 1, SHOWN_PAIRS).astype(int)):
+        loop = loops[row]
+        title = f"query {query.numbers[loop.query]}, match {match.numbers[loop.match]}"
+        images[title] = overlaid_scans(query, match, loop)
     caption = "Match in red, query in cyan; cells with points of both are white. Pairs are spread over the recording."
     return figure_picture(figures.overlays(images), "Pairs of images", caption=caption)
 
 
-def overlay_of(query: Recording, match: Recording, loop: LoopClosure) -> Float[np.ndarray, "h w 3"]:
-    """Overlay the images of the two scans of a loop, as RGB colours from 0 to 1 (`figures.overlaid`)."""
-    level = to_upright(loop, query=query.mounting_of(loop.query), match=match.mounting_of(loop.match))
-    images = (
-        square_image(query.scan(loop.query, labels=False)),
-        square_image(match.scan(loop.match, labels=False)),
-    )
-    return figures.overlaid(*images, level.match_from_query)
+def overlaid_scans(query: Recording, match: Recording, loop: LoopClosure) -> Float[np.ndarray, "h w 3"]:
+    """Overlay the images of the two scans of a loop, each from its recording, as RGB colours (`figures.overlaid`)."""
+    upright_loop = to_upright(loop, query=query.mounting_of(loop.query), match=match.mounting_of(loop.match))
+    query_image = square_image(query.scan(loop.query, labels=False))
+    match_image = square_image(match.scan(loop.match, labels=False))
+    return figures.overlaid(query_image, match_image, upright_loop.match_from_query)
 
 
-def _reasons(rejected: Sequence[RejectedClosure]) -> list[Text | TextTable]:
-    """Table of the reasons for rejections, with counts."""
+def _rejection_blocks(rejected: Sequence[RejectedClosure]) -> list[Text | TextTable]:
+    """Return a table of the reasons for which pairs were rejected, with counts and meanings."""
     if not rejected:
         return [missing("No pair was rejected.")]
     rows = [(reason, str(count), MEANING[reason]) for reason, count in count_reasons(rejected).items()]
@@ -192,13 +200,15 @@ def _reasons(rejected: Sequence[RejectedClosure]) -> list[Text | TextTable]:
     return [Text(about), TextTable(("reason", "pairs", "meaning"), rows, ("pairs",))]
 
 
-def _table(result: LoopSearchResult) -> Text | TextTable:
-    """Table of the wrong loops, if known, and of the loops with the lowest probabilities."""
+def _loop_table(result: LoopSearchResult) -> Text | TextTable:
+    """Return a table of up to 40 loops: wrong loops first, if they are known, then by increasing probability."""
     if not result.loops:
         return missing("No loops.")
-    recording, wrong = result.sessions[0].recording, set(_frames(wrong_loops(result)))
+    recording = result.sessions[0].recording
+    wrong = set(_frame_pairs(wrong_loops(result)))
     header = ("query", "match", "x [m]", "y [m]", "yaw [deg]", "probability", "overlap")
-    header += () if recording.positions is None else ("true distance [m]",)
+    if recording.positions is not None:
+        header += ("true distance [m]",)
     rows = []
     for loop in sorted(result.loops, key=lambda loop: ((loop.query, loop.match) not in wrong, loop.probability)):
         x, y = loop.match_from_query[:2, 3]
@@ -216,24 +226,20 @@ def _table(result: LoopSearchResult) -> Text | TextTable:
     return TextTable(header, rows[:SHOWN_ROWS], header[2:])
 
 
-def _transforms(result: LoopSearchResult, names: list[str]) -> Section:
-    """Table of the transforms between the recordings."""
+def _transform_section(result: LoopSearchResult, names: list[str]) -> Section:
+    """Return a table of the transforms between each two recordings. `names` are those of the recordings."""
     header = ("match", "query", "loops", "x [m]", "y [m]", "z [m]", "yaw [deg]", "+- [m]", "+- [deg]")
     rows = []
-    for pair in result.pairs:
-        transforms = result.between(*pair).transforms
-        for aligned in transforms:
-            frames = (
-                names[session]
-                if segment.is_odometry
-                else f"{names[session]}, from the LiDAR at scan {segment.first} to scan {segment.last}"
-                for session, segment in zip(pair, (aligned.match, aligned.query), strict=True)
-            )
-            pose, sigma = aligned.match_from_query, np.sqrt(np.diag(aligned.covariance))
-            values = (*pose[:3, 3], np.degrees(yaw_of(pose)), np.hypot(*sigma[:2]), np.degrees(sigma[5]))
-            rows.append((*frames, f"{aligned.loops}", *(f"{value:.2f}" for value in values)))
+    for match, query in result.pairs:
+        transforms = result.between(match, query).transforms
+        for transform in transforms:
+            frames = (_frame_name(transform.match, names[match]), _frame_name(transform.query, names[query]))
+            pose = transform.match_from_query
+            sigma = np.sqrt(np.diag(transform.covariance))  # x, y, z in metres; roll, pitch, yaw in radians
+            numbers = (*pose[:3, 3], np.degrees(yaw_of(pose)), np.hypot(*sigma[:2]), np.degrees(sigma[5]))
+            rows.append((*frames, f"{transform.loops}", *(f"{number:.2f}" for number in numbers)))
         if not transforms:
-            rows.append((*(names[session] for session in pair), "no common place found", *[""] * 6))
+            rows.append((names[match], names[query], "no common place found", *[""] * (len(header) - 3)))
     meaning = (
         "Pose of the query recording's frame in the match recording's frame, with standard deviations of position in "
         "the plane and yaw. All numbers are in frames.json."
@@ -241,18 +247,27 @@ def _transforms(result: LoopSearchResult, names: list[str]) -> Section:
     return Section("Transforms", [Text(meaning), TextTable(header, rows, header[2:])])
 
 
-def _common_frames(result: LoopSearchResult, names: list[str], optimized: OptimizedTrajectory | None) -> list[Section]:
-    """Section with the trajectories of each group of recordings with a common place, if there is odometry."""
-    groups = placements(result)
+def _frame_name(segment: TrajectorySegment, name: str) -> str:
+    """Return the coordinate frame of a part of a recording in words, given the recording's name."""
+    return name if segment.is_odometry else f"{name}, from the LiDAR at scan {segment.first} to scan {segment.last}"
+
+
+def _common_frame_sections(
+    result: LoopSearchResult, names: list[str], optimized: OptimizedTrajectory | None
+) -> list[Section]:
+    """Draw each group of recordings with common places in one coordinate frame, if all recordings have odometry."""
     if not figures.can_draw() or any(session.odometry is None for session in result.sessions):
         return []
+    groups = placements(result)  # of each recording: the first recording of its group, and the transform to its frame
     pictures = []
-    for group in dict.fromkeys(group for group, _ in groups):
-        positions = {}
-        for number, ((other, group_from_odom), session) in enumerate(zip(groups, result.sessions, strict=True)):
-            if other == group and session.odometry is not None:
-                poses = group_from_odom @ session.odometry[: session.frames]
-                positions[number] = (poses if optimized is None else result.split(optimized.poses)[number])[:, :3, 3]
+    for first in dict.fromkeys(group for group, _ in groups):
+        positions = {}  # of the frames of each recording in the group
+        for session, (group, group_from_odom) in enumerate(groups):
+            odometry = result.sessions[session].odometry
+            if group == first and odometry is not None:
+                poses = group_from_odom @ odometry[: result.sessions[session].frames]
+                poses = poses if optimized is None else result.split(optimized.poses)[session]
+                positions[session] = poses[:, :3, 3]
         if len(positions) < 2:
             continue
         pairs = [
@@ -260,8 +275,8 @@ def _common_frames(result: LoopSearchResult, names: list[str], optimized: Optimi
             for loop in result.loops
             if loop.match_session != loop.query_session and {loop.match_session, loop.query_session} <= set(positions)
         ]
-        caption = f"The odometry in the frame of {names[group]}. A line connects the two scans of each loop."
-        caption = caption if optimized is None else f"{_sentence(optimized)} Frame of {names[group]}."
-        plot = figures.loops_between({names[number]: path for number, path in positions.items()}, pairs)
+        caption = f"The odometry in the frame of {names[first]}. A line connects the two scans of each loop."
+        caption = caption if optimized is None else f"{_as_sentence(optimized)} Frame of {names[first]}."
+        plot = figures.loops_between({names[session]: path for session, path in positions.items()}, pairs)
         pictures.append(figure_picture(plot, "Trajectories in one frame", caption=caption))
     return [Section("Together", pictures)] if pictures else []

@@ -22,19 +22,21 @@ if TYPE_CHECKING:
 class Text:
     """Paragraph of plain text."""
 
-    kind: ClassVar = "text"
+    kind: ClassVar = "text"  # selects the block's HTML in page.html.j2
     text: str
     style: Literal["", "about", "missing"] = ""
-    """about: a note. missing: why a section is empty or how to fill it."""
+    """CSS class. about: a note. missing: why a section is empty or how to fill it."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Embedded image, with its alternative text."""
+    """Embedded image."""
 
     kind: ClassVar = "picture"
     uri: str
+    """The image itself, as a data URI."""
     name: str
+    """Alternative text."""
     width: int | None = None
     """Width on the page in pixels."""
     caption: str = ""
@@ -57,7 +59,7 @@ class Section:
 
 
 def render(title: str, about: str, sections: Sequence[Section]) -> str:
-    """Return a page of these sections as HTML."""
+    """Return a page as HTML: the title, a line about the page, and the sections."""
     import jinja2  # imported here, because only pages need it
 
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
@@ -78,11 +80,12 @@ def figure_picture(figure: "matplotlib.figure.Figure", name: str, *, caption: st
 
 
 def bev_picture(bev: Num[np.ndarray, "h w"], name: str) -> Picture:
-    """Return point counts as an embedded grey image."""
+    """Return the point counts of an image seen from above as an embedded grey image."""
     stream = io.BytesIO()
     Image.fromarray((255 * brightness(bev)).astype(np.uint8)).save(stream, format="PNG")
     return Picture(_uri(stream), name)
 
 
 def _uri(png: io.BytesIO) -> str:
+    """Return a PNG file as a data URI."""
     return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode("ascii")

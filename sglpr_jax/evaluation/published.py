@@ -1,7 +1,7 @@
 """Numbers of the SG-LPR paper: tables 1 to 7, row by row as printed.
 
-The rows of a table do not share one protocol. The paper names the source of each row. The protocol of each source is
-our reading (docs/concepts/protocols.md):
+The rows of a table do not share one protocol. The paper names the source of each row. From the source we infer the
+protocol (docs/concepts/protocols.md):
 
 - "RINet's paper": `pairs-f1max`, F1max over pairs with 100 negatives per positive.
 - "its own paper": `top1-f1max`, top-1 F1max with 3 m, 20 m and 30 s.
@@ -58,9 +58,9 @@ class Table:
 
 
 def _read(table: dict[str, Any]) -> Table:
-    """Return a table of `published.json`, whose rows have method, kind, source, scores and printed mean."""
-    rows = [Row(method, tuple(scores), mean, kind, source) for method, kind, source, scores, mean in table["rows"]]
-    return Table(**{**table, "columns": tuple(table["columns"]), "rows": tuple(rows)})
+    """Return a table of `published.json`, whose rows are lists of method, kind, source, scores and printed mean."""
+    rows = tuple(Row(method, tuple(scores), mean, kind, source) for method, kind, source, scores, mean in table["rows"])
+    return Table(table["number"], table["title"], table["dataset"], tuple(table["columns"]), rows)
 
 
 TABLES = tuple(map(_read, json.loads((resources.files("sglpr_jax.evaluation") / "published.json").read_text())))
@@ -73,24 +73,21 @@ TABLE_3_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset}, b
 
 
 def table_1_rows(sequence: str) -> list[tuple[str, ...]]:
-    """Return method, score and source of the learned methods in table 1, for one KITTI sequence.
-
-    Raises ValueError if table 1 does not have the sequence.
-    """
+    """Return method, score and source of the learned methods in table 1. Raises ValueError for another sequence."""
     if sequence not in TABLE_1.columns:
         raise ValueError(f"expected a sequence with published numbers, {', '.join(TABLE_1.columns)}, found {sequence}")
-    i = TABLE_1.columns.index(sequence)
-    return [(row.method, f"{row.scores[i]:.3f}", row.source) for row in TABLE_1.rows if row.kind == "learned"]
+    column = TABLE_1.columns.index(sequence)
+    return [(row.method, f"{row.scores[column]:.3f}", row.source) for row in TABLE_1.rows if row.kind == "learned"]
 
 
 def table_3_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return method, scores and mean of table 3 for these query sessions, marked as published.
+    """Return rows of table 3 for these query sessions: "published: METHOD", the scores and their mean.
 
     Cells of sessions that are not in the table are empty and do not count in the mean. Raises ValueError if the
     database is not that of the table, or if the table has none of the sessions.
     """
-    columns = [session for session in sessions if session in TABLE_3.columns]
-    if database != NCLT_DATABASE or not columns:
+    sessions_in_table = [session for session in sessions if session in TABLE_3.columns]
+    if database != NCLT_DATABASE or not sessions_in_table:
         raise ValueError(
             f"expected database {NCLT_DATABASE} and queries among {', '.join(TABLE_3.columns)}, for which numbers "
             f"are published; found database {database} and queries {', '.join(sessions)}"
@@ -98,7 +95,9 @@ def table_3_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]
     rows = []
     for row in TABLE_3.rows:
         scores = dict(zip(TABLE_3.columns, row.scores, strict=True))
-        mean = row.mean if len(columns) == len(scores) else fmean(scores[session] for session in columns)
+        mean = fmean(scores[session] for session in sessions_in_table)
+        if len(sessions_in_table) == len(scores):
+            mean = row.mean  # as printed, which may differ from the mean of the rounded scores
         cells = (f"{scores[session]:.3f}" if session in scores else "" for session in sessions)
         rows.append((f"published: {row.method}", *cells, f"{mean:.3f}"))
     return rows

@@ -1,4 +1,4 @@
-"""Tables and JSON of results."""
+"""Tables and JSON of results of protocols (`Result`)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,10 +21,11 @@ MOST_IN_CELL = 300
 MOST_COLUMNS = 6
 """Maximum number of protocols side by side. More do not fit a terminal."""
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
+"""Columns of a table of results. Counts are in "rests on", the dimensions of distances in "distance"."""
 PRECISIONS = (0.99, 1.0)
 """Precisions for which results state a threshold."""
 COORDINATES = ("distance", "precision", "recall")
-"""Numbers of a point of a curve, in the order of tables."""
+"""Keys of a point of a precision-recall curve (`_point`), in the order of tables."""
 
 
 class PrintsItself:
@@ -41,16 +42,13 @@ class PrintsItself:
 
 @dataclass(frozen=True)
 class TextTable:
-    """Table of plain text, for the terminal and for pages.
-
-    In the terminal, control characters are escaped and very long lines are shortened.
-    """
+    """Table of plain text. The terminal shows control characters escaped and very long lines shortened."""
 
     kind: ClassVar = "table"
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     numbers: Sequence[str] = ()
-    """Columns of numbers, which are typeset differently."""
+    """Names of the columns with numbers, which are right-aligned."""
     title: str = ""
     caption: str = ""
 
@@ -64,15 +62,12 @@ class TextTable:
 
 
 def _plain(text: str, *, style: str = "") -> Text:
-    # rich would interpret names with brackets as styles, or reject them.
+    """Return text that rich prints as it is. From a str, rich would interpret names in brackets as styles."""
     return Text("\n".join(printable(line, most=MOST_IN_CELL) for line in text.split("\n")), style=style)
 
 
 def results_table(results: Sequence[Result], *, title: str = "", published_on: bool = False) -> TextTable:
-    """Return a table with one row per protocol: rule, score, interval, counts, distance and poses.
-
-    With `published_on`, it has a column with the poses of the published numbers.
-    """
+    """Return a table with a row for each result, and with `published_on` the poses of the published numbers."""
     rows = [
         (
             result.name,
@@ -91,14 +86,12 @@ def results_table(results: Sequence[Result], *, title: str = "", published_on: b
 
 
 def threshold_table(results: Sequence[Result]) -> TextTable:
-    """Return the descriptor distances up to which answers or pairs are accepted.
-
-    Each result with a curve has a row for the highest F1 and for each of `PRECISIONS`.
-    """
+    """Return a table with the descriptor distance of each curve at the highest F1 and at `PRECISIONS`."""
     header = ("protocol", "threshold for", "descriptor distance", "precision", "recall")
     rows = []
     for result in results:
-        if (curve := result.curve) is None:
+        curve = result.curve
+        if curve is None:
             continue
         points = {"highest F1": _point(curve, curve.best), **_at_precisions(curve, "precision {:g}")}
         for goal, point in points.items():
@@ -108,15 +101,12 @@ def threshold_table(results: Sequence[Result]) -> TextTable:
 
 
 def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> TextTable:
-    """Return a table of scores with one row per method and one column per protocol.
-
-    If there are more than `MOST_COLUMNS` protocols, rows and columns are exchanged. All methods are scored on the same
-    sequence.
-    """
-    header = ("method", *(result.name for result in next(iter(methods.values()))))
+    """Return a table of scores, with a row for each method. More than `MOST_COLUMNS` protocols are rows instead."""
+    first_results = next(iter(methods.values()))
+    header = ("method", *(result.name for result in first_results))
     rows = [(name, *(format_score(result.score) for result in results)) for name, results in methods.items()]
-    if len(header) - 1 > MOST_COLUMNS:
-        _, *rows = zip(header, *rows, strict=True)
+    if len(first_results) > MOST_COLUMNS:
+        _, *rows = zip(header, *rows, strict=True)  # transposed
         header = ("protocol", *methods)
     return TextTable(header, rows, header[1:], title)
 
@@ -133,7 +123,7 @@ def format_score(score: float) -> str:
 
 
 def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return values for `json.dump`: score (null without a revisit), interval, rule, counts and curve summary."""
+    """Return values for `json.dump`, a dictionary for each result. The score is null without a revisit."""
     return [
         {
             "protocol": result.name,
@@ -158,14 +148,17 @@ def score_or_none(score: float) -> float | None:
     return None if math.isnan(score) else score
 
 
-def _at_precisions(curve: PrecisionRecallCurve, name: str) -> dict[str, dict[str, float] | None]:
-    """Return the point of each of `PRECISIONS`, or None if no threshold reaches this precision."""
-    return {name.format(goal): _point(curve, curve.at_precision(goal)) for goal in PRECISIONS}
+def _at_precisions(curve: PrecisionRecallCurve, key: str) -> dict[str, dict[str, float] | None]:
+    """Return the point of the curve for each of `PRECISIONS` (None if not reached). `key` is the format of the keys."""
+    return {key.format(precision): _point(curve, curve.at_precision(precision)) for precision in PRECISIONS}
 
 
 def _point(curve: PrecisionRecallCurve, index: int | None) -> dict[str, float] | None:
-    """Return precision, recall and largest accepted descriptor distance at a threshold of the curve."""
+    """Return precision, recall and largest accepted descriptor distance at the threshold with this index."""
     if index is None:
         return None
-    precision, recall, threshold = curve.precision[index], curve.recall[index], curve.thresholds[index]
-    return {"precision": float(precision), "recall": float(recall), "distance": float(-threshold)}
+    return {
+        "precision": float(curve.precision[index]),
+        "recall": float(curve.recall[index]),
+        "distance": float(-curve.thresholds[index]),  # thresholds are negated distances
+    }

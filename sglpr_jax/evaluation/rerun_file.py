@@ -1,4 +1,4 @@
-"""The loops of a recording as a file for the rerun viewer (extra `view`): trajectories, scans, loops, image pairs."""
+"""Writes the loops of a recording, with trajectories and scans, to a file for the rerun viewer (extra `view`)."""
 
 import importlib
 import importlib.util
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.evaluation.loops_page import overlay_of, wrong_loops
+from sglpr_jax.evaluation.loops_page import overlaid_scans, wrong_loops
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.result import LoopSearchResult, Session
@@ -16,18 +16,18 @@ from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transformed, travelled
 
 KEYFRAME_M = 5.0
-"""Distance between two scans in the file, in metres."""
+"""Travelled distance between two scans in the file, in metres."""
 VOXEL_M = 0.5
-"""Edge of a voxel, in metres. One point in each is kept."""
+"""Edge of a voxel, in metres. Of each scan, one point in each voxel is written."""
 TIMELINE = "frame"
-BEFORE, AFTER = (150, 150, 150), (40, 120, 220)
-RIGHT, WRONG = (60, 180, 75), (230, 30, 30)
-SCAN = (110, 110, 110)
-"""Colours of the trajectories, the loops and the scans, red, green, blue."""
+GREY, BLUE = (150, 150, 150), (40, 120, 220)
+GREEN, RED = (60, 180, 75), (230, 30, 30)
+DARK_GREY = (110, 110, 110)
+"""Colours of the trajectories before and after correction, of right and wrong loops, and of the scans."""
 
 
 def check_installed() -> None:
-    """Raises ImportError with the command that installs rerun, if it is missing."""
+    """Raise ImportError, with the command that installs rerun, if it is missing."""
     if importlib.util.find_spec("rerun") is None:
         raise ImportError("--rerun needs rerun-sdk: pip install 'sglpr-jax[view]'")
 
@@ -35,26 +35,26 @@ def check_installed() -> None:
 def write_rerun(result: LoopSearchResult, path: Path | str, *, optimized: OptimizedTrajectory | None = None) -> None:
     """Write the loops of a recording as an .rrd file for the rerun viewer.
 
-    The time line counts frames. With poses (odometry or, without it, known poses) the file has the trajectory, the
-    corrected one, the scan at every 5 m, and a line for each loop. Without poses it has the images of the loops laid
-    over each other, and the probabilities. Loops that are wrong by known poses are red. Raises ImportError if rerun is
-    not installed, WriteError if the file cannot be written.
+    The time line counts frames. The file has the overlaid images of the loops, and the probability of each candidate.
+    With odometry or known positions it also has a map: the trajectory, the `optimized` trajectory, and a line for each
+    loop, red if the loop is wrong by known positions. With odometry the map has a scan every 5 m. Raises ImportError if
+    rerun is not installed, WriteError if the file cannot be written.
     """
     check_installed()
     rerun: Any = importlib.import_module("rerun")
-    poses = _poses(result, optimized)
+    poses = _map_poses(result, optimized)
     with replacing(Path(path)) as temporary:
         stream = rerun.RecordingStream("sglpr-jax", recording_id=f"loops {result.sessions[0].recording.name}")
-        stream.save(temporary, default_blueprint=_layout(with_map=poses is not None))
+        stream.save(temporary, default_blueprint=_viewer_layout(with_map=poses is not None))
         if poses is not None:
             _log_map(rerun, stream, result.sessions[0], poses, is_corrected=optimized is not None)
         _log_loops(rerun, stream, result, poses)
-        _log_evidence(rerun, stream, result)
+        _log_candidates(rerun, stream, result)
         stream.disconnect()
 
 
-def _poses(result: LoopSearchResult, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
-    """Pose of each searched frame in the map: corrected, by odometry, or a known position without a rotation."""
+def _map_poses(result: LoopSearchResult, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
+    """Return the poses of the searched frames (corrected, odometry, or positions without rotation), or None."""
     session = result.sessions[0]
     if optimized is not None:
         return optimized.poses
@@ -68,51 +68,52 @@ def _poses(result: LoopSearchResult, optimized: OptimizedTrajectory | None) -> F
     return poses
 
 
-def _layout(*, with_map: bool) -> Any:
+def _viewer_layout(*, with_map: bool) -> Any:
+    """Return a blueprint of the viewer: on the left the map, if there is one; on the right images, plots and texts."""
     views = importlib.import_module("rerun.blueprint")
     images = views.Spatial2DView(origin="pair", name="Query (cyan) on match (red)")
-    lines = views.TimeSeriesView(origin="evidence", name="Evidence")
-    beside = views.Vertical(images, lines, views.TextLogView(origin="evidence/loop", name="Loops"))
-    space = [views.Spatial3DView(origin="map", name="Map")] if with_map else []
-    return views.Blueprint(views.Horizontal(*space, beside))
+    plots = views.TimeSeriesView(origin="evidence", name="Evidence")
+    texts = views.TextLogView(origin="evidence/loop", name="Loops")
+    maps = [views.Spatial3DView(origin="map", name="Map")] if with_map else []
+    return views.Blueprint(views.Horizontal(*maps, views.Vertical(images, plots, texts)))
 
 
 def _log_map(
     rerun: Any, stream: Any, session: Session, poses: Float[np.ndarray, "n 4 4"], *, is_corrected: bool
 ) -> None:
-    """Log the trajectories, the sensor, and the scans of keyframes."""
+    """Log the trajectories, the position of the sensor at each frame, and a scan every `KEYFRAME_M`."""
     stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    lines = {"given": (poses, BEFORE)}
+    trajectories = {"given": (poses, GREY)}
     if is_corrected and session.odometry is not None:
-        lines = {"given": (session.odometry[: session.frames], BEFORE), "corrected": (poses, AFTER)}
-    for name, (path, colour) in lines.items():
+        trajectories = {"given": (session.odometry[: session.frames], GREY), "corrected": (poses, BLUE)}
+    for name, (path, colour) in trajectories.items():
         stream.log(f"map/trajectory/{name}", rerun.LineStrips3D([path[:, :3, 3]], colors=[colour]), static=True)
-    # The first frame of every `KEYFRAME_M` of the path. Known positions have no rotation, so scans need odometry.
-    keyframes = np.unique(np.floor(travelled(poses) / KEYFRAME_M), return_index=True)[1].tolist()
+    _, keyframes = np.unique(np.floor(travelled(poses) / KEYFRAME_M), return_index=True)  # first frame of each 5 m
+    # Known positions have no rotation and images no points, so neither can place scans in the map.
     with_scans = session.odometry is not None and not session.recording.has_images
     for frame, pose in enumerate(poses):
         stream.set_time(TIMELINE, sequence=frame)
-        stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[AFTER]))
+        stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[BLUE]))
         if with_scans and frame in keyframes and session.recording.ids[frame] not in session.skipped:
             points = session.recording.scan(frame, labels=False).points
             if points is not None and len(points):
-                in_map = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)
-                stream.log(f"map/scans/{frame}", rerun.Points3D(in_map, colors=[SCAN], radii=[0.05]))
+                map_points = transformed(pose, _thinned_points(points).astype(np.float64)).astype(np.float32)
+                stream.log(f"map/scans/{frame}", rerun.Points3D(map_points, colors=[DARK_GREY], radii=[0.05]))
 
 
-def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
-    """One point in each voxel."""
+def _thinned_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
+    """Return the first finite point in each voxel."""
     finite = points[np.isfinite(points).all(axis=1)]
-    _, first = np.unique(np.floor(finite / VOXEL_M).astype(np.int64), axis=0, return_index=True)
-    return finite[first]
+    _, first_rows = np.unique(np.floor(finite / VOXEL_M).astype(np.int64), axis=0, return_index=True)
+    return finite[first_rows]
 
 
 def _log_loops(rerun: Any, stream: Any, result: LoopSearchResult, poses: Float[np.ndarray, "n 4 4"] | None) -> None:
-    """Log a line in the map, the pair of images and a text for each loop, at the frame of the query."""
+    """Log each loop at the frame of its query: a line in the map (with `poses`), the overlaid images and a text."""
     recording = result.sessions[0].recording
     wrong = {(loop.query, loop.match) for loop in wrong_loops(result)}
     for loop in result.loops:
-        colour = WRONG if (loop.query, loop.match) in wrong else RIGHT
+        colour = RED if (loop.query, loop.match) in wrong else GREEN
         overlap = "" if loop.overlap is None else f", overlap {loop.overlap:.2f}"
         label = f"probability {loop.probability:.4f}{overlap}"
         stream.set_time(TIMELINE, sequence=loop.query)
@@ -120,13 +121,13 @@ def _log_loops(rerun: Any, stream: Any, result: LoopSearchResult, poses: Float[n
             ends = poses[[loop.match, loop.query], :3, 3]
             line = rerun.LineStrips3D([ends], colors=[colour], labels=[label], show_labels=False)
             stream.log(f"map/loops/{loop.query}", line)
-        image = (255 * np.clip(overlay_of(recording, recording, loop), 0, 1)).astype(np.uint8)
+        image = (255 * np.clip(overlaid_scans(recording, recording, loop), 0, 1)).astype(np.uint8)
         stream.log("pair", rerun.Image(image).compress(jpeg_quality=90))
         stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {label}"))
 
 
-def _log_evidence(rerun: Any, stream: Any, result: LoopSearchResult) -> None:
-    """Log correlation of the candidate of each frame, and its probability without the evidence of neighbours."""
+def _log_candidates(rerun: Any, stream: Any, result: LoopSearchResult) -> None:
+    """Log image correlation and probability (without the evidence of neighbouring frames) of each compared pair."""
     candidates = result.sessions[0].candidates
     if result.model is None or not candidates:
         return

@@ -1,4 +1,4 @@
-"""Scoring of descriptors, top-k lists and scored pairs, with a result that prints itself."""
+"""Scores descriptors, top-k lists and scored pairs. The results are an `Evaluation`, which prints itself as tables."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,38 +24,40 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 
 MISTAKE_GAP = 10
-"""Minimum gap between the queries of two shown mistakes, in frames. Neighbouring frames make the same mistake."""
+"""Minimum gap between the queries of listed false positives, in frames: neighbouring frames make the same mistake."""
 MOST_MISTAKES = 6
+"""Maximum number of listed false positives."""
 
 
 @dataclass(frozen=True)
 class FalsePositive:
-    """Answer that is accepted at the threshold of F1max but shows another place."""
+    """Answer that is accepted at the threshold of F1max but shows another place than the query."""
 
     query: int
     answer: int
+    """Frame numbers of the query and its answer."""
     metres: float
-    """Distance between the positions of the two frames, in metres and in the dimensions of the protocol."""
+    """Distance between the positions of the two frames in metres, in 2-D or 3-D like the protocol."""
     distance: float
     """Distance between the two descriptors."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(report.PrintsItself):
-    """Results of methods on one recording, or of one method across sessions. Prints itself as tables."""
+    """Results of methods on one recording, or of one method on several query sessions. Prints itself as tables."""
 
     title: str
     about: str
     """Description of the input and its distance, in one line."""
     methods: Mapping[str, Sequence[Result]]
-    """Results by the name of the method, one for each protocol. The first method is the evaluated one; the others are
-    for comparison. Across sessions: by the name of the query session."""
+    """Results, one for each protocol, by the name of the method. The first method is the evaluated one; the others are
+    for comparison. With a database session, the keys are query sessions instead of methods."""
     positions: Float[np.ndarray, "n 3"] | None = None
     """Position of each frame in metres, z up. None across sessions and for labelled pairs without positions."""
     published: Sequence[tuple[str, ...]] = ()
-    """Rows of the paper's numbers, if requested."""
+    """Rows of a table with the paper's numbers, if requested."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
-    """JSON values: the files, and the configuration, weights and distance of the descriptors."""
+    """Files, configuration, weights and distance of the descriptors, as values for JSON."""
     database: str | None = None
     """Name of the database session. None for one recording."""
 
@@ -67,32 +69,34 @@ class Evaluation(report.PrintsItself):
         return [result for results in self._by_protocol().values() for result in results]
 
     @cached_property
-    def judged(self) -> Result | None:
-        """First result of a protocol that accepts answers by a threshold, or None."""
+    def thresholded_result(self) -> Result | None:
+        """First result of a protocol that accepts answers up to a distance threshold, or None."""
         return next((result for result in self.results if result.answers is not None), None)
 
     @cached_property
-    def worst(self) -> Sequence[FalsePositive]:
-        """Up to `MOST_MISTAKES` false positives of `judged`, in order of descriptor distance."""
-        result, positions, worst = self.judged, self.positions, list[FalsePositive]()
+    def worst_false_positives(self) -> Sequence[FalsePositive]:
+        """Up to 6 false positives of `thresholded_result` by descriptor distance, at least 10 frames apart."""
+        result, positions = self.thresholded_result, self.positions
         if result is None or positions is None:
-            return worst
+            return []
         assert result.answers is not None and result.answer_distances is not None and result.decisions is not None
-        wrong = np.flatnonzero(result.decisions == Decision.FALSE_POSITIVE)
-        for query in wrong[np.argsort(result.answer_distances[wrong], kind="stable")].tolist():
+        false_positives = np.flatnonzero(result.decisions == Decision.FALSE_POSITIVE)
+        by_distance = false_positives[np.argsort(result.answer_distances[false_positives], kind="stable")]
+        worst: list[FalsePositive] = []
+        for query in by_distance.tolist():
             if len(worst) < MOST_MISTAKES and all(abs(query - other.query) >= MISTAKE_GAP for other in worst):
                 answer = int(result.answers[query])
-                apart_m = np.linalg.norm((positions[query] - positions[answer])[: result.dimensions])
-                worst.append(FalsePositive(query, answer, float(apart_m), float(result.answer_distances[query])))
+                metres = float(np.linalg.norm((positions[query] - positions[answer])[: result.dimensions]))
+                worst.append(FalsePositive(query, answer, metres, float(result.answer_distances[query])))
         return worst
 
     def _by_protocol(self) -> dict[str, tuple[Result, ...]]:
-        """Return the results of all methods or query sessions by the protocol's name on the command line."""
-        names = {protocol.title: name for name, protocol in PROTOCOLS.items()}
-        return {names[results[0].name]: results for results in zip(*self.methods.values(), strict=True)}
+        """Return the results of all methods or query sessions, by the protocol's name on the command line."""
+        name_of_title = {protocol.title: name for name, protocol in PROTOCOLS.items()}
+        return {name_of_title[results[0].name]: results for results in zip(*self.methods.values(), strict=True)}
 
     def table(self) -> report.TextTable:
-        """Return the table of all scores: methods side by side, or the query sessions, their mean and the paper's."""
+        """Return the table of all scores: by method, or by query session with their mean and the paper's numbers."""
         if self.database is None:
             return report.comparison(self.methods)
         header = ("", *map(printable, self.methods), "mean")
@@ -103,7 +107,7 @@ class Evaluation(report.PrintsItself):
         return report.TextTable(header, [*rows, *self.published], header[1:], self.title)
 
     def published_tables(self) -> list[report.TextTable | str]:
-        """Return the paper's numbers that `table` does not have, and the note on them. Empty if not requested."""
+        """Return the paper's numbers, if requested, and a note on them. Across sessions `table` has the numbers."""
         if not self.published:
             return []
         if self.database is not None:
@@ -121,23 +125,25 @@ class Evaluation(report.PrintsItself):
                 }
                 for name, results in self._by_protocol().items()
             }
-            beside = {"about": paper.TABLE_3_NOTE, "columns": self.table().header, "rows": self.published}
-            published = {"published": beside} if self.published else {}
-            return {**self.made_with, "database_session": self.database, "results": results, **published}
+            values = {**self.made_with, "database_session": self.database, "results": results}
+            if self.published:
+                columns = self.table().header
+                values["published"] = {"about": paper.TABLE_3_NOTE, "columns": columns, "rows": self.published}
+            return values
         return {
             **self.made_with,
             "results": report.to_json(self.results),
-            "false_positives": [dataclasses.asdict(mistake) for mistake in self.worst],
+            "false_positives": [dataclasses.asdict(pair) for pair in self.worst_false_positives],
             "compared": {name: report.to_json(results) for name, results in list(self.methods.items())[1:]},
             "published": self.published,
         }
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[report.TextTable | str]:
-        alone = self.database is None
-        yield report.results_table(self.results, title=self.title if alone else "")
-        if alone and any(result.curve is not None for result in self.results):
+        has_sessions = self.database is not None
+        yield report.results_table(self.results, title="" if has_sessions else self.title)
+        if not has_sessions and any(result.curve is not None for result in self.results):
             yield report.threshold_table(self.results)
-        if not alone or len(self.methods) > 1:
+        if has_sessions or len(self.methods) > 1:
             yield self.table()
         yield from self.published_tables()
 
@@ -154,37 +160,39 @@ def evaluate(
     """Score descriptors, a top-k list or scored pairs.
 
     Arguments:
-      source: A file that `evaluation.inputs` can read, an opened input, or descriptors (n, d) as an array of
-        numpy, of JAX or of any type that numpy converts.
-      protocols: Names in `PROTOCOLS`. `all` selects every protocol that fits the source. An empty sequence selects
-        the default protocols that fit, or every protocol that fits if no default does.
+      source: A file that `evaluation.inputs` can read, an opened input, or an array (n, d) of descriptors.
+      protocols: Names in `PROTOCOLS`. `all` selects every protocol that fits the source. By default, the default
+        protocols that fit are used, or every protocol that fits if no default does.
       positions: Positions (n, 3) of the frames in metres, z up. They replace the positions of `source`.
       times: Times (n,) of the frames in seconds. They replace the times of `source`.
       distance: Name of the distance between descriptors. By default the distance of `source`, or L2 for an array.
       published: Whether to add the numbers of the paper for the sequence.
 
-    Raises:
-      ValueError: If positions are missing, or if a protocol or an option does not fit the source.
+    Raises ValueError if positions are missing, or if a protocol or an option does not fit the source.
 
     Example:
       print(sglpr_jax.evaluate("08.npz"))
     """
-    clock = None if times is None else np.asarray(times, np.float64)
-    options, trajectory = {"times": clock}, None
+    times = None if times is None else np.asarray(times, np.float64)
+    trajectory = None
     if positions is not None:
-        trajectory = Trajectory(np.asarray(positions, np.float64), clock, "positions given as an array", by_row=True)
+        trajectory = Trajectory(np.asarray(positions, np.float64), times, "positions given as an array", by_row=True)
     if isinstance(source, str | Path):
         path = Path(source)
-        read = read_input(path, trajectory, sequence=path.stem, distance=distance)
+        file_input = read_input(path, trajectory, sequence=path.stem, distance=distance)
         with naming(path):
-            read = _with_options(read, **options)
-        return evaluate_methods({path.stem: read}, protocols, published=published, file=path)
+            file_input = _with_fields(file_input, times=times)
+        return evaluate_methods({path.stem: file_input}, protocols, published=published, file=path)
     if distance is not None:
-        distance_function(distance)
+        distance_function(distance)  # raises ValueError if the name is unknown
     if isinstance(source, Input):
-        if trajectory is not None:
-            options |= {"positions": trajectory.positions, "pose_source": trajectory.source}
-        source = _with_options(source, **options, distance=distance)
+        source = _with_fields(
+            source,
+            times=times,
+            positions=trajectory and trajectory.positions,
+            pose_source=trajectory and trajectory.source,
+            distance=distance,
+        )
     else:
         rows = np.asarray(source)
         if rows.ndim != 2:
@@ -197,13 +205,13 @@ def evaluate(
     return evaluate_methods({"descriptors": source}, protocols, published=published)
 
 
-def _with_options(source: Input, **options: Any) -> Input:
-    """Replace fields of the source by options that are not None. Raises ValueError if an option does not fit."""
-    options = {name: value for name, value in options.items() if value is not None}
-    for name in options:
+def _with_fields(source: Input, **fields: Any) -> Input:
+    """Replace the fields that are not None. Raises ValueError if this kind of input has no such field."""
+    fields = {name: value for name, value in fields.items() if value is not None}
+    for name in fields:
         if not hasattr(source, name):
             raise ValueError(f"expected no {name} beside {_about(source)}, found {name}")
-    return dataclasses.replace(source, **options)
+    return dataclasses.replace(source, **fields)
 
 
 def evaluate_methods(
@@ -215,37 +223,36 @@ def evaluate_methods(
       methods: Input of each method, by name. The first method is the evaluated one.
       protocols: Names in `PROTOCOLS`. Without names, or with `all`, they are chosen to fit the first method.
       published: Whether to add the numbers of the paper for the sequence.
-      file: File of the first method.
+      file: File of the first method, for the title and the JSON.
 
-    Raises:
-      ValueError: If a method cannot be scored, or has other frames than the first. The message names the method.
+    Raises ValueError, with the name of the method, if a method cannot be scored or has other frames than the first.
     """
-    source = next(iter(methods.values()))
-    names = chosen_protocols(kind_of(source), protocols)
+    first = next(iter(methods.values()))
+    protocol_names = chosen_protocols(kind_of(first), protocols)
     results = {}
-    for method, other in methods.items():
+    for method, source in methods.items():
         with naming(method):
-            check_agreement(source, other)
-            results[method] = score(other, names)
-    if isinstance(source, ScoredPairs):
-        sequence, title = "scored pairs", f"{'pairs' if file is None else file.name}, {len(source.pairs)} pairs"
+            check_agreement(first, source)
+            results[method] = score(source, protocol_names)
+    if isinstance(first, ScoredPairs):
+        sequence, title = "scored pairs", f"{'pairs' if file is None else file.name}, {len(first.pairs)} pairs"
     else:
-        sequence, title = source.sequence, f"sequence {printable(source.sequence)}, {len(source)} scans"
+        sequence, title = first.sequence, f"sequence {printable(first.sequence)}, {len(first)} scans"
     made_with: dict[str, Any] = {} if file is None else {"file": str(file)}
-    if isinstance(source, DescriptorFile):
-        made_with |= {"config": source.config, "weights_hash": source.weights_hash, "distance": source.distance}
+    if isinstance(first, DescriptorFile):
+        made_with |= {"config": first.config, "weights_hash": first.weights_hash, "distance": first.distance}
     return Evaluation(
         title=title,
-        about=_about(source) if file is None else f"{file}: {_about(source)}",
+        about=_about(first) if file is None else f"{file}: {_about(first)}",
         methods=results,
-        positions=source.positions,
+        positions=first.positions,
         published=paper.table_1_rows(sequence) if published else (),
         made_with=made_with,
     )
 
 
 def _about(source: Input) -> str:
-    """Describe the source and its distance."""
+    """Describe an input in a few words, with the name of its descriptor distance if it has one."""
     if isinstance(source, ScoredPairs):
         return "scored pairs" + (" with labels" if source.labels is not None else "")
     if isinstance(source, TopK):

@@ -1,4 +1,4 @@
-"""Score of the segmentation head: intersection over union (IoU) of semantic maps, beside predicting one class."""
+"""Scores the segmentation head: intersection over union (IoU) of semantic maps, and of a constant prediction."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,13 +26,14 @@ PICTURE = "segmentation.png"
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SegmentationScore(PrintsItself):
-    """Segmentation scores over all counted cells. Prints itself as a table."""
+    """IoU of each class over all cells with points and a label. Prints itself as a table."""
 
     iou: Float[np.ndarray, " k"]
     """Intersection over union of each class, NaN for a class without cells."""
     shares: Float[np.ndarray, " k"]
     """Fraction of the cells that belong to each class."""
     cells: int
+    """Number of cells with points and a label."""
     categories: int = 20
     """Number of categories in the taxonomy of the classes (`labels.taxonomy`)."""
     title: str = ""
@@ -43,7 +44,7 @@ class SegmentationScore(PrintsItself):
         return float(np.nanmean(self.iou))
 
     @property
-    def present(self) -> int:
+    def n_present(self) -> int:
         """Number of classes that occur."""
         return int((self.shares > 0).sum())
 
@@ -55,7 +56,7 @@ class SegmentationScore(PrintsItself):
     @property
     def majority_mean_iou(self) -> float:
         """Mean IoU of predicting the most frequent class everywhere."""
-        return float(self.shares.max() / self.present)
+        return float(self.shares.max() / self.n_present)  # the IoU of this class is its share, of the others 0
 
     def to_json(self) -> dict[str, Any]:
         """Return values for `json.dump`. The score of a class that does not occur is null."""
@@ -74,7 +75,7 @@ class SegmentationScore(PrintsItself):
         header = ("class", "share of the cells", "IoU")
         classes = zip(taxonomy(self.categories).names, self.shares, self.iou, strict=True)
         rows = [(name, f"{share:.2%}", f"{iou:.3f}") for name, share, iou in classes if share]
-        rows.append((f"mean of {self.present} classes", "", f"{self.mean_iou:.3f}"))
+        rows.append((f"mean of {self.n_present} classes", "", f"{self.mean_iou:.3f}"))
         rows.append((f"{self.majority} everywhere", "", f"{self.majority_mean_iou:.3f}"))
         return TextTable(header, rows, header[1:], self.title, f"{self.cells} cells with points and a label")
 
@@ -90,34 +91,32 @@ def segment_recording(
 ) -> SegmentationScore | None:
     """Predict semantic maps of a recording, score them, and draw the middle labelled scan into `folder` (figure 7).
 
-    `on_map` is called with row, scan and map of every scan; without it, only labelled scans are predicted.
-
-    Returns:
-      Score of all labelled scans. None without labels.
-
-    Raises:
-      ValueError: If there are labels, but no cell is counted.
+    `on_map` is called with row, scan and map of every scan. Without it, only labelled scans are predicted. Returns None
+    without labels. Raises ValueError if there are labels, but no cell has both points and a label.
     """
-    config, labelled = params.config, np.flatnonzero(recording.labelled).tolist()
-    rows = labelled if on_map is None else range(len(recording))
-    middle, confusion = None, np.zeros((config.classes, config.classes), np.int64)
+    config = params.config
+    labelled_rows = np.flatnonzero(recording.labelled).tolist()
+    rows = labelled_rows if on_map is None else range(len(recording))
+    confusion = np.zeros((config.classes, config.classes), np.int64)
+    middle_map = None
     with progress(f"segment {recording.name}", len(rows)) as show:
         for done, row in enumerate(rows, start=1):
             scan = recording.scan(row)
             semantic = semantic_map(params, scan, min_confidence=min_confidence)
             if on_map is not None:
                 on_map(row, scan, semantic)
-            if labelled and row == labelled[len(labelled) // 2]:
-                middle = semantic
-            classes = config.classes
-            confusion += confusion_matrix(semantic.truth, semantic.predicted, counted=semantic.seen, classes=classes)
+            if labelled_rows and row == labelled_rows[len(labelled_rows) // 2]:
+                middle_map = semantic
+            confusion += confusion_matrix(
+                semantic.truth, semantic.predicted, counted=semantic.seen, classes=config.classes
+            )
             show(done)
-    if middle is None:
+    if middle_map is None:
         return None
-    title = f"segmentation of {len(labelled)} scans of {recording.name}"
+    title = f"segmentation of {len(labelled_rows)} scans of {recording.name}"
     score = score_confusion(confusion, categories=config.categories, title=title)
     if figures.can_draw():
-        figures.save(draw_map(middle, config), folder / PICTURE)
+        figures.save(draw_map(middle_map, config), folder / PICTURE)
     return score
 
 
@@ -142,17 +141,17 @@ def confusion_matrix(
     counted: Bool[np.ndarray, "*b h w"],
     classes: int,
 ) -> Int[np.ndarray, "k k"]:
-    """Return the number of counted cells of true class i that are predicted as class j.
+    """Return the number of cells of true class i (row) that are predicted as class j (column).
 
-    As in SemanticKITTI, cells of class 0 (unlabelled) are ignored. Matrices of several scans may be added.
+    Cells that are not `counted` or unlabelled (class 0) are ignored. Matrices of several scans may be added.
     """
     counted = counted & (truth != UNLABELLED)
-    pairs = truth[counted].astype(np.int64) * classes + prediction[counted]
-    return np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
+    matrix_cells = truth[counted].astype(np.int64) * classes + prediction[counted]
+    return np.bincount(matrix_cells, minlength=classes**2).reshape(classes, classes)
 
 
 def score_confusion(confusion: Int[np.ndarray, "k k"], *, categories: int = 20, title: str = "") -> SegmentationScore:
-    """Return the scores of a confusion matrix. Raises ValueError if no cell was counted."""
+    """Return the scores of a confusion matrix (rows: true class). Raises ValueError if the matrix is all zero."""
     cells_of_class = confusion.sum(1)
     cells = int(cells_of_class.sum())
     if not cells:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from sglpr_jax.evaluation.inputs import read_descriptor_file
 from sglpr_jax.evaluation.protocols import PROTOCOLS, chosen_protocols
@@ -14,7 +15,7 @@ from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
 APART_M = 25.0
-"""Largest distance, in metres, at which a protocol across sessions considers two frames the same place."""
+"""Largest radius of one place, in metres, of the protocols across sessions (`pointnetvlad-recall`)."""
 
 
 def evaluate_sessions(
@@ -28,44 +29,46 @@ def evaluate_sessions(
       names: Names of the protocols. Without names, or with `all`, every protocol across sessions is used.
       published: Whether to add the rows of table 3 of the paper.
 
-    Raises:
-      ValueError: If a file has no positions, if a session occurs twice, does not overlap with the database or has
-        descriptors of another method, or if a protocol is unknown.
+    Raises ValueError if a file has no positions, if a session occurs twice, does not overlap with the database or has
+    descriptors of another method, or if a protocol is unknown.
     """
     for path in (database, *queries):
         if path.suffix != ".npz":
             raise ValueError(f"{path}: expected descriptor files of bin/embed (.npz) for an evaluation across sessions")
-    first, *files = map(read_descriptor_file, (database, *queries))
-    for path, file in zip(queries, files, strict=True):
+    database_file, *query_files = map(read_descriptor_file, (database, *queries))
+    for path, file in zip(queries, query_files, strict=True):
         with naming(path):
-            check_same_method(first, file)
+            check_same_method(database_file, file)
     protocols = [PROTOCOLS[name] for name in chosen_protocols("sessions", names)]
-    sessions = [file.sequence for file in files]
-    if len({first.sequence, *sessions}) <= len(sessions):
-        raise ValueError(f"expected different sessions, found database {first.sequence}, queries {', '.join(sessions)}")
-    for file in files:
-        _check_one_world(first, file)
-    width = first.descriptors.shape[1]
+    database_name, query_names = database_file.sequence, [file.sequence for file in query_files]
+    if len({database_name, *query_names}) < 1 + len(query_names):
+        sessions = f"database {database_name}, queries {', '.join(query_names)}"
+        raise ValueError(f"expected different sessions, found {sessions}")
+    for file in query_files:
+        _check_overlap(database_file, file)
+    width = database_file.descriptors.shape[1]
     return Evaluation(
-        title=f"database {printable(first.sequence)}; queries of {len(sessions)} sessions",
-        about=f"{database}: descriptors of {width} numbers, compared by {first.distance}",
-        methods={file.sequence: [protocol(first, file) for protocol in protocols] for file in files},
-        published=table_3_rows(first.sequence, sessions) if published else (),
+        title=f"database {printable(database_name)}; queries of {len(query_names)} sessions",
+        about=f"{database}: descriptors of {width} numbers, compared by {database_file.distance}",
+        methods={file.sequence: [protocol(database_file, file) for protocol in protocols] for file in query_files},
+        published=table_3_rows(database_name, query_names) if published else (),
         made_with={"files": [str(path) for path in queries], "database": str(database)},
-        database=first.sequence,
+        database=database_name,
     )
 
 
-def _check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
-    """Raise ValueError if the areas of the two sessions do not overlap. Their positions then have different frames."""
-    (low, high), (low_q, high_q) = (
-        (plane.min(axis=0), plane.max(axis=0)) for plane in (positions_of(database, 2), positions_of(queries, 2))
-    )
-    if np.any(low_q > high + APART_M) or np.any(high_q < low - APART_M):
-        there, here = (
-            f"x {a[0]:.0f} to {b[0]:.0f}, y {a[1]:.0f} to {b[1]:.0f} m" for a, b in ((low, high), (low_q, high_q))
-        )
+def _check_overlap(database: DescriptorFile, queries: DescriptorFile) -> None:
+    """Raise ValueError if the areas of two sessions are more than 25 m apart. Their world frames then differ."""
+    database_xy, query_xy = positions_of(database, 2), positions_of(queries, 2)
+    is_beyond = query_xy.min(axis=0) > database_xy.max(axis=0) + APART_M
+    is_before = query_xy.max(axis=0) < database_xy.min(axis=0) - APART_M
+    if np.any(is_beyond | is_before):
         raise ValueError(
-            f"expected {queries.sequence} in the world frame of the database {database.sequence} ({there}), found it "
-            f"elsewhere ({here}): no place is in both"
+            f"expected {queries.sequence} in the world frame of the database {database.sequence} "
+            f"({_area(database_xy)}), found it elsewhere ({_area(query_xy)}): no place is in both"
         )
+
+
+def _area(xy: Float[np.ndarray, "n 2"]) -> str:
+    (min_x, min_y), (max_x, max_y) = xy.min(axis=0), xy.max(axis=0)
+    return f"x {min_x:.0f} to {max_x:.0f}, y {min_y:.0f} to {max_y:.0f} m"

@@ -14,9 +14,10 @@ NO_SEGMENTATION = "no-segmentation"
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to train: its name in tables, and the changes to the preset's configuration."""
+    """A variant of the model or its training: changes to the configuration of the preset."""
 
     label: str
+    """Name in tables."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Fields of TrainConfig with their dotted names, as on the command line of bin/train."""
 
@@ -40,7 +41,7 @@ VARIANTS: dict[str, Variant] = {
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure: its content and the variants that it needs."""
+    """A table or figure of the paper: its content and the variants that it compares."""
 
     kind: Literal["table", "figure"]
     title: str
@@ -49,12 +50,12 @@ class Experiment:
     rotated: bool = False
     """Whether every scan of the test recordings is rotated by its own random angle."""
     beside_handcrafted: bool = False
-    """Whether handcrafted methods are compared with the variants."""
+    """Whether handcrafted methods and other weights are compared with the variants."""
     across_sessions: bool = False
-    """Whether the test uses sessions of another dataset. One model per variant then suffices: the one trained without
-    the first recording."""
+    """Whether the test recordings are sessions of another dataset. Each variant then needs only one model: the one
+    trained without the first recording."""
     protocols: tuple[str, ...] = (TOP1,)
-    """Protocols of a table. There is a table for each; the published rows are in the table of their protocol."""
+    """Protocols of a table. One table is written for each, with the published rows of this protocol."""
     needs_labels: bool = False
     """Whether the experiment draws labels or compares variants that learn from them."""
 
@@ -137,7 +138,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 
 
 def variant_config(preset: TrainConfig, variant: str) -> TrainConfig:
-    """Return the preset with the changes of a variant."""
+    """Return the preset with the changes of a variant, which is a name in `VARIANTS`."""
     config = preset
     for name, value in VARIANTS[variant].changes.items():
         config = _with_field(config, name, value)
@@ -145,6 +146,8 @@ def variant_config(preset: TrainConfig, variant: str) -> TrainConfig:
 
 
 def _with_field(config: Any, path: str, value: Any) -> Any:
-    """Return a configuration with another value of the field at a dotted path."""
-    name, _, rest = path.partition(".")
-    return dataclasses.replace(config, **{name: _with_field(getattr(config, name), rest, value) if rest else value})
+    """Return a configuration with another value of the field at a dotted path, such as `model.head.cbam`."""
+    name, _, path_within = path.partition(".")
+    if path_within:
+        value = _with_field(getattr(config, name), path_within, value)
+    return dataclasses.replace(config, **{name: value})

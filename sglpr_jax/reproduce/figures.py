@@ -1,4 +1,4 @@
-"""Figures 5 to 9 of finished runs."""
+"""Draws figures 5 to 9 of the paper from finished training runs."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -18,24 +18,28 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 Figures = Iterator[tuple[str, "matplotlib.figure.Figure"]]
-"""Pictures of a figure, by the name of a recording, or by an empty name."""
+"""Yields the pictures of a figure with the name of their recording, which is empty for a picture of all recordings."""
 HEAT_MAPS = ("decoder", "CBAM")
+"""Names of the layers in figure 8."""
 
 
 def precision_recall(reproduction: Reproduction) -> Figures:
-    """Figure 5: a plot for each recording with a line for each method."""
+    """Figure 5: a plot for each recording with a precision-recall curve for each method."""
     for seq in reproduction.seqs:
-        labels = reproduction.labels("figure5").items()
-        curves = {label: reproduction.score(method, seq).curve for method, label in labels}
-        lines = {label: curve for label, curve in curves.items() if curve is not None}
-        if lines:
-            yield seq, figures.precision_recall(lines, title=seq)
+        curves = {}
+        for method, label in reproduction.labels("figure5").items():
+            curve = reproduction.score(method, seq).curve
+            if curve is not None:  # None without a revisit
+                curves[label] = curve
+        if curves:
+            yield seq, figures.precision_recall(curves, title=seq)
 
 
 def trajectories(reproduction: Reproduction) -> Figures:
     """Figure 6: a plot for each recording with the model's decisions along the trajectory."""
     for seq in reproduction.seqs:
-        positions, decisions = reproduction.recording(seq).positions, reproduction.score(FULL, seq).decisions
+        positions = reproduction.recording(seq).positions
+        decisions = reproduction.score(FULL, seq).decisions
         if decisions is not None and positions is not None:
             yield seq, figures.trajectory(positions, decisions, title=seq)
 
@@ -45,9 +49,9 @@ def semantic_maps(reproduction: Reproduction) -> Figures:
     for seq in reproduction.seqs:
         recording, params = reproduction.recording(seq), reproduction.params(FULL, seq)
         row = len(recording) // 2
-        semantic, labelled = semantic_map(params, recording.scan(row)), bool(recording.labelled[row])
+        semantic = semantic_map(params, recording.scan(row))
         title = f"{seq}, scan {recording.ids[row]}"
-        yield seq, draw_map(semantic, params.config, labelled=labelled, title=title)
+        yield seq, draw_map(semantic, params.config, labelled=bool(recording.labelled[row]), title=title)
 
 
 def feature_heat_maps(reproduction: Reproduction) -> Figures:
@@ -61,21 +65,19 @@ def feature_heat_maps(reproduction: Reproduction) -> Figures:
     for recording in (reproduction.recording(seq), reproduction.session_recordings()[-1]):
         row = len(recording) // 2
         image = np.asarray(view(recording.scan(row, labels=False), model.grid, image=model.image).image)
-        maps = {
-            f"{name}: {layer}": values
-            for name, params in models.items()
-            for layer, values in heat_maps(params, image).items()
-            if layer in HEAT_MAPS
-        }
+        maps = {}
+        for name, params in models.items():
+            layers = heat_maps(params, image).items()
+            maps |= {f"{name}: {layer}": heat_map for layer, heat_map in layers if layer in HEAT_MAPS}
         title = f"{recording.name}, scan {recording.ids[row]}, without and with the segmentation branch"
         yield recording.name, figures.heat_maps(image, maps, title=title)
 
 
 def categories(reproduction: Reproduction) -> Figures:
     """Figure 9: the score of every recording over the number of categories."""
-    variants = EXPERIMENTS["figure9"].variants.items()
+    variants = EXPERIMENTS["figure9"].variants.items()  # the labels are the numbers of categories
     curves = {
-        seq: [(int(number), reproduction.score(variant, seq).score) for variant, number in variants]
+        seq: [(int(label), reproduction.score(variant, seq).score) for variant, label in variants]
         for seq in reproduction.seqs
     }
     yield "", figures.learning_curves({"top-1 F1max": curves}, xlabel="categories")
@@ -91,9 +93,10 @@ FIGURES: Mapping[str, Callable[[Reproduction], Figures]] = {
 
 
 def write_figures(reproduction: Reproduction, name: str) -> list[Path]:
-    """Draw and write the pictures of a figure. Returns their paths."""
+    """Draw all pictures of a figure, then write them. Returns their paths."""
     paths = []
     for seq, figure in list(FIGURES[name](reproduction)):
-        paths.append(reproduction.folder / f"{name}{seq and f'-{file_name(seq)}'}.png")
+        suffix = f"-{file_name(seq)}" if seq else ""
+        paths.append(reproduction.folder / f"{name}{suffix}.png")
         figures.save(figure, paths[-1])
     return paths

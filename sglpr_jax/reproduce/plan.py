@@ -1,4 +1,4 @@
-"""Before a reproduction trains: checks of its inputs, the missing runs, and the estimated training time."""
+"""Prepares a reproduction: checks the inputs, finds the missing training runs and estimates the training time."""
 
 import time
 from collections.abc import Sequence
@@ -23,25 +23,24 @@ from sglpr_jax.training.step import train_step
 TIMED_STEPS = 3
 
 
-def check(reproduction: Reproduction, names: Sequence[str], nclt: Path | None = None) -> None:
-    """Check recordings, methods, weights and sessions for the chosen tables and figures.
-
-    Raises ValueError, FileNotFoundError or ImportError (matplotlib) that names what is unknown or missing.
-    """
+def check_inputs(reproduction: Reproduction, names: Sequence[str], nclt: Path | None = None) -> None:
+    """Raise ValueError, FileNotFoundError or ImportError (matplotlib) if the named tables or figures lack an input."""
     if not names:
         raise ValueError(f"expected tables or figures, found none; choose from all, {', '.join(EXPERIMENTS)}")
     data, trained = reproduction.data, reproduction.trained
-    recordings, experiments = recording_names(data), {name: EXPERIMENTS[name] for name in names}
+    recordings = recording_names(data)
+    experiments = {name: EXPERIMENTS[name] for name in names}
     if not reproduction.seqs:
         raise ValueError(
             f"{data}: expected recordings named as in the paper, found {', '.join(recordings)}; choose yours with --seq"
         )
     if any(experiment.kind == "figure" for experiment in experiments.values()) and not figures.can_draw():
         raise ImportError("figures need matplotlib: pip install 'sglpr-jax[viz]'")
-    alone = [name for name, experiment in experiments.items() if not experiment.beside_handcrafted]
-    if not trained and (alone or not (reproduction.methods or reproduction.weights)):
-        what = f"{', '.join(alone)}, which compares trained variants" if alone else "no --weights and no --method"
-        raise ValueError(f"with --no-train, expected tables 1 to 3 or figure 5 of other methods, found {what}")
+    variants_only = [name for name, experiment in experiments.items() if not experiment.beside_handcrafted]
+    if not trained and (variants_only or not (reproduction.methods or reproduction.weights)):
+        only = ", ".join(variants_only)
+        found = f"{only}, which compares trained variants" if only else "no --weights and no --method"
+        raise ValueError(f"with --no-train, expected tables 1 to 3 or figure 5 of other methods, found {found}")
     if trained and len(recordings) < 2:
         raise ValueError(
             f"{data}: expected two recordings or more, to train and test on, found {', '.join(recordings)}"
@@ -55,15 +54,16 @@ def check(reproduction: Reproduction, names: Sequence[str], nclt: Path | None = 
             raise ValueError(f"{nclt}: expected two sessions or more, found {', '.join(sessions)}")
     for name in reproduction.weights:
         method_with_weights(name)  # raises an error if the weights are missing or damaged
-    for name in (name for name, experiment in experiments.items() if experiment.needs_labels):
-        for seq in recordings:
+    for name, experiment in experiments.items():
+        for seq in recordings if experiment.needs_labels else ():
             if not reproduction.recording(seq).has_labels:
                 raise ValueError(f"{name} is about semantics: expected labels in sequence {seq} of {data}, found none")
-    if len(alone) < len(experiments):
+    if len(variants_only) < len(experiments):
         _check_methods(reproduction)
 
 
 def _check_methods(reproduction: Reproduction) -> None:
+    """Raise ValueError for an unknown method, or if a test recording lacks the points or labels that a method needs."""
     for name in reproduction.methods:
         if name not in HANDCRAFTED:
             raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
@@ -78,20 +78,21 @@ def _check_methods(reproduction: Reproduction) -> None:
 
 
 class Plan(NamedTuple):
-    """The runs that the experiments need, and those that are not trained yet, as (variant, recording)."""
+    """The training runs that the experiments need. A run (variant, recording) trains without this test recording."""
 
     runs: tuple[tuple[str, str], ...]
     missing: tuple[tuple[str, str], ...]
+    """Runs that are not trained to the end."""
     steps: int
     without_revisits: tuple[str, ...] = ()
     """Test recordings without revisits, by the rule of top-1 F1max. They have no scores."""
 
     def text(self, seconds_per_step: float | None) -> str:
-        """Describe the plan."""
-        done = len(self.runs) - len(self.missing)
-        lines = [f"{len(self.runs)} leave-one-out runs of {self.steps} steps, {done} of them already trained"]
+        """Describe the plan: missing runs by variant, recordings without scores, and the time to train."""
+        trained = len(self.runs) - len(self.missing)
+        lines = [f"{len(self.runs)} leave-one-out runs of {self.steps} steps, {trained} of them already trained"]
         for variant in dict.fromkeys(variant for variant, _ in self.missing):
-            recordings = ", ".join(seq for name, seq in self.missing if name == variant)
+            recordings = ", ".join(seq for missing_variant, seq in self.missing if missing_variant == variant)
             lines.append(f"  {VARIANTS[variant].label}: to train for {recordings}")
         if self.without_revisits:
             lines.append(f"no revisits in {', '.join(self.without_revisits)}: no scores for them, and no means")
@@ -102,32 +103,34 @@ class Plan(NamedTuple):
 
 
 def make_plan(reproduction: Reproduction, names: Sequence[str]) -> Plan:
-    """Return the plan for these experiments.
-
-    Experiments across sessions need only one run of each variant. Raises ValueError if a run has other settings.
-    """
-    runs, scored = {}, {}
-    for experiment in (EXPERIMENTS[name] for name in names):
+    """Return the plan for these experiments. Raises ValueError if a run in the folder has other settings."""
+    experiments = [EXPERIMENTS[name] for name in names]
+    runs = {}  # keys in order, without repetition
+    for experiment in experiments:
+        # Across sessions, one run of each variant suffices: none is trained on the sessions.
         seqs = reproduction.seqs[:1] if experiment.across_sessions else reproduction.seqs
-        scored |= {} if experiment.across_sessions else dict.fromkeys(seqs)
         runs |= dict.fromkeys((variant, seq) for variant in experiment.variants for seq in seqs)
     missing = tuple(run for run in runs if not reproduction.is_trained(*run))
-    straight = [seq for seq in scored if not _has_revisits(reproduction.recording(seq))]
-    return Plan(tuple(runs), missing, reproduction.config.steps, tuple(straight))
+    without_revisits = ()
+    if not all(experiment.across_sessions for experiment in experiments):  # otherwise only sessions are scored
+        without_revisits = tuple(seq for seq in reproduction.seqs if not _has_revisits(reproduction.recording(seq)))
+    return Plan(tuple(runs), missing, reproduction.config.steps, without_revisits)
 
 
 def _has_revisits(recording: Recording) -> bool:
-    assert recording.positions is not None  # checked by `check`
+    """Return whether a recording has a revisit by the rule of top-1 F1max: within 3 m and 30 s older."""
+    assert recording.positions is not None  # checked by `check_inputs`
     return bool(revisits(recording.positions, times=recording.times).any())
 
 
 def time_a_step(reproduction: Reproduction, variant: str, seq: str) -> float:
-    """Measure the duration of a training step in seconds, on the first batches of the run, without compilation."""
+    """Measure the duration of a training step of a run in seconds, on its first batches, without compilation."""
     config, recordings = reproduction.config_of(variant), reproduction.recordings_but(seq)
     network, batches = ImageNetwork(config), batches_of(recordings, tuple_pool(recordings, config), config)
     state, start = network.new_state(), 0.0
     for step in range(1 + TIMED_STEPS):
-        start = time.perf_counter() if step == 1 else start
+        if step == 1:  # step 0 compiles and is not timed
+            start = time.perf_counter()
         state, metrics = train_step(state, batches.batch(step), network=network)
         jax.block_until_ready(metrics)
     return (time.perf_counter() - start) / TIMED_STEPS

@@ -1,4 +1,4 @@
-"""A reproduction: its trained models, descriptors and scores, in one folder per run. Missing ones are created."""
+"""A reproduction of the paper: trains models, computes descriptors and scores, and keeps the results in folders."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -32,12 +32,13 @@ from sglpr_jax.training.run_folder import CONFIG_FILE, require_same_settings
 ROTATION_SEED = 0
 BATCH = 16
 DONE_FILE = "trained.json"
+"""File in the folder of a run with the number of steps, written at the end of training."""
 WITHOUT_TRAINING = "without-training"
 
 
 @functools.cache
 def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
-    """Open a recording once. A second opening would silently omit scans that disappear."""
+    """Open a recording of a dataset once, so that its scans stay the same if files disappear later."""
     return open_recording(data, seq, pose_source=pose_source)
 
 
@@ -59,7 +60,7 @@ class Reproduction:
     weights: tuple[str, ...] = ()
     """Weights for comparison: shipped names or folders."""
     sessions: Callable[[], Path] = Path
-    """Returns the folder of sessions in NCLT's layout. Called only by experiments that need sessions."""
+    """Returns the folder of sessions in NCLT's layout. Called only for experiments across sessions."""
     trained: bool = True
     """Whether variants are trained."""
     pose_source: PoseChoice = "auto"
@@ -71,14 +72,14 @@ class Reproduction:
         return variant_config(self.config, variant)
 
     def is_trained(self, variant: str, seq: str) -> bool:
-        """Whether a run is finished. Raises ValueError if it has other settings."""
+        """Return whether a run has done all steps. Raises ValueError if it has other settings or more steps."""
         folder = self._folder(variant, seq)
         if not (folder / CONFIG_FILE).is_file():  # a process that was killed early leaves a folder without a run
             return False
         require_same_settings(folder, run_settings(self.config_of(variant), self._settings(seq)), limits=LIMITS)
         path = folder / DONE_FILE
-        done = read_json(path) if path.is_file() else {"steps": 0}
-        steps = done.get("steps") if isinstance(done, dict) else done
+        content = read_json(path) if path.is_file() else {"steps": 0}
+        steps = content.get("steps") if isinstance(content, dict) else content
         if type(steps) is not int:
             raise ValueError(f'{path}: expected {{"steps": a number}}, found {steps!r:.60}')
         if steps > self.config.steps:
@@ -86,7 +87,7 @@ class Reproduction:
         return steps == self.config.steps
 
     def train(self, variant: str, seq: str, *, stopped: Callable[[], bool]) -> TrainResult:
-        """Train the remaining steps of a run. Raises ValueError if it was started with other settings."""
+        """Train the remaining steps, or until `stopped` is true. Raises ValueError if the run has other settings."""
         folder = self._folder(variant, seq)
         result = train(
             self.config_of(variant),
@@ -111,24 +112,25 @@ class Reproduction:
         return _opened(self.data, seq, self.pose_source)
 
     def recordings_but(self, seq: str) -> list[Recording]:
-        """Return the training recordings of the runs for `seq`."""
+        """Return the training recordings of the runs that are tested on `seq`: all others of the dataset."""
         return [self.recording(name) for name in recording_names(self.data) if name != seq]
 
     def session_recordings(self) -> list[Recording]:
-        """Open the sessions. The first is the database."""
+        """Open the sessions. The first is the database, the others are queries."""
         root = self.sessions()
         return [open_recording(root, session) for session in recording_names(root)]
 
     def labels(self, name: str) -> Mapping[str, str]:
-        """Return the label of each variant of a table or figure by its name, and of the methods compared with them."""
-        experiment = EXPERIMENTS[name]
-        compared = (*self.weights, *self.methods) if experiment.beside_handcrafted else ()
-        return {**(experiment.variants if self.trained else {}), **{method: method for method in compared}}
+        """Return the labels of the rows of a table or figure, by the name of the variant or other method."""
+        labels = dict(EXPERIMENTS[name].variants) if self.trained else {}
+        if EXPERIMENTS[name].beside_handcrafted:
+            labels |= {method: method for method in (*self.weights, *self.methods)}
+        return labels
 
     def descriptors(
         self, method: str, seq: str, *, of: Recording | None = None, rotated: bool = False
     ) -> DescriptorFile:
-        """Return the descriptors of the recording `seq`, or of the recording `of`.
+        """Return the descriptors of the recording `seq` or of the recording `of`, with `rotated` at random angles.
 
         `method` is a variant, whose model was trained without `seq`, a handcrafted method, or weights.
         """
@@ -148,10 +150,11 @@ class Reproduction:
 
     @functools.cache  # noqa: B019  a process has one reproduction
     def score(self, method: str, seq: str, protocol: str = TOP1, *, rotated: bool = False) -> Result:
-        """Return the result of a variant, a handcrafted method or weights, by default by the paper's protocol."""
+        """Return the result of a variant, a handcrafted method or weights on the recording `seq` by a protocol."""
         return PROTOCOLS[protocol](self.descriptors(method, seq, rotated=rotated))
 
     def _method(self, method: str, seq: str, recording: Recording) -> Method:
+        """Return the method that describes the scans of `recording`, given the name of a variant, method or weights."""
         if method in VARIANTS:
             return network(self.params(method, seq))
         if method in HANDCRAFTED:
@@ -159,6 +162,7 @@ class Reproduction:
         return method_with_weights(method)
 
     def _settings(self, seq: str) -> dict[str, str]:
+        """Return the settings of a run that its configuration does not have. A resumed run must have the same."""
         return {"seq": seq, "data": str(self.data), "preset": self.preset, "pose_source": self.pose_source}
 
     def _folder(self, variant: str, seq: str) -> Path:
@@ -166,8 +170,8 @@ class Reproduction:
 
 
 def content_of(method: str) -> Takes:
-    """Return what a handcrafted method or weights need in a recording. `method` is a name or a folder of weights."""
+    """Return what a method needs in a recording. `method` is a handcrafted method, or the name or folder of weights."""
     if method in HANDCRAFTED:
         return HANDCRAFTED[method].takes
-    learned = method_of(Path(method))
-    return LEARNED[learned].takes if learned in LEARNED else "images"
+    learned_method = method_of(Path(method))
+    return LEARNED[learned_method].takes if learned_method in LEARNED else "images"

@@ -8,7 +8,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
 def random_drive(seed, n=60):
-    """A recording in which frames are often 0 to 30 m from older ones; descriptors that know only part of it."""
+    """Return positions, noisy descriptors and times of a recording with frames 0 to 30 m from older ones."""
     rng = np.random.default_rng(seed)
     positions = rng.uniform(-15, 15, (n, 3)) * [1, 1, 0.2]
     descriptors = (positions + rng.normal(scale=4, size=(n, 3))) @ rng.normal(size=(3, 8)) / 20
@@ -20,7 +20,7 @@ def distance(a, b):
 
 
 def f1_max(thresholds, count):
-    """The highest F1 over (tp, fp, fn) counted at every threshold."""
+    """Return the highest F1 over all thresholds. `count` returns (tp, fp, fn) of a threshold."""
     return max((2 * tp / (2 * tp + fp + fn) if tp else 0.0) for tp, fp, fn in map(count, thresholds))
 
 
@@ -35,7 +35,7 @@ def within(file: DescriptorFile, metres: float, dimensions: int, *, closed: bool
 
 
 def ranked(file: DescriptorFile, query: int, database: Iterable[int]) -> list[int]:
-    """The database, the nearest descriptor first."""
+    """Return the frames of the database, nearest descriptor first."""
     return sorted(database, key=lambda i: distance(file.descriptors[query], file.descriptors[i]))
 
 
@@ -45,7 +45,7 @@ def top1(
     right: Callable[[int, int], bool],
     wrong: Callable[[int, int], bool] | None = None,
 ) -> tuple[float, int, float]:
-    """F1max, revisits and Recall@1; without `wrong`, every accepted answer that is not right is false."""
+    """Return F1max, number of revisits and Recall@1. Without `wrong`, every answer that is not right is wrong."""
     answers = []
     for query, database in databases.items():
         best = ranked(file, query, database)[0]
@@ -67,7 +67,7 @@ def top1(
 def pairs(
     file: DescriptorFile, positive: Callable[[float, int], bool], first_gap: int = 1
 ) -> tuple[float, dict[str, int]]:
-    """F1max over pairs with every negative beyond 20 m, and the numbers of pairs."""
+    """Return F1max over pairs with all negatives (beyond 20 m), and the numbers of positive and negative pairs."""
     p, d = file.positions[:, :2], file.descriptors
     every = [(i, j) for i in range(len(file)) for j in range(i + 1 - first_gap)]
     right = [distance(d[i], d[j]) for i, j in every if positive(distance(p[i], p[j]), i - j)]
@@ -82,7 +82,7 @@ def pairs(
 
 
 def recall(file: DescriptorFile, databases: dict[int, range], right: Callable[[int, int], bool], n: int) -> float:
-    """Recall@n over the queries with something to find."""
+    """Return Recall@n over the queries with a right answer in their database."""
     found = []
     for query, database in databases.items():
         if any(right(query, i) for i in database):
@@ -91,7 +91,7 @@ def recall(file: DescriptorFile, databases: dict[int, range], right: Callable[[i
 
 
 def recall_across(database: DescriptorFile, queries: DescriptorFile, metres: float, n: int) -> tuple[float, int]:
-    """Recall@n across two sessions, and how many queries have something to find."""
+    """Return Recall@n of one session in another, and the number of queries with a right answer there."""
     found = []
     for position, descriptor in zip(queries.positions, queries.descriptors, strict=True):
         near = [distance(position[:2], p[:2]) < metres for p in database.positions]

@@ -12,7 +12,7 @@ from sglpr_jax.se3 import transform
 
 @pytest.fixture(scope="session")
 def make_file() -> Callable[..., DescriptorFile]:
-    """Return a maker of descriptor files from positions and descriptors."""
+    """Return a function that makes a descriptor file from positions and descriptors."""
 
     def make(positions, descriptors, *, times=None, sequence="town"):
         return DescriptorFile(
@@ -38,14 +38,14 @@ def two_laps() -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def noisy_laps(make_file, two_laps) -> DescriptorFile:
-    """Two laps, described by their positions with noise."""
+    """Return a descriptor file of two laps. The descriptors are positions with noise."""
     noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
     return make_file(two_laps, two_laps / 200 + noise)
 
 
 @pytest.fixture(scope="session")
 def mistaken(make_file, two_laps) -> DescriptorFile:
-    """Two laps of which frames 500 and 501 look like 10 and 11, and 600 almost like 20; 700 meets its own place."""
+    """Return two laps with false matches: frames 500 and 501 with 10 and 11, and 600 (less similar) with 20."""
     descriptors = two_laps / 200
     descriptors[[500, 501]] = descriptors[[10, 11]]
     descriptors[600] = descriptors[20] + [0.001, 0, 0]
@@ -55,13 +55,13 @@ def mistaken(make_file, two_laps) -> DescriptorFile:
 
 @pytest.fixture(scope="session")
 def straight() -> np.ndarray:
-    """Return positions (800, 3) of a recording that never comes back."""
+    """Return positions (800, 3) of a recording without a revisit."""
     return np.arange(800.0)[:, None] * [1.0, 0.0, 0.0]
 
 
 @pytest.fixture
 def found_loops(tmp_path) -> LoopSearchResult:
-    """Three loops of eight images, with odometry."""
+    """Return the result of a search with three loops among eight images, with odometry."""
     rng = np.random.default_rng(0)
     images = {tmp_path / f"{i:06d}.png": rng.uniform(0, 10, (20, 20)).astype(np.float32) for i in range(8)}
     odometry = np.stack([transform(float(x), 0.0, 0.0) for x in range(8)])

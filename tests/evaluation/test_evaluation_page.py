@@ -1,4 +1,4 @@
-"""The folder of an evaluation: the page stands alone and says what was found; other files in the folder stay."""
+"""The folder of an evaluation: content of the page, and files that are written, removed or kept."""
 
 import base64
 import dataclasses
@@ -26,7 +26,7 @@ VOID = {"meta", "img", "br"}
 
 
 class Parsed(HTMLParser):
-    """A page as a browser would see it: its texts by headline, its pictures, and whether tags close in order."""
+    """Parses a page: its texts by headline, its pictures, and whether tags are closed in order."""
 
     def __init__(self, html: str):
         super().__init__()
@@ -77,7 +77,7 @@ def render(found, pictures=None):
     return html, Parsed(html)
 
 
-def test_the_page_says_what_the_results_say_and_stands_alone(found):
+def test_the_page_shows_the_results_without_external_files(found):
     html, seen = render(found)
     assert "<title>&lt;town&gt; &amp; co</title>" in html and "<script" not in html and "url(" not in html
     assert all(address.startswith("data:") for address in seen.addresses)
@@ -93,14 +93,14 @@ def test_the_page_says_what_the_results_say_and_stands_alone(found):
         assert "--weights" in seen.texts[headline] and "--data" in seen.texts[headline]
 
 
-def test_what_is_missing_is_said_with_its_option(found):
+def test_an_empty_section_names_the_option_that_fills_it(found):
     _, seen = render(Evaluation("", "", {"mine": found.results[1:]}, None))
     assert "no protocol" in seen.texts["Precision and recall"].lower() and seen.images == []
     assert "--poses" in seen.texts["Trajectory"] and "--protocol" in seen.texts["Worst false positives"]
 
 
-def test_pictures_stand_where_they_belong(found):
-    mistake, other = found.worst
+def test_pictures_are_in_their_sections(found):
+    mistake, other = found.worst_false_positives
     assert (mistake.query, mistake.answer, other.answer) == (500, 10, 20)
     counts = np.arange(24 * 20).reshape(24, 20)
     maps = figure_picture(figures.segmentation_panel(counts, None, counts % 20, resolution_m=0.5), "a map")
@@ -117,7 +117,7 @@ def names_in(folder) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_plots_of_an_earlier_evaluation_go_and_other_files_stay(found, sessions, tmp_path):
+def test_plots_of_an_earlier_evaluation_are_removed_and_other_files_stay(found, sessions, tmp_path):
     two = dataclasses.replace(found, methods={"mine": found.results, "same": found.results})
     mine = tmp_path / "precision-recall-raw.png"
     mine.write_bytes(b"not of this command")
@@ -127,14 +127,14 @@ def test_plots_of_an_earlier_evaluation_go_and_other_files_stay(found, sessions,
     assert len(written) == 2
 
 
-def test_where_no_evaluation_was_nothing_is_removed(sessions, tmp_path):
+def test_nothing_is_removed_from_a_folder_without_an_evaluation(sessions, tmp_path):
     (tmp_path / "trajectory.png").write_bytes(b"not of this command")
     (tmp_path / "results.json").write_text('{"sequence": "08", "raw": {}}')
     write_evaluation(sessions, tmp_path)
     assert names_in(tmp_path) == {"trajectory.png", "results.json", "report.html"}
 
 
-def test_a_name_with_markup_is_printed_drawn_and_written_as_it_is(mistaken, tmp_path):
+def test_a_name_with_markup_is_printed_drawn_and_written_unchanged(mistaken, tmp_path):
     name = "[/red]<b>$x_{$\udcff\nb\x1b[2J"
     file = dataclasses.replace(mistaken, sequence=name)
     other = dataclasses.replace(file, descriptors=file.descriptors[:, ::-1].copy())

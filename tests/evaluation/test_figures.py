@@ -13,7 +13,7 @@ from sglpr_jax.se3 import transform
 
 
 def pixels(figure, path):
-    """Return the saved picture's pixels (h, w, 3)."""
+    """Return the pixels (h, w, 3) of the saved picture."""
     figures.save(figure, path)
     assert [found.name for found in path.parent.iterdir()] == [path.name]
     with Image.open(path) as image:
@@ -21,7 +21,7 @@ def pixels(figure, path):
 
 
 def shows(picture, colour):
-    """Whether at least 20 pixels have this colour."""
+    """Return whether at least 20 pixels have this colour."""
     return np.sum(np.abs(picture - np.array(colour)).max(axis=-1) <= 3) >= 20
 
 
@@ -57,7 +57,7 @@ def test_a_trajectory_shows_each_decision_in_its_colour(tmp_path, two_laps):
     assert shows(picture, (0x2B, 0x5F, 0xC4))
 
 
-def test_a_segmentation_panel_is_in_metres_and_in_the_names_and_colours_of_its_classes(tmp_path):
+def test_a_segmentation_panel_has_metres_and_names_and_colours_of_classes(tmp_path):
     bev = np.zeros((20, 40), np.int32)
     bev[:, :20] = 3
     truth = np.where(bev > 0, CATEGORIES.index("road"), 0)
@@ -77,13 +77,13 @@ def test_a_segmentation_panel_is_in_metres_and_in_the_names_and_colours_of_its_c
     assert shows(middle[:, 2 * third :], building) and not shows(middle[:, 2 * third :], road)
 
 
-def test_without_matplotlib_the_extra_is_named(monkeypatch):
+def test_the_error_without_matplotlib_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[viz\]'"):
         figures.learning_curves({"loss": {"raw": [(0, 0.1)]}})
 
 
-def test_a_right_pose_makes_the_picture_white_and_a_wrong_one_coloured():
+def test_an_overlay_is_white_with_the_right_pose_and_coloured_with_a_wrong_one():
     match, query = (0.3, -0.2, 0.5), (1.4, 0.8, 2.5)
     images = [seen_from(place(0), pose) for pose in (query, match)]
     right = figures.overlaid(*images, transform(*relative(match, query)))

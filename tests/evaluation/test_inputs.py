@@ -1,4 +1,4 @@
-"""Files of any method: what is read from them, which protocols fit, and one error for each way to be wrong."""
+"""Input files of any method: their content, the protocols that fit, and errors of invalid files."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ def poses(two_laps) -> Trajectory:
 
 @pytest.fixture
 def read(tmp_path, poses):
-    """Read what a file of this name and content gives; bytes and arrays are written as they are."""
+    """Return a function that writes a file (text, bytes or array) and reads it with `read_input`."""
 
     def read(name, content, *, trajectory=poses, **options):
         path = tmp_path / name
@@ -33,7 +33,7 @@ def read(tmp_path, poses):
     return read
 
 
-def test_a_matrix_is_scored_as_the_file_it_would_make(read, make_file, two_laps):
+def test_a_matrix_has_the_score_of_a_descriptor_file(read, make_file, two_laps):
     rows = np.abs(two_laps).astype(np.uint8)
     found = read("mine.npy", rows)
     assert (found.sequence, found.distance, found.pose_source) == ("town", "l2", "laps.csv (csv)")
@@ -43,7 +43,7 @@ def test_a_matrix_is_scored_as_the_file_it_would_make(read, make_file, two_laps)
     assert read("mine.npy", rows, distance="cosine").distance == "cosine"
 
 
-def test_poses_of_other_times_are_interpolated_at_those_of_an_own_file(tmp_path, make_file, two_laps):
+def test_poses_are_interpolated_at_the_times_of_a_descriptor_file(tmp_path, make_file, two_laps):
     times = np.arange(800) * 0.1
     make_file(two_laps, two_laps, times=times).save(tmp_path / "own.npz")
     stamps = np.arange(0.25, 60, 0.5)
@@ -60,7 +60,7 @@ def test_poses_of_other_times_are_interpolated_at_those_of_an_own_file(tmp_path,
         read_input(tmp_path / "own.npz", late, sequence="x")
 
 
-def test_poses_of_all_scans_serve_a_file_from_which_some_were_left_out(tmp_path, make_file, two_laps, poses):
+def test_poses_of_all_scans_fit_a_file_with_skipped_scans(tmp_path, make_file, two_laps, poses):
     whole = dataclasses.replace(make_file(two_laps, two_laps), positions=None)
     kept = ~np.isin(np.arange(800), (3, 700))
     whole.only(kept).save(tmp_path / "own.npz")
@@ -73,7 +73,7 @@ def test_poses_of_all_scans_serve_a_file_from_which_some_were_left_out(tmp_path,
         read_input(tmp_path / "own.npz", few, sequence="x")
 
 
-def test_methods_beside_an_own_file_take_its_positions_and_times(tmp_path, make_file, two_laps):
+def test_other_methods_get_positions_and_times_of_the_descriptor_file(tmp_path, make_file, two_laps):
     make_file(two_laps, two_laps, times=np.arange(800) * 0.1).save(tmp_path / "own.npz")
     np.save(tmp_path / "mine.npy", two_laps)
     (tmp_path / "list.txt").write_text("400: 0\n")
@@ -84,7 +84,7 @@ def test_methods_beside_an_own_file_take_its_positions_and_times(tmp_path, make_
         assert found[name].pose_source == "made up"
 
 
-def test_methods_on_poses_without_times_share_those_of_an_own_file(tmp_path, make_file, two_laps, poses):
+def test_methods_with_poses_without_times_get_the_times_of_a_descriptor_file(tmp_path, make_file, two_laps, poses):
     names = ("mine.npy", "pairs.txt", "own.npz")
     make_file(two_laps, two_laps, times=np.arange(800) * 0.1).save(tmp_path / "own.npz")
     np.save(tmp_path / "mine.npy", two_laps)
@@ -120,13 +120,13 @@ def test_top_k_lists_and_scored_pairs(read):
         ("list.txt", "5: 0=.5 3\n", "expected a score for every retrieved frame or for none, found 1 without"),
     ],
 )
-def test_bad_input_is_one_error_that_names_the_file(read, monkeypatch, name, content, error):
+def test_bad_input_raises_an_error_with_the_file_name(read, monkeypatch, name, content, error):
     monkeypatch.setattr("pickle.load", lambda *_, **__: pytest.fail("a pickle was read"))
     with pytest.raises(ValueError, match=rf"{name}.*{error}"):
         read(name, content)
 
 
-def test_protocols_fit_the_input(read):
+def test_default_protocols_fit_the_input(read):
     inputs = read("a.npy", np.ones((800, 2))), read("p.txt", "5 0 .5\n"), read("b.txt", "5: 0\n")
     matrix, pairs, bare = map(kind_of, inputs)
     assert chosen_protocols(matrix, ()) == ["top1-f1max", "pairs-f1max", "bevplace-recall-at-1"]

@@ -1,4 +1,4 @@
-"""The page of loops of one or several recordings stands alone and shows what was found."""
+"""The page of loops of one or several recordings: its sections, tables and pictures."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ def with_session(found: LoopSearchResult, **change) -> LoopSearchResult:
     return dataclasses.replace(found, sessions=(dataclasses.replace(found.sessions[0], **change),))
 
 
-def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_path):
+def test_the_page_has_trajectory_pairs_and_least_probable_loops(found, tmp_path):
     page = Parsed(loops_page(found))
     assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs"]
     assert all(address.startswith("data:") for address in page.addresses)
@@ -35,7 +35,7 @@ def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_
     assert "0.9950" in table and "000005" in table and "17.2" in table
 
 
-def test_without_odometry_or_loops_or_frames_it_says_so(found):
+def test_the_page_says_if_odometry_loops_or_frames_are_missing(found):
     assert len(Parsed(loops_page(with_session(found, odometry=None))).images) == 2
     none = dataclasses.replace(found, loops=())
     assert loops_page(none).count("No loops.") == 2
@@ -61,7 +61,7 @@ def test_rejected_pairs_are_counted_by_reason(found):
     assert "Rejected pairs are grey." in page.texts["Trajectory"]
 
 
-def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(known):
+def test_wrong_loops_are_counted_and_come_first(known):
     page = Parsed(loops_page(known))
     assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Trajectory"]
     table = page.texts["Loops"]
@@ -71,7 +71,7 @@ def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(known)
 
 @pytest.fixture
 def known(found) -> LoopSearchResult:
-    """The same with true positions, off the odometry, and with candidates: two loops, and one that is none."""
+    """Return the result with true positions and candidates: two are loops, one is not. The odometry has an error."""
     model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((8, 3))
     positions[:, 0] = [0, 1, 2, 3, 4, 5, 6, 97]
@@ -81,7 +81,7 @@ def known(found) -> LoopSearchResult:
     return with_session(dataclasses.replace(found, model=model), recording=recording, candidates=candidates)
 
 
-def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(known):
+def test_the_share_of_loops_is_drawn_if_positions_are_known(known):
     page = Parsed(loops_page(known))
     assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs", "Reliability"]
     said = page.texts["Reliability"]

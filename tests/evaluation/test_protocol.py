@@ -1,4 +1,4 @@
-"""What protocols are given: top-k lists and scored pairs in place of descriptors, and what is refused."""
+"""Inputs of protocols: top-k lists and scored pairs instead of descriptors, and invalid inputs."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from .by_the_letter import random_drive
 
 @pytest.fixture(scope="module")
 def listed(noisy_laps) -> TopK:
-    """All frames of the recording for each of its frames, best first."""
+    """Return a top-k list with all frames of the recording for each frame, best first."""
     file = noisy_laps
     apart = np.linalg.norm(file.descriptors[:, None] - file.descriptors[None], axis=2)
     nearest = np.argsort(apart, axis=1)
@@ -30,7 +30,7 @@ def listed(noisy_laps) -> TopK:
 @pytest.mark.parametrize(
     "protocol", [other for name, other in protocols_taking("scored top-k list").items() if name != "ssc-recall"]
 )
-def test_a_list_scores_as_the_descriptors_it_was_made_of(noisy_laps, listed, protocol):
+def test_a_list_has_the_score_of_its_descriptors(noisy_laps, listed, protocol):
     by_descriptors, by_list = protocol(noisy_laps), protocol(listed)
     assert by_list.score == pytest.approx(by_descriptors.score)
     assert by_list.interval == pytest.approx(by_descriptors.interval, abs=1e-3)
@@ -39,7 +39,7 @@ def test_a_list_scores_as_the_descriptors_it_was_made_of(noisy_laps, listed, pro
     np.testing.assert_array_equal(by_list.decisions, by_descriptors.decisions)
 
 
-def test_ssc_counts_every_row_of_a_list(noisy_laps, listed):
+def test_ssc_recall_counts_every_listed_query(noisy_laps, listed):
     asked = SSC_RECALL(noisy_laps)
     queries = np.flatnonzero(asked.decisions)
     rows = replace(listed, queries=queries, nearest=listed.nearest[queries], scores=None)
@@ -58,7 +58,7 @@ def test_a_list_without_answers_scores_nothing(listed):
         assert not np.any(result.decisions == Decision.TRUE_POSITIVE)
 
 
-def test_far_from_zero_the_nearest_are_still_found():
+def test_nearest_descriptors_are_exact_for_large_values():
     rng = np.random.default_rng(0)
     rows = (1000 + rng.normal(size=(300, 64))).astype(np.float32)
     nearest, _ = nearest_descriptors(rows[150:], rows, np.full(150, 150), k=3, distance="l2")
@@ -90,7 +90,7 @@ def test_pairs_without_labels_are_labelled_by_position(noisy_laps):
         ({"scores": np.full((800, 800), np.nan)}, "expected a finite score"),
     ],
 )
-def test_lists_must_fit(listed, change, error):
+def test_invalid_lists_are_refused(listed, change, error):
     with pytest.raises(ValueError, match=error):
         replace(listed, **change)
     with pytest.raises(ValueError, match=r"expected pairs of frames from 0 .* found -1 in row 1"):
@@ -98,7 +98,7 @@ def test_lists_must_fit(listed, change, error):
 
 
 @pytest.mark.parametrize("name", ["top1-f1max", "pairs-f1max", "ssc-recall", "bevplace-nclt-recall"])
-def test_cosine_is_l2_of_unit_length(make_file, name):
+def test_cosine_equals_l2_of_unit_vectors(make_file, name):
     positions, descriptors, times = random_drive(0, n=230)
     lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
     by_cosine = replace(make_file(positions, descriptors, times=times), distance="cosine")
@@ -113,7 +113,7 @@ def test_cosine_is_l2_of_unit_length(make_file, name):
 
 
 @pytest.mark.slow
-def test_a_distance_between_sets_serves_for_pairs_and_for_neighbours(make_file):
+def test_a_handcrafted_distance_works_for_pairs_and_for_nearest_descriptors(make_file):
     rng = np.random.default_rng(0)
     rows = rng.uniform(size=(90, 1200)).astype(np.float32)
     file = replace(make_file(np.zeros((90, 3)), rows), distance="scan-context")

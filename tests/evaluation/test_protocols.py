@@ -1,4 +1,4 @@
-"""Each protocol against its rule in plain loops, and what all protocols have in common."""
+"""Each protocol equals its rule in plain loops. Properties of all protocols."""
 
 from dataclasses import replace
 
@@ -38,14 +38,14 @@ UNPUBLISHED = "5 m, no published split: database is the first 60% of the frames,
 
 @pytest.fixture(scope="module")
 def recording(make_file):
-    """A random recording of 230 frames without times, long enough for a gap of 150 frames."""
+    """Return a random recording of 230 frames without times, long enough for a gap of 150 frames."""
     positions, descriptors, _ = random_drive(0, n=230)
     return make_file(positions, descriptors)
 
 
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=15)
-def test_top1_follows_the_rule_to_the_letter(make_file, seed):
+def test_top1_equals_the_rule_in_plain_loops(make_file, seed):
     positions, descriptors, times = random_drive(seed)
     file = make_file(positions, descriptors, times=times)
     databases = {}
@@ -67,7 +67,7 @@ def test_top1_follows_the_rule_to_the_letter(make_file, seed):
         (OVERLAP_TRANSFORMER_F1MAX, {i: range(i - 100) for i in range(150, 229)}, 15, 2),
     ],
 )
-def test_protocols_with_a_gap_follow_their_rule(recording, protocol, databases, metres, dimensions):
+def test_protocols_with_a_gap_equal_their_rule_in_plain_loops(recording, protocol, databases, metres, dimensions):
     result, near = protocol(recording), within(recording, metres, dimensions)
     score, revisits, recall_at_1 = top1(recording, databases, near)
     assert result.score == pytest.approx(score)
@@ -106,7 +106,7 @@ def test_top1_decides_every_frame(make_file, two_laps):
 
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=10)
-def test_pairs_follow_the_rule_to_the_letter(make_file, seed):
+def test_pairs_equal_the_rule_in_plain_loops(make_file, seed):
     positions, descriptors, _ = random_drive(seed, n=70)
     file = make_file(positions * 1.5, descriptors)
     expected, counts = pairs(file, lambda apart, gap: apart < 3 and gap > 50)
@@ -130,15 +130,15 @@ def test_sgpr_pairs_have_no_gap_and_few_negatives(make_file, two_laps):
 
 @given(st.integers(0, 10_000), st.sampled_from([0, 1, 150, 6000, 10**6]))
 @settings(deadline=None, max_examples=15)
-def test_drawn_pairs_are_those_that_are_drawn_from_a_list_of_all(seed, most):
+def test_drawn_pairs_equal_a_draw_from_the_list_of_all_pairs(seed, most):
     positions = 4 * random_drive(seed, n=200)[0][:, :2]  # most pairs are more than 20 m apart
     every = frame_pairs(positions, are_apart)
     expected = np.random.default_rng(seed).choice(every, min(most, len(every)), replace=False)
-    found = drawn_frame_pairs(positions, are_apart, most=most, rng=np.random.default_rng(seed))
+    found = drawn_frame_pairs(positions, are_apart, max_pairs=most, rng=np.random.default_rng(seed))
     np.testing.assert_array_equal(found, np.sort(expected))
 
 
-def test_ssc_recall_asks_every_frame_that_has_something_to_find(recording):
+def test_queries_of_ssc_recall_are_all_revisits(recording):
     databases = {i: range(i - 50) for i in range(51, 230)}
     right = within(recording, 5, 2, closed=True)
     result = SSC_RECALL(recording)
@@ -158,7 +158,7 @@ def test_ssc_recall_asks_every_frame_that_has_something_to_find(recording):
         (BEVPLACE_V1_RECALL, "05", 2761, 1551, "5 m, BEVPlace split: database 0 to 999, queries 1200 to 2750"),
     ],
 )
-def test_bevplaces_split_is_used_for_kittis_sequences_alone(make_file, protocol, sequence, frames, queries, rule):
+def test_the_split_of_bevplace_is_used_for_kitti_sequences_only(make_file, protocol, sequence, frames, queries, rule):
     there_and_back = np.abs(np.arange(frames) - frames // 2)[:, None] * [1.0, 0.0, 0.0]
     result = protocol(make_file(there_and_back, there_and_back, sequence=sequence))
     assert result.rule == rule
@@ -166,8 +166,8 @@ def test_bevplaces_split_is_used_for_kittis_sequences_alone(make_file, protocol,
     assert list(result.recalls) == list(protocol.numbers) and set(result.recalls.values()) == {1.0}
 
 
-def test_neighbours_across_the_seam_are_no_revisits(make_file):
-    """Up a street and back by another one, 30 m away; at the end the robot stands still where it has been before."""
+def test_frames_next_to_the_end_of_the_database_are_no_queries(make_file):
+    """The robot drives along a street, returns 30 m beside it, and stops at an earlier position."""
     up = np.arange(60.0)[:, None] * [1.0, 0, 0]
     back = up[::-1][:40] + np.array([0, 30, 0])
     alone = BEVPLACE_RECALL_AT_1(make_file(np.vstack([up, back]), np.ones((100, 4))))
@@ -181,7 +181,7 @@ def test_neighbours_across_the_seam_are_no_revisits(make_file):
 
 @pytest.fixture(scope="module")
 def sessions(make_file):
-    """Three sessions over the same ground, of 150, 60 and 90 frames."""
+    """Return three sessions in the same area, of 150, 60 and 90 frames."""
     files = []
     for seed, n in enumerate((150, 60, 90)):
         positions, _, _ = random_drive(seed, n=n)
@@ -190,7 +190,7 @@ def sessions(make_file):
     return files
 
 
-def test_nclt_recall_is_asked_across_two_sessions(sessions):
+def test_nclt_recall_of_one_session_in_another(sessions):
     database, queries, _ = sessions
     result = BEVPLACE_NCLT_RECALL(database, queries)
     expected, revisits = recall_across(database, queries, 5, 1)
@@ -221,7 +221,7 @@ def test_pointnetvlad_recall_is_the_mean_over_ordered_pairs_of_runs(make_file, s
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)
-def test_descriptors_that_know_the_place_score_one(make_file, two_laps, noisy_laps, straight, name):
+def test_perfect_descriptors_have_score_one(make_file, two_laps, noisy_laps, straight, name):
     protocol, file = PROTOCOLS[name], make_file(two_laps, two_laps / 200)
     noisy, other = (protocol(noisy_laps, seed=seed) for seed in (0, 1))
     low, high = noisy.interval
@@ -244,7 +244,7 @@ def test_descriptors_that_know_the_place_score_one(make_file, two_laps, noisy_la
         protocol(replace(file, positions=None))
 
 
-def test_blocks_leave_no_seam(make_file, monkeypatch):
+def test_scores_do_not_depend_on_block_sizes(make_file, monkeypatch):
     positions, descriptors, times = random_drive(3)
     file = make_file(positions, descriptors, times=times)
     whole = [protocol(file) for protocol in DESCRIPTORS.values()]

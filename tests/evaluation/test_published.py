@@ -1,4 +1,4 @@
-"""The paper's tables: whole, consistent with each other, and with means as printed."""
+"""The tables of the paper are complete, consistent, and have the printed means."""
 
 import re
 
@@ -9,12 +9,12 @@ from sglpr_jax.evaluation.published import TABLE_1, TABLES
 
 ROUNDING = 0.0005 + 1e-9
 ODD_MEANS = {(1, "SC_LPR"): 0.8533, (2, "SC_LPR"): 0.8533}
-"""Rows whose printed mean is another one; see the module's docstring."""
+"""Rows whose printed mean differs from the mean of their scores, see `published`."""
 NAMES = {"SC": "Scan Context", "LI": "LiDAR Iris", "PNV": "PointNetVLAD", "OT": "OverlapTransformer"}
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: f"table {table.number}")
-def test_every_row_is_whole_and_its_mean_as_printed(table):
+def test_every_row_is_complete_and_has_the_printed_mean(table):
     for row in table.rows:
         assert len(row.scores) == len(table.columns) and 0 <= min(row.scores) <= max(row.scores) <= 1
         expected = ODD_MEANS.get((table.number, row.method), row.mean)
@@ -22,8 +22,8 @@ def test_every_row_is_whole_and_its_mean_as_printed(table):
     assert len({row.method for row in table.rows}) == len(table.rows)
 
 
-def test_the_numbers_are_the_papers(shared):
-    """Every row's seven numbers, in this order, stand in one line of the paper's text, and there are no others."""
+def test_the_numbers_are_in_the_text_of_the_paper(shared):
+    """The numbers of each row are in one line of the text, in this order, and the text has no other such line."""
     text = (shared / "paper/sg-lpr.md").read_text()
     printed = []
     for line in text[text.index("\nTable 1.") :].splitlines():

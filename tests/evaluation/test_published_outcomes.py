@@ -1,4 +1,4 @@
-"""Outcomes that other methods' authors published, scored by our protocols: the numbers they printed."""
+"""Our protocols applied to the published outputs of other methods give the published scores."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from sglpr_jax.evaluation.protocols.top1 import CONTOUR_CONTEXT_F1MAX, TOP1_F1MA
         ("08", 345, 0.9826),
     ],
 )
-def test_sscs_lists_give_its_recall(shared, sequence, rows, recall):
+def test_ssc_lists_give_the_published_recall(shared, sequence, rows, recall):
     positions, times, source = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     listed = np.loadtxt(shared / f"data/protocol/ssc_top25_{sequence}.txt", dtype=np.int64)
     result = SSC_RECALL(TopK(sequence, positions, times, source, listed[:, 0], listed[:, 1:]))
@@ -30,7 +30,7 @@ def test_sscs_lists_give_its_recall(shared, sequence, rows, recall):
     assert result.recalls[1] <= result.recalls[25] <= 1
 
 
-def test_contour_contexts_outcome_gives_its_f1max(shared):
+def test_contour_context_outcome_gives_the_published_f1max(shared):
     lines = (shared / "data/protocol/contour_context_outcome_08.txt").read_text().splitlines()
     fields = [line.split() for line in lines]
     pairs = [field[1].split("-") for field in fields]  # "2000-x": no answer
@@ -58,13 +58,13 @@ def test_contour_contexts_outcome_gives_its_f1max(shared):
 @pytest.mark.parametrize(
     ("sequence", "revisits"), [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
 )
-def test_revisits_are_logg3ds(shared, make_file, sequence, revisits):
+def test_numbers_of_revisits_equal_those_of_logg3d_net(shared, make_file, sequence, revisits):
     positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     result = TOP1_F1MAX(make_file(positions, positions, times=times, sequence=sequence))
     assert result.counts["revisits"] == revisits
 
 
-def test_positive_pairs_are_rinets_on_kittis_own_poses(shared):
+def test_positive_pairs_equal_those_of_rinet_on_kitti_poses(shared):
     rows = np.loadtxt(shared / "data/protocol/neg_100_07.txt", dtype=np.int64)
     published = {tuple(pair) for pair in rows[rows[:, 2] == 1, :2].tolist()}
     found = {}

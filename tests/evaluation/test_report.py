@@ -25,7 +25,7 @@ def render(table, width=200):
     return capture.get()
 
 
-def test_methods_stand_side_by_side_with_the_names_of_many_protocols_whole(found, nothing_to_find, noisy_laps):
+def test_the_comparison_shows_whole_names_of_many_protocols(found, nothing_to_find, noisy_laps):
     text = render(report.comparison({"ours": found, "other": nothing_to_find}))
     rows = {line.split("│")[1].strip(): line for line in text.splitlines() if "│" in line}
     assert f"{found[0].score:.3f}" in rows["ours"]
@@ -36,7 +36,7 @@ def test_methods_stand_side_by_side_with_the_names_of_many_protocols_whole(found
         assert any(result.name in line and report.format_score(result.score) in line for line in lines)
 
 
-def test_json_says_the_same(found, nothing_to_find):
+def test_json_has_the_numbers_of_the_results(found, nothing_to_find):
     top1, pairs, recall = json.loads(json.dumps(report.to_json(found), allow_nan=False))
     assert top1["score"] == found[0].score and top1["interval"] == list(found[0].interval)
     assert top1["counts"] == {"queries": 510, "revisits": 400}

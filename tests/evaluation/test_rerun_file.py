@@ -1,4 +1,4 @@
-"""The file for the rerun viewer holds the trajectory, a line for each loop, its images, and the evidence."""
+"""The file for the rerun viewer has trajectories, scans, a line and images for each loop, and probabilities."""
 
 import dataclasses
 import subprocess
@@ -19,13 +19,13 @@ SMALL = Sensor(elevations_deg=(2.0, -2.0, -6.0, -12.0), azimuth_steps=90)
 
 
 def entities(path: Path) -> set[str]:
-    """Entities of a file, as the program of rerun lists them."""
+    """Return the entities of a file, as listed by the command of rerun."""
     command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
     run = subprocess.run(command, capture_output=True, text=True, check=True)
     return {word for line in run.stdout.splitlines() for word in line.replace("`", " ").split() if word.startswith("/")}
 
 
-def test_both_trajectories_and_each_loop_are_there(found_loops, tmp_path):
+def test_the_file_has_both_trajectories_and_each_loop(found_loops, tmp_path):
     moved = found_loops.sessions[0].odometry @ transform(0.1, 0.0, 0.0)
     write_rerun(found_loops, tmp_path / "a.rrd", optimized=OptimizedTrajectory(moved, np.ones(3, bool)))
     there = entities(tmp_path / "a.rrd")
@@ -33,14 +33,14 @@ def test_both_trajectories_and_each_loop_are_there(found_loops, tmp_path):
     assert expected | {"/pair", "/evidence/loop"} <= there
 
 
-def test_without_poses_the_images_remain(found_loops, tmp_path):
+def test_a_file_without_poses_has_the_images(found_loops, tmp_path):
     bare = dataclasses.replace(found_loops.sessions[0], odometry=None)
     write_rerun(dataclasses.replace(found_loops, sessions=(bare,)), tmp_path / "a.rrd")
     there = entities(tmp_path / "a.rrd")
     assert "/pair" in there and not any(name.startswith("/map") for name in there)
 
 
-def test_scans_of_keyframes_and_the_evidence(tmp_path):
+def test_the_file_has_scans_and_probabilities(tmp_path):
     drive = simulate_recording("08", scans=12, seed=3, sensor=SMALL)
     found = find_loops(drive, load("circular"), odometry=drive.poses.world_from_lidar, registered=False)
     write_rerun(found, tmp_path / "a.rrd")

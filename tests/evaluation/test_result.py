@@ -6,7 +6,7 @@ from sglpr_jax.metrics import decision_curve
 
 
 @pytest.mark.parametrize("pairs", [True, False])
-def test_the_interval_is_that_of_resampling_in_a_loop(pairs):
+def test_the_interval_equals_that_of_resampling_in_a_loop(pairs):
     rng = np.random.default_rng(0)
     if pairs:  # some queries have many
         positive = rng.random(400) < 0.4
@@ -26,7 +26,7 @@ def test_the_interval_is_that_of_resampling_in_a_loop(pairs):
     assert found == pytest.approx(percentile_interval(np.array(resamples)), abs=0.015)
 
 
-def test_a_share_is_resampled_as_drawing_does():
+def test_resampled_means_equal_those_of_drawn_queries():
     found = np.arange(200) < 150
     low, high = percentile_interval(resampled_means(found, np.random.default_rng(0)))
     spread = 1.96 * np.sqrt(0.75 * 0.25 / 200)

@@ -1,4 +1,4 @@
-"""One call scores a descriptor file, a path or arrays; its result prints itself and has the worst mistakes."""
+"""`evaluate` scores a descriptor file, a path or arrays. The result has the worst false positives."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ def scores(*args, **options):
     return [result.score for result in evaluate(*args, **options).results]
 
 
-def test_a_file_a_path_and_arrays_score_alike(file, tmp_path):
+def test_a_file_a_path_and_arrays_have_equal_scores(file, tmp_path):
     file.save(tmp_path / "town.npz")
     np.save(tmp_path / "town.npy", file.descriptors)
     where = {"positions": file.positions, "times": file.times}
@@ -34,7 +34,7 @@ def test_a_file_a_path_and_arrays_score_alike(file, tmp_path):
         evaluate(np.zeros(3), **where)
 
 
-def test_options_stand_in_for_what_a_file_says_itself(file, tmp_path):
+def test_options_replace_the_fields_of_a_file(file, tmp_path):
     def found(*args, **options):
         return evaluate(*args, ["top1-f1max"], **options)
 
@@ -51,7 +51,7 @@ def test_options_stand_in_for_what_a_file_says_itself(file, tmp_path):
         assert "last 30 s excluded" in moved.results[0].rule
 
 
-def test_options_that_cannot_apply_are_refused(file):
+def test_options_that_do_not_fit_the_input_are_refused(file):
     pairs = ScoredPairs(np.array([[0, 1], [0, 2]]), np.array([0.5, 0.1]), np.array([True, False]))
     for source, options, message in (
         (pairs, {"times": file.times}, "^expected no times beside scored pairs"),
@@ -63,10 +63,10 @@ def test_options_that_cannot_apply_are_refused(file):
             evaluate(source, **options)
 
 
-def test_the_surest_mistakes_come_first_and_neighbours_once(mistaken):
+def test_false_positives_are_sorted_by_distance_without_neighbours(mistaken):
     result = TOP1_F1MAX(mistaken)
     assert np.sum(result.decisions == Decision.FALSE_POSITIVE) == 3
-    first, second = Evaluation("", "", {"": [result]}, mistaken.positions).worst
+    first, second = Evaluation("", "", {"": [result]}, mistaken.positions).worst_false_positives
     assert (first.query, first.answer, first.distance) == (500, 10, 0)
     assert (second.query, second.answer) == (600, 20)
     assert second.distance == pytest.approx(0.001, rel=1e-3)

@@ -17,7 +17,7 @@ def score(truth, prediction, counted) -> SegmentationScore:
 
 
 def reference(truth, prediction, counted):
-    """Intersection over union, a class at a time."""
+    """Return the intersection over union of each class, computed class by class."""
     counted = counted & (truth != 0)
     iou = np.full(CLASSES, np.nan)
     for c in np.unique(truth[counted]):
@@ -28,7 +28,7 @@ def reference(truth, prediction, counted):
 
 @settings(deadline=None, max_examples=25)
 @given(truth=maps, prediction=maps, counted=arrays(bool, SHAPE))
-def test_scores_are_those_of_one_class_at_a_time(truth, prediction, counted):
+def test_scores_equal_those_computed_class_by_class(truth, prediction, counted):
     counted[0, 0, 0], truth[0, 0, 0] = True, 3
     result = score(truth, prediction, counted)
     expected = reference(truth, prediction, counted)
@@ -43,7 +43,7 @@ def test_scores_are_those_of_one_class_at_a_time(truth, prediction, counted):
 
 
 @pytest.mark.parametrize("label", [0, 1])
-def test_without_a_cell_to_count_there_is_no_score(label):
+def test_no_counted_cell_is_an_error(label):
     truth = np.full((1, 2, 2), label, np.int32)
     with pytest.raises(ValueError, match="cells with points and labels, found none"):
         score(truth, truth, np.full(truth.shape, label == 0))

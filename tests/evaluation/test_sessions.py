@@ -1,4 +1,4 @@
-"""One map, many sessions: the columns are the protocols' own scores, and every wrong set of files is refused."""
+"""Evaluation across sessions: scores and mean of the query sessions, published rows, and invalid files."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ MAP, NCLT = "2012-01-15", TABLE_3.columns
 
 @pytest.fixture
 def session(make_file):
-    """Return a maker of sessions along one street, 10 m to a frame, described by where they are and some noise."""
+    """Return a function that makes a session on one street, a frame every 10 m, with noisy positions as descriptors."""
 
     def make(name: str, *, noise_m: float = 6.0, offset_m: float = 0.0):
         rng = np.random.default_rng(len(name) + int(name[5:7]))
@@ -26,7 +26,7 @@ def session(make_file):
 
 @pytest.fixture
 def evaluate(tmp_path):
-    """Evaluate sessions that are written to files."""
+    """Return a function that writes sessions to files and evaluates them."""
 
     def call(database, queries, names=(), **options):
         paths = [tmp_path / f"{number}.npz" for number in range(1 + len(queries))]
@@ -37,7 +37,7 @@ def evaluate(tmp_path):
     return call
 
 
-def test_columns_are_the_protocols_scores_and_their_mean(session, evaluate):
+def test_columns_are_the_scores_of_the_sessions_and_their_mean(session, evaluate):
     database, queries = session(MAP), [session(NCLT[0]), session(NCLT[1])]
     found = evaluate(database, queries)
     assert len(evaluate(database, queries, ["pointnetvlad-recall"]).table().rows) == 1
@@ -50,7 +50,7 @@ def test_columns_are_the_protocols_scores_and_their_mean(session, evaluate):
     ]
 
 
-def test_a_session_without_revisits_says_so_and_is_no_part_of_the_mean(session, evaluate):
+def test_a_session_without_revisits_is_not_in_the_mean(session, evaluate):
     near, beside = session(NCLT[0]), session(NCLT[1])
     beside = dataclasses.replace(beside, positions=np.add(beside.positions, [0, 12, 0]))
     (row,) = evaluate(session(MAP), [near, beside], ["bevplace-nclt-recall"]).table().rows
@@ -59,7 +59,7 @@ def test_a_session_without_revisits_says_so_and_is_no_part_of_the_mean(session, 
     assert alone[1:] == ("no revisit", "no revisit")
 
 
-def test_published_rows_are_table_3s_in_the_same_columns(session, evaluate):
+def test_published_rows_have_the_columns_of_the_sessions(session, evaluate):
     queries = [session(name) for name in NCLT]
     whole = evaluate(session(MAP), queries, ["bevplace-nclt-recall"], published=True)
     assert [row[0] for row in whole.published] == [f"published: {row.method}" for row in TABLE_3.rows]
@@ -68,7 +68,7 @@ def test_published_rows_are_table_3s_in_the_same_columns(session, evaluate):
     assert part[-1] == ("published: SG-LPR", "0.913", "", "0.947", "0.930")
 
 
-def test_sessions_of_two_worlds_or_named_twice_are_refused(session, evaluate):
+def test_sessions_that_do_not_overlap_or_occur_twice_are_refused(session, evaluate):
     database = session(MAP)
     with pytest.raises(ValueError, match=r"2012-02-04 in the world frame of the database .* no place is in both"):
         evaluate(database, [session(NCLT[0], offset_m=2000)])

@@ -1,6 +1,6 @@
 """Protocols: published rules that compute one score from the output of a method on a recording.
 
-The same descriptors score very differently under different protocols. Every result therefore has its rule and counts.
+The same descriptors score very differently under different protocols, so every result states its distances and counts.
 To add a protocol, add it to the file of its kind (`top1`, `pairs`, `recall`) and to `PROTOCOLS`.
 """
 
@@ -33,11 +33,7 @@ PROTOCOLS: Mapping[str, Protocol] = {
 }
 """All protocols by their names on the command line, in the order of tables."""
 ALL = "all"
-"""Name that selects every protocol that fits."""
-_IN_WORDS: dict[Kind, str] = {
-    "top-k list": "a top-k list without scores",
-    "scored top-k list": "a top-k list",
-}
+"""Name that selects every protocol that fits the input."""
 
 
 def protocols_taking(kind: Kind) -> dict[str, Protocol]:
@@ -46,7 +42,7 @@ def protocols_taking(kind: Kind) -> dict[str, Protocol]:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise ValueError if a name is neither a protocol of one recording nor `all`. The message has the nearest name."""
+    """Raise ValueError if a name is neither a protocol for one recording nor `all`. The message has a near name."""
     across_sessions = protocols_taking("sessions")
     available = [name for name in PROTOCOLS if name not in across_sessions]
     for name in names:
@@ -60,10 +56,10 @@ def check_names(names: Sequence[str]) -> None:
 
 
 def chosen_protocols(kind: Kind, names: Sequence[str]) -> list[str]:
-    """Return the names of the protocols that score this kind of input.
+    """Return the given protocol names without repetition, or the names of protocols that fit this kind of input.
 
-    Without names, the default protocols (`Protocol.headline`) that fit are returned. If none of them fits, or for the
-    name `all`, every protocol that fits is returned. Raises ValueError if a named protocol does not fit.
+    Without names, the default protocols (`Protocol.headline`) that fit are returned. If none of them fits, or if a name
+    is `all`, every protocol that fits is returned. Raises ValueError if a named protocol does not fit.
     """
     fitting = protocols_taking(kind)
     if not names:
@@ -72,11 +68,12 @@ def chosen_protocols(kind: Kind, names: Sequence[str]) -> list[str]:
         return list(fitting)
     for name in names:
         if name not in fitting:
-            kind_in_words = _IN_WORDS.get(kind, kind)
-            raise ValueError(f"expected protocols for {kind_in_words}, which are {', '.join(fitting)}; found {name}")
+            words = {"top-k list": "a top-k list without scores", "scored top-k list": "a top-k list"}
+            available = f"{words.get(kind, kind)}, which are {', '.join(fitting)}"
+            raise ValueError(f"expected protocols for {available}; found {name}")
     return list(dict.fromkeys(names))
 
 
 def score(source: Input, names: Sequence[str] = ()) -> list[Result]:
-    """Return the result of each named protocol (`chosen_protocols`). Raises ValueError if positions are missing."""
+    """Return the results of the protocols of `chosen_protocols`. Raises ValueError if positions are missing."""
     return [PROTOCOLS[name](source) for name in chosen_protocols(kind_of(source), names)]

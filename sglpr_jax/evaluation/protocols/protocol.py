@@ -24,8 +24,8 @@ BLOCK = 512
 class TopK:
     """Top-k list: the frames that a method retrieved for some frames of a sequence, best first.
 
-    A query that is not listed has no answer and counts as missed. Raises ValueError if a frame is out of range, if a
-    query is listed twice, if numbers of rows differ, or if a value is not finite.
+    A query that is not listed has no answer and counts as missed. Raises ValueError if the list is empty, if a frame is
+    out of range, if a query is listed twice, if array shapes do not match, or if a position or score is not finite.
     """
 
     sequence: str
@@ -49,12 +49,12 @@ class TopK:
             raise ValueError("expected a list with at least one query, found none")
         if self.positions.shape != (len(self), 3) or not np.isfinite(self.positions).all():
             raise ValueError(
-                f"expected finite positions (n, 3), found shape {self.positions.shape} or values that are not finite"
+                f"expected finite positions (n, 3), found shape {self.positions.shape} or non-finite values"
             )
         if self.times is not None and self.times.shape != (len(self),):
-            raise ValueError(f"expected {len(self)} times, one for each position, found {self.times.shape}")
+            raise ValueError(f"expected {len(self)} times, one for each position, found shape {self.times.shape}")
         if self.nearest.ndim != 2 or len(self.nearest) != q or self.nearest.shape[1] == 0:
-            raise ValueError(f"expected {q} rows of retrieved frames, found {self.nearest.shape}")
+            raise ValueError(f"expected retrieved frames of shape ({q}, k >= 1), found shape {self.nearest.shape}")
         _check_frames("query", self.queries, 0, len(self))
         _check_frames("retrieved", self.nearest, -1, len(self))
         if len(np.unique(self.queries)) < q:
@@ -70,26 +70,29 @@ class TopK:
     def lookup(
         self, queries: Int[np.ndarray, " q"], ends: Int[np.ndarray, " q"], k: int
     ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
-        """Same as `nearest_frames`. Listed frames outside the database of a query are ignored."""
-        row = np.full(len(self), -1)
-        row[self.queries] = np.arange(len(self.queries))
-        row = row[queries]
-        allowed = (row >= 0)[:, None] & (self.nearest[row] >= 0) & (self.nearest[row] < ends[:, None])
-        order = np.argsort(~allowed, axis=1, kind="stable")
-        nearest = np.take_along_axis(np.where(allowed, self.nearest[row], -1), order, axis=1)[:, :k]
+        """Return the first k listed frames below `ends` for each query, and the negated score of the first frame.
+
+        Rows with fewer than k frames are padded with -1. The score is infinite without an answer or without scores.
+        """
+        list_row_of_frame = np.full(len(self), -1)
+        list_row_of_frame[self.queries] = np.arange(len(self.queries))
+        list_row = list_row_of_frame[queries]  # -1: the query is not listed
+        listed = self.nearest[list_row]
+        allowed = (list_row >= 0)[:, None] & (listed >= 0) & (listed < ends[:, None])
+        allowed_first = np.argsort(~allowed, axis=1, kind="stable")
+        nearest = np.take_along_axis(np.where(allowed, listed, -1), allowed_first, axis=1)[:, :k]
         distance = np.full(len(queries), np.inf)
         if self.scores is not None:
-            best = np.take_along_axis(self.scores[row], order[:, :1], axis=1)[:, 0]
-            distance = np.where(nearest[:, 0] >= 0, -best, np.inf)
+            best_score = np.take_along_axis(self.scores[list_row], allowed_first[:, :1], axis=1)[:, 0]
+            distance = np.where(nearest[:, 0] >= 0, -best_score, np.inf)
         return np.pad(nearest, ((0, 0), (0, k - nearest.shape[1])), constant_values=-1), distance
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredPairs:
-    """Pairs of frames of a sequence with scores and optional labels.
+    """Pairs of frames of a sequence with scores, and with labels or positions.
 
-    Raises ValueError if the list is empty, if a frame is out of range, if the numbers of rows differ, or if both labels
-    and positions are missing.
+    Raises ValueError if the list is empty, if a frame is out of range, or if numbers of rows differ.
     """
 
     pairs: Int[np.ndarray, "_p 2"]
@@ -108,12 +111,12 @@ class ScoredPairs:
         if p == 0:
             raise ValueError("expected a list with at least one pair, found none")
         if self.pairs.shape != (p, 2) or len(self.scores) != p or (self.labels is not None and len(self.labels) != p):
-            raise ValueError(
-                f"expected {p} pairs of frames with {p} scores, and {p} labels or none, found other numbers of rows"
-            )
+            labels = "no" if self.labels is None else len(self.labels)
+            found = f"pairs of shape {self.pairs.shape}, {len(self.scores)} scores, {labels} labels"
+            raise ValueError(f"expected {p} pairs of frames with {p} scores, and {p} labels or none; found {found}")
         if self.labels is None and self.positions is None:
             raise ValueError("expected labels, or positions to compute them from, found neither")
-        n = np.iinfo(np.int64).max if self.positions is None else len(self.positions)
+        n = np.iinfo(np.int64).max if self.positions is None else len(self.positions)  # without positions: any number
         _check_frames("pairs of", self.pairs, 0, n)
 
 
@@ -122,7 +125,7 @@ Input = Source | ScoredPairs
 
 
 def kind_of(source: Input) -> Kind:
-    """Return the kind of `source`."""
+    """Return the kind of an input of one recording, by which a protocol says that it can score the input."""
     if isinstance(source, ScoredPairs):
         return "scored pairs"
     if isinstance(source, TopK):
@@ -131,26 +134,27 @@ def kind_of(source: Input) -> Kind:
 
 
 def _check_frames(what: str, frames: Int[np.ndarray, "..."], first: int, n: int) -> None:
-    """Raise ValueError if a frame is not in the range from `first` to n - 1. The message names the first such row."""
-    for index in np.argwhere((frames < first) | (frames >= n))[:1]:
-        outside = frames[tuple(index)]
-        raise ValueError(f"expected {what} frames from {first} to {n - 1}, found {outside} in row {index[0]}")
+    """Raise ValueError with the first row that has a frame number outside `first` to n - 1."""
+    outside = np.argwhere((frames < first) | (frames >= n))
+    if len(outside):
+        index = tuple(outside[0])
+        raise ValueError(f"expected {what} frames from {first} to {n - 1}, found {frames[index]} in row {index[0]}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol(abc.ABC):
-    """Protocol for scoring a method. Subclasses define `__call__`, and their instances the numbers of one paper."""
+    """Rule for scoring a method. A subclass computes the score; an instance has the distances of one paper."""
 
     name: str
     """Name on the command line."""
     title: str
-    """Name of its results."""
+    """Name of the results in tables."""
     rule: str
     """Rule in words: which answers are right and what is counted."""
     source: str
     """Publication, with the file of its code that defines the rule."""
     published_on: str
-    """Poses of the published numbers."""
+    """Poses with which the published scores were computed."""
     dimensions: Literal[2, 3]
     """Dimensions of distances between frames: 2 for x and y, 3 for x, y and z."""
     takes: tuple[Kind, ...]
@@ -160,13 +164,10 @@ class Protocol(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, *sources: Input, seed: int = 0) -> Result:
-        """Score one source or several sessions. `seed` is that of the bootstrap interval and of drawn pairs.
+        """Score a source or sessions. `seed` draws pairs and resamples. Raises ValueError if positions are missing."""
 
-        Raises ValueError if positions are missing.
-        """
-
-    def result(self, rule: str, *sources: Input) -> Result:
-        """Return a result of these sources without a score. `rule` has the distances in words."""
+    def new_result(self, rule: str, *sources: Input) -> Result:
+        """Return a result without a score yet. `rule` describes the distances, such as "3 m / 20 m, all negatives"."""
         poses = ", ".join(dict.fromkeys(source.pose_source for source in sources if source.pose_source)) or None
         return Result(self.title, rule, self.dimensions, poses, self.published_on)
 
@@ -181,9 +182,10 @@ def positions_of(source: Source, dimensions: int = 3) -> Float[np.ndarray, "n {d
 def nearest_frames(
     source: Source, queries: Int[np.ndarray, " q"], ends: Int[np.ndarray, " q"], *, k: int = 1
 ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
-    """Return the best k of the first `ends` frames for each query, best first, and the distance of the best.
+    """Return the best k frames for each query, best first, and the distance of the best frame.
 
-    Rows with fewer than k frames are padded with -1. The distance is infinite for a query without an answer.
+    Query i may only be answered with the frames 0 to ends[i] - 1. Rows with fewer than k frames are padded with -1. The
+    distance is infinite for a query without an answer.
     """
     if isinstance(source, TopK):
         return source.lookup(queries, ends, k)
@@ -198,35 +200,40 @@ def nearest_descriptors(
     k: int,
     distance: str,
 ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
-    """Return the nearest k of the first `ends` >= 1 descriptors for each query, and the distance of the nearest.
+    """Return the rows of the nearest k descriptors for each query, nearest first, and the distance of the nearest.
 
-    `distance` is a name in `distances.DISTANCES`. Rows with fewer than k descriptors are padded with -1.
+    Query i is compared with the first ends[i] >= 1 rows of the database. `distance` is a name in `distances.DISTANCES`.
+    Rows of the result with fewer than k descriptors are padded with -1.
     """
-    nearest, best = np.full((len(queries), k), -1, dtype=np.int64), np.zeros(len(queries))
-    exact = database.astype(np.float64)
-    norms, compare = np.sum(exact**2, axis=1), distance_function(distance)
+    nearest = np.full((len(queries), k), -1, dtype=np.int64)
+    nearest_distance = np.zeros(len(queries))
+    database_f64 = database.astype(np.float64)
+    squared_norms = np.sum(database_f64**2, axis=1)
+    compare = distance_function(distance)
+    columns = min(k, len(database))
     for start in range(0, len(queries), BLOCK):
-        rows = slice(start, start + BLOCK)
+        block = slice(start, start + BLOCK)
         if distance == "l2":
-            # |q - d|^2 without |q|^2, which is constant in a row. In float64: the terms cancel far from zero.
-            ranking = norms[None, :] - 2 * queries[rows].astype(np.float64) @ exact.T
+            # |q - d|^2 - |q|^2 ranks as |q - d| does. In float64, because the terms nearly cancel for large values.
+            ranking = squared_norms[None, :] - 2 * queries[block].astype(np.float64) @ database_f64.T
         else:
-            ranking = compare(queries[rows], database)
-        ranking[np.arange(len(database)) >= ends[rows, None]] = np.inf
-        nearest[rows, : min(k, len(database))] = smallest(ranking, min(k, len(database)))
-        best[rows] = np.take_along_axis(ranking, nearest[rows, :1], axis=1)[:, 0]
+            ranking = compare(queries[block], database)
+        ranking[np.arange(len(database)) >= ends[block, None]] = np.inf
+        nearest[block, :columns] = smallest(ranking, columns)
+        nearest_distance[block] = np.take_along_axis(ranking, nearest[block, :1], axis=1)[:, 0]
     if distance == "l2":
-        best = np.linalg.norm(queries - database[nearest[:, 0]], axis=1).astype(np.float64)
-    return np.where(nearest < ends[:, None], nearest, -1), best
+        nearest_distance = np.linalg.norm(queries - database[nearest[:, 0]], axis=1).astype(np.float64)
+    return np.where(nearest < ends[:, None], nearest, -1), nearest_distance
 
 
 def near_answers(
     queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], nearest: Int[np.ndarray, "q k"], near: Near
 ) -> Bool[np.ndarray, "q k"]:
-    """Return whether each retrieved frame is near its query, given positions in metres. False for padding."""
-    return near(np.linalg.norm(queries[:, None] - database[nearest], axis=2)) & (nearest >= 0)
+    """Return whether each retrieved frame is near its query, by positions in metres. Padding (-1) is not near."""
+    metres = np.linalg.norm(queries[:, None] - database[nearest], axis=2)
+    return near(metres) & (nearest >= 0)
 
 
 def recall_at(hits: Bool[np.ndarray, "q k"], numbers: Iterable[int]) -> dict[int, float]:
-    """Return Recall@N for each N, given whether each of the k answers to a query is right."""
+    """Return Recall@N for each N: the share of queries with a right answer among the first N of their k answers."""
     return {n: float(np.mean(hits[:, :n].any(axis=1))) for n in numbers}

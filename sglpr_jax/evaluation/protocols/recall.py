@@ -31,59 +31,58 @@ SPLITS = {
     "06": (600, 800, 1101),
     "08": (1000, 1200, 4071),
 }
-"""BEVPlace++: end of the database, start of the queries and end of the queries, by sequence. The queries end with the
-KITTI sequence."""
+"""Splits of BEVPlace++ by KITTI sequence: end of the database, start and end of the queries, as frame numbers. The end
+of the queries is the end of the sequence."""
 V1_SPLITS = {"00": SPLITS["00"], "02": SPLITS["02"], "05": (1000, 1200, 2751), "06": SPLITS["06"]}
-"""BEVPlace: the same without 08 and with ten queries fewer in 05."""
+"""Splits of BEVPlace: those of BEVPlace++ without 08, and with ten queries fewer in 05."""
 DATABASE_SHARE = 0.6
 """Fraction of the frames that is the database, for recordings without a published split."""
 SEAM_M = 20.0
-"""Distance between the last frame of the database and the first query, in metres, without a published split.
-
-Closer frames are neighbours, not revisits. The published splits skip 200 frames, which are too many for a short
-recording.
-"""
+"""Distance between the last frame of the database and the first query in metres, without a published split. Published
+splits skip 200 frames (neighbours, not revisits), which are too many for a short recording."""
 GAP = 50
 """The database of frame i is frames 0 to i - 51 in SSC's recall."""
 
 Split = tuple[Int[np.ndarray, " q"], Int[np.ndarray, " q"], str]
-"""Queries of a recording, the number of its first frames that are the database of each query, and the rule in words."""
+"""Query frames, the end of the database of each query (frames 0 to end - 1), and the rule in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recall(Protocol):
-    """Recall@N on one recording. The score and its interval, which resamples queries, are of the first N.
+    """Recall@N on one recording. The score and its bootstrap interval are those of the first of `numbers`.
 
-    A query counts if its database has a near frame. The answer is right if such a frame is among the first N answers.
+    Recall@N is the share of counted queries with a near frame among their first N answers. A query is a revisit if its
+    database has a near frame. By default only revisits are counted.
     """
 
     takes: tuple[Kind, ...] = ("descriptors", "top-k list", "scored top-k list")
-    near: Near = lambda apart: apart < 5
+    near: Near = lambda metres: metres < 5
+    """Whether an answer at this distance in metres is right."""
     split: Callable[[Source, Float[np.ndarray, "n _"]], Split]
     """Selects the queries, given a source and its positions in metres."""
     every_query_counts: bool = False
-    """Whether queries without a revisit count, as missed."""
+    """Whether queries that are no revisits are counted, too. They are always missed."""
     numbers: tuple[int, ...] = (1,)
     """The numbers N, increasing."""
 
     def __call__(self, source: Source, *, seed: int = 0) -> Result:
         """Score descriptors or a top-k list. Raises ValueError if positions are missing."""
         positions = positions_of(source, self.dimensions)
-        queries, ends, words = self.split(source, positions)
+        queries, ends, split = self.split(source, positions)
         revisited = has_near(positions[queries], positions, ends, self.near)
         nearest, _ = nearest_frames(source, queries, ends, k=self.numbers[-1])
-        hits = near_answers(positions[queries], positions, nearest, self.near)
+        right = near_answers(positions[queries], positions, nearest, self.near)
         counted = np.ones_like(revisited) if self.every_query_counts else revisited
         decisions = np.full(len(source), Decision.NOT_A_QUERY, dtype=np.int8)
-        first = np.where(hits[:, 0], Decision.TRUE_POSITIVE, Decision.FALSE_NEGATIVE)
-        decisions[queries] = np.where(counted, first, Decision.UNCOUNTED)
+        first_answer = np.where(right[:, 0], Decision.TRUE_POSITIVE, Decision.FALSE_NEGATIVE)
+        decisions[queries] = np.where(counted, first_answer, Decision.UNCOUNTED)
         counts = {"queries": len(queries), "revisits": int(revisited.sum())}
-        result = replace(self.result(f"5 m, {words}", source), counts=counts, decisions=decisions)
+        result = replace(self.new_result(f"5 m, {split}", source), counts=counts, decisions=decisions)
         if not counted.any():
             return result
-        n, hits = self.numbers[0], hits[counted]
-        recalls = recall_at(hits, self.numbers)
-        answered = np.logical_or.reduce(hits[:, :n], axis=1)
+        n = self.numbers[0]
+        recalls = recall_at(right[counted], self.numbers)
+        answered = np.asarray(right[counted, :n].any(axis=1))
         interval = percentile_interval(resampled_means(answered, np.random.default_rng(seed)))
         return replace(result, score=recalls[n], recalls=recalls, interval=interval)
 
@@ -91,22 +90,23 @@ class Recall(Protocol):
 def _published_split(
     source: Source, positions: Float[np.ndarray, "n _"], *, paper: str, splits: Mapping[str, tuple[int, int, int]]
 ) -> Split:
-    """Split of BEVPlace: the first part of a recording is the database, a later part has the queries.
+    """Return a split like BEVPlace's: the first frames of a recording are the database, and later frames are queries.
 
-    `splits` apply if name and number of frames are those of a KITTI sequence. For other recordings the database is the
-    first 60 % of the frames, and the queries begin at the first frame 20 m from its last frame.
+    `splits` are used for recordings with the name and number of frames of a KITTI sequence. For other recordings the
+    database is the first 60 % of the frames, and the first query is the first frame 20 m from the end of the database.
     """
     n = len(source)
     if source.sequence in splits and SPLITS[source.sequence][2] == n:
-        end, first, last = splits[source.sequence]
-        words = f"{paper} split: database 0 to {end - 1}, queries {first} to {last - 1}"
+        database_end, first_query, queries_end = splits[source.sequence]
+        rule = f"{paper} split: database 0 to {database_end - 1}, queries {first_query} to {queries_end - 1}"
     else:
-        end, last = max(int(DATABASE_SHARE * n), 1), n
-        apart = np.linalg.norm(positions[end:] - positions[end - 1], axis=1)
-        first = end + int(next(iter(np.flatnonzero(apart >= SEAM_M)), n - end))
+        database_end, queries_end = max(int(DATABASE_SHARE * n), 1), n
+        metres = np.linalg.norm(positions[database_end:] - positions[database_end - 1], axis=1)
+        is_far = metres >= SEAM_M
+        first_query = database_end + int(is_far.argmax()) if is_far.any() else n
         database = f"database is the first {DATABASE_SHARE:.0%} of the frames"
-        words = f"no published split: {database}, queries begin {SEAM_M:g} m from its end"
-    return np.arange(first, last), np.full(last - first, end), words
+        rule = f"no published split: {database}, queries begin {SEAM_M:g} m from its end"
+    return np.arange(first_query, queries_end), np.full(queries_end - first_query, database_end), rule
 
 
 BEVPLACE_RECALL_AT_1 = Recall(
@@ -132,21 +132,21 @@ BEVPLACE_V1_RECALL = Recall(
 )
 
 
-def _up_to_5_m(apart: Float[np.ndarray, "..."]) -> np.ndarray:
-    return apart <= 5
+def _up_to_5_m(metres: Float[np.ndarray, "..."]) -> np.ndarray:
+    return metres <= 5
 
 
 def _ssc_split(source: Source, positions: Float[np.ndarray, "n _"]) -> Split:
-    """Select the frames with a revisit, or every row of a top-k list.
+    """Return SSC's split: the frames more than 50 older are the database; queries are the revisits or a list's queries.
 
-    With this rule SSC's own lists give the published numbers, although one or two rows of some sequences have no
-    revisit on these poses.
+    With every listed query, SSC's own lists give the published scores, although a few of them are no revisits here.
     """
     ends = np.maximum(np.arange(len(source)) - GAP, 0)
     if isinstance(source, TopK):
         return source.queries, ends[source.queries], f"gap {GAP} frames, every row"
-    frames = np.flatnonzero(ends)
-    queries = frames[has_near(positions[frames], positions, ends[frames], _up_to_5_m)]
+    frames = np.flatnonzero(ends)  # the first frames have no database
+    is_revisit = has_near(positions[frames], positions, ends[frames], _up_to_5_m)
+    queries = frames[is_revisit]
     return queries, ends[queries], f"gap {GAP} frames"
 
 
@@ -166,46 +166,50 @@ SSC_RECALL = Recall(
 
 @dataclass(frozen=True, kw_only=True)
 class SessionRecall(Protocol):
-    """Recall of sessions in each other: all frames of one are the database, all frames of another are the queries.
+    """Recall of query sessions in database sessions: all frames of one are the database, all of another the queries.
 
-    Queries count as in `Recall`. With `every_pair`, score and recalls are means over every ordered pair of sessions
-    that has a query that counts. Otherwise the first of two sessions is the database. The interval resamples the
-    queries that count, in each pair.
+    Only revisits count: queries with a near frame in the database. With `every_pair`, each session is the database of
+    each other session, and the score and the recalls are means over these ordered pairs, without the pairs that have no
+    revisit. Otherwise the first of two sessions is the database. The bootstrap interval resamples the revisits.
     """
 
     takes: tuple[Kind, ...] = ("sessions",)
     dimensions: Literal[2, 3] = 2
     metres: float
     near: Near
+    """Whether an answer at this distance is right: up to `metres`."""
     neighbours: int = 1
-    """Number of retrieved frames."""
+    """Number of retrieved frames. The score is the recall of the first 1 % of the database, up to this number."""
     every_pair: bool = False
-    """Whether every ordered pair is scored, by Recall@1 %: the first max(round(n / 100), 1) answers, at most
-    `neighbours`, for a database of n frames. Otherwise one pair is scored by Recall@1."""
+    """Whether every ordered pair of sessions is scored. Otherwise the first is the database of the second."""
 
     def __call__(self, *sessions: DescriptorFile, seed: int = 0) -> Result:
         """Score two or more sessions. Raises ValueError for fewer, or for descriptors of different methods."""
         if len(sessions) < 2:
             raise ValueError(f"expected at least two sessions, found {len(sessions)}")
-        queries, revisits, recalls, answered = 0, 0, [], []
-        for database, other in itertools.permutations(sessions, 2) if self.every_pair else [sessions]:
-            check_same_method(database, other)
-            there, here = positions_of(database, 2), positions_of(other, 2)
-            ends = np.full(len(here), len(there))
+        pairs = list(itertools.permutations(sessions, 2)) if self.every_pair else [sessions]
+        revisits = 0
+        recalls, answered = [], []  # of each pair with a revisit
+        for database, queries in pairs:
+            check_same_method(database, queries)
+            database_xy, query_xy = positions_of(database, 2), positions_of(queries, 2)
+            ends = np.full(len(query_xy), len(database_xy))  # every query is compared with the whole database
             nearest, _ = nearest_descriptors(
-                other.descriptors, database.descriptors, ends, k=self.neighbours, distance=database.distance
+                queries.descriptors, database.descriptors, ends, k=self.neighbours, distance=database.distance
             )
-            hits = near_answers(here, there, nearest, self.near)[has_near(here, there, ends, self.near)]
-            queries, revisits = queries + len(here), revisits + len(hits)
-            if len(hits):
-                recalls.append(recall_at(hits, range(1, self.neighbours + 1)))
-                answered.append(hits[:, : max(round(len(there) / 100), 1)].any(axis=1))
-        pairs = f"every ordered pair of {len(sessions)} sessions"
+            revisited = has_near(query_xy, database_xy, ends, self.near)
+            right = near_answers(query_xy, database_xy, nearest, self.near)[revisited]
+            revisits += len(right)
+            if len(right):
+                one_percent = max(round(len(database_xy) / 100), 1)
+                recalls.append(recall_at(right, range(1, self.neighbours + 1)))
+                answered.append(right[:, :one_percent].any(axis=1))
+        rule = f"every ordered pair of {len(sessions)} sessions"
         if not self.every_pair:
-            pairs = f"database {sessions[0].sequence}, queries {sessions[1].sequence}"
+            rule = f"database {sessions[0].sequence}, queries {sessions[1].sequence}"
         counts = {"session pairs": len(answered)} if self.every_pair else {}
-        counts |= {"queries": queries, "revisits": revisits}
-        result = replace(self.result(f"{self.metres:g} m, {pairs}", *sessions), counts=counts)
+        counts |= {"queries": sum(len(queries) for _, queries in pairs), "revisits": revisits}
+        result = replace(self.new_result(f"{self.metres:g} m, {rule}", *sessions), counts=counts)
         if not answered:
             return result
         rng = np.random.default_rng(seed)
@@ -224,7 +228,7 @@ BEVPLACE_NCLT_RECALL = SessionRecall(
     source="BEVPlace++, nclt_dataset.py",
     published_on="NCLT's ground truth",
     metres=5.0,
-    near=lambda apart: apart < 5,
+    near=lambda metres: metres < 5,
 )
 """Published with 2012-01-15 as the database and 2012-02-04, 03-17, 06-15, 09-28, 11-16 and 2013-02-23 as queries. The
 frames used there are not published."""
@@ -235,7 +239,7 @@ POINTNETVLAD_RECALL = SessionRecall(
     source="PointNetVLAD, evaluate.py; MinkLoc3D",
     published_on="Oxford RobotCar's positions",
     metres=25.0,
-    near=lambda apart: apart <= 25,
+    near=lambda metres: metres <= 25,
     neighbours=25,
     every_pair=True,
 )

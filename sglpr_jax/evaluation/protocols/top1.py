@@ -24,10 +24,10 @@ from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 class Top1(Protocol):
     """Top-1 retrieval with answers that are right or wrong according to their distance in metres.
 
-    A query is a revisit if a frame of its database would be a right answer. An accepted answer is a true positive if it
-    is right, a false positive if it is wrong, else not counted. A rejected answer is a false negative for a revisit,
-    else a true negative. Every distinct distance is a threshold. The interval resamples queries. Recall@N is the share
-    of revisits with a right answer among the nearest N frames, without a threshold.
+    The database of a query is the frames that are old enough. A query is a revisit if its database has a right answer.
+    An accepted answer is a true positive if it is right, a false positive if it is wrong, else not counted. A rejected
+    answer is a false negative for a revisit, else a true negative. Every distinct descriptor distance is a threshold.
+    Recall@N is the share of revisits with a right answer among the nearest N frames, without a threshold.
     """
 
     takes: tuple[Kind, ...] = ("descriptors", "scored top-k list")
@@ -47,58 +47,66 @@ class Top1(Protocol):
     numbers: tuple[int, ...] = (1,)
     """The numbers N of Recall@N."""
     one_percent: bool = False
-    """Whether 1 % of all frames is one more number N."""
+    """Whether Recall@N is also computed for N = 1 % of all frames."""
 
     def __call__(self, source: Source, *, seed: int = 0) -> Result:
         """Score descriptors or a top-k list with scores. Raises ValueError if positions or scores are missing."""
         if isinstance(source, TopK) and source.scores is None:
             raise ValueError(f"{self.title}: expected a list with scores for the threshold, found no scores")
-        n, positions, (ends, excluded) = len(source), positions_of(source, self.dimensions), self._databases(source)
+        n = len(source)
+        positions = positions_of(source, self.dimensions)
+        ends, excluded = self._databases(source)
         queries = np.flatnonzero(ends)
         numbers = sorted({*self.numbers, max(round(n / 100), 1)} if self.one_percent else self.numbers)
         nearest, distance = nearest_frames(source, queries, ends[queries], k=numbers[-1])
-        is_wrong = self.wrong or (lambda apart: ~self.right(apart))
-        right, wrong = (near_answers(positions[queries], positions, nearest, near) for near in (self.right, is_wrong))
+        right = near_answers(positions[queries], positions, nearest, self.right)
+        wrong = near_answers(positions[queries], positions, nearest, self.wrong or (lambda metres: ~self.right(metres)))
         revisited = has_near(positions[queries], positions, ends[queries], self.right)
         recalls = recall_at(right[revisited], numbers) if revisited.any() else {}
 
-        late = queries >= self.first_thresholded
-        queries, distance, revisited = queries[late], distance[late], revisited[late]
-        nearest, right, wrong = (columns[late, 0] for columns in (nearest, right, wrong))
-        answers, distances = np.full(n, -1, dtype=np.int64), np.full(n, np.inf)
-        answers[queries], distances[queries] = nearest, distance
+        # F1max: only the first answer of each query, and only the queries from `first_thresholded` on.
+        counted = queries >= self.first_thresholded
+        queries, distance, revisited = queries[counted], distance[counted], revisited[counted]
+        nearest, right, wrong = nearest[counted, 0], right[counted, 0], wrong[counted, 0]
         result = replace(
-            self.result(f"{self.metres}, {excluded}", source),
+            self.new_result(f"{self.metres}, {excluded}", source),
             counts={"queries": len(queries), "revisits": int(revisited.sum())},
             recalls=recalls,
-            answers=answers,
-            answer_distances=distances,
+            answers=_fill_frames(n, queries, nearest, default=-1),
+            answer_distances=_fill_frames(n, queries, distance, default=np.inf),
         )
         accepted = np.zeros(len(queries), dtype=bool)
-        if revisited.any() and not np.isfinite(distance).any():
+        if revisited.any() and not np.isfinite(distance).any():  # no query has an answer
             result = replace(result, score=0.0, interval=(0.0, 0.0))
         elif revisited.any():
             flags = {"true_if_accepted": right, "false_if_accepted": wrong, "missed_if_rejected": revisited}
             result = with_f1_max(result, -distance, query=queries, seed=seed, **flags)
             assert result.curve is not None
             accepted = -distance >= result.curve.thresholds[result.curve.best]
-        decisions = np.full(n, Decision.NOT_A_QUERY, dtype=np.int8)
-        decisions[queries] = np.select(
+        decisions = np.select(
             [accepted & right, accepted & wrong, accepted, revisited],
             [Decision.TRUE_POSITIVE, Decision.FALSE_POSITIVE, Decision.UNCOUNTED, Decision.FALSE_NEGATIVE],
             Decision.TRUE_NEGATIVE,
         )
+        decisions = _fill_frames(n, queries, decisions, default=Decision.NOT_A_QUERY).astype(np.int8)
         return replace(result, decisions=decisions)
 
     def _databases(self, source: Source) -> tuple[Int[np.ndarray, " n"], str]:
-        """Return the number of first frames that are the database of each frame (0: no query), and the gap in words."""
+        """Return how many of the first frames are the database of each frame (0: not a query), and the gap in words."""
         if self.gap is None:
-            last = f"{EXCLUDED_FRAMES} frames" if source.times is None else f"{EXCLUDED_S:g} s"
-            return database_end(len(source), times=source.times), f"last {last} excluded"
+            gap = f"{EXCLUDED_FRAMES} frames" if source.times is None else f"{EXCLUDED_S:g} s"
+            return database_end(len(source), times=source.times), f"last {gap} excluded"
         ends = np.maximum(np.arange(len(source)) - self.min_age + 1, 0)
         if not self.last_is_query:
             ends[-1] = 0
         return ends, f"gap {self.gap} frames"
+
+
+def _fill_frames(n: int, queries: Int[np.ndarray, " q"], values: np.ndarray, *, default: int | float) -> np.ndarray:
+    """Return an array of n frames with the value of each query, and the default for frames that are no queries."""
+    frames = np.full(n, default)
+    frames[queries] = values
+    return frames
 
 
 TOP1_F1MAX = Top1(
@@ -109,8 +117,8 @@ TOP1_F1MAX = Top1(
     published_on="SemanticKITTI's poses",
     dimensions=3,
     metres="3 m / 20 m",
-    right=lambda apart: apart <= 3,
-    wrong=lambda apart: apart > 20,
+    right=lambda metres: metres <= 3,
+    wrong=lambda metres: metres > 20,
     headline=True,
 )
 """The published code uses 1000 thresholds (Locus: 200)."""
@@ -123,13 +131,13 @@ SCAN_CONTEXT_F1MAX = Top1(
     published_on="Scan Context's own pose files",
     dimensions=2,
     metres="5 m",
-    right=lambda apart: apart < 5,
+    right=lambda metres: metres < 5,
     gap=50,
     min_age=49,
     last_is_query=False,
 )
-"""The gap of the published code (gisbi-kim/scancontext) includes the query, and the oldest of its frames is in the
-database. That code compares 50 candidates chosen by ring key, at 100 thresholds; here all frames are compared."""
+"""The gap in the published code (gisbi-kim/scancontext) includes the query, and the oldest frame of the gap is in the
+database. That code compares 50 candidates, chosen by ring key, at 100 thresholds. Here all frames are compared."""
 
 CONTOUR_CONTEXT_F1MAX = Top1(
     name="contour-context-f1max",
@@ -139,12 +147,12 @@ CONTOUR_CONTEXT_F1MAX = Top1(
     published_on="Contour Context's own sensor poses",
     dimensions=3,
     metres="5 m",
-    right=lambda apart: apart < 5,
+    right=lambda metres: metres < 5,
     gap=150,
     min_age=151,
 )
 """The published code (lewisjiang/contour-context) applies the gap only to false negatives and expects the method to
-answer with older frames. Its numbers are of KITTI 08."""
+answer with older frames. The published scores are of KITTI 08."""
 
 OVERLAP_TRANSFORMER_F1MAX = Top1(
     name="overlap-transformer-f1max",
@@ -154,7 +162,7 @@ OVERLAP_TRANSFORMER_F1MAX = Top1(
     published_on="overlaps, from KITTI 00's poses",
     dimensions=2,
     metres="15 m in place of overlaps",
-    right=lambda apart: apart < 15,
+    right=lambda metres: metres < 15,
     gap=100,
     min_age=101,
     last_is_query=False,
@@ -162,5 +170,5 @@ OVERLAP_TRANSFORMER_F1MAX = Top1(
     numbers=(1, 5, 10, 20),
     one_percent=True,
 )
-"""The published code uses overlaps of range images and 10,000 thresholds up to a squared distance of 1. The 15 m in
-place of the overlaps are those of CVTNet, by the same authors, so the score is not the published one."""
+"""The published code uses overlaps of range images and 10,000 thresholds up to a squared distance of 1. Here an answer
+within 15 m is right, as in CVTNet by the same authors. The score therefore differs from the published one."""
