@@ -85,7 +85,7 @@ def mirrored(*parts: Primitive) -> ObjectModel:
 
 
 def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep: float = 1.0) -> list[Spot]:
-    """Keeps the fraction `keep` of the spots at random, shifts them by about `metres`, and turns them by up to 3 deg."""
+    """Keeps a random fraction `keep` of the spots, shifts them by about `metres`, and turns them by up to 3 degrees."""
     spots = [spot for spot in spots if rng.random() < keep]
     moves = rng.normal(scale=metres, size=(len(spots), 2)).tolist()
     turns = np.radians(rng.uniform(-3, 3, len(spots))).tolist()
