@@ -57,7 +57,7 @@ def _floor(
     height: float,
     occupancy: float,
 ) -> list[Spot]:
-    """Cars in stalls of width `stall`, and pillars, along aisles along x. The fraction `occupancy` of stalls is full."""
+    """Cars in stalls of width `stall`, and pillars, along aisles along x. A fraction `occupancy` of stalls is full."""
     xs, pillar = np.arange(TURN_M, run_m - TURN_M, stall), (block(BUILDING, 0.4, 0.6, height),)
     cars = jittered(rng, on_both_sides(xs, aisle_ys, CAR_M, lambda: car(rng), np.pi / 2), 0.12, keep=occupancy)
     pillar_ys = np.concatenate([aisle_ys - PILLAR_M, aisle_ys + PILLAR_M])
