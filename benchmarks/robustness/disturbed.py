@@ -180,20 +180,17 @@ class Trial:
             time.sleep(1e-3)
 
     def count_differing(self, undisturbed: dict[str, bytes], what: str, *, complete: bool = False) -> int:
-        """Name and count files that differ from an undisturbed run, without those that vary.
+        """Prints and counts the files that differ from an undisturbed run, except those in `Writer.varies`.
 
         With `complete`, missing files count too.
         """
         files = self.files()
-        differing = [
-            name
-            for name in ({**files, **undisturbed} if complete else files)
-            if files.get(name) != undisturbed.get(name)
-        ]
-        named = [name for name in differing if not any(fnmatch.fnmatch(name, one) for one in self.writer.varies)]
-        for name in named:
+        names = {**files, **undisturbed} if complete else files
+        differing = [name for name in names if files.get(name) != undisturbed.get(name)]
+        wrong = [name for name in differing if not any(fnmatch.fnmatch(name, one) for one in self.writer.varies)]
+        for name in wrong:
             print(f"{self.name}: {name} {what}", file=sys.stderr)
-        return len(named)
+        return len(wrong)
 
 
 def _sizes(folder: Path) -> list[tuple[str, int]]:
