@@ -65,14 +65,14 @@ PROGRAMS = {
 }
 
 
-def name_of(words: list[str]) -> str | None:
-    """The program that the first words name."""
+def program_name(words: list[str]) -> str | None:
+    """Name in `PROGRAMS` that is the first two words or the first word of a command line, or None."""
     return next((name for name in (" ".join(words[:2]), *words[:1]) if name in PROGRAMS), None)
 
 
 def main(words: list[str]) -> None:
-    """Run a program with its flags."""
-    name = name_of(words)
+    """Runs the program that a command line names, with its flags. Without a name, lists all programs."""
+    name = program_name(words)
     if name is not None:
         flags = words[len(name.split()) :]
         tyro.cli(PROGRAMS[name].load(), args=flags, prog=f"python -m benchmarks {name}")

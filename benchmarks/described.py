@@ -1,9 +1,9 @@
-"""Described drives in files: what the loop detector keeps of each scan, so that a search need not render them again.
+"""Files of simulated drives with the descriptor and image of each scan, so that benchmarks render each drive once.
 
 Each file has these arrays of n scans:
 
     descriptors (n, 256) float32, images (n, h, w) uint8, world_from_lidar (n, 4, 4) in metres, times (n,) in seconds
-    scale: factor for the lengths of the images; and facts of the drive, such as its world and seed
+    scale: factor for all lengths in the images; and properties of the drive as texts, such as its world and seed
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from benchmarks.drives import Odometry, odometry_of, recording_of, revisited
+from benchmarks.drives import Odometry, is_revisit, odometry_of, recording_of
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
@@ -27,7 +27,7 @@ from sglpr_jax.se3 import travelled
 from sglpr_jax.sim.recording import SimulatedRecording
 
 REPEATING_M, WAY_M = 3.0, 30.0
-"""Where places repeat, a revisit is within the first distance after this length of path, in metres."""
+"""In repeating sceneries, a revisit is within the first distance of a scan at least the second length before (m)."""
 
 
 class DescribedDrive(NamedTuple):
@@ -39,33 +39,33 @@ class DescribedDrive(NamedTuple):
     """Poses, with lengths multiplied by `scale`."""
     times: Float[np.ndarray, " n"]
     facts: dict[str, str]
-    """World, route, seed, sensor and carrier, or others."""
+    """Properties of the drive by name, such as world, route, seed, sensor and carrier."""
     scale: int
 
     def odometry(self, kind: Odometry, seed: int) -> Float[np.ndarray, "n 4 4"] | None:
-        """The true poses, the same with drift, or None."""
+        """True poses if `kind` is "exact", true poses with drift if it is "drifting", or None. Lengths are scaled."""
         odometry = odometry_of(kind, scaled_poses(self.world_from_lidar, 1 / self.scale), seed=seed)
         return None if odometry is None else scaled_poses(odometry, self.scale)
 
     @property
     def revisits(self) -> Bool[np.ndarray, " n"]:
-        """Which scans come within 3 m of one from which at least 30 m were travelled."""
+        """Whether each scan is within 3 m of an earlier scan, at least 30 m of path before."""
         poses, scale = self.world_from_lidar, self.scale
-        return revisited(poses[:, :3, 3], travelled(poses), near_m=REPEATING_M * scale, apart=WAY_M * scale)
+        return is_revisit(poses[:, :3, 3], travelled(poses), near_m=REPEATING_M * scale, min_progress=WAY_M * scale)
 
     @property
     def recording(self) -> Recording:
-        """The recording of the images."""
-        return recording_of(self.path.stem, [Scan(image=one.image) for one in self.keyframes], self.times)
+        """Recording whose scans are the stored images."""
+        return recording_of(self.path.stem, [Scan(image=keyframe.image) for keyframe in self.keyframes], self.times)
 
 
 def store(path: Path, drive: SimulatedRecording, params: Params, *, scale: Scale = 1, **facts: Any) -> None:
-    """Render and describe a drive, and write its file."""
+    """Renders and describes a drive, and writes its file."""
     recording = scaled(drive, scale)
     keyframes = [describe_scan(params, recording.scan(i, labels=False)) for i in range(len(recording))]
     arrays = {
-        "descriptors": np.stack([one.descriptor for one in keyframes]),
-        "images": np.stack([one.image for one in keyframes]),
+        "descriptors": np.stack([keyframe.descriptor for keyframe in keyframes]),
+        "images": np.stack([keyframe.image for keyframe in keyframes]),
         "world_from_lidar": drive.poses.world_from_lidar,
         "times": drive.poses.times,
     }
@@ -74,21 +74,20 @@ def store(path: Path, drive: SimulatedRecording, params: Params, *, scale: Scale
 
 
 def read(path: Path) -> DescribedDrive:
-    """Read a drive."""
+    """Reads a file that `store` has written."""
     with np.load(path) as file:
         scale, facts = int(file["scale"]), {name: str(file[name]) for name in file.files if not file[name].ndim}
-        keyframes = [Keyframe(*pair, None) for pair in zip(file["descriptors"], file["images"], strict=True)]
+        keyframes = [Keyframe(*arrays, None) for arrays in zip(file["descriptors"], file["images"], strict=True)]
         poses = scaled_poses(file["world_from_lidar"], scale)
         return DescribedDrive(path, keyframes, poses, file["times"], facts, scale)
 
 
 def read_all(folder: Path, worlds: Sequence[str] = (), sensors: Sequence[str] = ()) -> Iterator[DescribedDrive]:
-    """The drives of a folder through some worlds and by some sensors, or through and by all if none is named."""
+    """Yields the drives of a folder whose world is in `worlds` and whose sensor is in `sensors`. Empty means any."""
     for path in sorted(folder.glob("*.npz")):
         drive = read(path)
-        if drive.facts["world"] in (worlds or [drive.facts["world"]]) and drive.facts["sensor"] in (
-            sensors or [drive.facts["sensor"]]
-        ):
+        is_wanted_world = not worlds or drive.facts["world"] in worlds
+        if is_wanted_world and (not sensors or drive.facts["sensor"] in sensors):
             yield drive
 
 
@@ -99,8 +98,10 @@ def replay(
     *,
     breaks: bool = False,
 ) -> Iterator[list[Any]]:
-    """Add the scans of a drive to a search, and yield what it returns. With `breaks`, the motion is unknown in the
-    middle."""
+    """Adds the scans of a drive to a search, one by one, and yields the results of `add_keyframe`.
+
+    With `breaks`, the motion to the scan in the middle of the drive is unknown.
+    """
     for i, keyframe in enumerate(drive.keyframes):
         pose = None if odometry is None else odometry[i]
         continues = not (breaks and i == len(drive.keyframes) // 2)

@@ -31,9 +31,9 @@ LIDARS = {
     "os0-32-140": dataclasses.replace(SENSORS["os0-32"], azimuths_deg=(-70.0, 70.0)),
 }
 OTHER_M = 20.0
-"""In towns, frames farther apart than this show different places."""
+"""Distance above which two frames of a town show different places, in metres."""
 STEPS = {"hdl64e": 900, "hdl32e": 1080}
-"""Default firings per turn, of other sensors all."""
+"""Default firings per turn. The default of other sensors is the sensor's own number."""
 CARS = (("hdl64e", "vehicle"), ("vlp16", "vehicle"))
 WALKERS = (("os0-32", "backpack"), ("os0-32-140", "handheld"))
 MOUNTED = {
@@ -49,9 +49,9 @@ class Drive(NamedTuple):
     """A simulated drive."""
 
     world: str
-    """Scenery of a town, or scenery that repeats."""
+    """Name of a scenery: of a town (`SCENERIES`), or where places repeat (`REPEATING`)."""
     route: str
-    """Route of a town, or its kind of revisits: "none", "same" or "opposite". Sceneries that repeat have only these."""
+    """Kind of revisits: "none", "same" or "opposite". Towns also accept a route, such as "08"."""
     seed: int
     sensor: str
     carrier: str
@@ -63,7 +63,7 @@ class Drive(NamedTuple):
 
     @property
     def other_m(self) -> float:
-        """Frames farther apart than this show different places, in metres."""
+        """Distance above which two frames show different places, in metres."""
         return OTHER_M if self.world in SCENERIES else REPEATING[self.world].other_m
 
 
@@ -72,7 +72,7 @@ class Drives:
     """Drives of a benchmark: each world with each route, seed, sensor and carrier."""
 
     drives: tuple[str, ...] = ()
-    """WORLD:ROUTE:SEED, in place of the next three."""
+    """WORLD:ROUTE:SEED, instead of `world`, `route` and `seed`."""
     world: tuple[str, ...] = (*REPEATING, *SCENERIES)
     """Sceneries that repeat, and sceneries of towns."""
     route: tuple[str, ...] = REVISITS
@@ -89,16 +89,18 @@ class Drives:
     """Scans per second. None: the rate of the carrier or of the scenery."""
 
     def __iter__(self) -> Iterator[Drive]:
-        """All drives."""
-        named = [text.split(":") for text in self.drives]
-        for world, route, seed in named or (
-            (w, r, s) for s, r, w in itertools.product(self.seed, self.route, self.world)
-        ):
-            mounted = tuple(itertools.product(self.sensor, self.carrier)) or MOUNTED.get(world, CARS)
-            yield from (Drive(world, route, int(seed), *each) for each in mounted)
+        """Yields all drives: world, route and seed, each with all sensors and carriers."""
+        combinations = [text.split(":") for text in self.drives]
+        if not combinations:
+            product = itertools.product(self.seed, self.route, self.world)
+            combinations = [[world, route, seed] for seed, route, world in product]
+        for world, route, seed in combinations:
+            sensors_and_carriers = tuple(itertools.product(self.sensor, self.carrier)) or MOUNTED.get(world, CARS)
+            for sensor, carrier in sensors_and_carriers:
+                yield Drive(world, route, int(seed), sensor, carrier)
 
     def simulate(self, drive: Drive, *, scans: int | None = None) -> SimulatedRecording:
-        """The recording of a drive."""
+        """Returns the recording of a drive, with `scans` scans if given."""
         steps = STEPS.get(drive.sensor) if self.azimuth_steps is None else self.azimuth_steps
         options: dict[str, Any] = {
             "scans": scans or self.scans,
@@ -125,7 +127,10 @@ WALKS = Drives(
 
 
 def lidar(name: str, azimuth_steps: int | None) -> Sensor:
-    """A sensor with at most this number of firings a turn, if it turns. Raises ValueError for an unknown one."""
+    """Sensor of this name from `LIDARS`. A rotating sensor has at most `azimuth_steps` firings per turn.
+
+    Raises ValueError if the name is unknown.
+    """
     if name not in LIDARS:
         raise ValueError(f"expected a sensor among {', '.join(LIDARS)}, found {name!r}")
     sensor = LIDARS[name]
@@ -135,14 +140,14 @@ def lidar(name: str, azimuth_steps: int | None) -> Sensor:
 
 
 def in_memory(recording: SimulatedRecording, frames: Sequence[int] | np.ndarray | None = None) -> Recording:
-    """The recording, with all scans or those of some frames rendered once."""
+    """Renders the scans of `frames`, by default of all, and returns the recording with only these scans, unlabelled."""
     frames = range(len(recording)) if frames is None else frames
-    rendered = {recording.paths[i]: recording.points(int(i)) for i in frames}
-    return dataclasses.replace(recording, read=lambda path, labels, lasers: Scan(points=rendered[path]))
+    points = {recording.paths[i]: recording.points(int(i)) for i in frames}
+    return dataclasses.replace(recording, read=lambda path, labels, lasers: Scan(points=points[path]))
 
 
 def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
-    """The recording, with scans from a folder in KITTI's format. The folder is written unless it exists."""
+    """Returns the recording with scans from a folder in KITTI's format, unlabelled. Writes a missing folder first."""
     if not folder.exists():
         with replacing(folder) as temporary:
             temporary.mkdir(parents=True)
@@ -156,7 +161,7 @@ def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
 
 
 def recording_of(name: str, scans: Sequence[Scan], times: Float[np.ndarray, " n"] | None = None) -> Recording:
-    """A recording of scans or images in memory."""
+    """Returns a recording of scans or images in memory."""
     paths = tuple(Path(f"{i:06d}") for i in range(len(scans)))
     scan_of = dict(zip(paths, scans, strict=True))
     return Recording(
@@ -170,36 +175,40 @@ def recording_of(name: str, scans: Sequence[Scan], times: Float[np.ndarray, " n"
 
 
 def odometry_of(kind: Odometry, poses: Float[np.ndarray, "n 4 4"], *, seed: int) -> Float[np.ndarray, "n 4 4"] | None:
-    """The true poses, the same with drift (`drifted`), or None."""
+    """Odometry from true poses: None, the same poses ("exact"), or poses with drift ("drifting", see `drifted`)."""
     if kind == "none":
         return None
     return poses if kind == "exact" else drifted(poses, seed=seed)
 
 
 def drifted(poses: Float[np.ndarray, "n 4 4"], *, seed: int, turn_deg: float = 0.5) -> Float[np.ndarray, "n 4 4"]:
-    """Odometry of a drive: 1 % too long or short, turned by `turn_deg` every 100 m, both with as much noise again."""
+    """Odometry of a drive: 1 % too long or short, and rotated by `turn_deg` every 100 m, both with noise.
+
+    The noise has a standard deviation of 1 % of each step, and of `turn_deg` over 100 m.
+    """
     rng = np.random.default_rng(seed)
     steps = inverse(poses[:-1]) @ poses[1:]
     metres = np.linalg.norm(steps[:, :3, 3], axis=1)
-    length = 1 + 0.01 * (rng.choice([-1, 1]) + rng.normal(size=len(steps)))
-    turn = np.radians(turn_deg) * (
-        rng.choice([-1, 1]) * metres / 100 + rng.normal(size=len(steps)) * np.sqrt(metres / 100)
-    )
+    scales = 1 + 0.01 * (rng.choice([-1, 1]) + rng.normal(size=len(steps)))
+    bias = rng.choice([-1, 1]) * metres / 100
+    angles = np.radians(turn_deg) * (bias + rng.normal(size=len(steps)) * np.sqrt(metres / 100))
     odometry = [np.eye(4)]
-    for step, scale, angle in zip(steps, length, turn, strict=True):
+    for step, scale, angle in zip(steps, scales, angles, strict=True):
         step = step.copy()
         step[:3, 3] *= scale
         odometry.append(odometry[-1] @ step @ transform(0.0, 0.0, angle))
     return np.stack(odometry)
 
 
-def revisited(
-    positions: Float[np.ndarray, "n 3"], progress: Float[np.ndarray, " n"], *, near_m: float, apart: float
+def is_revisit(
+    positions: Float[np.ndarray, "n 3"], progress: Float[np.ndarray, " n"], *, near_m: float, min_progress: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which scans come within `near_m` of an earlier one. Their progress, a time or travelled distance, differs by at
-    least `apart`."""
-    is_revisit = np.zeros(len(positions), bool)
+    """Whether each scan is within `near_m` of an earlier scan whose progress is at least `min_progress` less.
+
+    The progress is a time, frame number or travelled distance.
+    """
+    revisits = np.zeros(len(positions), bool)
     for i, position in enumerate(positions):
-        old = positions[progress <= progress[i] - apart]
-        is_revisit[i] = len(old) > 0 and np.linalg.norm(old - position, axis=1).min() < near_m
-    return is_revisit
+        earlier = positions[progress <= progress[i] - min_progress]
+        revisits[i] = len(earlier) > 0 and np.linalg.norm(earlier - position, axis=1).min() < near_m
+    return revisits

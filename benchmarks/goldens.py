@@ -103,7 +103,7 @@ def _run(line: str, folder: Path) -> None:
 
 
 def differences(before: Path, after: Path, *, within: float) -> list[str]:
-    """What differs between two folders, one line for a file."""
+    """One line for each file that differs between two folders, or exists in only one of them."""
     names = [set(map(str, _compared(folder))) for folder in (before, after)]
     lines = [f"{name}: in one folder only" for name in sorted(names[0] ^ names[1])]
     for name in sorted(names[0] & names[1]):
@@ -120,7 +120,10 @@ def _compared(folder: Path) -> Iterator[Path]:
 
 
 def same(first: Path, second: Path, *, within: float) -> bool:
-    """Whether two files are equal or, if `within` is not 0, have numbers that nearly are."""
+    """Whether two files are equal or, if `within` is not 0, differ only in numbers and by at most `within`.
+
+    Pages and pictures are not compared.
+    """
     if first.suffix in (".html", ".png") or first.read_bytes() == second.read_bytes():
         return True
     if first.suffix not in (*TEXT, ".npz", ".safetensors"):
@@ -130,7 +133,7 @@ def same(first: Path, second: Path, *, within: float) -> bool:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of a file; of a text its numbers and the text between them."""
+    """Arrays of a file. A text becomes the array of its numbers and the text without them."""
     if path.suffix == ".safetensors":
         return safetensors.numpy.load_file(path)
     if path.suffix == ".npz":

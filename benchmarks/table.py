@@ -4,12 +4,12 @@ from typing import Any
 
 
 class Table:
-    """Prints its columns, and then each row as soon as it is added."""
+    """Markdown table that prints its header first, and each row when it is added."""
 
     def __init__(self, *columns: str):
         self.add(*columns)
         print("|" + "---|" * len(columns))
 
     def add(self, *cells: Any) -> None:
-        """Print a row."""
+        """Prints a row."""
         print(f"| {' | '.join(map(str, cells))} |", flush=True)

@@ -1,7 +1,7 @@
-"""Timing of jobs against each other on a machine that is never quiet.
+"""Timing of jobs against each other on a machine that also runs other programs.
 
-Jobs run in turn, in the opposite order at every other repeat. Ratios are formed within each repeat, so that load from
-outside meets all jobs alike. Reported are the median of those ratios and their spread.
+Jobs run in turn, in the opposite order at every other repeat, so that other programs slow all jobs equally. Reports
+give the median and the spread of the ratios within each repeat.
 """
 
 import importlib.metadata
@@ -23,14 +23,14 @@ from jaxtyping import Float
 from benchmarks.table import Table
 
 Job = Callable[[], Any]
-SPREAD = (0.1, 0.9)
+SPREAD = (0.1, 0.9)  # quantiles that bound the reported spread
 BUSY_ALLOWANCE = 0.5
-"""Load average beyond the CPUs that does not matter yet."""
+"""Load average beyond the number of CPUs that causes no warning."""
 _SPAWN = multiprocessing.get_context("spawn")
 
 
 def clocked(job: Job) -> Callable[[], float]:
-    """A job that returns its seconds."""
+    """Returns a function that runs a job and returns its seconds."""
 
     def run() -> float:
         start = time.perf_counter()
@@ -41,9 +41,9 @@ def clocked(job: Job) -> Callable[[], float]:
 
 
 def in_turn(jobs: Sequence[Callable[[], float]], *, repeats: int) -> Float[np.ndarray, "repeats jobs"]:
-    """Seconds of jobs that return them. A first run of each, which compiles, does not count."""
+    """Runs jobs that return their seconds, in alternating order, and returns these seconds."""
     for job in jobs:
-        job()
+        job()  # compiles
     seconds = np.zeros((repeats, len(jobs)))
     for repeat in range(repeats):
         for i in range(len(jobs))[:: -1 if repeat % 2 else 1]:
@@ -52,14 +52,14 @@ def in_turn(jobs: Sequence[Callable[[], float]], *, repeats: int) -> Float[np.nd
 
 
 def median_seconds(job: Job, *, repeats: int) -> float:
-    """Median seconds of one job."""
+    """Median duration of a job, in seconds."""
     return float(np.median(in_turn([clocked(job)], repeats=repeats)))
 
 
 def run_command(
     command: Sequence[str | Path], environment: Mapping[str, str] = os.environ, folder: Path | str | None = None
 ) -> tuple[float, float]:
-    """Run a command in a folder. Returns its seconds and processor seconds, or raises SystemExit if it fails."""
+    """Runs a command in a folder. Returns its seconds and processor seconds. Raises SystemExit if it fails."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     ended = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder)
     seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -69,10 +69,9 @@ def run_command(
 
 
 class Contender:
-    """A job in a process of its own. A call runs it once and returns its seconds.
+    """Job in a separate process. A call runs the job once and returns its seconds.
 
-    `make_job(*arguments)` is called in that process. A framework that it imports or uses first there gets `threads`
-    threads.
+    The process calls `make_job(*arguments)`. Frameworks that this function imports use `threads` threads.
     """
 
     def __init__(self, name: str, make_job: Callable[..., Job], *arguments: Any, threads: int):
@@ -83,14 +82,14 @@ class Contender:
         far_end.close()
 
     def run(self) -> tuple[Any, float]:
-        """What the job returns, and its seconds. Raises SystemExit if the process has ended."""
+        """Runs the job and returns its result and its seconds. Raises SystemExit if the process has ended."""
         return self._ask("run")
 
     def __call__(self) -> float:
         return self.run()[1]
 
     def forget_peak(self) -> None:
-        """Let `usage` begin anew: compiling needs memory, too."""
+        """Resets `usage`, so that the memory and time of compilation do not count."""
         self._ask("forget peak")
 
     def usage(self) -> tuple[float, float]:
@@ -106,7 +105,8 @@ class Contender:
 
 
 def _serve(pipe, threads: int, make_job: Callable[..., Job], arguments: tuple) -> None:
-    os.environ["NPROC"] = os.environ["OMP_NUM_THREADS"] = str(threads)  # XLA's and PyTorch's
+    """Answers the questions of a `Contender` in its process: "run", "forget peak" and "usage"."""
+    os.environ["NPROC"] = os.environ["OMP_NUM_THREADS"] = str(threads)  # for XLA and for PyTorch
     job, processor_s = make_job(*arguments), []
     while True:
         try:
@@ -114,30 +114,30 @@ def _serve(pipe, threads: int, make_job: Callable[..., Job], arguments: tuple) -
         except EOFError:
             return
         if question == "run":
-            start, used = time.perf_counter(), time.process_time()
-            value = job()
-            pipe.send((value, time.perf_counter() - start))
-            processor_s.append(time.process_time() - used)
+            start, processor_start = time.perf_counter(), time.process_time()
+            result = job()
+            pipe.send((result, time.perf_counter() - start))
+            processor_s.append(time.process_time() - processor_start)
         elif question == "forget peak":
             processor_s.clear()
-            pipe.send(Path("/proc/self/clear_refs").write_text("5"))  # of all that it can clear: VmHWM
+            pipe.send(Path("/proc/self/clear_refs").write_text("5"))  # 5 resets the peak VmHWM
         else:
             pipe.send((float(np.median(processor_s)), peak_mb()))
 
 
 def peak_mb() -> float:
-    """The most memory that this process has held, in 10^6 bytes."""
+    """Peak of the resident memory of this process, in 10^6 bytes."""
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return int(status["VmHWM"].split()[0]) * 1024 / 1e6
 
 
 def resident_mb(process: int | str = "self") -> float:
-    """Memory that a process holds, in 10^6 bytes."""
+    """Resident memory of a process, in 10^6 bytes."""
     return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def warn_if_busy(threads: int) -> None:
-    """Print a warning if other programs leave too few CPUs for `threads`."""
+    """Prints a warning if other programs leave too few CPUs for `threads`."""
     busy, cpus = os.getloadavg()[0], os.cpu_count() or 1
     if busy + threads > cpus + BUSY_ALLOWANCE:
         print(
@@ -147,7 +147,7 @@ def warn_if_busy(threads: int) -> None:
 
 
 def check_equal(name: str, ours: np.ndarray, theirs: np.ndarray, *, tolerance: float) -> None:
-    """Print the largest difference; raises SystemExit if it is above `tolerance` times the largest value."""
+    """Prints the largest difference. Raises SystemExit if it is above `tolerance` times the maximum of `theirs`."""
     difference, scale = np.abs(np.subtract(ours, theirs)).max(), np.abs(theirs).max()
     print(f"{name}: largest difference {difference:.2g}, largest value {scale:.3g}")
     if not difference <= tolerance * scale:
@@ -162,11 +162,11 @@ def report(
     packages: Sequence[str],
     threads: int,
 ) -> None:
-    """Print names and seconds of two contenders, the ratios, and what is needed to repeat them."""
-    (name, seconds), (against, others) = ours, other
-    low, middle, high = np.quantile(seconds / others, (SPREAD[0], 0.5, SPREAD[1]))
-    table = Table("", f"{against}, ms", f"{name}, ms", f"{name} / {against}", "spread")
-    milliseconds = (f"{1e3 * np.median(each):.4g}" for each in (others, seconds))
+    """Prints seconds and ratios of two contenders, given as name and seconds, and the command and versions."""
+    (name, seconds), (other_name, other_seconds) = ours, other
+    low, middle, high = np.quantile(seconds / other_seconds, (SPREAD[0], 0.5, SPREAD[1]))
+    table = Table("", f"{other_name}, ms", f"{name}, ms", f"{name} / {other_name}", "spread")
+    milliseconds = (f"{1e3 * np.median(of_one):.4g}" for of_one in (other_seconds, seconds))
     table.add(title, *milliseconds, f"{middle:.3f}", f"{low:.3f} to {high:.3f}")
     print(f"Medians of {len(seconds)} repeats. Below 1 {name} is faster. Spread: the 10 % and 90 % quantiles.")
     print(f"{threads} threads each; GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")
@@ -174,7 +174,7 @@ def report(
 
 
 def about(*packages: str) -> dict[str, str]:
-    """What is needed to repeat a measurement."""
+    """Command, versions of Python and `packages`, and machine of a measurement."""
     versions = [f"{name} {importlib.metadata.version(name)}" for name in packages]
     load = ", ".join(f"{average:.1f}" for average in os.getloadavg())
     return {

@@ -147,14 +147,14 @@ def _exact(drives: Drives, places: int, n: int) -> list[Asked]:
     rng, first = np.random.default_rng(10**6), next(_blocks(drives, places))
     rows = rng.permutation(len(first) // 2)[:n]
     queries = drives.near(np.concatenate([first[rows], first[len(first) // 2 :][rows]]), rng, spread=0.5)
-    apart, names = np.full((2 * n, 10), np.inf), np.zeros((2 * n, 10), int)
+    distance, names = np.full((2 * n, 10), np.inf), np.zeros((2 * n, 10), int)  # squared distances
     for number, block in enumerate(_blocks(drives, places)):
-        found = 2 - 2 * queries @ block.T
-        near = np.argpartition(found, 10, axis=1)[:, :10]
-        apart = np.hstack([apart, np.square(queries[:, None] - block[near], dtype=float).sum(axis=2)])
-        names = np.hstack([names, number * BLOCK + near])
-        order = np.argsort(apart, axis=1)[:, :10]
-        apart, names = (np.take_along_axis(each, order, axis=1) for each in (apart, names))
+        rough_distance = 2 - 2 * queries @ block.T
+        nearest = np.argpartition(rough_distance, 10, axis=1)[:, :10]
+        distance = np.hstack([distance, np.square(queries[:, None] - block[nearest], dtype=float).sum(axis=2)])
+        names = np.hstack([names, number * BLOCK + nearest])
+        order = np.argsort(distance, axis=1)[:, :10]
+        distance, names = (np.take_along_axis(table, order, axis=1) for table in (distance, names))
     answers = [[f"{name // BLOCK:06d}/{name % BLOCK:06d}" for name in row] for row in names.tolist()]
     return [Asked("random", queries[:n], answers[:n]), Asked("drives", queries[n:], answers[n:])]
 

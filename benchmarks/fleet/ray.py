@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 BLOCK, NEAREST = 256, 10
 """Scans that are searched at a time, and places that are found for each."""
 MAX_DISTANCE, MIN_SCANS = 0.8, 5
-"""Recordings may overlap if so many scans of one have a place of the other within this distance of descriptors."""
+"""Recordings may overlap if MIN_SCANS scans of one have a descriptor of the other within MAX_DISTANCE."""
 
 
 def embed(
@@ -154,8 +154,8 @@ def overlaps(index: FleetIndex, rows: "pyarrow.Table", where: str) -> set[tuple[
         near = found["distance"].to_numpy() <= MAX_DISTANCE
         queries, others = found["query"].to_numpy()[near] + start, found["recording"].to_numpy()[near]
         pairs |= set(zip(queries.tolist(), others.tolist(), strict=True))
-    counted = Counter(other for _, other in pairs)
-    return {(min(own, other), max(own, other)) for other, scans in counted.items() if scans >= MIN_SCANS}
+    scan_counts = Counter(other for _, other in pairs)
+    return {(min(own, other), max(own, other)) for other, scans in scan_counts.items() if scans >= MIN_SCANS}
 
 
 class PairSearch:

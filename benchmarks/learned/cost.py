@@ -52,9 +52,9 @@ def cost(
 
     recording_scans, costs = [recording.scan(row) for row in range(scans + 1)], {}
     rows = [iter(range(scans + 1)) for _ in methods]
-    jobs = [
-        clocked(lambda method=method, left=left: describe_row(method, next(left)))
-        for method, left in zip(methods, rows, strict=True)
+    jobs = [  # each run describes the next scan
+        clocked(lambda method=method, next_rows=next_rows: describe_row(method, next(next_rows)))
+        for method, next_rows in zip(methods, rows, strict=True)
     ]
     seconds = np.median(in_turn(jobs, repeats=scans), axis=0).tolist()
     for contender, method, taken in zip(contenders, methods, seconds, strict=True):

@@ -34,7 +34,7 @@ Labels = Callable[[Scan], Int[np.ndarray, " n"]]
 
 
 class Dataset(NamedTuple):
-    """A folder of recordings, and what makes it."""
+    """Folder of recordings, and the options of `simulate` that write it."""
 
     part: str
     name: str
@@ -126,7 +126,7 @@ def labels(
 
 
 def _relabel(folder: Path, out: Path, labels: Labels) -> None:
-    """Link a dataset, with labels of its own."""
+    """Writes a copy of a dataset with labels from `labels`. All other files are links."""
     out.mkdir(parents=True, exist_ok=True)
     _link(folder / "simulation.json", out / "simulation.json")
     for name in recording_names(folder):

@@ -1,6 +1,6 @@
-"""Contenders of the comparison, and their scores on recordings that none of them was trained on.
+"""Contenders of the comparison of learned methods, and their scores on recordings that were not used for training.
 
-A contender is called by a handcrafted method (`scan-context`), shipped weights (`sglpr`), an untrained network
+The name of a contender is a handcrafted method (`scan-context`), shipped weights (`sglpr`), an untrained network
 (`rinet@random:0`), or a folder of weights (`rinet-0`, `rinet-0/weights-4000`) in the folder of the runs.
 """
 
@@ -73,10 +73,12 @@ class Entry(NamedTuple):
 def entry(name: str, runs: Path) -> Entry:
     """The contender called `name`. Raises FileNotFoundError if there is no method, weights or run of that name."""
     if name in HANDCRAFTED:
-        return Entry(
-            name, HANDCRAFTED[name].takes, lambda recording: handcrafted(name, None if recording.has_images else GRID)
-        )
-    method, _, weights = name.rpartition("@")
+
+        def make_method(recording: Recording) -> Method:
+            return handcrafted(name, None if recording.has_images else GRID)
+
+        return Entry(name, HANDCRAFTED[name].takes, make_method)
+    method, _, weights = name.rpartition("@")  # METHOD@random:SEED is untrained
     if name in sglpr_jax.shipped_weights():
         params = sglpr_jax.load(name)
         return Entry(name, "images", lambda recording: network(params), params)
@@ -89,17 +91,18 @@ def entry(name: str, runs: Path) -> Entry:
     folder = runs / name
     folder = folder / LAST if (folder / LAST / "config.json").is_file() else folder
     trained = method_with_weights(str(folder))
-    return Entry(name, content_of(str(folder)), lambda recording: trained, None, *_seen(folder))
+    images, seconds = _training_effort(folder)
+    return Entry(name, content_of(str(folder)), lambda recording: trained, images=images, seconds=seconds)
 
 
-def _seen(folder: Path) -> tuple[int, float]:
-    """The number of images and the training time of weights, from their file or the scores of the run."""
-    about = json.loads((folder / "config.json").read_text())
-    if "images" in about:
-        return about["images"], about["seconds"]
+def _training_effort(folder: Path) -> tuple[int, float]:
+    """Number of training images and training time (s) of weights, from their configuration or the run's scores."""
+    config = json.loads((folder / "config.json").read_text())
+    if "images" in config:
+        return config["images"], config["seconds"]
     lines = [json.loads(line) for line in (folder.parent / SCORES_FILE).read_text().splitlines()]
-    named = folder.name.removeprefix(f"{LAST}-")
-    line = next((one for one in lines if str(one["images"]) == named), lines[-1])
+    snapshot = folder.name.removeprefix(f"{LAST}-")  # number of images, or the last weights
+    line = next((line for line in lines if str(line["images"]) == snapshot), lines[-1])
     return line["images"], line["seconds"]
 
 
@@ -177,18 +180,18 @@ def _fits(contender: Entry, test: Test) -> bool:
 
 
 def _result(contender: Entry, test: Test, folder: Path, *, verify: bool) -> Mapping[str, Any]:
-    """Return the scores of a contender on a recording, computed unless they are known."""
+    """Returns the stored scores of a contender on a recording, or computes and stores them."""
     path = folder / f"{test.name}.json"
-    known = json.loads(path.read_text()) if path.is_file() else None
-    wanted = verify and test.database is None and not test.rotated
-    if known is not None and (not wanted or "verified top1" in known["scores"]):
-        return known
+    stored = json.loads(path.read_text()) if path.is_file() else None
+    verifies = verify and test.database is None and not test.rotated
+    if stored is not None and (not verifies or "verified top1" in stored["scores"]):
+        return stored
     file = _described(contender, test.recording, rotated=test.rotated)
     if test.database is not None:
         scores = {"recall": BEVPLACE_NCLT_RECALL(_described(contender, test.database), file).score}
     else:
         scores = _scores(file, split=test.name.startswith("kitti-") and test.name.split("-")[1] in SPLIT)
-    if wanted:
+    if verifies:
         images = _images(test.recording)
         scores |= {f"verified {name}": score for name, score in _scores(_verified(file, images)).items()}
     about = {"images": contender.images, "seconds": contender.seconds, "numbers": file.descriptors.shape[1]}
@@ -223,17 +226,23 @@ def _scores(source: Source, *, split: bool = False) -> dict[str, float]:
 
 
 def _recall(source: Source, answers: np.ndarray | None) -> float:
-    """Return the fraction of the revisits that are answered with a place within 5 m, in x and y; NaN without any."""
+    """Fraction of the revisits whose answer is within FOUND_M (5 m) in x and y, or NaN without revisits.
+
+    `answers` are frames, or -1 for no answer.
+    """
     assert source.positions is not None and answers is not None
-    places = source.positions[:, :2]
-    queries = np.flatnonzero(ends := database_end(len(places), times=source.times))
-    revisited = queries[has_near(places[queries], places, ends[queries], lambda apart: apart <= FOUND_M)]
-    apart = np.linalg.norm(places[revisited] - places[answers[revisited]], axis=1)
-    return math.nan if not len(revisited) else float(np.mean((apart <= FOUND_M) & (answers[revisited] >= 0)))
+    xy = source.positions[:, :2]
+    ends = database_end(len(xy), times=source.times)  # frame i is compared with the frames before ends[i]
+    queries = np.flatnonzero(ends)
+    revisits = queries[has_near(xy[queries], xy, ends[queries], lambda metres: metres <= FOUND_M)]
+    if not len(revisits):
+        return math.nan
+    distance = np.linalg.norm(xy[revisits] - xy[answers[revisits]], axis=1)
+    return float(np.mean((distance <= FOUND_M) & (answers[revisits] >= 0)))
 
 
 def _verified(file: DescriptorFile, images: Float32[np.ndarray, "n h w"]) -> TopK:
-    """Return the nearest places of each frame, ordered by the correlation of their images."""
+    """The CANDIDATES frames with the nearest descriptors of each frame, ordered by the correlation of their images."""
     ends = database_end(len(file), times=file.times)
     queries = np.flatnonzero(ends)
     nearest, _ = nearest_frames(file, queries, ends[queries], k=CANDIDATES)
@@ -252,7 +261,7 @@ def _verified(file: DescriptorFile, images: Float32[np.ndarray, "n h w"]) -> Top
 
 
 def _correlations(images: np.ndarray, query: int, nearest: np.ndarray) -> np.ndarray:
-    """Return the correlation of a frame with each of its nearest places; -1 where there is no further place."""
+    """Correlation of the image of `query` with those of the frames `nearest`, or -1 where `nearest` is negative."""
     peaks = search(query_spectra(images[query]), match_spectra(images[nearest]))
-    aligned = (refine(images[query], images[place], peaks.at(k)) for k, place in enumerate(nearest))
-    return np.where(nearest >= 0, [float(one.correlation) for one in aligned], -1.0)
+    alignments = (refine(images[query], images[frame], peaks.at(k)) for k, frame in enumerate(nearest))
+    return np.where(nearest >= 0, [float(alignment.correlation) for alignment in alignments], -1.0)

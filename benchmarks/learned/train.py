@@ -88,9 +88,9 @@ def stages(folder: Path) -> Iterator[Path]:
 
 
 class Clock(Callback):
-    """Training time of a run, added up over its stages, without scores and compilation.
+    """Training time of a run, summed over its stages, without scores and compilation.
 
-    The first lines after each start state no speed; their steps count with the mean speed.
+    Metrics after a start have no speed. Their steps are counted with the mean speed.
     """
 
     def __init__(self, folder: Path, *, limit_s: float):
@@ -108,18 +108,19 @@ class Clock(Callback):
         return self._timed_s * self._steps / max(self._timed, 1)
 
     @property
-    def over(self) -> bool:
-        """Whether the limit is reached."""
+    def is_over(self) -> bool:
+        """Whether the time limit is reached."""
         return self.seconds >= self._limit_s
 
     def on_start(self, step: int, steps: int) -> None:
         self._last = step
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        made, self._last = step - self._last, step
-        self._steps += made
+        new_steps, self._last = step - self._last, step
+        self._steps += new_steps
         if SPEED in values:
-            self._timed, self._timed_s = self._timed + made, self._timed_s + made / values[SPEED]
+            self._timed += new_steps
+            self._timed_s += new_steps / values[SPEED]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,13 +202,13 @@ def _train(
         before = 0 if upright else settings.upright_images
         staged = dataclasses.replace(config, steps=(images - before) // per_step, rotate=not upright)
         clock = Clock(folder, limit_s=settings.seconds)
-        if clock.over:
+        if clock.is_over:
             return
         options = {"resume": (run / "config.json").is_file(), "callback": clock}
         options["weights"] = folder / UPRIGHT / WEIGHTS if before else None
         stage = [one for one in recordings if not upright or one.name != OPPOSITE]
         with stop_on_signal() as stopped:
-            result = sglpr_jax.train(staged, stage, out=run, stopped=lambda: stopped() or clock.over, **options)  # noqa: B023
+            result = sglpr_jax.train(staged, stage, out=run, stopped=lambda: stopped() or clock.is_over, **options)  # noqa: B023
         seen = before + result.steps * per_step
         print(f"{run}: {seen} images, {clock.seconds:.0f} s", file=sys.stderr, flush=True)
         if stopped():

@@ -1,4 +1,4 @@
-"""Evidence that is missing where places repeat: how well the right place of each revisit fits, and a lookalike."""
+"""Comparison of the right place of each revisit with the best wrong place, in sceneries where places look alike."""
 
 from collections import Counter
 from pathlib import Path
@@ -26,18 +26,17 @@ VERIFICATION = VerificationConfig()
 
 
 class Revisit(NamedTuple):
-    """A scan that was compared with its right place: the best fit at the true pose, and the best at a wrong one."""
+    """Scan that was compared with its right place. A fit is the alignment of the scan with one place."""
 
     drive: DescribedDrive
     query: int
     fits: Fits
-    right: int
-    """Row of the fit."""
-    wrong: int | None
+    right: int  # row in `fits` of the best fit with the true pose
+    wrong: int | None  # row of the best fit with a wrong pose, or None
 
     @property
     def ratio(self) -> float:
-        """Correlation of the best wrong fit over that of the right one. 0 without a wrong fit."""
+        """Correlation of the best wrong fit, divided by that of the right fit. 0 without a wrong fit."""
         if self.wrong is None:
             return 0.0
         return float(self.fits.peaks.correlation[self.wrong] / self.fits.peaks.correlation[self.right])
@@ -54,7 +53,7 @@ class Revisit(NamedTuple):
         return np.asarray(within_reach(self.drive.keyframes[frame].image, VERIFICATION))
 
     def overlay(self, row: int) -> Float[np.ndarray, "n n 3"]:
-        """The scan over the place of a fit, at the pose of this fit."""
+        """Image of the scan over the place of the fit in this row, at the pose of the fit."""
         peak = self.fits.peaks.at(row)
         pose = transform(float(peak.x), float(peak.y), float(peak.yaw))
         return overlaid(self.image(self.query), self.image(int(self.fits.frames[row])), pose)
@@ -103,16 +102,16 @@ def evidence(
 
 
 def _compared_revisits(drive: DescribedDrive, params: sglpr_jax.Params) -> list[Revisit]:
-    """The revisits of a drive that were compared with their right place."""
+    """Revisits of a drive that were compared with their right place."""
     poses, revisits, search = drive.world_from_lidar, list[Revisit](), CandidateSearch(params)
-    way_m, is_revisit = travelled(poses), drive.revisits
+    travelled_m, is_revisit = travelled(poses), drive.revisits
     for query, _ in enumerate(replay(search, drive)):
         fits = search.fits
         peaks = zip(fits.peaks.x, fits.peaks.y, fits.peaks.yaw, strict=True)
-        fitted = np.array([transform(*map(float, peak)) for peak in peaks]).reshape(-1, 4, 4)
-        errors = pose_errors([(query, frame) for frame in fits.frames.tolist()], fitted, poses)
-        before = way_m[fits.frames] <= way_m[query] - WAY_M * drive.scale
-        right = _best(fits, errors.right & before)
+        fitted_poses = np.array([transform(*map(float, peak)) for peak in peaks]).reshape(-1, 4, 4)
+        errors = pose_errors([(query, frame) for frame in fits.frames.tolist()], fitted_poses, poses)
+        is_old = travelled_m[fits.frames] <= travelled_m[query] - WAY_M * drive.scale
+        right = _best(fits, errors.right & is_old)
         if is_revisit[query] and right is not None:
             revisits.append(Revisit(drive, query, fits, right, _best(fits, errors.wrong)))
     return revisits

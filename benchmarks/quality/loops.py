@@ -23,10 +23,10 @@ from benchmarks.quality.scoring import (
     Closure,
     Counts,
     closures_of,
-    counted,
+    count_loops,
+    describe_errors,
     pose_errors,
     rule_of,
-    told,
     town_rule,
 )
 from benchmarks.table import Table
@@ -52,7 +52,7 @@ from sglpr_jax.sim.recording import SimulatedRecording
 
 PEERS = Path(__file__).resolve().parent / "peers"
 KEPT, NO_LOOP = 1000.0, -100.0
-"""Log odds that a returned loop gets in addition, so that it is answered first, and those of pairs that are none."""
+"""Log odds that are added to returned loops, so that they have the highest scores, and log odds of missing pairs."""
 COLUMNS = ("scans", "loops", "right", "wrong", "recall", "wrong poses", "of these in the plane", "recall by poses")
 
 
@@ -73,14 +73,14 @@ class Task(NamedTuple):
         return self.drive.path.with_suffix("")
 
     def files(self) -> Path:
-        """The folder, with the scans in KITTI's format and their times."""
+        """Writes the scans in KITTI's format and their times unless they exist, and returns their folder."""
         on_disk(self.simulate(), self.folder)
         np.savetxt(self.folder / "times.txt", self.drive.times)
         return self.folder
 
 
 class Answer(NamedTuple):
-    """What a method returns."""
+    """Result of a method."""
 
     closures: list[Closure]
     trajectory: Float[np.ndarray, "n 4 4"] | None = None
@@ -88,41 +88,42 @@ class Answer(NamedTuple):
     """Loops of two scans with their poses, if the method has such loops."""
 
 
-def _by_detector(task: Task, detector: LoopDetector) -> Answer:
-    """All loops of the detector that the odometry does not contradict."""
+def _search_with(detector: LoopDetector, task: Task) -> Answer:
+    """All loops of the detector that are consistent with the odometry."""
     for _ in replay(detector, task.drive, task.odometry):
         pass
     loops, drift = detector.loops, detector.finder.present_drift
-    loops = loops if task.odometry is None else accept_loops(loops, detector.finder.motion.path, drift=drift)[0]
+    if task.odometry is not None:
+        loops = accept_loops(loops, detector.finder.motion.path, drift=drift)[0]
     return Answer(closures_of(loops), None, loops)
 
 
-class _StoredByScanContext(StoredScans):
-    """Stored scans whose nearest ones are those by Scan Context."""
+class _ScanContextStore(StoredScans):
+    """Stored scans whose nearest scans are found with Scan Context."""
 
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k scans that are nearest over all rotations, in order."""
-        allowed = np.flatnonzero(among)
-        apart = scan_context_distance(descriptor[None], self.index.descriptors[allowed])[0]
-        return allowed[np.argsort(apart, kind="stable")[:k]]
+        """Up to k scans among those with a true `among`, in the order of their distance over all rotations."""
+        rows = np.flatnonzero(among)
+        distance = scan_context_distance(descriptor[None], self.index.descriptors[rows])[0]
+        return rows[np.argsort(distance, kind="stable")[:k]]
 
 
-def _by_scan_context(task: Task) -> Answer:
-    """Scan Context chooses the candidates and nothing else: motion, comparison of images and decision are ours."""
+def _search_by_scan_context(task: Task) -> Answer:
+    """Scan Context chooses the candidates. The loop detector does the rest."""
     detector, recording = LoopDetector(task.params), task.simulate()
     index = Index.empty(NUMBERS, weights_hash=detector.finder.index.weights_hash)
-    detector.finder.stored = _StoredByScanContext(index)
+    detector.finder.stored = _ScanContextStore(index)
     keyframes = [
         keyframe._replace(descriptor=scan_context(recording.points(i)))
         for i, keyframe in enumerate(task.drive.keyframes)
     ]
-    return _by_detector(task._replace(drive=task.drive._replace(keyframes=keyframes)), detector)
+    return _search_with(detector, task._replace(drive=task.drive._replace(keyframes=keyframes)))
 
 
-def _by_bin_loops(task: Task) -> Answer:
-    """`bin/loops --odometry auto --optimize`, with imports, compilation and the pages that it writes."""
+def _search_by_bin_loops(task: Task) -> Answer:
+    """Runs `bin/loops --odometry auto --optimize` on the scans' files."""
     out = task.folder.with_name(f"{task.folder.name}-ours")
     mounting = task.simulate().mounting or Mounting(MODEL_HEIGHT_M)
     flags = ["--format", "kitti", "--odometry", "auto", "--optimize", "--out", out, "--weights", task.weights]
@@ -132,27 +133,28 @@ def _by_bin_loops(task: Task) -> Answer:
     return Answer(closures_of(loops), read_tum(out / "trajectory-optimized.tum")[0], loops)
 
 
-def _by_local_maps(task: Task, *, method: str) -> Answer:
-    """A program that closes loops between local maps. MapClosures does not correct kiss-icp's odometry."""
+def _search_by_local_maps(task: Task, *, method: str) -> Answer:
+    """Runs kiss-slam or MapClosures, which close loops between local maps, in its own environment (`peers/run.py`)."""
     out = task.folder.with_name(f"{task.folder.name}-{method}.json")
     run_command([_peer_python(task.environment), PEERS / "run.py", method, task.files(), out])
     answer = json.loads(out.read_text())
-    maps = [np.arange(*ends) for ends in answer["maps"]]
-    pairs = [sorted((one["source"], one["target"]), reverse=True) for one in answer["closures"]]
-    return Answer([Closure(maps[newer], maps[older]) for newer, older in pairs], np.array(answer["trajectory"]))
+    scans_of_maps = [np.arange(first, end) for first, end in answer["maps"]]
+    pairs = [sorted((closure["source"], closure["target"]), reverse=True) for closure in answer["closures"]]
+    closures = [Closure(scans_of_maps[newer], scans_of_maps[older]) for newer, older in pairs]
+    return Answer(closures, np.array(answer["trajectory"]))
 
 
 METHODS: dict[str, Callable[[Task], Answer]] = {
-    "sglpr": lambda task: _by_detector(task, LoopDetector(task.params)),
-    "scan-context": _by_scan_context,
-    "bin-loops": _by_bin_loops,
-    "kiss-slam": functools.partial(_by_local_maps, method="kiss-slam"),
-    "map-closures": functools.partial(_by_local_maps, method="map-closures"),
+    "sglpr": lambda task: _search_with(LoopDetector(task.params), task),
+    "scan-context": _search_by_scan_context,
+    "bin-loops": _search_by_bin_loops,
+    "kiss-slam": functools.partial(_search_by_local_maps, method="kiss-slam"),
+    "map-closures": functools.partial(_search_by_local_maps, method="map-closures"),
 }
 
 
 def _peer_python(environment: Path) -> Path:
-    """The Python of kiss-slam's and MapClosures' environment. It has another numpy, and is made on first use."""
+    """Python of an environment with kiss-slam and MapClosures, which is created if it does not exist."""
     python = environment / "bin" / "python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", environment], check=True)
@@ -172,17 +174,17 @@ def loops(
 ) -> None:
     """Search simulated drives by several methods. Prints a row for each drive and method, and sums.
 
-    A loop in a town is right if its scans are within 10 m and wrong beyond 20 m; recall is that of scans within 5 m of
-    one that is 30 s older. Where places repeat, a loop is wrong beyond the scenery's `other_m`; recall is that of scans
-    within 3 m of one that was 30 m of path before. kiss-slam and MapClosures close loops between local maps of 100 m:
-    such a loop is right if two of its scans are near each other, and wrong if all are far apart.
+    A loop in a town is right if its scans are within 10 m, and wrong beyond 20 m. A revisit is a scan within 5 m of a
+    scan that is 30 s older. In repeating sceneries, a loop is wrong beyond the scenery's `other_m`, and a revisit is
+    within 3 m of a scan that was 30 m of path before. kiss-slam and MapClosures close loops between local maps of
+    100 m. Such a loop is right if two of its scans are near each other, and wrong if all are far apart.
 
-    Poses of loops of two scans are wrong by `scoring.PoseErrors`. Recall by poses is that of scans within 3 m of one
-    that was 30 m of path before, on the same storey.
+    Poses of loops of two scans are right or wrong by `scoring.PoseErrors`. Recall by poses is the share of the scans
+    within 3 m of a scan 30 m of path before that have a loop with a right pose.
 
     Described scans are kept in `out`, so that a further search does not render them. The error of a trajectory is the
-    root mean square of positions after rigid alignment. Methods in processes of their own (kiss-slam, map-closures,
-    bin-loops) read files; their seconds contain imports and compilation.
+    root mean square of positions after rigid alignment. kiss-slam, map-closures and bin-loops run in separate
+    processes, read files, and their seconds include imports and compilation.
 
     Args:
         drives: drives to search.
@@ -201,19 +203,20 @@ def loops(
         if not path.exists():
             described.store(path, simulate(), params, scale=scale, **drive._asdict())
         stored = described.read(path)
-        given = stored.odometry(odometry, drive.seed)
+        task = Task(stored, simulate, stored.odometry(odometry, drive.seed), params, weights, environment)
         poses = scaled_poses(stored.world_from_lidar, 1 / stored.scale)
         rule = rule_of(drive, poses, stored.times)
         for name in method:
-            start = time.perf_counter(), _processor_s()
-            answer = METHODS[name](Task(stored, simulate, given, params, weights, environment))
-            seconds = time.perf_counter() - start[0], _processor_s() - start[1]
-            counts = counted(answer.closures, poses[:, :3, 3], rule)
-            numbers = np.array([len(stored.keyframes), *counts, *_pose_counts(stored, answer.loops)])
+            start, processor_start = time.perf_counter(), _processor_s()
+            answer = METHODS[name](task)
+            seconds, processor_seconds = time.perf_counter() - start, _processor_s() - processor_start
+            loop_counts = count_loops(answer.closures, poses[:, :3, 3], rule)
+            counts = np.array([len(stored.keyframes), *loop_counts, *_pose_counts(stored, answer.loops)])
             error = "-" if answer.trajectory is None else f"{trajectory_error(answer.trajectory, poses[:, :3, 3]):.2f}"
-            errors = told(answer.loops, stored.world_from_lidar)
-            table.add(drive.name, name, *(f"{value:.0f}" for value in seconds), *_cells(numbers), error, errors)
-            sums.setdefault((drive.world, drive.route, name), []).append(numbers)
+            errors = describe_errors(answer.loops, stored.world_from_lidar)
+            times = (f"{seconds:.0f}", f"{processor_seconds:.0f}")
+            table.add(drive.name, name, *times, *_cells(counts), error, errors)
+            sums.setdefault((drive.world, drive.route, name), []).append(counts)
     table = Table("world", "revisits", "method", *COLUMNS)
     for key, counts in sums.items():
         table.add(*key, *_cells(np.sum(counts, axis=0)))
@@ -225,21 +228,31 @@ def _processor_s() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def _cells(numbers: Int[np.ndarray, " 10"]) -> list[str]:
-    """Cells of `COLUMNS`."""
-    scans, *counts, wrong, in_plane, recalled, revisits = numbers.tolist()
-    known = Counts(*counts)
+def _cells(counts: Int[np.ndarray, " 10"]) -> list[str]:
+    """Cells of `COLUMNS` from the number of scans, the five `Counts`, and the four numbers of `_pose_counts`."""
+    scans, *loop_counts, wrong, in_plane, recalled, revisits = counts.tolist()
+    loops = Counts(*loop_counts)
     recall = f"{recalled / revisits:.3f}" if revisits else ""
-    return [*map(str, (scans, *known[:3])), known.recall, str(wrong), str(in_plane), recall]
+    return [
+        str(scans),
+        str(loops.loops),
+        str(loops.right),
+        str(loops.wrong),
+        loops.recall,
+        str(wrong),
+        str(in_plane),
+        recall,
+    ]
 
 
 def _pose_counts(drive: DescribedDrive, loops: Sequence[Any]) -> list[int]:
-    """Wrong poses, those of them in the plane, revisits with a right pose, and revisits."""
-    poses = np.array([one.match_from_query for one in loops])
-    errors = pose_errors([(one.query, one.match) for one in loops], poses, drive.world_from_lidar)
-    right = {loop.query for loop, is_right in zip(loops, errors.right, strict=True) if is_right}
-    revisits, in_plane = set(np.flatnonzero(drive.revisits).tolist()), errors.wrong & (errors.storey_m <= STOREY_M)
-    return [int(errors.wrong.sum()), int(in_plane.sum()), len(right & revisits), len(revisits)]
+    """Numbers of wrong poses, of wrong poses on the same storey, of revisits with a right pose, and of revisits."""
+    poses = np.array([loop.match_from_query for loop in loops])
+    errors = pose_errors([(loop.query, loop.match) for loop in loops], poses, drive.world_from_lidar)
+    right_queries = {loop.query for loop, is_right in zip(loops, errors.right, strict=True) if is_right}
+    revisits = set(np.flatnonzero(drive.revisits).tolist())
+    wrong_on_storey = errors.wrong & (errors.storey_m <= STOREY_M)
+    return [int(errors.wrong.sum()), int(wrong_on_storey.sum()), len(right_queries & revisits), len(revisits)]
 
 
 def images(
@@ -261,8 +274,9 @@ def images(
         poses[:, :3] = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
         given = odometry_of("drifting" if odometry else "none", poses, seed=seed)
         found = sglpr_jax.find_loops(recording, params, odometry=given, registered=False)
-        counts = counted(closures_of(found.loops), poses[:, :3, 3], town_rule(poses[:, :3, 3], recording.times))
-        print(f"{name}: {counts.loops} loops, {counts.wrong} wrong, recall {counts.recall}; {told(found.loops, poses)}")
+        counts = count_loops(closures_of(found.loops), poses[:, :3, 3], town_rule(poses[:, :3, 3], recording.times))
+        errors = describe_errors(found.loops, poses)
+        print(f"{name}: {counts.loops} loops, {counts.wrong} wrong, recall {counts.recall}; {errors}")
         assert found.model is not None
         for one in reliability_of(found.sessions[0].candidates, found.model, poses[:, :3, 3]):
             share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.probability:.4f} said"
@@ -273,24 +287,25 @@ def images(
 def _report_top1(
     found: LoopSearchResult, poses: Float[np.ndarray, "n 4 4"], descriptors: Float32[np.ndarray, "n d"]
 ) -> None:
-    """Print top-1 F1max and Recall@1 if each query is answered by its most probable pair, or by a returned loop.
+    """Prints top-1 F1max and Recall@1 of the most probable match of each query, without and with loops preferred.
 
-    Frames without a candidate are answered by the nearest descriptor that is old enough, with the least log odds.
+    The match of a frame without a candidate is the nearest descriptor that is old enough, with the log odds NO_LOOP.
     """
     assert found.model is not None
     session = found.sessions[0]
-    pairs = [(one.query, one.match) for one in session.candidates]
-    log_odds = found.model.log_odds(Evidence.stack([one.evidence for one in session.candidates]))
+    pairs = [(pair.query, pair.match) for pair in session.candidates]
+    log_odds = found.model.log_odds(Evidence.stack([pair.evidence for pair in session.candidates]))
     for frame in sorted({*range(EXCLUDED_FRAMES, len(poses))} - {query for query, _ in pairs}):
-        apart = np.linalg.norm(descriptors[: frame - EXCLUDED_FRAMES + 1] - descriptors[frame], axis=1)
-        pairs.append((frame, int(apart.argmin())))
+        distance = np.linalg.norm(descriptors[: frame - EXCLUDED_FRAMES + 1] - descriptors[frame], axis=1)
+        pairs.append((frame, int(distance.argmin())))
     log_odds = np.pad(log_odds, (0, len(pairs) - len(log_odds)), constant_values=NO_LOOP)
-    kept = {(one.query, one.match) for one in found.loops}
-    bonus = np.array([KEPT * (pair in kept) for pair in pairs])
+    loops = {(loop.query, loop.match) for loop in found.loops}
+    bonus = np.array([KEPT * (pair in loops) for pair in pairs])
     for title, scores in (("most probable", log_odds), ("most probable, loops first", log_odds + bonus)):
-        best = {pairs[i][0]: i for i in np.argsort(scores, kind="stable").tolist()}
-        queries = sorted(best)
-        chosen = np.array([best[query] for query in queries])
+        # In ascending order of scores, so that the best pair of each query remains.
+        best_pair = {pairs[i][0]: i for i in np.argsort(scores, kind="stable").tolist()}
+        queries = sorted(best_pair)
+        chosen = np.array([best_pair[query] for query in queries])
         source = TopK(
             sequence=session.recording.name,
             positions=poses[:, :3, 3],

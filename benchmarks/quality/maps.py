@@ -23,7 +23,7 @@ from sglpr_jax.sim.recording import plan_sessions
 from sglpr_jax.sim.sensor import SENSORS
 
 WELL_M, WELL_DEG, SURE = 0.5, 2.0, 0.99
-"""Largest errors of a right pose, and the probability of an answer that should not be wrong."""
+"""Largest errors of a right pose, and the minimum probability of a sure answer."""
 DAYS, ROUTES = ("2012-01-15", "2012-02-04"), ("00", "05", "08")
 DRIVE_S = 60.0
 """Duration of a drive, in seconds."""
@@ -46,8 +46,8 @@ class Drive(NamedTuple):
     sensor: str
 
 
-def _driven(root: Path, *, seed: int, sensor: str, day: int, scans: int, azimuth_steps: int) -> Drive:
-    """A drive through a town on a day. Its scans are rendered unless they exist."""
+def _drive(root: Path, *, seed: int, sensor: str, day: int, scans: int, azimuth_steps: int) -> Drive:
+    """Drive through a town on a day, with its scans in a folder below `root`, which are rendered unless they exist."""
     folder = root / f"{seed}-{sensor}-day{day}-{scans}x{azimuth_steps}"
     options = {"scans": scans, "rate_hz": scans / DRIVE_S, "seed": seed, "sensor": lidar(sensor, azimuth_steps)}
     recording = plan_sessions(DAYS, route=ROUTES[seed % len(ROUTES)], **options)[day].simulate()
@@ -88,13 +88,13 @@ def cloud(
     table = Table("seed", "query", "right", "of them probability >= .9", "queries")
     for seed in seeds:
         steps = {"scans": map_scans, "azimuth_steps": map_azimuth_steps}
-        first = _driven(out, seed=seed, sensor="hdl64e", day=0, **steps)
+        first = _drive(out, seed=seed, sensor="hdl64e", day=0, **steps)
         recording = _cloud_map(first)
         poses = recording.world_from_lidar
         assert poses is not None
         places = sglpr_jax.map_recording(recording, params, poses, spacing_m=spacing_m).places
         for sensor in queries:
-            query = _driven(out, seed=seed, sensor=sensor, day=1, scans=scans, azimuth_steps=900)
+            query = _drive(out, seed=seed, sensor=sensor, day=1, scans=scans, azimuth_steps=900)
             found = np.array(_located_in(places, params, query, first, poses, every))
             total[sensor] = total.get(sensor, 0) + found
             table.add(seed, sensor, *found)
@@ -104,14 +104,14 @@ def cloud(
 
 
 def _cloud_map(drive: Drive) -> Recording:
-    """The recording of the cloud and the trajectory that kiss-icp makes, in files that are kept."""
+    """Recording of a point cloud map and its trajectory by kiss-icp. Existing files of both are used again."""
     trajectory, path = (drive.folder.with_name(f"{drive.folder.name}-kiss.{suffix}") for suffix in ("tum", "pcd"))
     if not trajectory.exists():
         height_m = SENSORS[drive.sensor].height_m
         poses = scan_odometry(sglpr_jax.open_recording(drive.folder, format="kitti", sensor_height=height_m))
         write_tum(trajectory, poses, 0.5 + np.arange(len(poses)) * DRIVE_S / len(poses))
     if not path.exists():
-        points = _cloud_of(drive, sglpr_jax.read_odometry(trajectory, format="tum"))
+        points = _join_scans(drive, sglpr_jax.read_odometry(trajectory, format="tum"))
         count = len(points)
         header = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
         path.write_bytes((header + "DATA binary\n").encode() + points.astype("<f4").tobytes())
@@ -120,15 +120,16 @@ def _cloud_map(drive: Drive) -> Recording:
     return recording
 
 
-def _cloud_of(drive: Drive, poses: Float[np.ndarray, "n 4 4"]) -> Float32[np.ndarray, "m 3"]:
-    """Centroids of the voxels of all scans, in the frame of the poses."""
+def _join_scans(drive: Drive, poses: Float[np.ndarray, "n 4 4"]) -> Float32[np.ndarray, "m 3"]:
+    """Joins all scans with `poses` to one cloud: the centroid of the points in each voxel."""
     parts = []
     for row, pose in enumerate(poses):
         points = drive.scans.points(row)
         points = points[np.linalg.norm(points, axis=1) < FAR_M]
         parts.append((points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
     points = np.concatenate(parts)
-    voxels = np.floor(points / VOXEL_M).astype(np.int64) + (1 << 20)
+    voxels = np.floor(points / VOXEL_M).astype(np.int64) + (1 << 20)  # not negative
+    # A voxel's number has 21 bits for each of x, y and z.
     _, voxel, counts = np.unique(voxels @ (1 << np.array([42, 21, 0])), return_inverse=True, return_counts=True)
     return np.stack([np.bincount(voxel, weights=axis) / counts for axis in points.T], axis=1).astype(np.float32)
 
@@ -136,15 +137,20 @@ def _cloud_of(drive: Drive, poses: Float[np.ndarray, "n 4 4"]) -> Float32[np.nda
 def _located_in(
     places: sglpr_jax.PlaceMap, params: sglpr_jax.Params, query: Drive, first: Drive, poses: np.ndarray, every: int
 ) -> tuple[int, int, int]:
-    """Numbers of right answers, of right answers with a probability of .9 or more, and of queries."""
-    apart = distances(query.world_from_lidar[:, :2, 3], first.world_from_lidar[:, :2, 3])
+    """Relocates every `every`-th scan of `query` near the first drive in the map `places`, whose poses are `poses`.
+
+    Returns the numbers of right answers, of right answers with a probability of at least 0.9, and of queries.
+    """
+    distance = distances(query.world_from_lidar[:, :2, 3], first.world_from_lidar[:, :2, 3])
     mounting, right, sure, count = Mounting(SENSORS[query.sensor].height_m), 0, 0, 0
-    for row in np.flatnonzero(apart.min(axis=1) < APART_M)[::every].tolist():
-        near = int(apart[row].argmin())
-        expected = poses[near] @ inverse(first.world_from_lidar[near]) @ query.world_from_lidar[row]
+    for row in np.flatnonzero(distance.min(axis=1) < APART_M)[::every].tolist():
+        nearest = int(distance[row].argmin())
+        expected = poses[nearest] @ inverse(first.world_from_lidar[nearest]) @ query.world_from_lidar[row]
         best = places.relocate(params, Scan(points=query.scans.points(row), mounting=mounting))[0]
-        fits = is_right(best.world_from_query, expected)
-        right, sure, count = right + fits, sure + (fits and best.probability >= 0.9), count + 1
+        is_right_pose = is_right(best.world_from_query, expected)
+        right += is_right_pose
+        sure += is_right_pose and best.probability >= 0.9
+        count += 1
     return right, sure, count
 
 
@@ -201,22 +207,26 @@ def sensors(
     table = Table("map", "query", "recall@1", "right", "wrong at .99", "queries")
     for mapped in sensors:
         for asked in sensors:
-            results = [_located(*both) for both in zip(passes[mapped], passes[asked], strict=True)]
+            results = [_locate(*towns) for towns in zip(passes[mapped], passes[asked], strict=True)]
             near, right, wrong = np.concatenate(results, axis=1)
             table.add(mapped, asked, f"{near.mean():.3f}", f"{right.mean():.3f}", wrong.sum(), len(near))
 
 
-def _located(mapped: MappedDrive, asked: MappedDrive) -> Bool[np.ndarray, "3 n"]:
-    """For each query near the map: found by its descriptor, relocated right, and relocated wrong but sure."""
-    apart = distances(asked.poses[:, :2, 3], mapped.places.world_from_place[:, :2, 3])
-    rows = np.flatnonzero(apart.min(axis=1) < APART_M)
-    found = np.zeros((3, len(rows)), bool)
+def _locate(mapped: MappedDrive, queried: MappedDrive) -> Bool[np.ndarray, "3 n"]:
+    """Locates the queries of `queried` near the map of `mapped`.
+
+    Returns for each query whether its nearest descriptor is right, its pose is right, and its pose is wrong but sure.
+    """
+    places = mapped.places
+    distance = distances(queried.poses[:, :2, 3], places.world_from_place[:, :2, 3])
+    rows = np.flatnonzero(distance.min(axis=1) < APART_M)
+    results = np.zeros((3, len(rows)), bool)
     for i, row in enumerate(rows.tolist()):
-        nearest = mapped.places.index.query(asked.keyframes[row].descriptor).rows[0]
-        found[0, i] = apart[row, nearest] <= RIGHT_M
-        answers = mapped.places.relocate_keyframe(asked.keyframes[row], weights_hash=mapped.places.index.weights_hash)
+        nearest = places.index.query(queried.keyframes[row].descriptor).rows[0]
+        results[0, i] = distance[row, nearest] <= RIGHT_M
+        answers = places.relocate_keyframe(queried.keyframes[row], weights_hash=places.index.weights_hash)
         if answers:
-            pose, true = answers[0].world_from_query, asked.poses[row]
-            found[1, i] = is_right(pose, true)
-            found[2, i] = np.hypot(*(pose - true)[:2, 3]) > RIGHT_M and answers[0].probability >= SURE
-    return found
+            pose, true_pose = answers[0].world_from_query, queried.poses[row]
+            results[1, i] = is_right(pose, true_pose)
+            results[2, i] = np.hypot(*(pose - true_pose)[:2, 3]) > RIGHT_M and answers[0].probability >= SURE
+    return results

@@ -1,7 +1,7 @@
 """Errors of the poses of loops against their stated covariances, on simulated drives with true revisits.
 
 If a covariance C is right, the normalised error squared e^T C^-1 e follows a chi-square: median 2.37 and 95 % quantile
-7.81 for 3 degrees of freedom, 5.35 and 12.59 for 6. Aliases (`scoring.is_alias`) are no part of the quantiles. The
+7.81 for 3 degrees of freedom, 5.35 and 12.59 for 6. Aliases (`scoring.is_alias`) are excluded from the quantiles. The
 constants of the library were fitted on seeds 200 to 207 and 500 to 507.
 """
 
@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 import sglpr_jax
 from benchmarks.drives import WALKS, Drive, Drives, drifted, in_memory
-from benchmarks.quality.scoring import LOOP_M, closures_of, counted, is_alias, relative_errors, town_rule, twist
+from benchmarks.quality.scoring import LOOP_M, closures_of, count_loops, is_alias, relative_errors, town_rule, twist
 from benchmarks.table import Table
 from sglpr_jax.data.choices import Gravity
 from sglpr_jax.data.gravity import mounted
@@ -36,12 +36,12 @@ from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.styles import SCENERIES
 
 APART_M, APART_S = 10.0, 30.0
-"""The scans of a pair are at most so many metres and at least so many seconds apart."""
+"""Maximum distance in metres and minimum time in seconds between the scans of a pair."""
 PLANAR, UNSEEN = np.array([0, 1, 5]), np.array([3, 4, 2])
-"""x, y and yaw, and roll, pitch and height, in an error of 6 degrees of freedom."""
+"""Indices of x, y and yaw, and of roll, pitch and height, in an error of 6 degrees of freedom."""
 TOWNS = ("town:00:300", "outskirts:00:301", "town:06:302", "outskirts:08:303", "town:08:304", "outskirts:06:305",
          "lanes:00:306", "gardens:06:307")  # fmt: skip
-REPEATED = tuple(f"{name}:{way}:{400 + i}" for i, name in enumerate(REPEATING) for way in ("same", "opposite"))
+REPEATED = tuple(f"{name}:{revisit}:{400 + i}" for i, name in enumerate(REPEATING) for revisit in ("same", "opposite"))
 PAIRS = Drives((*TOWNS, *REPEATED), sensor=("hdl64e", "hdl32e", "vlp16"), scans=600, azimuth_steps=None)
 ERRORS = ("roll, pitch [deg]", "height [m]", "roll/pitch/height in 2 sigma", "95 % (7.81)")
 
@@ -55,9 +55,9 @@ def pairs(
 ) -> None:
     """Compare errors of pairs of revisits with their covariances. Prints a row for each world and sensor.
 
-    The normalised error is that of x, y and yaw, or of 6 degrees of freedom if scans are registered. Beside it are
-    roll, pitch and height: errors, the share within 2 standard deviations, and the normalised error. Drives where
-    places repeat have 300 scans.
+    The normalised error is that of x, y and yaw, or of 6 degrees of freedom if scans are registered. Further columns
+    show roll, pitch and height: errors, the share within 2 standard deviations, and the normalised error. Drives in
+    repeating sceneries have 300 scans.
 
     Args:
         drives: drives of the pairs.
@@ -72,19 +72,24 @@ def pairs(
         groups.setdefault((drive.world, drive.sensor, drive.carrier), []).append(drive)
     for key, group in groups.items():
         scans = drives.scans if key[0] in SCENERIES else 300
-        recordings = ((drives.simulate(drive, scans=scans), drive.seed) for drive in group)
-        of_drives = [_errors(*one, pairs, gravity, registered=registered) for one in recordings]
-        errors, covariances, squares, aliases = (np.concatenate(values) for values in zip(*of_drives, strict=True))
+        results = []
+        for drive in group:
+            recording = drives.simulate(drive, scans=scans)
+            results.append(_errors(recording, drive.seed, pairs, gravity, registered=registered))
+        errors, covariances, squares, aliases = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
         deviations = np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1])
-        numbers = (np.median(squares), np.quantile(squares, 0.95), np.median(deviations)) if len(squares) else ()
-        cells = [f"{number:.2f}" for number in numbers] or ["-"] * 3
+        statistics = (np.median(squares), np.quantile(squares, 0.95), np.median(deviations)) if len(squares) else ()
+        cells = [f"{statistic:.2f}" for statistic in statistics] or ["-"] * 3
         table.add(*key, len(aliases), aliases.sum(), *cells, *_cells(errors, covariances))
 
 
 def _errors(
     drive: SimulatedRecording, seed: int, count: int, gravity: Gravity | None, *, registered: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Errors (k, 6), covariances (k, 6, 6), normalised errors squared (k,), and aliases (n,) among all pairs."""
+    """Errors (k, 6), covariances (k, 6, 6) and normalised errors squared (k,) of the pairs that are no aliases.
+
+    The last array (n,) says which of all pairs are aliases.
+    """
     frames_of_pairs = _revisits(drive, count, np.random.default_rng(seed))
     frames = np.unique(frames_of_pairs)
     recording, poses = only(in_memory(drive, frames), frames.tolist()), drive.poses.world_from_lidar[frames]
@@ -105,33 +110,35 @@ def _errors(
 
 
 def _squares(errors: np.ndarray, covariances: np.ndarray, axes: np.ndarray) -> Float[np.ndarray, " k"]:
-    """Normalised errors squared of some degrees of freedom."""
-    part = errors[:, axes]
-    return np.einsum("ni,nij,nj->n", part, np.linalg.inv(covariances[:, axes[:, None], axes]), part)
+    """Normalised errors squared of the degrees of freedom with the indices `axes`."""
+    selected = errors[:, axes]
+    return np.einsum("ni,nij,nj->n", selected, np.linalg.inv(covariances[:, axes[:, None], axes]), selected)
 
 
 def _revisits(recording: SimulatedRecording, count: int, rng: np.random.Generator) -> Int[np.ndarray, "n 2"]:
-    """Pairs of query and match: of half the queries the nearest earlier scan, of the others one of any distance."""
+    """Draws pairs of query and match. Half of the matches are the nearest scan, the others have random distances."""
     positions, times = recording.poses.world_from_lidar[:, :3, 3], recording.poses.times
-    apart = distances(positions, positions)
-    apart[(apart > APART_M) | (times[:, None] - times[None] < APART_S)] = np.inf
-    queries = np.sort(rng.permutation(np.flatnonzero(np.isfinite(apart).any(axis=1)))[:count])
-    wanted = np.where(rng.random(len(queries)) < 0.5, 0, rng.uniform(0, APART_M, len(queries)))
-    matches = np.abs(apart[queries] - wanted[:, None]).argmin(axis=1)
+    distance = distances(positions, positions)
+    distance[(distance > APART_M) | (times[:, None] - times[None] < APART_S)] = np.inf
+    queries = np.sort(rng.permutation(np.flatnonzero(np.isfinite(distance).any(axis=1)))[:count])
+    wanted_distance = np.where(rng.random(len(queries)) < 0.5, 0, rng.uniform(0, APART_M, len(queries)))
+    matches = np.abs(distance[queries] - wanted_distance[:, None]).argmin(axis=1)
     return np.stack([queries, matches], axis=1)
 
 
 def _aligned(recording: Recording, pairs: np.ndarray) -> Iterator[LoopClosure]:
-    """The loops of pairs of query and match, by their images."""
+    """Yields loops of pairs of query and match, whose poses come from the alignment of their images."""
     for query, match in pairs.tolist():
-        ours, theirs = (square_image(recording.scan(frame, labels=False)) for frame in (query, match))
-        peak = bev_search.search(query_spectra(ours), match_spectra(theirs[None])).at(0)
+        query_image, match_image = (square_image(recording.scan(frame, labels=False)) for frame in (query, match))
+        peak = bev_search.search(query_spectra(query_image), match_spectra(match_image[None])).at(0)
+        alignment = jax.device_get(refine(query_image, match_image, peak))
         sensors = recording.mounting_of(query), recording.mounting_of(match)
-        loop = planar_loop(query, match, jax.device_get(refine(ours, theirs, peak)), probability=1.0, sensors=sensors)
+        loop = planar_loop(query, match, alignment, probability=1.0, sensors=sensors)
         yield to_lidar(loop, query=sensors[0], match=sensors[1])
 
 
 def _registered(recording: Recording, loop: LoopClosure) -> LoopClosure:
+    """Loop with pose and covariance from registering the points of its scans."""
     points = [recording.points(frame) for frame in (loop.query, loop.match)]
     registration = register(*points, initial=loop.match_from_query, initial_covariance=loop.covariance)
     return dataclasses.replace(loop, **registration._asdict())
@@ -160,18 +167,19 @@ def search(drives: tyro.conf.OmitArgPrefixes[Drives] = WALKS, *, weights: str = 
             session = found.sessions[0].recording
             print(*session.found, sep="\n", file=sys.stderr)
             registered = [_registered(session, loop) for loop in found.loops]
-            for how, loops in (("no", found.loops), ("yes", registered)):
-                counts = counted(closures_of(loops), poses[:, :3, 3], rule)
-                apart = [np.linalg.norm((poses[one.query] - poses[one.match])[:3, 3]) for one in loops]
-                right = [one for one, metres in zip(loops, apart, strict=True) if metres <= LOOP_M]
-                errors = np.array([twist(one) for one in relative_errors(right, poses)]).reshape(-1, 6)
-                covariances = np.array([one.covariance for one in right]).reshape(-1, 6, 6)
-                about = (gravity, "no" if given is None else "yes", how, counts.right, counts.wrong, counts.recall)
-                table.add(drive.name, *about, *_cells(errors, covariances))
+            for is_registered, loops in (("no", found.loops), ("yes", registered)):
+                counts = count_loops(closures_of(loops), poses[:, :3, 3], rule)
+                metres = [np.linalg.norm((poses[loop.query] - poses[loop.match])[:3, 3]) for loop in loops]
+                right = [loop for loop, distance in zip(loops, metres, strict=True) if distance <= LOOP_M]
+                errors = np.array([twist(error) for error in relative_errors(right, poses)]).reshape(-1, 6)
+                covariances = np.array([loop.covariance for loop in right]).reshape(-1, 6, 6)
+                has_odometry = "no" if given is None else "yes"
+                cells = (gravity, has_odometry, is_registered, counts.right, counts.wrong, counts.recall)
+                table.add(drive.name, *cells, *_cells(errors, covariances))
 
 
 def _cells(errors: Float[np.ndarray, "k 6"], covariances: Float[np.ndarray, "k 6 6"]) -> list[str]:
-    """Errors of roll, pitch and height beside their deviations, as cells."""
+    """Cells of `ERRORS`: errors of roll, pitch and height, their share within 2 sigma, and their normalised error."""
     if not len(errors):
         return ["-"] * len(ERRORS)
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))

@@ -1,4 +1,4 @@
-"""Real scans beside simulated ones: their histograms, and what weights of the simulator know of real semantics."""
+"""Comparison of real and simulated scans: histograms, and semantics of real scans by simulated training."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,6 +26,7 @@ from sglpr_jax.retrieval.image_maps import semantic_map
 GRID = model_preset("sglpr").grid
 
 Measures = Mapping[str, np.ndarray]
+"""Histograms by their names in `HISTOGRAMS`, each as fractions of its bins."""
 
 _RANGES = (0, 3, 5, 7.5, 10, 15, 20, 30, 40, 60, 80)
 _HEIGHTS = (-np.inf, -2.4, -2, -1.8, -1.6, -1.4, -1.2, -0.8, -0.4, 0, 0.5, 1, 1.5, 2, 3, np.inf)
@@ -51,7 +52,7 @@ HISTOGRAMS = {name: (title, _bin_names(edges)) for name, (title, edges) in _BINS
     "class_of_cells": ("occupied cells by class", CATEGORIES),
     "class_of_pixels": ("density image's window: cells by class", CATEGORIES),
 }
-"""Title and names of the bins of every histogram. A bin holds its lower edge and not its upper one."""
+"""Title and names of the bins of every histogram. A bin includes its lower edge and excludes its upper edge."""
 
 
 def compare(
@@ -93,6 +94,7 @@ def _measured(kind: str, root: Path, scans: int) -> Iterator[tuple[str, Measures
 
 
 def _measures(drive: Recording, row: int) -> Measures:
+    """Histograms of one scan or image."""
     if drive.has_images:
         return _image_measures(np.rint(drive.image(row) * (255 / DENSITY_MAX_COUNT)).astype(np.uint8))
     labels = drive.labels(row)
@@ -105,20 +107,19 @@ def _measured_range_images(folder: Path) -> Iterator[tuple[str, Measures]]:
         yield f"real range images {name}", _mean([_scan_measures(points, classes) for _, points, classes in images])
 
 
-def _mean(each: Sequence[Measures]) -> Measures:
-    """Means over the scans; of classes over those with labels."""
-    names = dict.fromkeys(name for measures in each for name in measures)
-    return {name: np.mean([one[name] for one in each if name in one], axis=0) for name in names}
+def _mean(of_scans: Sequence[Measures]) -> Measures:
+    """Mean of each histogram over the scans that have it."""
+    names = dict.fromkeys(name for measures in of_scans for name in measures)
+    return {name: np.mean([measures[name] for measures in of_scans if name in measures], axis=0) for name in names}
 
 
 def _distance_from_real(name: str, measure: str, sources: Mapping[str, Measures]) -> str:
-    """How much of a histogram must move to make the mean of the real drives (of the others, for a real one)."""
-    others = [
-        one[measure] for other, one in sources.items() if other.startswith("real") and other != name if measure in one
-    ]
-    if measure not in sources[name] or not others:
+    """Total variation in percent between a drive's histogram and the mean of all (other) real drives, or ""."""
+    others = [measures for other, measures in sources.items() if other.startswith("real") and other != name]
+    histograms = [measures[measure] for measures in others if measure in measures]
+    if measure not in sources[name] or not histograms:
         return ""
-    return f"{50 * np.abs(sources[name][measure] - np.mean(others, axis=0)).sum():.0f}"
+    return f"{50 * np.abs(sources[name][measure] - np.mean(histograms, axis=0)).sum():.0f}"
 
 
 def _draw(sources: Mapping[str, Measures]) -> Figure:
@@ -140,7 +141,7 @@ def _draw(sources: Mapping[str, Measures]) -> Figure:
 
 
 def _scan_measures(points: np.ndarray, classes: np.ndarray | None) -> Measures:
-    """All measures of a scan (n, 3) in metres; those of classes only where it has them."""
+    """All histograms of a scan (n, 3) in metres, those of classes only if `classes` is not None."""
     padding = (0, (1 << len(points).bit_length()) - len(points))  # few sizes, so few compilations
     padded, count = jnp.asarray(np.pad(points, (padding, (0, 0)))), jnp.asarray(len(points))
     counts = np.asarray(rasterize(padded, grid=GRID, count=count))
@@ -161,13 +162,12 @@ def _scan_measures(points: np.ndarray, classes: np.ndarray | None) -> Measures:
 
 
 def _image_measures(image: np.ndarray) -> Measures:
-    """The measures of a density image (151, 151) of grey values, in the orientation of eq. 1."""
+    """Histograms of a density image (151, 151) of grey values, in the orientation of the paper's equation 1."""
     half = image.shape[0] // 2
-    down, right = np.nonzero(image)
-    x, y = (right - half) * DENSITY_RESOLUTION_M, (half - down) * DENSITY_RESOLUTION_M
-    values = image[down, right]
+    rows, columns = np.nonzero(image)
+    x, y = (columns - half) * DENSITY_RESOLUTION_M, (half - rows) * DENSITY_RESOLUTION_M
     return {
-        "image_density": _histogram("image_density", values / 25.5),
+        "image_density": _histogram("image_density", image[rows, columns] / 25.5),
         "image_distance": _histogram("image_distance", np.hypot(x, y)),
         "image_lateral": _histogram("image_lateral", np.abs(y)),
     }
@@ -180,9 +180,9 @@ def _histogram(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def _share_of_classes(classes: np.ndarray) -> np.ndarray:
-    """The shares of the classes; class 0, which is no class, has none."""
+    """Fraction of each class among the labelled points or cells."""
     counts = np.bincount(classes.ravel(), minlength=len(CATEGORIES))
-    counts[0] = 0
+    counts[0] = 0  # class 0 is unlabelled
     return counts / max(counts.sum(), 1)
 
 
@@ -252,7 +252,7 @@ def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Itera
 
 
 def _commonest_by_cell(params: Params, root: Path, scans: int) -> np.ndarray:
-    """The commonest class of each cell (h, w) over simulated scans; road where none ever saw a point."""
+    """Most frequent class of each cell (h, w) in simulated scans, or road where no scan has a point."""
     grid = params.config.grid
     votes = np.zeros((grid.height, grid.width, params.config.classes), np.int64)
     rows, columns = np.indices(votes.shape[:2])

@@ -1,4 +1,4 @@
-"""What a sensor sees: gravity of a walk by IMU and ground, deskewing of fast turns, ranges, rotations of a scan."""
+"""Benchmarks of sensor effects: gravity of a walk by IMU and ground, deskewing of fast turns, and rotated scans."""
 
 import dataclasses
 from pathlib import Path
@@ -30,7 +30,7 @@ from sglpr_jax.sim.sensor import Sensor, scan
 from sglpr_jax.sim.world import World, build_world
 
 WALK = 0.2
-"""Speed of a person as a share of that of the simulated drive."""
+"""Speed of a walking person, as a fraction of the speed of the simulated drive."""
 RATE_HZ = 200.0
 GYRO_NOISE, GYRO_BIAS = 0.003, 0.005
 """Standard deviations of a sample and of the bias of the gyroscope, in radians per second."""
@@ -79,15 +79,17 @@ def imu(
 
 
 def _without_ground(recording: SimulatedRecording, share: float) -> Recording:
-    """The recording in memory. A share of its scans has no points below the sensor."""
+    """Recording in memory. A random fraction `share` of its scans has no points below the sensor."""
     rendered = in_memory(recording)
-    hidden = {path for path in rendered.paths if np.random.default_rng(int(path.name)).random() < share}
-    turned = dict(zip(rendered.paths, recording.poses.world_from_lidar[:, :3, :3], strict=True))
+    paths_without_ground = {path for path in rendered.paths if np.random.default_rng(int(path.name)).random() < share}
+    rotations = dict(zip(rendered.paths, recording.poses.world_from_lidar[:, :3, :3], strict=True))
 
     def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
         points = rendered.read(path, None, False).points
         assert points is not None
-        return Scan(points=points if path not in hidden else points[points @ turned[path][2] > 0])
+        if path in paths_without_ground:
+            points = points[points @ rotations[path][2] > 0]  # height above the sensor
+        return Scan(points=points)
 
     return dataclasses.replace(rendered, read=read)
 
@@ -95,30 +97,33 @@ def _without_ground(recording: SimulatedRecording, share: float) -> Recording:
 def _gravity_errors(
     ups: Float[np.ndarray, "n 3"], sigma_deg: Float[np.ndarray, " n"], poses: TimedPoses
 ) -> tuple[str, str, str]:
-    """Median and 95 % quantile of the errors about the two horizontal axes, and the share within 2 sigma."""
-    in_world = np.einsum("nij,nj->ni", poses.world_from_lidar[:, :3, :3], ups)
-    sizes = np.abs(np.degrees(in_world[:, :2]))
-    within = (sizes <= 2 * sigma_deg[:, None]).mean()
-    return f"{np.median(sizes):.2f}", f"{np.quantile(sizes, 0.95):.2f}", f"{within:.3f}"
+    """Cells: median and 95 % quantile of the errors about the two horizontal axes, and the share within 2 sigma.
+
+    `ups` are estimated upward unit vectors in the LiDAR frame.
+    """
+    ups_in_world = np.einsum("nij,nj->ni", poses.world_from_lidar[:, :3, :3], ups)
+    errors_deg = np.abs(np.degrees(ups_in_world[:, :2]))  # for small errors, the sine is the angle
+    within_2_sigma = (errors_deg <= 2 * sigma_deg[:, None]).mean()
+    return f"{np.median(errors_deg):.2f}", f"{np.quantile(errors_deg, 0.95):.2f}", f"{within_2_sigma:.3f}"
 
 
 def _measured_imu(poses: TimedPoses, rng: np.random.Generator) -> Imu:
     """Samples of an IMU in the frame of the LiDAR, along a smooth curve through the poses."""
-    stamps = np.arange(poses.times[0], poses.times[-1], 1 / RATE_HZ)
-    turned = RotationSpline(poses.times, Rotation.from_matrix(poses.world_from_lidar[:, :3, :3]))
-    path = CubicSpline(poses.times, poses.world_from_lidar[:, :3, 3] * [WALK, WALK, 1.0])
-    accelerations = turned(stamps).inv().apply(path(stamps, 2) + np.array([0, 0, STANDARD_GRAVITY]))
-    noisy = []
-    for values, noise, bias in (
-        (turned(stamps, 1), GYRO_NOISE, GYRO_BIAS),
-        (accelerations, ACCELERATION_NOISE, ACCELERATION_BIAS),
-    ):
-        noisy.append(values + rng.normal(scale=bias, size=3) + rng.normal(scale=noise, size=values.shape))
-    return Imu(stamps, *noisy)
+    times = np.arange(poses.times[0], poses.times[-1], 1 / RATE_HZ)
+    rotation = RotationSpline(poses.times, Rotation.from_matrix(poses.world_from_lidar[:, :3, :3]))
+    position = CubicSpline(poses.times, poses.world_from_lidar[:, :3, 3] * [WALK, WALK, 1.0])
+    accelerations = rotation(times).inv().apply(position(times, 2) + np.array([0, 0, STANDARD_GRAVITY]))
+    angular_rates = rotation(times, 1)
+
+    def with_noise(samples: np.ndarray, noise: float, bias: float) -> np.ndarray:
+        return samples + rng.normal(scale=bias, size=3) + rng.normal(scale=noise, size=samples.shape)
+
+    noisy_rates = with_noise(angular_rates, GYRO_NOISE, GYRO_BIAS)
+    return Imu(times, noisy_rates, with_noise(accelerations, ACCELERATION_NOISE, ACCELERATION_BIAS))
 
 
-class _Place(NamedTuple):
-    """A place of a town and the time when a scan begins there."""
+class _ScanStart(NamedTuple):
+    """Position in a town and time at which a scan begins."""
 
     world: World
     xy: Float[np.ndarray, "2"]
@@ -127,16 +132,15 @@ class _Place(NamedTuple):
     sensor: Sensor
 
     def poses(self, times: Float[np.ndarray, " n"], speed_mps: float, turn_deg: float) -> Float[np.ndarray, "n 4 4"]:
-        """Poses of the LiDAR at times since the begin of the scan."""
-        steps = np.linspace(-2 * TURN_S, 2 * TURN_S, 401)
-        angle = 2 * np.pi / SWING_S
-        yaw = self.yaw + np.radians(turn_deg) / angle * np.sin(angle * (steps - TURN_S / 2))
+        """Poses of the LiDAR at `times` (seconds since the start of the scan). `turn_deg` is the maximum yaw rate."""
+        even_times = np.linspace(-2 * TURN_S, 2 * TURN_S, 401)
+        omega = 2 * np.pi / SWING_S
+        yaw = self.yaw + np.radians(turn_deg) / omega * np.sin(omega * (even_times - TURN_S / 2))
         forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        xy = np.cumsum(forward, axis=0) * speed_mps * (steps[1] - steps[0])
-        xy += self.xy - xy[len(steps) // 2]
-        x, y, yaw = (np.interp(times, steps, values) for values in (*xy.T, yaw))
-        at = np.stack([x, y], axis=1)
-        return poses_on(self.world.ground.relief, at, yaw, height_m=self.sensor.height_m)
+        xy = np.cumsum(forward, axis=0) * speed_mps * (even_times[1] - even_times[0])
+        xy += self.xy - xy[len(even_times) // 2]  # at `self.xy` when the scan starts
+        x, y, yaw = (np.interp(times, even_times, coordinate) for coordinate in (*xy.T, yaw))
+        return poses_on(self.world.ground.relief, np.stack([x, y], axis=1), yaw, height_m=self.sensor.height_m)
 
     def scan(self, pose: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "n 3"]:
         """A scan without motion."""
@@ -149,11 +153,11 @@ class _Place(NamedTuple):
             points = self.scan(pose, seed)
             azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
             sectors.append(points[np.floor(azimuth / (2 * np.pi) * SECTORS).astype(int) == number])
-        return sectors, np.repeat(_middles(), [len(points) for points in sectors]).astype(np.float32)
+        return sectors, np.repeat(_sector_times(), [len(points) for points in sectors]).astype(np.float32)
 
 
-def _middles() -> Float[np.ndarray, " sectors"]:
-    """Time of each sector since the begin of the scan."""
+def _sector_times() -> Float[np.ndarray, " sectors"]:
+    """Time of the middle of each sector in seconds since the start of the scan."""
     return (np.arange(SECTORS) + 0.5) * TURN_S / SECTORS
 
 
@@ -185,44 +189,46 @@ def deskew(
             table.add(name, f"{motion}, {speed_mps:g} m/s, {turn_deg:g} deg/s", *cells)
 
 
-def _town(seed: int, places: int, sensor: Sensor) -> list[_Place]:
+def _town(seed: int, places: int, sensor: Sensor) -> list[_ScanStart]:
     """Places along a route of a town."""
     path = plan_path(np.random.default_rng((seed, 1)), "00", scans=600)
     world = build_world((seed, 2), path.xy, path.times)
     rows = np.linspace(20, len(path.times) - 20, places).astype(int)
-    return [_Place(world, path.xy[i], float(path.yaw[i]), float(path.times[i]), sensor) for i in rows]
+    return [_ScanStart(world, path.xy[i], float(path.yaw[i]), float(path.times[i]), sensor) for i in rows]
 
 
-def _motion_errors(speed_mps: float, turn_deg: float, towns: list[list[_Place]], params: Params) -> list[str]:
-    """Median errors and distances, and 95 % quantiles of the points, as cells."""
-    errors: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": []}
-    apart: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": [], "again": [], "other": []}
-    for places in towns:
+def _motion_errors(speed_mps: float, turn_deg: float, towns: list[list[_ScanStart]], params: Params) -> list[str]:
+    """Cells: median and 95 % quantile of the errors of points, and median distances of descriptors."""
+    point_errors: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": []}
+    descriptor_distances: dict[str, list[np.ndarray]] = {"skewed": [], "deskewed": [], "again": [], "other": []}
+    for starts in towns:
         clouds: dict[str, list[np.ndarray]] = {"still": [], "again": [], "skewed": [], "deskewed": []}
-        for number, place in enumerate(places):
-            stamps = TURN_S * np.array([-1.0, 0.0, 1.0])
-            trajectory, within = (place.poses(times, speed_mps, turn_deg) for times in (stamps, _middles()))
-            sectors, times = place.moving_scan(within, 3 * number)
-            true = [
-                transformed(inverse(trajectory[1]) @ pose, points) for pose, points in zip(within, sectors, strict=True)
+        for number, start in enumerate(starts):
+            scan_times = TURN_S * np.array([-1.0, 0.0, 1.0])  # of this scan and its neighbours
+            scan_poses = start.poses(scan_times, speed_mps, turn_deg)
+            sector_poses = start.poses(_sector_times(), speed_mps, turn_deg)
+            sectors, times = start.moving_scan(sector_poses, 3 * number)
+            true_points = [
+                transformed(inverse(scan_poses[1]) @ pose, points)
+                for pose, points in zip(sector_poses, sectors, strict=True)
             ]
             skewed = np.concatenate(sectors)
-            found = deskew_points(skewed, times, time=0.0, pose_times=stamps, world_from_lidar=trajectory)
-            for how, cloud in (("skewed", skewed), ("deskewed", found)):
-                clouds[how].append(cloud)
-                errors[how].append(np.linalg.norm(cloud - np.concatenate(true), axis=1))
-            for how, seed in (("still", 3 * number + 1), ("again", 3 * number + 2)):
-                clouds[how].append(place.scan(trajectory[1], seed))
-        described = {how: _descriptors(params, scans) for how, scans in clouds.items()}
-        for how in ("skewed", "deskewed", "again"):
-            apart[how].append(np.linalg.norm(described[how] - described["still"], axis=1))
-        at = np.array([place.xy for place in places])
-        others = distances(described["still"], described["still"])
-        others[distances(at, at) < OTHER_PLACE_M] = np.inf
-        apart["other"].append(others.min(axis=1))
-    metres = [np.concatenate(values) for values in errors.values()]
-    cells = [f"{np.median(values):.3f}, 95 % {np.quantile(values, 0.95):.3f}" for values in metres]
-    return cells + [f"{np.median(np.concatenate(values)):.3f}" for values in apart.values()]
+            deskewed = deskew_points(skewed, times, time=0.0, pose_times=scan_times, world_from_lidar=scan_poses)
+            for name, cloud in (("skewed", skewed), ("deskewed", deskewed)):
+                clouds[name].append(cloud)
+                point_errors[name].append(np.linalg.norm(cloud - np.concatenate(true_points), axis=1))
+            clouds["still"].append(start.scan(scan_poses[1], 3 * number + 1))
+            clouds["again"].append(start.scan(scan_poses[1], 3 * number + 2))  # with other noise
+        descriptors = {name: _descriptors(params, scans) for name, scans in clouds.items()}
+        for name in ("skewed", "deskewed", "again"):
+            descriptor_distances[name].append(np.linalg.norm(descriptors[name] - descriptors["still"], axis=1))
+        xy = np.array([start.xy for start in starts])
+        distance = distances(descriptors["still"], descriptors["still"])
+        distance[distances(xy, xy) < OTHER_PLACE_M] = np.inf
+        descriptor_distances["other"].append(distance.min(axis=1))
+    metres = [np.concatenate(errors) for errors in point_errors.values()]
+    cells = [f"{np.median(errors):.3f}, 95 % {np.quantile(errors, 0.95):.3f}" for errors in metres]
+    return cells + [f"{np.median(np.concatenate(of_scans)):.3f}" for of_scans in descriptor_distances.values()]
 
 
 def _descriptors(params: Params, clouds: list[np.ndarray]) -> Float[np.ndarray, "n d"]:
@@ -270,12 +276,12 @@ def rotation(
 
 
 def _rotated(params: Params, recording: Recording, views: list) -> Float[np.ndarray, "n d"]:
-    """Descriptors of rows of the recording, each rotated by its angle."""
-    describe, config, found = jax.jit(sglpr_jax.describe), params.config, []
+    """Descriptors of scans that are rotated. `views` are pairs of row and angle (radians, or None)."""
+    describe, config, descriptors = jax.jit(sglpr_jax.describe), params.config, []
     for start in range(0, len(views), BATCH):
-        part = views[start : start + BATCH]
-        seen = [view(recording.scan(row), config.grid, image=config.image, angle=angle) for row, angle in part]
-        images = [np.asarray(one.image) for one in seen]
-        images += images[-1:] * (BATCH - len(images))  # one program for all batches
-        found.append(np.asarray(describe(params, np.stack(images)))[: len(part)])
-    return np.concatenate(found)
+        batch = views[start : start + BATCH]
+        rotated = [view(recording.scan(row), config.grid, image=config.image, angle=angle) for row, angle in batch]
+        images = [np.asarray(of_scan.image) for of_scan in rotated]
+        images += images[-1:] * (BATCH - len(images))  # padding, so that all batches use the same compiled program
+        descriptors.append(np.asarray(describe(params, np.stack(images)))[: len(batch)])
+    return np.concatenate(descriptors)

@@ -71,13 +71,13 @@ def recall(
 
 
 def _recalls(drives: list[Drive], params: sglpr_jax.Params, length_m: float, every: int) -> list[float]:
-    """Recall@1 of each pass but the first."""
+    """Recall@1 of each pass after the first. Only every `every`-th scan is scored."""
     of_drives = []
     for town, drive in enumerate(drives):
         recording = submaps_of_passes(drive, length_m, seed=town)
         rows = [i for i in scored(drive) if i % every == 0]
         file = sglpr_jax.embed(params, only(recording, rows), on_bad_scan=lambda scan, error: None)
-        descriptors = np.full((len(rows), file.descriptors.shape[1]), np.inf)  # of a scan that shows nothing
+        descriptors = np.full((len(rows), file.descriptors.shape[1]), np.inf)  # inf for empty scans
         descriptors[np.isin([recording.ids[i] for i in rows], file.ids)] = file.descriptors
         of_drives.append((descriptors, drive.poses[rows, :3, 3] + [1e5 * town, 0, 0], drive.passes[rows]))
     descriptors, positions, passes = (np.concatenate(values) for values in zip(*of_drives, strict=True))
@@ -92,14 +92,15 @@ def _recalls(drives: list[Drive], params: sglpr_jax.Params, length_m: float, eve
 
 
 def scored(drive: Drive) -> list[int]:
-    """Scans that are not at the begin of a pass."""
-    first = np.searchsorted(drive.passes, drive.passes)
-    way = np.linalg.norm(np.diff(drive.poses[:, :3, 3], axis=0, prepend=drive.poses[:1, :3, 3]), axis=1).cumsum()
-    return np.flatnonzero(way - way[first] >= FIRST_M).tolist()
+    """Rows of the scans that are at least FIRST_M metres after the start of their pass."""
+    first_of_pass = np.searchsorted(drive.passes, drive.passes)
+    steps = np.diff(drive.poses[:, :3, 3], axis=0, prepend=drive.poses[:1, :3, 3])
+    length_m = np.linalg.norm(steps, axis=1).cumsum()
+    return np.flatnonzero(length_m - length_m[first_of_pass] >= FIRST_M).tolist()
 
 
 def submaps_of_passes(drive: Drive, length_m: float, *, seed: int) -> Recording:
-    """The recording with submaps by drifting odometry. Passes are kilometres apart, so no submap spans two."""
+    """Recording with submaps by drifting odometry. Passes are 10 km apart in height, so that no submap spans two."""
     odometry = drifted(drive.poses, seed=seed, turn_deg=1.0)
     odometry[:, 2, 3] += 1e4 * drive.passes
     return sglpr_jax.submaps(drive.recording, odometry, length_m=length_m)
@@ -109,18 +110,18 @@ def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Pa
     """The five passes, with a scan every metre in a folder (`on_disk`)."""
     line, left = _street(seed, metres)
     rng, paths, clock = np.random.default_rng((seed, 6)), [], 0.0
-    for number, aside in enumerate(PASSES.values()):
-        way = line + aside * left
-        path = timed(rng, way[::-1] if number % 2 else way, free_mps=SPEED_MPS, poses=metres)
+    for number, left_m in enumerate(PASSES.values()):
+        pass_line = line + left_m * left
+        path = timed(rng, pass_line[::-1] if number % 2 else pass_line, free_mps=SPEED_MPS, poses=metres)
         paths.append(path._replace(times=path.times + clock))
         clock = paths[-1].times[-1] + PAUSE_S
-    whole = PlanarPath(*(np.concatenate(values) for values in zip(*paths, strict=True)))
+    all_passes = PlanarPath(*(np.concatenate(arrays) for arrays in zip(*paths, strict=True)))
     starts = np.cumsum([0, *(len(path.times) for path in paths[:-1])])
-    every = [len(path.times) // metres for path in paths]
-    rows = np.concatenate([start + np.arange(metres) * step for start, step in zip(starts, every, strict=True)])
+    poses_per_scan = [len(path.times) // metres for path in paths]
+    rows = np.concatenate([start + np.arange(metres) * k for start, k in zip(starts, poses_per_scan, strict=True)])
     recording = drive_through(
-        build_world((seed, 7), whole.xy, whole.times),
-        whole,
+        build_world((seed, 7), all_passes.xy, all_passes.times),
+        all_passes,
         rows,
         name=f"{sensor}-{seed}",
         sensor=lidar(sensor, azimuth_steps),
@@ -132,11 +133,11 @@ def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Pa
 
 
 def _street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """A line of points every half metre, and the unit vectors to its left."""
+    """Line of `metres` metres with a point every half metre, and the unit vectors to its left."""
     xy = plan_path(np.random.default_rng((seed, 5)), ROUTE, scans=600, rate_hz=10.0).xy
-    way = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1).cumsum()])
-    at = np.arange(0.0, metres, 0.5)
-    line = np.stack([np.interp(at, way, axis) for axis in xy.T], axis=1)
-    ahead = np.gradient(line, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    return line, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    length_m = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1).cumsum()])
+    even_m = np.arange(0.0, metres, 0.5)
+    line = np.stack([np.interp(even_m, length_m, axis) for axis in xy.T], axis=1)
+    direction = np.gradient(line, axis=0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return line, np.stack([-direction[:, 1], direction[:, 0]], axis=1)

@@ -1,7 +1,7 @@
-"""Commands that write files, disturbed: killed, run twice at once, without room or rights, their input changed.
+"""Tests of commands that write files: killed, started twice at once, on a full disk, without rights, with bad input.
 
-Inputs are so small that a command takes a second. It runs in a process forked from this one, which has imported the
-command's module but never started JAX: so it starts in no time, and whoever kills it meets it at its work.
+Inputs are small, so that a command takes a second. A command runs in a process that is forked from this one, which has
+imported the command's module but not started JAX. The command therefore starts quickly, and a kill hits its work.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ from benchmarks.timing import about
 from sglpr_jax.files import half_written
 
 INPUTS, OUT, ERRORS = "inputs", "out", "stderr"
-"""Folder of what the commands read, folder and file that a command writes. The last two are in the command's folder."""
+"""Folder of the input files, and output folder and file for stderr within the folder of a command."""
 TIMEOUT_S = 900
 DRIVE = "--azimuth-steps 60 --sensor vlp16"
 TOWN = f"../{INPUTS}/town"
@@ -47,11 +47,11 @@ class Writer:
     line: str
     """Arguments."""
     varies: tuple[str, ...] = ()
-    """Patterns of files below `OUT` with times in them, that grow, or that only a killed run leaves for the next."""
+    """Patterns of files below `OUT` that may differ between runs, for example because they contain times."""
     resumed_by: str = ""
-    """If this file exists, the command is continued by --resume."""
+    """File below `OUT`. If it exists, the command is started with --resume."""
     refuses: str = ""
-    """Part of the error if the command has finished before and never does its work twice."""
+    """Part of the error of a command that refuses to run again after it has finished. Empty: it can run again."""
 
 
 WRITERS = {
@@ -90,11 +90,11 @@ def start(
     *,
     errors: str = ERRORS,
     file_bytes: int | None = None,
-    humble: bool = False,
+    unprivileged: bool = False,
 ) -> Process:
-    """Start a command in a folder. Its stderr goes to the file `errors` there.
+    """Starts a command in a folder. Its stderr goes to the file `errors` there.
 
-    No file may grow beyond `file_bytes`. A `humble` process may not write where its user may not, even if that is root.
+    Files are limited to `file_bytes`. An `unprivileged` process respects file permissions even if its user is root.
     """
     cache = folder.parent / "cache"
     os.environ |= {
@@ -113,7 +113,7 @@ def start(
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
         if file_bytes is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
-        if humble:  # without any capability, as capset(2) has it
+        if unprivileged:  # drops all capabilities, see capset(2)
             assert ctypes.CDLL(None).capset(struct.pack("Ii", 0x20080522, 0), bytes(24)) == 0
         cli.main()
 
@@ -123,23 +123,22 @@ def start(
 
 
 def status_of(process: Process) -> int:
-    """Wait for a process, and return its exit status. It is negative if a signal ended the process."""
+    """Waits for a process and returns its exit status, which is negative if a signal ended the process."""
     process.join(TIMEOUT_S)
     assert process.exitcode is not None, f"it has not ended after {TIMEOUT_S} s"
     return process.exitcode
 
 
-class Whole(NamedTuple):
-    """An undisturbed run."""
+class Undisturbed(NamedTuple):
+    """Result of an undisturbed run."""
 
-    files: dict[str, bytes]
+    files: dict[str, bytes]  # contents of the written files, by path
     seconds: float
-    changes: int
-    """Number of changes in its folder."""
+    changes: int  # number of changes in the output folder
 
 
 class Trial:
-    """A command in an empty folder. The folder of a command is always the same, because some files contain its path."""
+    """Command in an empty folder. The folder of a command is always the same, because some files contain its path."""
 
     def __init__(self, name: str, root: Path):
         self.name, self.writer, self.folder = name, WRITERS[name], root / name.replace(" ", "-")
@@ -148,7 +147,7 @@ class Trial:
         self.out.mkdir(parents=True)
 
     def start(self, **options: Any) -> Process:
-        """Start the command, or continue it. The options are those of `start`."""
+        """Starts the command, or continues it. The options are those of the function `start`."""
         resume = self.writer.resumed_by and (self.out / self.writer.resumed_by).exists()
         arguments = [*self.writer.line.split(), *["--resume"] * bool(resume)]
         return start(self.name.split()[0], arguments, self.folder, **options)
@@ -158,7 +157,7 @@ class Trial:
         return status_of(self.start(**options))
 
     def error(self, errors: str = ERRORS) -> str:
-        """What the command printed to stderr."""
+        """Text that the command printed to stderr."""
         path = self.folder / errors
         return path.read_text() if path.exists() else ""
 
@@ -172,53 +171,54 @@ class Trial:
         }
 
     def changes(self, process: Process) -> Iterator[None]:
-        """Yield for each change in what a process writes, until it ends. Looks 1000 times a second."""
-        before: list[tuple[str, int]] = []
+        """Yields at each change in the output folder while the process runs. Polls 1000 times a second."""
+        previous_sizes: list[tuple[str, int]] = []
         while process.is_alive():
-            if (now := _sizes(self.out)) != before:
-                before = now
+            if (sizes := _sizes(self.out)) != previous_sizes:
+                previous_sizes = sizes
                 yield
             time.sleep(1e-3)
 
-    def count_differing(self, whole: dict[str, bytes], what: str, *, complete: bool = False) -> int:
-        """Name and count files that differ from an undisturbed run, without those that vary.
+    def count_differing(self, undisturbed: dict[str, bytes], what: str, *, complete: bool = False) -> int:
+        """Prints and counts the files that differ from an undisturbed run, except those in `Writer.varies`.
 
         With `complete`, missing files count too.
         """
         files = self.files()
-        differing = [name for name in ({**files, **whole} if complete else files) if files.get(name) != whole.get(name)]
-        named = [name for name in differing if not any(fnmatch.fnmatch(name, one) for one in self.writer.varies)]
-        for name in named:
+        names = {**files, **undisturbed} if complete else files
+        differing = [name for name in names if files.get(name) != undisturbed.get(name)]
+        wrong = [name for name in differing if not any(fnmatch.fnmatch(name, one) for one in self.writer.varies)]
+        for name in wrong:
             print(f"{self.name}: {name} {what}", file=sys.stderr)
-        return len(named)
+        return len(wrong)
 
 
 def _sizes(folder: Path) -> list[tuple[str, int]]:
-    """Sizes of all files, hidden ones too, and all folders."""
+    """Paths with sizes of all files, also hidden ones, and of all folders, whose size is -1."""
     sizes = []
-    for where, folders, files in os.walk(folder):
-        sizes += [(os.path.join(where, name), -1) for name in folders]
-        for path in (os.path.join(where, name) for name in files):
+    for parent, folders, files in os.walk(folder):
+        sizes += [(os.path.join(parent, name), -1) for name in folders]
+        for path in (os.path.join(parent, name) for name in files):
             with contextlib.suppress(FileNotFoundError):
                 sizes.append((path, os.stat(path).st_size))
     return sorted(sizes)
 
 
-def _undisturbed(name: str, root: Path) -> Whole:
-    """Run twice: the first run compiles, and the second has to end with the same bytes."""
+def _undisturbed(name: str, root: Path) -> Undisturbed:
+    """Runs a command twice, and returns the second run. The first run compiles. Both must write the same bytes."""
     runs = []
     for _ in range(2):
         trial, begin = Trial(name, root), time.perf_counter()
         process = trial.start()
         changes = sum(1 for _ in trial.changes(process))
         assert status_of(process) == 0, f"{name}: {trial.error()}"
-        runs.append(Whole(trial.files(), time.perf_counter() - begin, changes))
+        runs.append(Undisturbed(trial.files(), time.perf_counter() - begin, changes))
     assert runs[1].files and not trial.count_differing(runs[0].files, "differs between two runs")
     return runs[1]
 
 
-def _disturb(commands: Sequence[str], rows_of: Callable[[str, Path, Whole], Iterator[dict[str, Any]]]) -> None:
-    """Make the inputs, and print a table of disturbed commands."""
+def _disturb(commands: Sequence[str], rows_of: Callable[[str, Path, Undisturbed], Iterator[dict[str, Any]]]) -> None:
+    """Makes the inputs, and prints the rows that `rows_of` yields for each command."""
     table = None
     with tempfile.TemporaryDirectory() as folder:
         inputs = Path(folder) / INPUTS
@@ -249,7 +249,7 @@ def kills(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 20, seed: 
     _disturb(commands, functools.partial(_killed, times=times, seed=seed))
 
 
-def _killed(name: str, root: Path, whole: Whole, *, times: int, seed: int) -> Iterator[dict[str, Any]]:
+def _killed(name: str, root: Path, undisturbed: Undisturbed, *, times: int, seed: int) -> Iterator[dict[str, Any]]:
     """Kill a command this many times, each time in an empty folder, and run it again."""
     draw = random.Random(f"{seed} {name}")
     counts = dict.fromkeys(("kills", "in the middle", "half-written", "next run fails", "other bytes"), 0)
@@ -259,24 +259,26 @@ def _killed(name: str, root: Path, whole: Whole, *, times: int, seed: int) -> It
         trial = Trial(name, root)
         process = trial.start()
         if attempt % 2:
-            for _ in itertools.islice(trial.changes(process), draw.randint(1, whole.changes)):
+            for _ in itertools.islice(trial.changes(process), draw.randint(1, undisturbed.changes)):
                 pass
             time.sleep(draw.uniform(0, 5e-3))
         else:
-            time.sleep(draw.uniform(0, whole.seconds))
+            time.sleep(draw.uniform(0, undisturbed.seconds))
         process.kill()
         if status_of(process) >= 0:
-            continue  # it was faster
+            continue  # the command had finished before
         counts["kills"] += 1
-        counts["in the middle"] += bool(half_written(trial.out)) or 0 < len(trial.files()) < len(whole.files)
-        counts["half-written"] += trial.count_differing(whole.files, "is not whole")
-        status, refuses = trial.run(), trial.writer.refuses
-        if status == 0 or (refuses and refuses in trial.error()):
-            counts["other bytes"] += trial.count_differing(whole.files, "differs after the next run", complete=True)
+        counts["in the middle"] += bool(half_written(trial.out)) or 0 < len(trial.files()) < len(undisturbed.files)
+        counts["half-written"] += trial.count_differing(undisturbed.files, "is not whole")
+        status, refusal = trial.run(), trial.writer.refuses
+        if status == 0 or (refusal and refusal in trial.error()):
+            counts["other bytes"] += trial.count_differing(
+                undisturbed.files, "differs after the next run", complete=True
+            )
         else:
             counts["next run fails"] += 1
             print(f"{name}: the next run ended with {status}: {trial.error()[-2000:]}", file=sys.stderr)
-    yield {"seconds": f"{whole.seconds:.1f}", "files": len(whole.files), **counts}
+    yield {"seconds": f"{undisturbed.seconds:.1f}", "files": len(undisturbed.files), **counts}
 
 
 def together(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 5) -> None:
@@ -289,7 +291,7 @@ def together(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 5) -> N
     _disturb(commands, functools.partial(_doubled, times=times))
 
 
-def _doubled(name: str, root: Path, whole: Whole, *, times: int) -> Iterator[dict[str, Any]]:
+def _doubled(name: str, root: Path, undisturbed: Undisturbed, *, times: int) -> Iterator[dict[str, Any]]:
     """Start a command twice at once, this many times."""
     counts = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
     for _ in range(times):
@@ -300,7 +302,7 @@ def _doubled(name: str, root: Path, whole: Whole, *, times: int) -> Iterator[dic
         counts["both end well" if not failures else "one is refused" if refused else "fail"] += 1
         for error in failures:
             print(f"{name}: one of two ended with: {error[-2000:]}", file=sys.stderr)
-        counts["other bytes"] += trial.count_differing(whole.files, "differs after two at once", complete=True)
+        counts["other bytes"] += trial.count_differing(undisturbed.files, "differs after two at once", complete=True)
     yield counts
 
 
@@ -315,43 +317,43 @@ def disk(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 4, seed: in
     _disturb(commands, functools.partial(_troubled, times=times, seed=seed))
 
 
-def _troubled(name: str, root: Path, whole: Whole, *, times: int, seed: int) -> Iterator[dict[str, Any]]:
+def _troubled(name: str, root: Path, undisturbed: Undisturbed, *, times: int, seed: int) -> Iterator[dict[str, Any]]:
     """Run a command with each of `TROUBLES`, this many times."""
     draw = random.Random(f"{seed} {name}")
     for trouble, run in TROUBLES.items():
         counts = dict.fromkeys(("refused in one line", "ends well", "anything else", "half-written"), 0)
         for _ in range(times):
             trial = Trial(name, root)
-            status = run(trial, whole, draw)
+            status = run(trial, undisturbed, draw)
             refused = status == 1 and _is_one_line(trial.error())
             kind = "ends well" if status == 0 else "refused in one line" if refused else "anything else"
             if kind == "anything else":
                 print(f"{name}, {trouble}: status {status}: {trial.error()[-2000:]}", file=sys.stderr)
             counts[kind] += 1
-            counts["half-written"] += trial.count_differing(whole.files, f"is not whole: {trouble}")
+            counts["half-written"] += trial.count_differing(undisturbed.files, f"is not whole: {trouble}")
         yield {"trouble": trouble, **counts}
 
 
 def _is_one_line(error: str) -> bool:
-    """Whether a command ended as it should if something is wrong."""
+    """Whether stderr ends with one line "error: ...", without a traceback."""
     return "Traceback" not in error and error.rstrip("\n").split("\n")[-1].startswith("error: ")
 
 
-def _without_room(trial: Trial, whole: Whole, draw: random.Random) -> int:
-    """No file may grow beyond a part of the largest one: to a program that is a full disk, and it takes no rights."""
-    return trial.run(file_bytes=draw.randrange(max(map(len, whole.files.values()))))
+def _without_room(trial: Trial, undisturbed: Undisturbed, draw: random.Random) -> int:
+    """Runs a command with limited file sizes, which fails like a full disk. The limit is below the largest file."""
+    return trial.run(file_bytes=draw.randrange(max(map(len, undisturbed.files.values()))))
 
 
-def _without_rights(trial: Trial, whole: Whole, draw: random.Random) -> int:
-    """Nobody may write into the folder."""
+def _without_rights(trial: Trial, undisturbed: Undisturbed, draw: random.Random) -> int:
+    """Runs a command whose output folder is read-only."""
     trial.out.chmod(0o555)
-    status = trial.run(humble=True)
+    status = trial.run(unprivileged=True)
     trial.out.chmod(0o755)
     return status
 
 
-def _meanwhile(trial: Trial, whole: Whole, draw: random.Random, change: Callable[[Path], None]) -> int:
-    """Change a file that the command names, or a scan of the drive that it names, at any time of its run."""
+def _meanwhile(trial: Trial, undisturbed: Undisturbed, draw: random.Random, change: Callable[[Path], None]) -> int:
+    """Changes an input file of the command, or a scan of its input recording, at a random time of its run."""
     root = trial.folder.parent
     inputs, before = root / INPUTS, root / "inputs-before"
     shutil.copytree(inputs, before)
@@ -359,7 +361,7 @@ def _meanwhile(trial: Trial, whole: Whole, draw: random.Random, change: Callable
         scans = sorted((trial.folder / SCANS).iterdir())
         named = [trial.folder / word for word in trial.writer.line.split() if word.startswith(f"../{INPUTS}/")]
         process = trial.start()
-        time.sleep(draw.uniform(0, whole.seconds))
+        time.sleep(draw.uniform(0, undisturbed.seconds))
         change(draw.choice([*scans[-len(named) :], *(one for one in named if one.is_file())]))
         return status_of(process)
     finally:
@@ -368,11 +370,11 @@ def _meanwhile(trial: Trial, whole: Whole, draw: random.Random, change: Callable
 
 
 def _cut(path: Path) -> None:
-    """Cut a file in the middle of a number."""
+    """Truncates a file to an odd size near its middle, so that it ends within a number."""
     os.truncate(path, path.stat().st_size // 2 | 1)
 
 
-TROUBLES: dict[str, Callable[[Trial, Whole, random.Random], int]] = {
+TROUBLES: dict[str, Callable[[Trial, Undisturbed, random.Random], int]] = {
     "full disk": _without_room,
     "read-only folder": _without_rights,
     "a file vanishes": functools.partial(_meanwhile, change=Path.unlink),

@@ -1,4 +1,4 @@
-"""What the benchmarks run on: the model of a preset, random weights, random scans and batches."""
+"""Inputs of the speed benchmarks: the model of a preset, random weights, random scans and batches."""
 
 import dataclasses
 
@@ -13,20 +13,20 @@ from sglpr_jax.training.batches import Batch
 from sglpr_jax.training.config import TrainConfig
 
 CLOUD_SPREAD = 0.29
-"""Standard deviation of x and y as a part of the window's width: 84 % of the points fall inside."""
+"""Standard deviation of x and y as a fraction of the window's width: 84 % of the points are inside."""
 
 MEAN_COUNT = 0.3
-"""Of the cells of a random image: a quarter of them are not empty."""
+"""Mean count of the cells of a random image. A quarter of the cells is not empty."""
 
 WEIGHT_NOISE = 0.01
-"""Added to initial weights, of which many are 0 or 1 and would hide that one stands in another's place."""
+"""Standard deviation of noise on initial weights. Many are 0 or 1, which would hide that two were exchanged."""
 
 
 def comparable_model(preset: str, *, labels: bool = True) -> ModelConfig:
-    """The preset's model, less what differs between frameworks or is no part of the network.
+    """Model of a preset without the parts that differ between frameworks.
 
-    Stochastic depth, which is random, is off; images of counts take the place of ready-made ones, which a step rotates;
-    without labels there is no segmentation head, as in a training without them.
+    Stochastic depth is off because it is random. Input images are images of counts. Without `labels`, there is no
+    segmentation head.
     """
     config = model_preset(preset)
     backbone = config.backbone
@@ -60,9 +60,9 @@ def random_images(number: int, grid: Grid, *, image: ImageKind) -> tuple[np.ndar
 
 
 def random_batch(config: TrainConfig, points: int, *, labels: bool = True) -> Batch:
-    """A step's tuples, all with labels or none: random clouds of so many points, or images.
+    """Random batch of a training step: clouds of `points` points, or images if `points` is 0.
 
-    Images with 0 points, and for a model of density images, which no step rasterises.
+    A model of density images always gets images, because a step does not rasterise them. All scans have labels or none.
     """
     positives, places = config.sampling.positives, config.images // config.tuples
     tuple_of, place_of = np.divmod(np.arange(config.images), places)

@@ -216,19 +216,19 @@ class Results:
         return {**row, "loops": len(self.latencies_s["edge"])}
 
     def _read(self) -> None:
-        """The loops of a scan come before its own line."""
+        """Reads all lines. The lines of a scan's loops come before the line of the scan."""
         assert self._node.stdout is not None
-        looped = None
+        last_loop_time = None
         for line in self._node.stdout:
-            now, value = time.time(), json.loads(line)
-            if value["type"] == "loop":
-                looped = now
+            now, message = time.time(), json.loads(line)
+            if message["type"] == "loop":
+                last_loop_time = now
                 continue
-            self.frames.append(value)
-            self.latencies_s["frame"].append(now - value["time"])
-            if looped is not None:
-                self.latencies_s["edge"].append(looped - value["time"])
-            looped = None
+            self.frames.append(message)
+            self.latencies_s["frame"].append(now - message["time"])
+            if last_loop_time is not None:
+                self.latencies_s["edge"].append(last_loop_time - message["time"])
+            last_loop_time = None
 
 
 def _wait_until(condition, node: subprocess.Popen) -> None:

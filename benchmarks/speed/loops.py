@@ -75,14 +75,14 @@ def _mean_s(job: Callable[[sglpr_jax.Scan], object], scans: list[sglpr_jax.Scan]
 
 
 def held_bytes(root: object) -> int:
-    """Bytes of an object and of all that it refers to, without functions, modules and classes."""
-    known, left, total = {id(root)}, [root], 0
-    while left:
-        current = left.pop()
+    """Bytes of an object and of all objects that it refers to, without functions, modules and classes."""
+    known_ids, queue, total = {id(root)}, [root], 0
+    while queue:
+        current = queue.pop()
         total += sys.getsizeof(current)
-        others = [current.base] if isinstance(current, np.ndarray) else gc.get_referents(current)
-        for other in others:
-            if id(other) not in known and not isinstance(other, type | ModuleType | FunctionType):
-                known.add(id(other))
-                left.append(other)
+        referents = [current.base] if isinstance(current, np.ndarray) else gc.get_referents(current)
+        for referent in referents:
+            if id(referent) not in known_ids and not isinstance(referent, type | ModuleType | FunctionType):
+                known_ids.add(id(referent))
+                queue.append(referent)
     return total

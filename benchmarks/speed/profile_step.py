@@ -1,6 +1,6 @@
-"""Where the time of a training step goes: part by part of the network, forward and backward, beside its floor.
+"""Time of a training step by parts of the network, forward and backward, and the minimum time by the device's peak.
 
-JAX's profiler tells how long each compiled operation ran, and its metadata which line of the network it comes from.
+JAX's profiler measures each compiled operation. The operation's metadata names the module that it comes from.
 """
 
 import re
@@ -89,7 +89,7 @@ def _timed_operations(folder: Path) -> Iterator[tuple[str, float]]:
 
 
 def _part_of(where: str) -> tuple[str, bool]:
-    """The part of the network that an operation is of, and whether it is of the backward pass."""
+    """Part of the network of an operation, from the path in its metadata, and whether it is in the backward pass."""
     modules: list[str] = []
     for step in _split_path(where):
         while wrapped := WRAPPER.match(step):
@@ -102,7 +102,7 @@ def _part_of(where: str) -> tuple[str, bool]:
 
 
 def _split_path(where: str) -> list[str]:
-    """At the slashes that are in no brackets: transpose(jvp(a/b))/c is two steps."""
+    """Splits a path at the slashes outside brackets: transpose(jvp(a/b))/c has two steps."""
     steps, open_brackets = [""], 0
     for letter in where:
         open_brackets += {"(": 1, ")": -1}.get(letter, 0)

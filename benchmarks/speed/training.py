@@ -28,10 +28,10 @@ NOMINAL_TYPE = "bfloat16"
 
 
 def count_flops(program: ClosedJaxpr) -> int:
-    """Operations of the matrix products and convolutions of a traced program, less what no output needs.
+    """Operations of the matrix products and convolutions that the outputs of a traced program need.
 
-    A product and its addition count two; of a branch the dearer side counts. XLA's own analysis counts the body of a
-    loop once. Raises ValueError for a product in a loop whose turns depend on values.
+    A product and its addition are two operations. Of a branch, the side with more operations counts. XLA's own analysis
+    counts the body of a loop once. Raises ValueError for a product in a loop whose number of turns is unknown.
     """
     needed, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars))
     return sum(map(_flops_of, needed.eqns))

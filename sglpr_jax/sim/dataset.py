@@ -10,12 +10,12 @@ from pathlib import Path
 
 from sglpr_jax.files import read_json, replacing
 from sglpr_jax.sim import RATE_HZ, SCANS
-from sglpr_jax.sim.drive import CARRIERS, check_drawing, name_of_path, read_path, scan_rows
+from sglpr_jax.sim.drive import CARRIERS, check_rate_and_seed, name_of_path, read_path, scan_rows
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import (
     PlannedRecording,
     SimulatedRecording,
-    numbered,
+    numbered_ids,
     plan_sessions,
     simulate_recording,
     simulate_repeating,
@@ -27,12 +27,13 @@ from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.styles import SCENERIES, TOWN
 
 SETTINGS_FILE = "simulation.json"
-VERSION = 3  # of the simulator's output; it changes whenever the scans of a seed change
-OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}  # of fields in older datasets
+VERSION = 3  # version of the simulator's output; it changes whenever the scans of a seed change
+OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}  # current names of old fields
 WORKERS = 2  # rendering threads; the compiled program leaves capacity for more than one
 ROUTES = ("00", "05", "08")  # default routes in towns
-REVISITED = ("01", "06", "08")  # where places repeat: without revisits, in the same, in the opposite direction
-DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
+REVISITED = ("01", "06", "08")
+"""Default routes in repeating sceneries: without revisits, with revisits in the same and in the opposite direction."""
+DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")  # default dates of sessions
 AZIMUTH_STEPS = 900  # firings per revolution in the default datasets
 BYTES_PER_RAY = {"scans": 16, "nclt": 5}  # approximate size of a scan with its labels, by layout
 BYTES_PER_IMAGE = 3500  # approximate size of an image with its label image, in bytes
@@ -57,8 +58,8 @@ class Simulated:
     def missing_bytes(self) -> int:
         """Approximate size of the missing recordings, in bytes."""
         rays = len(self.sensor.elevations_deg) * self.sensor.azimuth_steps
-        each = BYTES_PER_RAY[self.layout] * rays if self.layout in BYTES_PER_RAY else BYTES_PER_IMAGE
-        return each * self.scans * len(self.missing)
+        bytes_per_scan = BYTES_PER_RAY[self.layout] * rays if self.layout in BYTES_PER_RAY else BYTES_PER_IMAGE
+        return bytes_per_scan * self.scans * len(self.missing)
 
     def __str__(self) -> str:
         return f"{self.root}: recordings {', '.join(self.names)}"
@@ -85,8 +86,8 @@ def simulate(
 ) -> Simulated:
     """Drives a simulated LiDAR through simulated towns and writes scans, labels and poses.
 
-    Existing files are kept: the same call completes an interrupted dataset, and recordings can be added to one, but not
-    sessions, because their streets depend on the number of days.
+    Existing files are kept: the same call completes an interrupted dataset. Recordings can be added to a dataset.
+    Sessions cannot, because their streets depend on the number of days.
 
     Arguments:
       out: Output folder.
@@ -118,50 +119,60 @@ def simulate(
     Example:
       print(sglpr_jax.simulate("towns", routes=["08"], scans=400))
     """
-    lidar = _lidar(sensor or ("hdl32e-nclt" if sessions else "hdl64e"), azimuth_steps)
+    lidar = _find_sensor(sensor or ("hdl32e-nclt" if sessions else "hdl64e"), azimuth_steps)
     _check_arguments(routes, along, sessions, scenery, carrier, submap_m=submap_m, images=images, vary=vary)
-    repeats = scenery in REPEATING
+    is_repeating = scenery in REPEATING
     if routes is None:
-        routes = () if along or sessions else REVISITED if repeats else ROUTES
+        default_routes = REVISITED if is_repeating else ROUTES
+        routes = () if along or sessions else default_routes
     if rate_hz is None:
-        rate_hz = CARRIERS[carrier].rate_hz or REPEATING[scenery].rate_hz if repeats else RATE_HZ
-    layout = "nclt" if sessions else "varied" if vary else "images" if images else "scans"
+        rate_hz = (CARRIERS[carrier].rate_hz or REPEATING[scenery].rate_hz) if is_repeating else RATE_HZ
+    layout = "scans"
+    if sessions:
+        layout = "nclt"
+    elif images:
+        layout = "varied" if vary else "images"
     options = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
     settings = {
         "version": VERSION,
         "layout": layout,
-        "scenery": {"repeating": scenery} if repeats else dataclasses.asdict(SCENERIES[scenery]),
+        "scenery": {"repeating": scenery} if is_repeating else dataclasses.asdict(SCENERIES[scenery]),
         "sensor": dataclasses.asdict(lidar),
         "carrier": dataclasses.asdict(CARRIERS[carrier]),
         **options,
     }
     if sessions:
-        route, drives = next(iter(routes), "00"), {}
+        route, pose_files = next(iter(routes), "00"), {}
         plans = plan_sessions(sessions, route=route, sensor=lidar, scenery=SCENERIES[scenery], **options)
         settings |= {"sessions": sessions, "route": route}
     else:
-        check_drawing(rate_hz, seed)
-        drives, options = _drives(routes, along, scans), {**options, "sensor": lidar, "carrier": CARRIERS[carrier]}
-        plans = [_plan(name, file, scenery, submap_m, **options) for name, file in drives.items()]
+        check_rate_and_seed(rate_hz, seed)
+        pose_files = _pose_files(routes, along, scans)
+        options |= {"sensor": lidar, "carrier": CARRIERS[carrier]}
+        plans = [_plan(name, file, scenery, submap_m, **options) for name, file in pose_files.items()]
         settings |= {"submap_m": submap_m} if submap_m else {}
     out = Path(out)
-    _claim(out, settings, {f"drive {name}": _fingerprint(file) for name, file in drives.items()})
+    _claim(out, settings, {f"drive {name}": _fingerprint(file) for name, file in pose_files.items()})
     dataset = Simulated(out, tuple(plan.name for plan in plans), scans, layout, lidar)
     on_start(dataset)
     for k, plan in enumerate(plans):
-        count = len(plan.ids)
-        _write_drive(out, plan, LAYOUTS[layout], lambda done, k=k, n=count: on_progress(k * scans + done * scans // n))
+
+        def on_scan(done: int, k: int = k, count: int = len(plan.ids)) -> None:
+            on_progress(k * scans + done * scans // count)
+
+        _write_drive(out, plan, LAYOUTS[layout], on_scan)
     return dataset
 
 
 def default_dataset(cache: Path, *, sessions: bool = False) -> tuple[Path, dict]:
-    """Folder below `cache`, and options of `simulate`, of the default towns or of one town on three days."""
+    """Folder below `cache` and options of `simulate` for the default towns, or for one town on three days."""
     folder = f"{'sessions' if sessions else 'simulated'}-v{VERSION}-{SCANS}x{AZIMUTH_STEPS}-seed0"
     options = {"scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
     return cache / folder, options | ({"sessions": DAYS} if sessions else {})
 
 
-def _lidar(sensor: str | Sensor, azimuth_steps: int | None) -> Sensor:
+def _find_sensor(sensor: str | Sensor, azimuth_steps: int | None) -> Sensor:
+    """Sensor of this name, with `azimuth_steps` if it is not None. Raises ValueError if the name is unknown."""
     if isinstance(sensor, str):
         if sensor not in SENSORS:
             raise ValueError(f"expected a sensor among {', '.join(SENSORS)}, found {sensor!r}")
@@ -180,11 +191,12 @@ def _check_arguments(
     images: bool,
     vary: bool,
 ) -> None:
-    """Raises ValueError if a name is unknown, or if arguments contradict each other."""
+    """Raises ValueError if a scenery or carrier is unknown, or if arguments contradict each other."""
     names, sceneries = list(routes or ()), SCENERIES if sessions else {**SCENERIES, **REPEATING}
+    # In a repeating scenery, a drive is determined by its kind of revisits, so two equal kinds are the same drive.
     revisits = [ROLES[name].revisit for name in names if name in ROLES]
-    repeated = scenery in REPEATING and (along or len(set(revisits)) < len(revisits))
-    rules = (
+    has_equal_drives = scenery in REPEATING and (along or len(set(revisits)) < len(revisits))
+    rules = (  # condition that must hold, what was expected, what was found
         (
             not sessions or (not along and not images and len(names) <= 1),
             "with sessions, expected at most one route, no pose files and no images",
@@ -197,7 +209,7 @@ def _check_arguments(
         (0 <= submap_m < math.inf, "submap_m: expected metres, at least 0", f"{submap_m}"),
         (images or not vary, "vary: expected images", "scans; vary changes scans before they are converted to images"),
         (
-            not repeated,
+            not has_equal_drives,
             f"scenery {scenery}: expected no pose files and routes with different revisits, such as 01 06 08",
             " ".join([*names, *map(str, along)]),
         ),
@@ -207,8 +219,11 @@ def _check_arguments(
             raise ValueError(f"{expected}, found {found}")
 
 
-def _drives(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[str, Path | None]:
-    """Pose files of the drives, by name."""
+def _pose_files(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[str, Path | None]:
+    """Pose file of each drive by the drive's name, or None for a route.
+
+    Raises ValueError if a route is unknown, two drives have the same name, or `scans` is below 2.
+    """
     unknown = [name for name in routes if name not in ROLES]
     if unknown or scans < 2:
         raise ValueError(f"expected drives among {', '.join(ROLES)} with 2 scans or more, found {unknown}, {scans}")
@@ -219,7 +234,7 @@ def _drives(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[st
 
 
 def _plan(name: str, file: Path | None, scenery: str, submap_m: float, *, scans: int, **options) -> PlannedRecording:
-    """Drive of a route or along a pose file, with submaps of `submap_m`."""
+    """Plans the drive `name` along a route or a pose file. `options` are those of `simulate_recording`."""
 
     def simulate() -> SimulatedRecording:
         if scenery in REPEATING:
@@ -228,24 +243,28 @@ def _plan(name: str, file: Path | None, scenery: str, submap_m: float, *, scans:
             recording = simulate_recording(name, along=file, scenery=SCENERIES[scenery], scans=scans, **options)
         return with_submaps(recording, submap_m) if submap_m else recording
 
-    return PlannedRecording(name, numbered(scans if file is None else len(scan_rows(read_path(file), scans))), simulate)
+    scan_count = scans if file is None else len(scan_rows(read_path(file), scans))
+    return PlannedRecording(name, numbered_ids(scan_count), simulate)
 
 
 def _fingerprint(file: Path | None) -> str:
     """Hash of a pose file, or "route". The whole file is read, so a malformed file raises an error early."""
     if file is None:
         return "route"
-    return hashlib.sha256(b"".join(values.tobytes() for values in read_path(file))).hexdigest()[:16]
+    return hashlib.sha256(b"".join(array.tobytes() for array in read_path(file))).hexdigest()[:16]
 
 
-def _claim(root: Path, settings: dict, drives: dict[str, str]) -> None:
-    """Stores settings and drives in `root`, or checks that they match the stored ones. New drives are added."""
+def _claim(root: Path, settings: dict, fingerprints: dict[str, str]) -> None:
+    """Stores the settings and the fingerprints of drives in `root`. Fingerprints of new drives are added.
+
+    Raises ValueError if `root` holds other files, or other settings or fingerprints.
+    """
     path = root / SETTINGS_FILE
     if not path.exists() and root.is_dir() and any(not file.name.startswith(".") for file in root.iterdir()):
         raise ValueError(f"{root} holds files that were not simulated (no {SETTINGS_FILE}); choose another folder")
     stored = _read_settings(path) if path.exists() else {}
-    expected = json.loads(json.dumps({**settings, **drives}))  # as read from JSON: tuples become lists
-    merged = {**drives, **(stored or expected)}
+    expected = json.loads(json.dumps({**settings, **fingerprints}))  # as read from JSON: tuples become lists
+    merged = {**fingerprints, **(stored or expected)}
     different = [key for key, value in expected.items() if merged.get(key) != value]
     if different:
         described = ", ".join(f"{key} {expected[key]} (found {stored.get(key)})" for key in different)
@@ -262,16 +281,19 @@ def _read_settings(path: Path) -> dict:
         raise ValueError(f"{path}: expected the settings of a simulated dataset, found {settings!r:.60}")
     scenery = {OLD_NAMES.get(name, name): value for name, value in scenery.items()}
     sensor = settings.get("sensor")
-    rings = {name: getattr(Sensor, name) for name in ("azimuths_deg", "pattern")}
-    sensor = {**rings, **sensor} if isinstance(sensor, dict) else sensor
+    if isinstance(sensor, dict):
+        sensor = {"azimuths_deg": Sensor.azimuths_deg, "pattern": Sensor.pattern, **sensor}
     carrier = settings.get("carrier", dataclasses.asdict(CARRIERS["vehicle"]))
     return {**settings, **json.loads(json.dumps({"carrier": carrier, "sensor": sensor, "scenery": scenery}))}
 
 
 def _write_drive(root: Path, plan: PlannedRecording, layout: Layout, progress: Callable[[int], None]) -> None:
-    """Writes the missing files of one drive. The town is built only if files are missing."""
+    """Writes the missing files of one drive. The town is built only if files are missing.
+
+    `progress` is called with the number of existing scans.
+    """
     files = [layout.files_of_scan(root, plan.name, scan_id) for scan_id in plan.ids]
-    missing = [i for i, of_scan in enumerate(files) if not all(file.exists() for file in of_scan)]
+    missing = [i for i, scan_files in enumerate(files) if not all(file.exists() for file in scan_files)]
     progress(len(files) - len(missing))
     if not missing and layout.is_finished(root, plan.name):
         return

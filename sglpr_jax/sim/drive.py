@@ -41,9 +41,9 @@ class PlanarPath(NamedTuple):
     yaw: np.ndarray  # (n,) heading of the vehicle, radians
     times: np.ndarray  # (n,) seconds, from 0
 
-    def at(self, progress: Float[np.ndarray, " m"], times: Float[np.ndarray, " m"]) -> "PlanarPath":
-        """Returns the path that is at `times` where this path is at the times `progress`."""
-        x, y, yaw = (np.interp(progress, self.times, values) for values in (*self.xy.T, self.yaw))
+    def retimed(self, old_times: Float[np.ndarray, " m"], times: Float[np.ndarray, " m"]) -> "PlanarPath":
+        """Returns the poses of this path at `old_times` as a path with the times `times`, both in seconds."""
+        x, y, yaw = (np.interp(old_times, self.times, coordinate) for coordinate in (*self.xy.T, self.yaw))
         return PlanarPath(np.stack([x, y], axis=1), yaw, times)
 
 
@@ -59,7 +59,10 @@ def plan_path(
 ) -> PlanarPath:
     """Returns the path along route `name`, with a pose about every 0.1 s, for `scans / rate_hz` seconds or SHORTEST_S.
 
-    It has `days` equally long parts along the same streets, each with a multiple of `scans` poses.
+    The path has `days` equally long parts along the same streets, each with a multiple of `scans` poses.
+
+    Raises:
+      ValueError: The route is unknown, or `plan_route` finds no route that is so short.
     """
     if name not in ROLES:
         raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
@@ -67,16 +70,19 @@ def plan_path(
     seconds = max(scans / rate_hz, SHORTEST_S)
     middle = plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m), days=days)
     right_m = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * waves(rng, travelled(middle), SWAY_WAVELENGTH_M)
-    path = gaussian_filter1d(shifted(middle, -right_m), STEERING_M / STEP_M, axis=0, mode="nearest")
-    return timed(rng, path, free_mps=FREE_SPEED * role.speed_mps, poses=scans * days)
+    line = gaussian_filter1d(shifted(middle, -right_m), STEERING_M / STEP_M, axis=0, mode="nearest")
+    return timed(rng, line, free_mps=FREE_SPEED * role.speed_mps, poses=scans * days)
 
 
 def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps: float, poses: int) -> PlanarPath:
-    """Drive along `line`, with a multiple of `poses` poses. `free_mps` is the mean speed on free streets, in m/s."""
+    """Drive along `line`, at equal time steps of about 0.1 s. The number of poses is a multiple of `poses`.
+
+    `free_mps` is the mean speed on free streets, in m/s.
+    """
     heading = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
-    clock = _clock(rng, line, heading, free_mps)
-    times = _even_times(clock[-1], poses)
-    return PlanarPath(line, heading, clock).at(times, times)
+    point_times = _times_of_points(rng, line, heading, free_mps)
+    times = _even_times(point_times[-1], poses)
+    return PlanarPath(line, heading, point_times).retimed(times, times)
 
 
 def _even_times(end_s: float, poses: int) -> Float[np.ndarray, " n"]:
@@ -112,7 +118,7 @@ def name_of_path(file: Path) -> str:
 
 
 def scan_rows(path: PlanarPath, scans: int) -> Int[np.ndarray, " n"]:
-    """Returns every k-th row of a path, with the smallest k that gives at most `scans` rows."""
+    """Indices of every k-th pose of a path, with the smallest k that gives at most `scans` poses."""
     return np.arange(0, len(path.times), -(-len(path.times) // scans))
 
 
@@ -123,7 +129,7 @@ def speeds(path: PlanarPath) -> Float[np.ndarray, " n"]:
     return np.where(forward < 0, -1, 1) * np.linalg.norm(velocity, axis=1)
 
 
-def check_drawing(rate_hz: float, seed: int) -> None:
+def check_rate_and_seed(rate_hz: float, seed: int) -> None:
     """Raises ValueError if `rate_hz` is not positive and finite, or if `seed` is negative."""
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise ValueError(f"rate_hz: expected scans per second, more than 0, found {rate_hz}")
@@ -132,7 +138,7 @@ def check_drawing(rate_hz: float, seed: int) -> None:
 
 
 def drive_seed(seed: int, name: str) -> tuple[int, int]:
-    """Seed of one drive of a dataset. It depends on the name of the drive."""
+    """Seed of one drive of a dataset: the dataset's seed and a hash of the drive's name."""
     return seed, int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
 
 
@@ -147,7 +153,7 @@ def poses_on(
     """Returns world_from_lidar of a vehicle on the ground: x points forward, z along the normal of the ground.
 
     Arguments:
-      ground: Hills, or height (metres) and slope along x and y of the ground at each pose.
+      ground: Hills, or a pair of height (metres) and slope along x and y of the ground at each pose.
       xy: Position of the LiDAR, in metres.
       yaw: Heading of the vehicle, in radians.
       height_m: Height of the LiDAR above the ground along the normal, one value or one for each pose.
@@ -155,47 +161,47 @@ def poses_on(
     """
     if isinstance(ground, Relief):
         ground = relief_height(ground, xy), relief_gradient(ground, xy)
-    height, slope = ground
+    ground_height, slope = ground
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     x_axis = np.concatenate([forward, (forward * slope).sum(axis=1, keepdims=True)], axis=1)
     z_axis = np.concatenate([-slope, np.ones((len(yaw), 1))], axis=1)
-    steepness = np.linalg.norm(z_axis, axis=1)
+    normal_length = np.linalg.norm(z_axis, axis=1)
     x_axis /= np.linalg.norm(x_axis, axis=1, keepdims=True)
-    z_axis /= steepness[:, None]
+    z_axis /= normal_length[:, None]
     poses = np.tile(np.eye(4), (len(yaw), 1, 1))
     poses[:, :3, :3] = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=2)
     poses[:, :2, 3] = xy
-    poses[:, 2, 3] = height + height_m * steepness  # `height_m` along the normal
+    poses[:, 2, 3] = ground_height + height_m * normal_length  # a distance of `height_m` along the normal
     if tilt is not None:
         poses[:, :3, :3] @= Rotation.from_euler("yx", tilt).as_matrix()
     return poses
 
 
 def waves(rng: np.random.Generator, length: Float[np.ndarray, " n"], wavelength_m: Range) -> Float[np.ndarray, " n"]:
-    """Slowly varying random values along a path, between -1 and 1."""
+    """Mean of three random sines of the travelled `length`, in [-1, 1]. `wavelength_m` is the range of wavelengths."""
     wavelengths, phases = rng.uniform(*wavelength_m, 3), rng.uniform(0, 2 * np.pi, 3)
     return np.sin(2 * np.pi * length[:, None] / wavelengths + phases).mean(axis=1)
 
 
 def shifted(line: Line, left_m: Float[np.ndarray, " n"] | float) -> Line:
     """Shifts `line` to the left by `left_m` metres."""
-    ahead = np.gradient(line, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    return line + np.reshape(left_m, (-1, 1)) * np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    direction = np.gradient(line, axis=0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return line + np.reshape(left_m, (-1, 1)) * np.stack([-direction[:, 1], direction[:, 0]], axis=1)
 
 
-def _clock(
-    rng: np.random.Generator, path: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, " n"], free_mps: float
+def _times_of_points(
+    rng: np.random.Generator, line: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, " n"], free_mps: float
 ) -> Float[np.ndarray, " n"]:
-    """Time of each point of `path`, for the highest speed that streets, corners and a car's acceleration allow."""
-    length = travelled(path)
+    """Time of each point of `line`, for the highest speed that streets, corners and a car's acceleration allow."""
+    length = travelled(line)
     curvature = np.abs(np.gradient(heading, length)).clip(min=1e-6)
-    free = free_mps * (1 + 0.2 * waves(rng, length, SWAY_WAVELENGTH_M))
-    limit = np.minimum(free**2, LATERAL_ACCELERATION / curvature)
-    gain = 2 * ACCELERATION * length  # v^2 grows by at most 2 a s
-    limit = np.minimum.accumulate(limit - gain) + gain
-    limit = np.minimum.accumulate((limit + gain)[::-1])[::-1] - gain
-    speed = np.sqrt(limit)
+    free_speed = free_mps * (1 + 0.2 * waves(rng, length, SWAY_WAVELENGTH_M))
+    max_v2 = np.minimum(free_speed**2, LATERAL_ACCELERATION / curvature)  # maximum of the squared speed
+    v2_gain = 2 * ACCELERATION * length  # v^2 grows by at most 2 a s
+    max_v2 = np.minimum.accumulate(max_v2 - v2_gain) + v2_gain  # after slower points
+    max_v2 = np.minimum.accumulate((max_v2 + v2_gain)[::-1])[::-1] - v2_gain  # before slower points
+    speed = np.sqrt(max_v2)
     return np.concatenate([[0.0], np.cumsum(np.diff(length) / ((speed[1:] + speed[:-1]) / 2))])
 
 
@@ -216,17 +222,14 @@ class Carrier:
     bob_m: float = 0.0  # amplitude of the vertical motion with the steps, in metres
     sway_m: float = 0.0  # amplitude of the motion to the left and right with the steps, in metres
     halt_every_s: Range | None = None
-    """Range of the driving time between two halts, in seconds. A halt is a stand or, every second time, a reversal.
-
-    None never halts.
-    """
+    """Range of the driving time between halts, in seconds. Stands and reversals alternate. None never halts."""
     stand_s: Range = (5.0, 60.0)  # range of the duration of a stand, in seconds
     reverse_m: Range = (5.0, 15.0)  # range of the length of a reversal, in metres
 
     def motion(
         self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"] | float, Float[np.ndarray, " n"] | float]:
-        """Draws the motion of the sensor at `times`. Its mean height is `height_m` if the carrier has no height.
+        """Draws the motion of the sensor at `times`. If the carrier has no height, the mean height is `height_m`.
 
         Returns:
           Pitch and roll in radians, height above the ground, and distance to the left of the path, in metres.
@@ -241,35 +244,35 @@ class Carrier:
         """Inserts the halts into the drive along `path`. The number of poses is a multiple of `poses`."""
         if self.halt_every_s is None:
             return path
-        clock, progress = self._halts(rng, path)
-        even = np.arange(0, clock[-1], 1 / PATH_HZ)
-        smooth = gaussian_filter1d(np.interp(even, clock, progress), BRAKING_S * PATH_HZ, mode="nearest")
-        times = _even_times(even[-1], poses)
-        return path.at(np.interp(times, even, smooth), times)
+        times, path_times = self._knots(rng, path)
+        even_times = np.arange(0, times[-1], 1 / PATH_HZ)
+        smooth = gaussian_filter1d(np.interp(even_times, times, path_times), BRAKING_S * PATH_HZ, mode="nearest")
+        times = _even_times(even_times[-1], poses)
+        return path.retimed(np.interp(times, even_times, smooth), times)
 
-    def _halts(self, rng: np.random.Generator, path: PlanarPath) -> tuple[list[float], list[float]]:
-        """Knots of the drive with halts: times, and the times at which `path` is at the same places."""
+    def _knots(self, rng: np.random.Generator, path: PlanarPath) -> tuple[list[float], list[float]]:
+        """Draws halts. Returns times of the drive with halts, and times at which `path` is at the same positions."""
         assert self.halt_every_s is not None
-        clock, progress, length = [0.0], [0.0], travelled(path.xy)
+        times, path_times, length = [0.0], [0.0], travelled(path.xy)
 
-        def go(seconds: float, to: float) -> None:
-            clock.append(clock[-1] + seconds)
-            progress.append(to)
+        def add_knot(seconds: float, path_time: float) -> None:
+            times.append(times[-1] + seconds)
+            path_times.append(path_time)
 
         reverses, halt_s = rng.random() < 0.5, rng.uniform(*self.halt_every_s)
         while halt_s < path.times[-1]:
-            go(halt_s - progress[-1], halt_s)
+            add_knot(halt_s - path_times[-1], halt_s)
             if reverses:
-                metres = np.interp(halt_s, path.times, length) - rng.uniform(*self.reverse_m)
-                reversed_s = float(np.interp(metres, length, path.times))
-                go(SHIFT_S, halt_s)
-                go((halt_s - reversed_s) / REVERSE_SPEED, reversed_s)
-                go(SHIFT_S, reversed_s)
+                target_m = np.interp(halt_s, path.times, length) - rng.uniform(*self.reverse_m)
+                target_s = float(np.interp(target_m, length, path.times))
+                add_knot(SHIFT_S, halt_s)
+                add_knot((halt_s - target_s) / REVERSE_SPEED, target_s)
+                add_knot(SHIFT_S, target_s)
             else:
-                go(rng.uniform(*self.stand_s), halt_s)
+                add_knot(rng.uniform(*self.stand_s), halt_s)
             reverses, halt_s = not reverses, halt_s + rng.uniform(*self.halt_every_s)
-        go(float(path.times[-1]) - progress[-1], float(path.times[-1]))
-        return clock, progress
+        add_knot(float(path.times[-1]) - path_times[-1], float(path.times[-1]))
+        return times, path_times
 
 
 VEHICLE = Carrier()
@@ -287,19 +290,19 @@ CARRIERS = {
 
 def _body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
     """Draws pitch and roll of the vehicle's body relative to the ground at `times`, in radians."""
-    even = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
-    width = TILT_S * PATH_HZ
-    noise = gaussian_filter1d(rng.normal(size=(len(even), 2)), width, axis=0, mode="wrap")
-    noise *= np.sqrt(2 * width * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # undoes the loss of variance in the filter
-    return np.stack([np.interp(times, even, axis) for axis in noise.T], axis=1)
+    even_times = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
+    sigma = TILT_S * PATH_HZ
+    noise = gaussian_filter1d(rng.normal(size=(len(even_times), 2)), sigma, axis=0, mode="wrap")
+    noise *= np.sqrt(2 * sigma * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # the root undoes the filter's loss of variance
+    return np.stack([np.interp(times, even_times, angle) for angle in noise.T], axis=1)
 
 
 def _steps(
     rng: np.random.Generator, times: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Draws pitch and roll, and height, of a walking person at `times`, as fractions of their amplitudes."""
-    phase = np.pi * STEPS_HZ * times[:, None] * rng.uniform(0.97, 1.03, 2)  # the body sways once every two steps
-    sway = np.sin(phase * [2, 1] + rng.uniform(0, 2 * np.pi, 2))
-    seconds = rng.uniform(3, 8, 2)
-    drift = np.sin(2 * np.pi * times[:, None] / seconds + rng.uniform(0, 2 * np.pi, 2))
+    phase = np.pi * STEPS_HZ * times[:, None] * rng.uniform(0.97, 1.03, 2)
+    sway = np.sin(phase * [2, 1] + rng.uniform(0, 2 * np.pi, 2))  # pitch once every step, roll once every two steps
+    drift_period_s = rng.uniform(3, 8, 2)
+    drift = np.sin(2 * np.pi * times[:, None] / drift_period_s + rng.uniform(0, 2 * np.pi, 2))
     return 0.6 * sway + 0.4 * drift, np.sin(2 * phase[:, 0])

@@ -1,7 +1,8 @@
 """Ground: smooth hills, a raster of semantic labels, and the intersection of rays with both.
 
-Along a ray, a parabola approximates the ground. It has the height and slope below the sensor, and the true height where
-a first parabola meets the ray. The error at 30 to 40 m is at most 0.04 m in towns, sometimes 0.2 m in the outskirts.
+Along a ray, a parabola approximates the ground. The parabola has the height and slope below the sensor, and the true
+height at one more point, where a first parabola with the true curvature below the sensor meets the ray. The error at 30
+to 40 m is at most 0.04 m in towns, sometimes 0.2 m in the outskirts.
 """
 
 from typing import NamedTuple
@@ -19,8 +20,8 @@ CELL_M = 0.25  # size of a cell of the raster, in metres
 KERB_M = 0.12  # height of sidewalks, gardens and fields above the road, in metres
 ROAD_LEVEL = (ROAD, PARKING, OTHER_GROUND, LANE_MARKING)  # labels of ground at the level of the road
 
-_WAVES = 4
-_NEAR_M = 3.0  # minimum distance of the fitted point, in metres; closer hills bend by less than a millimetre
+_WAVES = 4  # number of waves whose sum is the height of the hills
+_NEAR_M = 3.0  # minimum distance of the parabola's second point, in metres; closer hills bend by less than a millimetre
 
 
 class Relief(NamedTuple):
@@ -33,14 +34,15 @@ class Relief(NamedTuple):
 
 def draw_relief(rng: np.random.Generator, scenery: Scenery = TOWN) -> Relief:
     """Draws hills with a slope of at most `scenery.steepest`. Some drives are nearly flat."""
-    number = 2 * np.pi / rng.uniform(*scenery.wavelength_m, _WAVES)
+    wave_number = 2 * np.pi / rng.uniform(*scenery.wavelength_m, _WAVES)
     bearing = rng.uniform(0, 2 * np.pi, _WAVES)
-    slopes = rng.uniform(0.2, 1.0) * scenery.steepest * rng.dirichlet(np.ones(_WAVES))  # the sum is the steepest one
-    wave = number[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-    return Relief(slopes / number, wave, rng.uniform(0, 2 * np.pi, _WAVES))
+    slopes = rng.uniform(0.2, 1.0) * scenery.steepest * rng.dirichlet(np.ones(_WAVES))  # sum <= scenery.steepest
+    wave = wave_number[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    return Relief(slopes / wave_number, wave, rng.uniform(0, 2 * np.pi, _WAVES))
 
 
 def _angle(relief: Relief, xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b k"]:
+    """Argument of the sine of each wave at `xy`, in radians."""
     return xy @ relief.wave.T + relief.phase
 
 
@@ -63,16 +65,17 @@ def relief_curvature(relief: Relief, xy: Float[np.ndarray, "*b 2"]) -> Float[np.
 class Ground(NamedTuple):
     """Raster of the labels of the ground, and the hills below it."""
 
-    label: np.ndarray  # (rows, columns) uint8 raw SemanticKITTI ids; row = y, column = x, cells of CELL_M
+    label: np.ndarray  # (rows along y, columns along x) uint8 raw SemanticKITTI ids of cells of CELL_M
     origin: np.ndarray  # (2,) x and y of the raster's first corner, metres
     relief: Relief
 
     def around(self, centre: Float[np.ndarray, "2"], reach_m: float) -> "Ground":
         """Crops a square of half size `reach_m` around `centre`. Outside the raster, the labels of its edge repeat."""
-        cells = int(reach_m / CELL_M) + 1
-        first = np.floor((centre - self.origin) / CELL_M).astype(int) - cells
-        columns, rows = (first[:, None] + np.arange(2 * cells + 1)).clip(0, np.array(self.label.shape)[::-1, None] - 1)
-        return Ground(self.label[np.ix_(rows, columns)], self.origin + first * CELL_M, self.relief)
+        reach_cells = int(reach_m / CELL_M) + 1
+        first_cell = np.floor((centre - self.origin) / CELL_M).astype(int) - reach_cells  # column and row
+        last_in_raster = np.array(self.label.shape)[::-1, None] - 1
+        columns, rows = (first_cell[:, None] + np.arange(2 * reach_cells + 1)).clip(0, last_in_raster)
+        return Ground(self.label[np.ix_(rows, columns)], self.origin + first_cell * CELL_M, self.relief)
 
 
 def label_at(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Int[np.ndarray, "*b"]:
@@ -83,8 +86,9 @@ def label_at(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Int[np.ndarray, "
 
 
 def surface_height(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
-    """Height of the ground at `xy` in metres. Other ground than ROAD_LEVEL is KERB_M above the road."""
-    return np.asarray(relief_height(ground.relief, xy) + KERB_M * ~np.isin(label_at(ground, xy), ROAD_LEVEL))
+    """Height of the ground at `xy` in metres. Ground whose label is not in ROAD_LEVEL is KERB_M above the road."""
+    is_raised = ~np.isin(label_at(ground, xy), ROAD_LEVEL)
+    return np.asarray(relief_height(ground.relief, xy) + KERB_M * is_raised)
 
 
 class GroundView(NamedTuple):
@@ -99,15 +103,15 @@ class GroundView(NamedTuple):
     curvature: AnyArray  # (2, 2) second derivatives of this road level, 1 / metres
 
 
-def ground_view(ground: Ground, sensor: Float[np.ndarray, "3"], *, reach_m: float) -> GroundView:
-    """Crops the ground to `reach_m` around a sensor at the world position `sensor`."""
-    xy, relief = sensor[:2], ground.relief
-    near = ground.around(xy, reach_m)
-    local = relief._replace(phase=(relief.wave @ xy + relief.phase) % (2 * np.pi))
-    height = sensor[2] - relief_height(relief, xy)
-    slopes = relief_gradient(relief, xy), relief_curvature(relief, xy)
-    numbers = (near.origin - xy, local, sensor[2], height, *slopes)
-    return GroundView(near.label, *jax.tree.map(np.float32, numbers))
+def ground_view(ground: Ground, sensor_xyz: Float[np.ndarray, "3"], *, reach_m: float) -> GroundView:
+    """Crops the ground to `reach_m` around a sensor at the world position `sensor_xyz`, as float32 for the device."""
+    xy, z, relief = sensor_xyz[:2], sensor_xyz[2], ground.relief
+    cropped = ground.around(xy, reach_m)
+    local_relief = relief._replace(phase=(relief.wave @ xy + relief.phase) % (2 * np.pi))
+    height = z - relief_height(relief, xy)
+    gradient, curvature = relief_gradient(relief, xy), relief_curvature(relief, xy)
+    fields = (cropped.origin - xy, local_relief, z, height, gradient, curvature)  # from corner to curvature
+    return GroundView(cropped.label, *jax.tree.map(np.float32, fields))
 
 
 def meet_ground(
@@ -118,24 +122,26 @@ def meet_ground(
     `rays` are unit vectors in the world's axes, from the sensor. Beyond `reach_m`, distances are rough. A ray that hits
     the face of a kerb gets the label behind the kerb, and the distance at which it would hit the road there.
     """
+    # Along a ray, the ground rises by slope * t + bend * t^2, and the ray by rays.z * t.
     slope = ground.gradient[0] * rays.x + ground.gradient[1] * rays.y
     curvature, closing = ground.curvature, slope - rays.z
     bend = 0.5 * (curvature[0, 0] * rays.x**2 + curvature[1, 1] * rays.y**2) + curvature[0, 1] * rays.x * rays.y
 
-    about = jnp.clip(_crossing(bend, closing, ground.height), _NEAR_M, reach_m)
-    rise = _height(ground.relief, about * rays.x, about * rays.y) - (ground.sensor_z - ground.height)
-    bend = (rise - slope * about) / about**2
+    first_distance = jnp.clip(_crossing(bend, closing, ground.height), _NEAR_M, reach_m)
+    hit_height = _height(ground.relief, first_distance * rays.x, first_distance * rays.y)
+    rise = hit_height - (ground.sensor_z - ground.height)
+    bend = (rise - slope * first_distance) / first_distance**2  # the parabola now has the true height there
 
     at_kerb, at_road = _crossing(bend, closing, ground.height - KERB_M), _crossing(bend, closing, ground.height)
     kerb_label, road_label = _label(rays, at_kerb, ground), _label(rays, at_road, ground)
-    raised = jnp.all(jnp.stack([kerb_label != low for low in ROAD_LEVEL]), axis=0) & jnp.isfinite(at_kerb)
-    distance = jnp.where(raised, at_kerb, at_road)
+    is_raised = jnp.all(jnp.stack([kerb_label != label for label in ROAD_LEVEL]), axis=0) & jnp.isfinite(at_kerb)
+    distance = jnp.where(is_raised, at_kerb, at_road)
     facing = jnp.clip(closing + 2 * bend * jnp.where(jnp.isfinite(distance), distance, 0), 0, 1)
-    return distance, jnp.where(raised, kerb_label, road_label), facing
+    return distance, jnp.where(is_raised, kerb_label, road_label), facing
 
 
 def _height(relief: Relief, x: Array, y: Array) -> Array:
-    """Height of the road level at x and y, in metres."""
+    """Height of the road level at x and y, in metres, on the device."""
 
     def add_wave(height: Array, wave: Relief) -> tuple[Array, None]:
         return height + wave.amplitude * jnp.sin(wave.wave[0] * x + wave.wave[1] * y + wave.phase), None
@@ -153,6 +159,7 @@ def _crossing(bend: Array, closing: Array, height: AnyArray) -> Array:
 
 
 def _label(rays: Vectors, distance: Array, ground: GroundView) -> Int[Array, "*rays"]:
+    """Label of the ground at `distance` along each ray. At inf, the label is arbitrary."""
     distance = jnp.where(jnp.isfinite(distance), distance, 0)
     (rows, columns), corner = ground.label.shape, ground.corner
     row = jnp.clip(jnp.floor((distance * rays.y - corner[1]) / CELL_M).astype(jnp.int32), 0, rows - 1)

@@ -38,11 +38,11 @@ class Layout(NamedTuple):
     A mounting of None is the mounting that the models expect.
     """
     drive_contents: Callable[[TimedPoses], dict[str, bytes]]
-    """Function that returns the files of the whole drive by name. They are written after all scans."""
-    last_file: str
-    """Last of the files of the whole drive. If it exists, the drive is complete."""
+    """Function that returns the contents of the files of the whole drive, by name. They are written after all scans."""
+    last_file: str  # last of the files of the whole drive; if it exists, the drive is complete
 
     def files_of_scan(self, root: Path, name: str, id: str) -> tuple[Path, ...]:
+        """Paths of the files of scan `id` in drive `name`."""
         return tuple(root / self.folder.format(name=name) / file.format(id=id) for file in self.scan_files)
 
     def file_of_drive(self, root: Path, name: str, file: str) -> Path:
@@ -57,35 +57,39 @@ class Layout(NamedTuple):
 def _image_and_labels(
     points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None, *, varied: bool = False
 ) -> tuple[bytes, ...]:
-    """Density image of a levelled scan, and image of the raw ids of its pixels. Empty pixels have the id 0."""
+    """PNG of a levelled scan's density image, and PNG of the raw label ids of its pixels, 0 for empty pixels.
+
+    With `varied`, the scan is changed by `vary` first.
+    """
     xyz = points[:, :3].astype(np.float32)
     if varied:
         xyz, labels = vary(xyz, labels, mounting)
     elif mounting is not None:
         xyz = mounting.level(xyz)
     image = density_image(xyz)
-    shown = np.where(image > 0, density_label_image(xyz, labels), 0)
-    return _png(image), _png(shown.astype(np.uint16))
+    label_image = np.where(image > 0, density_label_image(xyz, labels), 0)
+    return _encode_png(image), _encode_png(label_image.astype(np.uint16))
 
 
-def _png(pixels: UInt[np.ndarray, "rows columns"]) -> bytes:
+def _encode_png(pixels: UInt[np.ndarray, "rows columns"]) -> bytes:
     png = io.BytesIO()
     Image.fromarray(pixels).save(png, format="png")
     return png.getvalue()
 
 
-def _row(matrix: Float[np.ndarray, "r 4"]) -> str:
+def _matrix_line(matrix: Float[np.ndarray, "r 4"]) -> str:
+    """Line of the 12 numbers in the first three rows of a matrix."""
     return " ".join(f"{value:.9g}" for value in matrix[:3].ravel()) + "\n"
 
 
 def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
     """Calibration with identity projections, times, and poses world_from_camera, both in a camera's axes."""
-    projections = "".join(f"P{i}: {_row(np.eye(4))}" for i in range(4))
+    projections = "".join(f"P{i}: {_matrix_line(np.eye(4))}" for i in range(4))
     world_from_camera = CAMERA_FROM_LIDAR @ poses.world_from_lidar @ CAMERA_FROM_LIDAR.T
     return {
-        "calib.txt": f"{projections}Tr: {_row(CAMERA_FROM_LIDAR)}".encode(),
+        "calib.txt": f"{projections}Tr: {_matrix_line(CAMERA_FROM_LIDAR)}".encode(),
         "times.txt": "".join(f"{time:.6e}\n" for time in poses.times).encode(),
-        "poses.txt": "".join(_row(pose) for pose in world_from_camera).encode(),
+        "poses.txt": "".join(_matrix_line(pose) for pose in world_from_camera).encode(),
     }
 
 
@@ -104,10 +108,10 @@ def _nclt_files(poses: TimedPoses) -> dict[str, bytes]:
     lidar_from_body = np.eye(4)
     lidar_from_body[2, 3] = -NCLT_HEIGHT_M
     world_from_body = poses.world_from_lidar @ lidar_from_body
-    turns = np.diag(Z_UP_FROM_Z_DOWN) @ world_from_body[:, :3, :3] @ np.diag(Z_UP_FROM_Z_DOWN)
-    angles = Rotation.from_matrix(turns).as_euler("ZYX")[:, ::-1]
-    places = world_from_body[:, :3, 3] * Z_UP_FROM_Z_DOWN
-    rows = zip(poses.times, np.concatenate([places, angles], axis=1), strict=True)
+    rotations = np.diag(Z_UP_FROM_Z_DOWN) @ world_from_body[:, :3, :3] @ np.diag(Z_UP_FROM_Z_DOWN)
+    roll_pitch_yaw = Rotation.from_matrix(rotations).as_euler("ZYX")[:, ::-1]
+    positions = world_from_body[:, :3, 3] * Z_UP_FROM_Z_DOWN
+    rows = zip(poses.times, np.concatenate([positions, roll_pitch_yaw], axis=1), strict=True)
     lines = (f"{to_utime(time)}," + ",".join(f"{value:.9g}" for value in row) for time, row in rows)
     return {"groundtruth_{name}.csv": "".join(f"{line}\n" for line in lines).encode()}
 
@@ -121,7 +125,7 @@ _IMAGES = Layout(
     folder="{name}",
     scan_files=("imgs/{id}.png", "labels/{id}.png"),
     scan_contents=_image_and_labels,
-    drive_contents=lambda poses: {"pose.txt": "".join(map(_row, poses.world_from_lidar)).encode()},
+    drive_contents=lambda poses: {"pose.txt": "".join(map(_matrix_line, poses.world_from_lidar)).encode()},
     last_file="pose.txt",
 )
 LAYOUTS = {
@@ -152,7 +156,7 @@ label images, without times. "nclt" is the layout of NCLT's sessions, without la
 def vary(
     points: Float32[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"], mounting: Mounting | None
 ) -> tuple[Float32[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
-    """Removes points of some scans, levels the scan, and rotates it about z by a random angle.
+    """Removes random points or whole rings of some scans, levels the scan, and rotates it about z by a random angle.
 
     The random seed is a hash of `points`, which are in the LiDAR frame.
     """
@@ -165,14 +169,14 @@ def vary(
         corruption = Corruption("beams", BEAMS[int(len(BEAMS) * strength)])
     else:
         corruption = Corruption("clean")
-    left = corrupt(points, corruption, rng=rng)[1]
-    points, labels = points[left], labels[left]
+    remaining_rows = corrupt(points, corruption, rng=rng)[1]
+    points, labels = points[remaining_rows], labels[remaining_rows]
     points = points if mounting is None else mounting.level(points)
     return rotated(points, 2 * np.pi * seed / 2**32), labels
 
 
 def _has_rings(points: Float32[np.ndarray, "n 3"]) -> bool:
-    """Whether the points are those of rings. Submaps and sensors of other patterns keep all points instead."""
+    """Whether the points are ordered in rings, unlike the points of submaps and of scattered patterns."""
     try:
         ring_numbers(points)
     except ValueError:

@@ -16,22 +16,22 @@ _FACADE_M = 0.06
 
 
 class Primitive(NamedTuple):
-    """One shape of a thing, in metres and radians in the thing's frame: x forward, y left, z = 0 on the ground."""
+    """One shape of an object, in metres and radians in the object's frame: x forward, y left, z = 0 on the ground."""
 
     kind: Kind
     label: int
     size: tuple[float, float, float]  # length, width, height
-    x: float = 0.0
+    x: float = 0.0  # of the centre
     y: float = 0.0
-    bottom: float = 0.0
+    bottom: float = 0.0  # z of the lower end
     yaw: float = 0.0
-    roughness: float = 0.0
+    roughness: float = 0.0  # this and the following fields: see `Shapes`
     porosity: float = 0.0
     glass: float = 0.0
 
 
 ObjectModel = tuple[Primitive, ...]
-"""Parts that stand, appear and disappear together."""
+"""Object: parts that stand, appear and disappear together."""
 
 
 def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Primitive:
@@ -51,17 +51,17 @@ def ball(label: int, width: float, height: float, x: float = 0.0, y: float = 0.0
 
 def tree(rng: np.random.Generator, spread: Range) -> ObjectModel:
     """Tree whose crown has a diameter in the range `spread`, in metres. A large crown has several ellipsoids."""
-    crown, below = rng.uniform(*spread), rng.uniform(0.9, 2.6)
+    crown, crown_bottom = rng.uniform(*spread), rng.uniform(0.9, 2.6)
     thickness = 0.12 + 0.05 * crown * rng.uniform(0.6, 1.4)
-    parts = [post(labels.TRUNK, thickness, below + 0.35 * crown)]
+    parts = [post(labels.TRUNK, thickness, crown_bottom + 0.35 * crown)]
     lobes = 1 if crown < 3.5 else int(rng.integers(2, 5))
     for _ in range(lobes):
         size = crown * (1.0 if lobes == 1 else rng.uniform(0.6, 0.85))
         x, y = (rng.uniform(-0.5, 0.5, 2) * (crown - size)).tolist()
-        low = below + rng.uniform(0, 0.25) * crown * (lobes > 1)
+        bottom = crown_bottom + rng.uniform(0, 0.25) * crown * (lobes > 1)
         height = size * rng.uniform(0.8, 1.3)
         porosity = rng.uniform(0.45, 0.75)
-        parts.append(ball(labels.VEGETATION, size, height, x, y, bottom=low, roughness=0.7, porosity=porosity))
+        parts.append(ball(labels.VEGETATION, size, height, x, y, bottom=bottom, roughness=0.7, porosity=porosity))
     return tuple(parts)
 
 
@@ -74,29 +74,28 @@ def limbed_tree(rng: np.random.Generator, spread: Range) -> ObjectModel:
         width, height = rng.uniform((0.6, 0.7), (2.2, 1.8)).tolist()
         x, y = rng.uniform(-0.4, 0.4, 2).tolist()
         parts.append(ball(labels.TRUNK, width, height, x, y, bottom=fork - 0.2, roughness=0.4, porosity=0.8))
-    low, porosity = fork + rng.uniform(-0.3, 1.6), rng.uniform(0.55, 0.85)
-    parts.append(ball(labels.VEGETATION, crown, crown, bottom=low, roughness=0.9, porosity=porosity))
+    bottom, porosity = fork + rng.uniform(-0.3, 1.6), rng.uniform(0.55, 0.85)
+    parts.append(ball(labels.VEGETATION, crown, crown, bottom=bottom, roughness=0.9, porosity=porosity))
     return tuple(parts)
 
 
 def conifer(rng: np.random.Generator) -> ObjectModel:
     """Conifer with a crown that reaches the ground."""
-    spread = rng.uniform(1.5, 4)
-    leaves = ball(labels.VEGETATION, spread, 3 * spread, bottom=-0.8 * spread, roughness=0.5, porosity=0.45)
-    return post(labels.TRUNK, 0.3, 1.5), leaves
+    width = rng.uniform(1.5, 4)
+    crown = ball(labels.VEGETATION, width, 3 * width, bottom=-0.8 * width, roughness=0.5, porosity=0.45)
+    return post(labels.TRUNK, 0.3, 1.5), crown
 
 
-def bush(rng: np.random.Generator, large: float = 1.0) -> ObjectModel:
-    """Bush of one or two ellipsoids. `large` scales their size."""
+def bush(rng: np.random.Generator, scale: float = 1.0) -> ObjectModel:
+    """Bush of one or two ellipsoids, the second at a random offset. `scale` multiplies their size."""
     parts = []
-    large *= rng.uniform(0.6, 1.7)
+    scale *= rng.uniform(0.6, 1.7)
     for i in range(int(rng.integers(1, 3))):
-        length, width, height = large * rng.uniform((0.8, 0.8, 0.7), (3.0, 2.0, 2.4))
-        x, y = i * rng.uniform(-0.5, 0.5, 2) * (length, width)
+        length, width, height = scale * rng.uniform((0.8, 0.8, 0.7), (3.0, 2.0, 2.4))
+        x, y = (i * rng.uniform(-0.5, 0.5, 2) * (length, width)).tolist()
         size, yaw = (length, width, 1.4 * height), rng.uniform(0, np.pi)
-        parts.append(
-            Primitive("ellipsoid", labels.VEGETATION, size, float(x), float(y), -0.4 * height, yaw, 0.45, 0.45)
-        )
+        options = {"bottom": -0.4 * height, "yaw": yaw, "roughness": 0.45, "porosity": 0.45}
+        parts.append(Primitive("ellipsoid", labels.VEGETATION, size, x, y, **options))
     return tuple(parts)
 
 
@@ -111,12 +110,12 @@ def hedge(
 def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: float) -> ObjectModel:
     """Piece of an overgrown hedge along x: a dense face, with leaves behind it (y > 0) that become thinner."""
     parts = [*hedge(length, thickness, height, roughness=0.12, porosity=rng.uniform(0.2, 0.5))]
-    behind = thickness / 2
+    layer_y = thickness / 2  # front of the next layer of leaves
     for porosity in (0.55, 0.7, 0.8)[: int(rng.integers(0, 4))]:
-        depth, top = rng.uniform(0.5, 1.3), height * rng.uniform(0.9, 1.7)
-        layer = hedge(length, depth, top, roughness=0.6, porosity=porosity)[0]
-        parts.append(layer._replace(y=behind + depth / 2))
-        behind += depth
+        layer_depth, layer_height = rng.uniform(0.5, 1.3), height * rng.uniform(0.9, 1.7)
+        (layer,) = hedge(length, layer_depth, layer_height, roughness=0.6, porosity=porosity)
+        parts.append(layer._replace(y=layer_y + layer_depth / 2))
+        layer_y += layer_depth
     return tuple(parts)
 
 
@@ -127,20 +126,20 @@ def thicket(rng: np.random.Generator) -> ObjectModel:
         x, y = rng.uniform(-2.5, 2.5, 2).tolist()
         thickness = rng.uniform(0.15, 0.45)
         parts.append(post(labels.TRUNK, thickness, rng.uniform(4, 8), x, y))
-        size = rng.uniform(2.5, 5)
-        low = rng.uniform(1.0, 3.5)
+        crown = rng.uniform(2.5, 5)
+        bottom = rng.uniform(1.0, 3.5)
         porosity = rng.uniform(0.5, 0.75)
-        parts.append(ball(labels.VEGETATION, size, 1.5 * size, x, y, bottom=low, roughness=0.9, porosity=porosity))
+        parts.append(ball(labels.VEGETATION, crown, 1.5 * crown, x, y, bottom=bottom, roughness=0.9, porosity=porosity))
     return tuple(parts)
 
 
 def car(rng: np.random.Generator) -> ObjectModel:
     """Car: a body of full length, with a shorter and narrower cabin on top."""
     length, width, height = rng.uniform(3.7, 4.8), rng.uniform(1.65, 1.85), rng.uniform(1.4, 1.65)
-    cabin, estate = rng.uniform(0.45, 0.7) * length, rng.uniform(0, 0.12) * length
+    cabin_length, cabin_shift = rng.uniform(0.45, 0.7) * length, rng.uniform(0, 0.12) * length
     return (
         block(labels.CAR, length, width, 0.4 * height, bottom=0.22),
-        block(labels.CAR, cabin, 0.88 * width, 0.4 * height, x=-estate, bottom=0.6 * height),
+        block(labels.CAR, cabin_length, 0.88 * width, 0.4 * height, x=-cabin_shift, bottom=0.6 * height),
     )
 
 
@@ -174,6 +173,7 @@ def motorcycle(rng: np.random.Generator) -> ObjectModel:
 
 
 def _rider(rng: np.random.Generator, label: int, vehicle: Primitive) -> ObjectModel:
+    """Person on a vehicle of one part. Both have the label `label`."""
     body = Primitive("cylinder", label, (0.4, 0.45, rng.uniform(1.6, 1.85) - 0.7), bottom=0.7)
     return vehicle._replace(label=label), body
 
@@ -195,15 +195,15 @@ def person(rng: np.random.Generator) -> ObjectModel:
 def people(rng: np.random.Generator) -> ObjectModel:
     """One to three people side by side, including their arms and bags."""
     parts = []
-    for place in range(int(rng.integers(1, 4))):
+    for k in range(int(rng.integers(1, 4))):
         depth, width, height = rng.uniform((0.35, 0.5, 1.5), (0.6, 0.8, 1.9)).tolist()
         x, y = rng.uniform(-0.15, 0.15, 2).tolist()
-        parts.append(Primitive("cylinder", labels.PERSON, (depth, width, height), x, y + 0.75 * place, roughness=0.12))
+        parts.append(Primitive("cylinder", labels.PERSON, (depth, width, height), x, y + 0.75 * k, roughness=0.12))
     return tuple(parts)
 
 
 def moving(thing: ObjectModel) -> ObjectModel:
-    """`thing` with the labels of the moving classes."""
+    """Returns `thing` with the labels of the moving classes, see `labels.MOVING`."""
     return tuple(part._replace(label=labels.MOVING[part.label]) for part in thing)
 
 
@@ -221,32 +221,38 @@ class House(NamedTuple):
     glass: float
 
 
-def _block(width: float, depth: float, height: float, x: float, front: float, glass: float) -> Primitive:
+def _building_block(
+    width: float, depth: float, height: float, *, x: float = 0.0, front: float = 0.0, glass: float = 0.0
+) -> Primitive:
     """Box with its front at y = `front`. It extends below the ground."""
     size = width, depth, height + _BELOW_M
     return Primitive("box", labels.BUILDING, size, x, front + depth / 2, -_BELOW_M, roughness=_FACADE_M, glass=glass)
 
 
 def house(rng: np.random.Generator, plan: House, *, porch: bool) -> ObjectModel:
-    """House with the middle of its front at the origin, and y into the house. A `porch` needs room in front of it."""
-    width, depth, height = plan.width, plan.depth, plan.height
-    parts = [_block(width, depth, height, 0.0, 0.0, plan.glass)]
+    """House with the middle of its front at the origin, and y into the house, perhaps with a wing and balconies.
+
+    With `porch`, three of ten houses have a porch in front.
+    """
+    width, depth, height, glass = plan
+    parts = [_building_block(width, depth, height, glass=glass)]
     if width > 5 and rng.random() < 0.65:
-        side, share, recess = rng.choice((-1, 1)), rng.uniform(0.25, 0.6), rng.uniform(0.6, 2.5)
-        wing = share * width
-        main = _block(width - wing, depth, height, -side * wing / 2, 0.0, plan.glass)
-        lower = height * rng.uniform(0.5, 1.0)
-        parts = [main, _block(wing, depth - recess, lower, side * (width - wing) / 2, recess, plan.glass)]
+        side, fraction, recess = rng.choice((-1, 1)), rng.uniform(0.25, 0.6), rng.uniform(0.6, 2.5)
+        wing_width = fraction * width
+        main = _building_block(width - wing_width, depth, height, x=-side * wing_width / 2, glass=glass)
+        wing_x, wing_height = side * (width - wing_width) / 2, height * rng.uniform(0.5, 1.0)
+        wing = _building_block(wing_width, depth - recess, wing_height, x=wing_x, front=recess, glass=glass)
+        parts = [main, wing]
     if porch and rng.random() < 0.3:
         x = rng.uniform(-0.4, 0.4) * (width - 1.6)
-        parts.append(_block(1.6, 1.2, 2.6, x, -1.0, plan.glass))
+        parts.append(_building_block(1.6, 1.2, 2.6, x=x, front=-1.0, glass=glass))
     if height > 6 and rng.random() < 0.35:
         length, x = rng.uniform(2, 0.4 * width + 2), rng.uniform(-0.2, 0.2) * width
-        for storey in range(1, int(height / 3)):
+        for storey in range(1, int(height / 3)):  # one balcony for each upper storey
             parts.append(block(labels.BUILDING, length, 1.3, 1.1, x, -0.6, bottom=3.0 * storey - 0.2))
     return tuple(parts)
 
 
 def garage(rng: np.random.Generator, width: float) -> ObjectModel:
     """Garage or shed with its front at the origin."""
-    return (_block(width, rng.uniform(4, 6.5), rng.uniform(2.2, 3.0), 0.0, 0.0, 0.0),)
+    return (_building_block(width, rng.uniform(4, 6.5), rng.uniform(2.2, 3.0)),)

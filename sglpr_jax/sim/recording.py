@@ -1,5 +1,4 @@
-"""Simulated drives as recordings, whose scans are rendered on demand: through towns, also on several days, and through
-surroundings where places repeat."""
+"""Simulated drives through towns and repeating sceneries, as recordings whose scans are rendered on demand."""
 
 import dataclasses
 import datetime
@@ -23,7 +22,7 @@ from sglpr_jax.sim.drive import (
     Carrier,
     PlanarPath,
     TimedPoses,
-    check_drawing,
+    check_rate_and_seed,
     drive_seed,
     name_of_path,
     plan_path,
@@ -96,7 +95,7 @@ def simulate_recording(
       ValueError: The route is unknown, `rate_hz` is not positive, `seed` is negative, or the pose file is malformed.
       FileNotFoundError: The pose file does not exist.
     """
-    check_drawing(rate_hz, seed)
+    check_rate_and_seed(rate_hz, seed)
     name = name if along is None else name_of_path(along)
     seeds = drive_seed(seed, name)
     if along is None:
@@ -105,7 +104,7 @@ def simulate_recording(
         path = read_path(along)
     world = build_world(seeds, path.xy, path.times, scenery=scenery)
     rows = scan_rows(path, scans)
-    return drive_through(world, path, rows, name=name, sensor=sensor, carrier=carrier, **random_of(seeds))
+    return drive_through(world, path, rows, name=name, sensor=sensor, carrier=carrier, **_key_and_rng(seeds))
 
 
 def simulate_repeating(
@@ -118,15 +117,15 @@ def simulate_repeating(
     rate_hz: float | None = None,
     carrier: Carrier = VEHICLE,
 ) -> SimulatedRecording:
-    """Returns the recording of a drive through surroundings where places repeat.
+    """Returns the recording of a drive through a scenery where different places look alike.
 
     Arguments:
       name: Scenery, from `REPEATING`.
       scans: Number of scans, evenly spaced over the drive.
       seed: Seed of the scenery and the drive, at least 0.
       sensor: LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of at most 0.5 m.
-      revisit: "none": frames 30 s apart are more than `other_m` apart. "opposite": returns on the same way.
-        "same": drives one and a half laps along a closed path.
+      revisit: "none": frames 30 s apart are farther apart than the scenery's `other_m`. "opposite": returns along the
+        same path. "same": drives one and a half laps along a closed path.
       rate_hz: Scans per second. None uses the rate of the carrier or of the scenery.
       carrier: Carrier of the sensor, such as one of `CARRIERS`. Slow ones and halts bring frames 30 s apart closer.
 
@@ -142,14 +141,14 @@ def simulate_repeating(
         raise ValueError(f"revisit: expected one of {', '.join(REVISITS)}, found {revisit!r}")
     scenery = REPEATING[name]
     rate_hz = carrier.rate_hz or scenery.rate_hz if rate_hz is None else rate_hz
-    check_drawing(rate_hz, seed)
+    check_rate_and_seed(rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
     world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
     height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
     if height_m is not None:
         sensor = dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))
     options = {"name": f"{name}-{revisit}", "sensor": sensor, "carrier": carrier}
-    return drive_through(world, path, scan_rows(path, scans), **options, **random_of(seeds))
+    return drive_through(world, path, scan_rows(path, scans), **options, **_key_and_rng(seeds))
 
 
 def plan_drive(
@@ -164,10 +163,11 @@ def plan_drive(
     """Draws a scenery and the drive through it. The number of poses is a multiple of `scans`."""
     rng = np.random.default_rng((*seeds, 1))
     speed = rng.uniform(*(carrier.speed_mps or scenery.speed_mps))
-    length = max(scans / rate_hz, SHORTEST_S) * speed / {"none": 1, "opposite": 2, "same": LAPS}[revisit]
+    passes = {"none": 1, "opposite": 2, "same": LAPS}[revisit]
+    length_m = max(scans / rate_hz, SHORTEST_S) * speed / passes
     if revisit == "same":  # a lap has room for the scenery even if the carrier is slow
-        length = max(length, SHORTEST_S * scenery.speed_mps[0] / LAPS)
-    site = scenery.site(rng, length, scenery.is_closed(revisit))
+        length_m = max(length_m, SHORTEST_S * scenery.speed_mps[0] / LAPS)
+    site = scenery.site(rng, length_m, scenery.is_closed(revisit))
     line = driven_line(rng, site, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
     path = carrier.halted(rng, timed(rng, line, free_mps=speed, poses=scans), poses=scans)
     return build(site, line, clearance_m=scenery.clearance_m), path
@@ -186,20 +186,22 @@ def plan_sessions(
     """Plans one session for each date. The town is built when the first session is simulated.
 
     The first session drives `route`, the others the same streets in another order, partly in the opposite direction. As
-    in NCLT, times are seconds since 1970, and ids are these times in microseconds. Other arguments and errors are as in
+    in NCLT, times are seconds since 1970, and ids are these times in microseconds. Other arguments are as in
     `simulate_recording`.
 
     Raises:
-      ValueError: A date is invalid or repeated, or there are no dates. Or `scans` is below 2.
+      ValueError: A date is invalid or repeated, there are no dates, or `scans` is below 2. Or the route, `rate_hz` or
+        `seed` is invalid.
     """
-    check_drawing(rate_hz, seed)
+    check_rate_and_seed(rate_hz, seed)
     starts = [_start_of(date) for date in dates]
     if len(set(dates)) < max(len(dates), 1) or scans < 2:
         raise ValueError(f"expected different dates and 2 scans or more, found {', '.join(dates) or 'none'}; {scans}")
     seeds, days = drive_seed(seed, f"sessions {route}"), len(dates)
     path = plan_path(np.random.default_rng((*seeds, 1)), route, scans=scans, rate_hz=rate_hz, days=days)
-    path = path._replace(times=path.times + PAUSE_S * (np.arange(len(path.times)) * days // len(path.times)))
-    town = functools.cache(lambda: build_world(seeds, path.xy, path.times, scenery=scenery))
+    day_of_pose = np.arange(len(path.times)) * days // len(path.times)
+    path = path._replace(times=path.times + PAUSE_S * day_of_pose)
+    cached_town = functools.cache(lambda: build_world(seeds, path.xy, path.times, scenery=scenery))
 
     def plan(day: int, rows: np.ndarray) -> PlannedRecording:
         times = starts[day] + path.times[rows] - path.times[rows[0]]
@@ -207,7 +209,7 @@ def plan_sessions(
 
         def simulate() -> SimulatedRecording:
             options = {"name": dates[day], "ids": ids, "times": times, "sensor": sensor}
-            return drive_through(town(), path, rows, **options, **random_of((*seeds, day)))
+            return drive_through(cached_town(), path, rows, **options, **_key_and_rng((*seeds, day)))
 
         return PlannedRecording(dates[day], ids, simulate)
 
@@ -225,24 +227,24 @@ def _start_of(date: str) -> float:
 
 
 def with_submaps(recording: SimulatedRecording, length_m: float) -> SimulatedRecording:
-    """Returns the recording with submaps of `length_m` metres by the true poses."""
-    view = submaps(recording, recording.poses.world_from_lidar, length_m=length_m)
+    """Returns the recording with submaps of `length_m` metres instead of scans, joined with the true poses."""
+    submap_recording = submaps(recording, recording.poses.world_from_lidar, length_m=length_m)
 
     def render(i: int) -> tuple[np.ndarray, np.ndarray]:
-        scan = view.scan(i)
-        assert scan.points is not None and scan.labels is not None
-        return np.pad(scan.points, ((0, 0), (0, 1))), scan.labels  # submaps have no intensities
+        submap = submap_recording.scan(i)
+        assert submap.points is not None and submap.labels is not None
+        return np.pad(submap.points, ((0, 0), (0, 1))), submap.labels  # intensities are 0
 
-    return dataclasses.replace(recording, read=view.read, render=render, found=view.found)
+    return dataclasses.replace(recording, read=submap_recording.read, render=render, found=submap_recording.found)
 
 
-def numbered(scans: int) -> tuple[str, ...]:
-    """Names of scans that are numbered from 0."""
+def numbered_ids(scans: int) -> tuple[str, ...]:
+    """Ids of scans that are numbered from 0: "000000", "000001" and so on."""
     return tuple(f"{i:06d}" for i in range(scans))
 
 
-def random_of(seeds: tuple[int, ...]) -> dict[str, Any]:
-    """`key` and `rng` of `drive_through`."""
+def _key_and_rng(seeds: tuple[int, ...]) -> dict[str, Any]:
+    """Arguments `key` and `rng` of `drive_through`."""
     key = functools.reduce(jax.random.fold_in, seeds[1:], jax.random.key(seeds[0]))
     return {"key": key, "rng": np.random.default_rng((*seeds, 2))}
 
@@ -260,46 +262,46 @@ def drive_through(
     rng: np.random.Generator,
     carrier: Carrier = VEHICLE,
 ) -> SimulatedRecording:
-    """Returns the recording of a drive along `path` through a town, with scans at some of its rows.
+    """Returns the recording of a drive through a town along `path`, with scans at the poses in `rows`.
 
-    By default, `ids` numbers the scans, and `times` (seconds) are those of the town. `key` draws the measurements, and
+    By default, `ids` numbers the scans, and `times` (seconds) are those of the path. `key` draws the measurements, and
     `rng` the sway. The carrier determines height and sway, not the speed.
     """
-    clock = path.times[rows]
-    ids, times = ids or numbered(len(rows)), clock if times is None else times
-    tilt, height, left = carrier.motion(rng, clock, height_m=sensor.height_m)
-    yaw = path.yaw[rows]
-    aside = np.reshape(left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    of_lidar = in_world = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
-    if world.levels is not None:  # storeys above one another
-        xy, ground, slope = (values[rows] for values in world.levels.along(path.xy))
-        in_world = poses_on(world.ground.relief, xy + aside, yaw, height_m=height, tilt=tilt)
-        of_lidar = poses_on((ground, slope), path.xy[rows] + aside, yaw, height_m=height, tilt=tilt)
+    path_times, yaw = path.times[rows], path.yaw[rows]
+    ids, times = ids or numbered_ids(len(rows)), path_times if times is None else times
+    tilt, height, left_m = carrier.motion(rng, path_times, height_m=sensor.height_m)
+    sway = np.reshape(left_m, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    true_poses = poses_on(world.ground.relief, path.xy[rows] + sway, yaw, height_m=height, tilt=tilt)
+    rendered_poses = true_poses
+    if world.levels is not None:  # storeys above one another are simulated side by side
+        xy, ground_height, slope = (per_pose[rows] for per_pose in world.levels.along(path.xy))
+        rendered_poses = poses_on(world.ground.relief, xy + sway, yaw, height_m=height, tilt=tilt)
+        true_poses = poses_on((ground_height, slope), path.xy[rows] + sway, yaw, height_m=height, tilt=tilt)
     speed = speeds(path)[rows]
     height_m = sensor.height_m if carrier.height_m is None else carrier.height_m
-    row_of = {scan_id: i for i, scan_id in enumerate(ids)}
+    row_of_id = {scan_id: i for i, scan_id in enumerate(ids)}
 
     @functools.lru_cache(maxsize=KEPT_SCANS)
     def render(i: int) -> tuple[np.ndarray, np.ndarray]:
-        pose, velocity = in_world[i], np.array([speed[i], 0, 0])
-        return scan(jax.random.fold_in(key, i), world, pose, sensor=sensor, time=float(clock[i]), velocity=velocity)
+        options = {"sensor": sensor, "time": float(path_times[i]), "velocity": np.array([speed[i], 0, 0])}
+        return scan(jax.random.fold_in(key, i), world, rendered_poses[i], **options)
 
     def read(path: Path, label_path: Path | None, lasers: bool) -> Scan:
-        points, labels = render(row_of[path.name])
+        points, labels = render(row_of_id[path.name])
         return Scan(points=points[:, :3], labels=None if label_path is None else labels)
 
-    names = tuple(Path(scan_id) for scan_id in ids)
+    paths = tuple(Path(scan_id) for scan_id in ids)  # not files: `read` finds the id in them
     return SimulatedRecording(
         name=name,
         ids=ids,
-        positions=of_lidar[:, :3, 3],
+        positions=true_poses[:, :3, 3],
         times=times,
         pose_source="simulation",
-        paths=names,
-        label_paths=names,
+        paths=paths,
+        label_paths=paths,
         read=read,
         mounting=None if height_m == MODEL_HEIGHT_M else Mounting(height_m),
         on_disk=False,
-        poses=TimedPoses(of_lidar, times),
+        poses=TimedPoses(true_poses, times),
         render=render,
     )

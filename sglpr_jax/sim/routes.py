@@ -14,10 +14,10 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 STEP_M = 0.5  # distance between two points of a route's line, in metres
-BLOCKS_PER_LOOP = 12
+BLOCKS_PER_LOOP = 12  # minimum number of streets for each loop of a route
 ROUNDABOUT_RADIUS_M = 10.0
 SHORTEST_LOOP = {False: 6, True: 4}  # minimum number of streets between two visits, by `Role.opposite`: at least 30 s
-TRIES, TRIES_PER_LOOP = 100, 30
+TRIES, TRIES_PER_LOOP = 100, 30  # maximum number of attempts to draw a walk, and a loop of it
 
 Revisit = Literal["none", "same", "opposite"]
 REVISITS: tuple[Revisit, ...] = ("none", "same", "opposite")
@@ -25,7 +25,7 @@ Line = Float[np.ndarray, "_ 2"]
 """Points of a line in the plane, in metres."""
 Node = tuple[int, int]
 """Crossing of the lattice: column and row."""
-STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # from a crossing to its four neighbours
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +88,8 @@ def travelled(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
 def resampled(line: Float[np.ndarray, "n 2"], step_m: float) -> Float[np.ndarray, "m 2"]:
     """Resamples a line to points about `step_m` metres apart."""
     length = travelled(line)
-    at = np.linspace(0, length[-1], max(2, round(length[-1] / step_m) + 1))
-    return np.stack([np.interp(at, length, axis) for axis in line.T], axis=1)
+    even_lengths = np.linspace(0, length[-1], max(2, round(length[-1] / step_m) + 1))
+    return np.stack([np.interp(even_lengths, length, axis) for axis in line.T], axis=1)
 
 
 def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node]:
@@ -103,12 +103,12 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
         for _ in range(blocks):
             if rng.random() >= role.straight:
                 heading = (1, 0) if heading[0] == 0 else (0, int(rng.choice([-1, 1])))
-            walk.append(_moved(walk[-1], heading))
+            walk.append(_neighbour(walk[-1], heading))
         return walk
     loops = min(role.loops, max(1, blocks // BLOCKS_PER_LOOP))
-    shares = np.diff(np.linspace(0, blocks, loops + 1).round().astype(int)).tolist()
+    blocks_of_loops = np.diff(np.linspace(0, blocks, loops + 1).round().astype(int)).tolist()
     for _ in range(TRIES):
-        if walk := _walk_in_loops(rng, role, shares):
+        if walk := _walk_in_loops(rng, role, blocks_of_loops):
             return walk
     raise ValueError(f"no walk of {blocks} blocks with {loops} loops was found; a loop needs 8 blocks or more")
 
@@ -119,28 +119,28 @@ def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -
     Each later day begins with a U-turn at a roundabout, and takes the streets driven least often in its direction.
     """
     walk = plan_walk(rng, role, blocks=blocks)
-    ahead = defaultdict(set)
+    neighbours = defaultdict(set)
     for a, b in pairwise(walk):
-        ahead[a].add(b)
-        ahead[b].add(a)
-    driven = Counter(pairwise(walk))
+        neighbours[a].add(b)
+        neighbours[b].add(a)
+    drive_count = Counter(pairwise(walk))
     for step in range(blocks * (days - 1)):
-        crossing, before = walk[-1], walk[-2]
-        choices = sorted(ahead[crossing] - {before}) if step % blocks else []
-        counts = [
-            driven[crossing, node] + rng.random() for node in choices
-        ]  # random among streets driven equally often
-        walk.append(choices[np.argmin(counts)] if choices else before)
-        driven[crossing, walk[-1]] += 1
+        crossing, previous = walk[-1], walk[-2]
+        is_start_of_day = step % blocks == 0
+        choices = [] if is_start_of_day else sorted(neighbours[crossing] - {previous})
+        # The fraction decides at random among streets that were driven equally often.
+        counts = [drive_count[crossing, node] + rng.random() for node in choices]
+        walk.append(choices[np.argmin(counts)] if choices else previous)  # without choices: a U-turn
+        drive_count[crossing, walk[-1]] += 1
     return walk
 
 
-def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> list[Node]:
-    """Walk with one loop of about `share` streets after another, or an empty list at a dead end."""
+def _walk_in_loops(rng: np.random.Generator, role: Role, blocks_of_loops: list[int]) -> list[Node]:
+    """Draws a walk of several loops with about these numbers of streets. Returns [] at a dead end."""
     walk = [(0, 0)]
-    for share in shares:
-        again = max(1, round(role.again * share))
-        attempts = (_with_loop(rng, role, walk, new=share - again, again=again) for _ in range(TRIES_PER_LOOP))
+    for blocks in blocks_of_loops:
+        again = max(1, round(role.again * blocks))
+        attempts = (_with_loop(rng, role, walk, new=blocks - again, again=again) for _ in range(TRIES_PER_LOOP))
         walk = next(filter(None, attempts), [])
         if not walk:
             break
@@ -148,47 +148,57 @@ def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> l
 
 
 def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: int, again: int) -> list[Node]:
-    """`nodes`, `new` streets back to an earlier crossing, and `again` streets once more; or [] at a dead end."""
+    """Extends `nodes` by `new` streets to an earlier crossing, then by `again` streets that were driven once before.
+
+    Returns [] if there is no such loop.
+    """
     wandering = int(rng.integers(new // 2, max(new - 1, 1) + 1))
-    walk = _wandered(rng, role, nodes, wandering)
-    left = new - wandering
-    paths = _paths_back(walk, left + 1) if walk else {}
-    shortest = max(SHORTEST_LOOP[role.opposite], new // 2)
-    driven = Counter(_streets(walk))
-    closings = []
+    walk = _with_new_crossings(rng, role, nodes, wandering)
+    returning = new - wandering
+    paths = _paths_back(walk, returning + 1) if walk else {}
+    shortest_loop = max(SHORTEST_LOOP[role.opposite], new // 2)
+    drive_count = Counter(_streets(walk))
+    closed_walks = []
     for k, node in enumerate(walk):
         path = paths.get(node, [])
-        if len(path) < max(left - 1, 1) or len(walk) - 1 + len(path) - k < shortest:
+        loop_streets = len(walk) - 1 + len(path) - k
+        if len(path) < max(returning - 1, 1) or loop_streets < shortest_loop:
             continue
-        second = walk[max(k - again, 0) : k + 1][::-1] if role.opposite else walk[k : k + again + 1]
-        if len(second) == again + 1 and all(driven[street] == 1 for street in _streets(second)):
-            closings.append(walk + path + second[1:])
-    return closings[rng.integers(len(closings))] if closings else []
+        revisited = walk[max(k - again, 0) : k + 1][::-1] if role.opposite else walk[k : k + again + 1]
+        if len(revisited) == again + 1 and all(drive_count[street] == 1 for street in _streets(revisited)):
+            closed_walks.append(walk + path + revisited[1:])
+    return closed_walks[rng.integers(len(closed_walks))] if closed_walks else []
 
 
-def _wandered(rng: np.random.Generator, role: Role, nodes: list[Node], steps: int) -> list[Node]:
-    """`nodes` and `steps` unvisited crossings, or an empty list at a dead end."""
+def _with_new_crossings(rng: np.random.Generator, role: Role, nodes: list[Node], steps: int) -> list[Node]:
+    """Extends `nodes` by `steps` random unvisited crossings. Returns [] at a dead end."""
     walk, visited = list(nodes), set(nodes)
     for _ in range(steps):
-        ahead = _moved(walk[-1], walk[-1], walk[-2]) if len(walk) > 1 else (1, 0)
-        free = [node for step in STEPS if (node := _moved(walk[-1], step)) not in visited]
-        if not free:
+        heading = (1, 0)
+        if len(walk) > 1:
+            heading = (walk[-1][0] - walk[-2][0], walk[-1][1] - walk[-2][1])
+        choices = [step for step in STEPS if _neighbour(walk[-1], step) not in visited]
+        if not choices:
             return []
-        weights = np.array([role.straight if node == ahead else (1.01 - role.straight) / 2 for node in free])
-        walk.append(free[rng.choice(len(free), p=weights / weights.sum())])
+        # If straight on is free, it has about the probability `role.straight`. The .01 avoids weights of 0.
+        weights = np.array([role.straight if step == heading else (1.01 - role.straight) / 2 for step in choices])
+        walk.append(_neighbour(walk[-1], choices[rng.choice(len(choices), p=weights / weights.sum())]))
         visited.add(walk[-1])
     return walk
 
 
 def _paths_back(walk: list[Node], longest: int) -> dict[Node, list[Node]]:
-    """Shortest paths of up to `longest` streets from the end of `walk`, over unvisited crossings to visited ones."""
+    """Shortest paths of up to `longest` streets from the end of `walk`, over unvisited crossings to visited ones.
+
+    The key of a path is its last crossing.
+    """
     visited, reached = set(walk), set(walk)
     frontier: dict[Node, list[Node]] = {walk[-1]: []}
     paths: dict[Node, list[Node]] = {}
-    for _ in range(longest):
+    for _ in range(longest):  # breadth-first search
         next_frontier = {}
         for end, path in frontier.items():
-            for node in (_moved(end, step) for step in STEPS):
+            for node in (_neighbour(end, step) for step in STEPS):
                 if node in visited:
                     paths.setdefault(node, [*path, node])
                 elif node not in reached:
@@ -199,13 +209,12 @@ def _paths_back(walk: list[Node], longest: int) -> dict[Node, list[Node]]:
 
 
 def _streets(walk: list[Node]) -> list[tuple[Node, Node]]:
-    """Streets of a walk, equal for both directions."""
+    """Streets of a walk, as pairs of crossings in ascending order, which are equal for both directions."""
     return [(min(a, b), max(a, b)) for a, b in pairwise(walk)]
 
 
-def _moved(node: Node, step: Node, origin: Node = (0, 0)) -> Node:
-    """`node` + `step` - `origin`."""
-    return node[0] + step[0] - origin[0], node[1] + step[1] - origin[1]
+def _neighbour(node: Node, step: Node) -> Node:
+    return node[0] + step[0], node[1] + step[1]
 
 
 def _line(rng: np.random.Generator, role: Role, walk: np.ndarray) -> Line:
@@ -216,31 +225,37 @@ def _line(rng: np.random.Generator, role: Role, walk: np.ndarray) -> Line:
     jitter = rng.uniform(-role.winding, role.winding, (columns, rows, 2))
     crossing = (lattice + jitter) * role.block_m
     bend = rng.uniform(-role.winding, role.winding, (2, columns, rows)) / 2  # of streets along x and along y
-    is_round = rng.random((columns, rows)) < role.roundabouts
+    is_roundabout = rng.random((columns, rows)) < role.roundabouts
     nodes: list[Node] = [(int(column), int(row)) for column, row in walk - low]
-    for before, node, after in zip(nodes[:-2], nodes[1:-1], nodes[2:], strict=True):
-        is_round[node] |= before == after  # the vehicle makes a U-turn here
+    for previous, node, following in zip(nodes[:-2], nodes[1:-1], nodes[2:], strict=True):
+        is_roundabout[node] |= previous == following  # the vehicle makes a U-turn here
     parts = []
-    for a, b in pairwise(nodes):
-        first, last = sorted((a, b))
-        street = _parabola(crossing[first], crossing[last], bend[0 if last[0] > first[0] else 1][first])
-        street = street if a == first else street[::-1]
-        for node in (a, b):
-            if is_round[node]:
+    for start, end in pairwise(nodes):
+        first, last = sorted((start, end))  # the street has the same line in both directions
+        axis = 0 if last[0] > first[0] else 1
+        street = _parabola(crossing[first], crossing[last], bend[axis][first])
+        if start != first:
+            street = street[::-1]
+        for node in (start, end):
+            if is_roundabout[node]:
                 street = street[np.linalg.norm(street - crossing[node], axis=1) > ROUNDABOUT_RADIUS_M]
-        parts += [_arc(crossing[a], parts[-1][-1], street[0])] if parts and is_round[a] else []
+        if parts and is_roundabout[start]:
+            parts.append(_roundabout_arc(crossing[start], parts[-1][-1], street[0]))
         parts.append(street)
     return np.concatenate(parts)
 
 
 def _parabola(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], bend: float) -> Line:
-    """Street from one crossing to its neighbour. Its tangents meet `bend` times its length to the left."""
-    middle = (start + end) / 2 + bend * np.array([start[1] - end[1], end[0] - start[0]])
+    """Street from one crossing to its neighbour. Its end tangents meet `bend` times its length to the left."""
+    tangent_point = (start + end) / 2 + bend * np.array([start[1] - end[1], end[0] - start[0]])
     t = np.linspace(0, 1, 60)[:, None]
-    return (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
+    return (1 - t) ** 2 * start + 2 * t * (1 - t) * tangent_point + t**2 * end
 
 
-def _arc(centre: Float[np.ndarray, "2"], entry: Float[np.ndarray, "2"], exit: Float[np.ndarray, "2"]) -> Line:
+def _roundabout_arc(
+    centre: Float[np.ndarray, "2"], entry: Float[np.ndarray, "2"], exit: Float[np.ndarray, "2"]
+) -> Line:
+    """Counter-clockwise arc around a roundabout. If entry and exit are the same point, it is a full circle."""
     first, last = (np.arctan2(*(point - centre)[::-1]) for point in (entry, exit))
     angle = first + np.linspace(0, (last - first) % (2 * np.pi) or 2 * np.pi, 30)
     return centre + ROUNDABOUT_RADIUS_M * np.stack([np.cos(angle), np.sin(angle)], axis=1)

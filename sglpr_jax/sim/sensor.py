@@ -1,4 +1,4 @@
-"""Simulation of a LiDAR: one scan of a world, a revolution or a sector."""
+"""Simulation of a LiDAR: parameters of sensors, and `scan`, which simulates one scan of a world."""
 
 import dataclasses
 import functools
@@ -47,7 +47,7 @@ def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
 
 TURN_S = 0.1  # duration of a scan, in seconds
 STEPS = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
-"""Steps of the sequence from one azimuth, laser and scan to the next: irrational numbers without a common multiple."""
+"""Steps of the sequence in `scattered` from one azimuth, laser and scan to the next: independent irrational numbers."""
 LASERS_AT_A_TIME = 16  # maximum size of a block, which divides the number of lasers
 
 
@@ -62,8 +62,8 @@ class Sensor:
     azimuth_steps: int = 1800
     azimuths_deg: tuple[float, float] = (0.0, 360.0)  # first and last azimuth of a scan, counter-clockwise, in degrees
     pattern: ScanPattern = "rings"
-    """"rings" repeats the elevations in every scan. "scattered" gives every ray another elevation in the band around
-    its laser's elevation, differently in every scan. "scattered-round" also has a round field of view."""
+    """"rings" repeats the elevations in every scan. "scattered" spreads the rays over the bands around the elevations,
+    differently in every scan. "scattered-round" also has a round field of view."""
     height_m: float = 1.73  # height above the road, in metres
     min_range_m: float = 2.5
     max_range_m: float = 80.0
@@ -71,12 +71,10 @@ class Sensor:
     dropout: float = 0.02  # fraction of the returns that are lost, whatever the surface
     faintest_echo: float = 6e-6
     """Strength of an echo that is detected with a probability of 63 %, see `raycast.echo_returns`."""
-    edge_share: float = 0.3  # fraction of the returns at an edge with a range between those of its two sides
+    edge_share: float = 0.3  # fraction of the returns at an edge whose range is between the ranges of its two sides
     shadows_deg: tuple[tuple[float, float, float], ...] = ()
-    """Occlusions by the vehicle: first azimuth, last azimuth (counter-clockwise) and elevation, in degrees.
-
-    Between these azimuths, rays below this elevation do not return.
-    """
+    """Occlusions by the vehicle: first azimuth, last azimuth (counter-clockwise) and elevation below which no ray
+    between these azimuths returns, all in degrees."""
     motion_distortion: bool = False
     """Whether points are relative to the sensor's position when they were measured, instead of the scan's pose."""
 
@@ -97,7 +95,7 @@ KITTI_SHADOWS_DEG = (
     (231.0, 239.0, -20.5),
     (284.0, 302.0, -15.8),
 )
-"""Occlusions measured in KITTI's scans: bonnet, roof and other parts on the roof."""
+"""Occlusions measured in KITTI's scans: bonnet, roof and other parts on the roof. See `Sensor.shadows_deg`."""
 HDL64E = Sensor(shadows_deg=KITTI_SHADOWS_DEG)
 SENSORS = {
     "hdl64e": HDL64E,
@@ -191,7 +189,7 @@ def view_of(
     )
     ground = ground_view(world.ground, world_from_lidar[:3, 3], reach_m=sensor.max_range_m)
     velocity = np.zeros(3) if velocity is None else velocity
-    rays = None if sensor.pattern == "rings" else _rays(sensor, time=time)
+    rays = None if sensor.pattern == "rings" else _ray_directions(sensor, time=time)
     return View(candidates, ground, rotation.astype(np.float32), velocity.astype(np.float32), rays)
 
 
@@ -200,88 +198,98 @@ def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
     """Casts the rays of one revolution. `jax.vmap` over keys and views simulates many revolutions."""
     key_surface, key_echoes = jax.random.split(key)
     surface = first_surface(key_surface, view, sensor=sensor)
-    reach, returned = _echoes(key_echoes, surface, sensor)
+    ranges, returned = _measured_ranges(key_echoes, surface, sensor)
     steps = sensor.azimuth_steps
-    points = [axis[:, :steps] * reach for axis in _rays_of(view, sensor)]
+    xyz = [axis[:, :steps] * ranges for axis in _rays_of_view(view, sensor)]
     if sensor.motion_distortion:
-        since_middle = TURN_S * (jnp.arange(steps, dtype=jnp.float32) / steps - 0.5)
-        points = [axis - view.velocity[i] * since_middle[None, :] for i, axis in enumerate(points)]
+        seconds_from_middle = TURN_S * (jnp.arange(steps, dtype=jnp.float32) / steps - 0.5)
+        xyz = [axis - view.velocity[i] * seconds_from_middle[None, :] for i, axis in enumerate(xyz)]
     intensity = reflectivity(surface.label) * (0.5 + 0.5 * surface.facing)
-    return Turn(jnp.stack([*points, intensity], axis=-1), surface.label, returned)
+    return Turn(jnp.stack([*xyz, intensity], axis=-1), surface.label, returned)
 
 
 def returned_points(turn: Turn) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
     """Points and labels of the returns of one revolution, on the host."""
-    points, labels, returned = (np.asarray(part) for part in turn)
+    points, labels, returned = (np.asarray(array) for array in turn)
     rows = np.flatnonzero(returned)
     return points.reshape(-1, 4).take(rows, axis=0), labels.take(rows)
 
 
 @functools.partial(jax.jit, static_argnames="sensor")
 def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
-    """Finds the ground or shape that each ray (lasers, azimuths) hits first. Blocks of low lasers finish early."""
-    rays = _rays_of(view, sensor)
+    """Finds the ground or shape that each ray (lasers, azimuths) hits first, in blocks of LASERS_AT_A_TIME lasers.
+
+    Ray casting in a block stops at its farthest hit, so blocks of low lasers, which hit the near ground, finish early.
+    """
+    rays = _rays_of_view(view, sensor)
     lasers, azimuths = rays.x.shape
     key_depth, key_pores = jax.random.split(key)
     chance = Chance(jax.random.exponential(key_depth, rays.x.shape), jax.random.bits(key_pores, rays.x.shape))
 
-    def of_block(block: tuple[Vectors, Chance]) -> Surface:
+    def surface_of_block(block: tuple[Vectors, Chance]) -> Surface:
         rays, chance = block
-        upright = Vectors(*(row[0] * rays.x + row[1] * rays.y + row[2] * rays.z for row in view.rotation))
-        distance, label, facing = meet_ground(upright, view.ground, reach_m=sensor.max_range_m)
+        world_rays = Vectors(*(row[0] * rays.x + row[1] * rays.y + row[2] * rays.z for row in view.rotation))
+        distance, label, facing = meet_ground(world_rays, view.ground, reach_m=sensor.max_range_m)
         distance = jnp.minimum(distance, sensor.max_range_m)
         ground = Surface(distance, label, facing, jnp.zeros(distance.shape, bool))
-        hit, slot = nearest_hit(upright, view.candidates, distance, chance)
-        shape = surface_of_shapes(upright, hit, slot, view.candidates)
-        return jax.tree.map(lambda a, b: jnp.where(shape.distance < ground.distance, b, a), ground, shape)
+        hit_distance, slot = nearest_hit(world_rays, view.candidates, distance, chance)
+        shape = surface_of_shapes(world_rays, hit_distance, slot, view.candidates)
+        is_shape = shape.distance < ground.distance
+        return jax.tree.map(lambda of_ground, of_shape: jnp.where(is_shape, of_shape, of_ground), ground, shape)
 
-    in_blocks = (-1, math.gcd(lasers, LASERS_AT_A_TIME), azimuths)
-    surface = jax.lax.map(of_block, jax.tree.map(lambda values: values.reshape(in_blocks), (rays, chance)))
-    return jax.tree.map(lambda values: values.reshape(lasers, azimuths)[:, : sensor.azimuth_steps], surface)
-
-
-def _rays_of(view: View, sensor: Sensor) -> Vectors:
-    return _rays(sensor) if view.rays is None else view.rays
+    block_shape = (-1, math.gcd(lasers, LASERS_AT_A_TIME), azimuths)
+    blocks = jax.tree.map(lambda array: array.reshape(block_shape), (rays, chance))
+    surface = jax.lax.map(surface_of_block, blocks)
+    return jax.tree.map(lambda array: array.reshape(lasers, azimuths)[:, : sensor.azimuth_steps], surface)
 
 
-def _rays(sensor: Sensor, *, time: float = 0.0) -> Vectors:
+def _rays_of_view(view: View, sensor: Sensor) -> Vectors:
+    return _ray_directions(sensor) if view.rays is None else view.rays
+
+
+def _ray_directions(sensor: Sensor, *, time: float = 0.0) -> Vectors:
     """Unit vectors of the rays in the LiDAR frame, as arrays (lasers, azimuths). The azimuths fill whole sectors."""
     columns = sector_count(sensor.azimuth_steps) * COLUMNS
     first, last = np.radians(sensor.azimuths_deg)
     azimuth = (first + np.arange(columns) * ((last - first) / sensor.azimuth_steps))[None, :]
-    repeats = sensor.pattern == "rings"
-    degrees = np.array(sensor.elevations_deg)[:, None]
-    elevation = np.radians(degrees if repeats else scattered(sensor.elevations_deg, columns, time=time))
-    level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(elevation), columns))
-    axes = (level * np.cos(azimuth), level * np.sin(azimuth), up)
+    if sensor.pattern == "rings":
+        elevation = np.radians(np.array(sensor.elevations_deg)[:, None])
+    else:
+        elevation = np.radians(scattered(sensor.elevations_deg, columns, time=time))
+    horizontal, z = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(elevation), columns))
+    axes = (horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), z)
     return Vectors(*(jnp.asarray(axis, jnp.float32) for axis in axes))
 
 
-def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]:
-    """Measured range of each ray, and whether the ray returns."""
-    key_noise, key_seen, key_edge = jax.random.split(key, 3)
+def _measured_ranges(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]:
+    """Measured range of each ray in metres, 0 without a return, and whether the ray returns."""
+    key_noise, key_detection, key_edge = jax.random.split(key, 3)
     shape = surface.distance.shape
     returned = (surface.distance < sensor.max_range_m) & echo_returns(
-        jax.random.uniform(key_seen, shape), surface, faintest_echo=sensor.faintest_echo, dropout=sensor.dropout
+        jax.random.uniform(key_detection, shape), surface, faintest_echo=sensor.faintest_echo, dropout=sensor.dropout
     )
-    reach = mix_edges(jax.random.uniform(key_edge, shape), surface.distance, returned, share=sensor.edge_share)
-    reach = reach + sensor.range_noise_m * jax.random.normal(key_noise, shape)
-    returned &= (reach >= sensor.min_range_m) & (reach < sensor.max_range_m) & ~_shadowed(sensor)
-    return jnp.where(returned, reach, 0), returned
+    ranges = mix_edges(jax.random.uniform(key_edge, shape), surface.distance, returned, share=sensor.edge_share)
+    ranges = ranges + sensor.range_noise_m * jax.random.normal(key_noise, shape)
+    returned &= (ranges >= sensor.min_range_m) & (ranges < sensor.max_range_m) & ~_is_hidden(sensor)
+    return jnp.where(returned, ranges, 0), returned
 
 
-def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
+def _is_hidden(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
     """Whether the vehicle occludes each ray, or the ray is outside a round field of view."""
     first, last = sensor.azimuths_deg
     azimuth = first + np.arange(sensor.azimuth_steps) * ((last - first) / sensor.azimuth_steps)
     elevation = np.array(sensor.elevations_deg)[:, None]
-    hidden = np.zeros((len(elevation), len(azimuth)), bool)
+    is_hidden = np.zeros((len(elevation), len(azimuth)), bool)
     if sensor.pattern == "scattered-round":
-        up, side = ((one - (one.max() + one.min()) / 2) / (np.ptp(one) / 2) for one in (elevation, azimuth))
-        hidden |= up**2 + side**2 > 1
-    for first, last, below in sensor.shadows_deg:
-        hidden |= ((azimuth - first) % 360 <= last - first) & (elevation < below)
-    return hidden
+        is_hidden |= _scaled(elevation) ** 2 + _scaled(azimuth) ** 2 > 1
+    for first, last, lowest in sensor.shadows_deg:
+        is_hidden |= ((azimuth - first) % 360 <= last - first) & (elevation < lowest)
+    return is_hidden
+
+
+def _scaled(angles: np.ndarray) -> np.ndarray:
+    """Maps angles linearly to [-1, 1]."""
+    return (angles - (angles.max() + angles.min()) / 2) / (np.ptp(angles) / 2)
 
 
 def scattered(elevations_deg: Sequence[float], azimuths: int, *, time: float) -> Float[np.ndarray, "lasers {azimuths}"]:
@@ -289,8 +297,8 @@ def scattered(elevations_deg: Sequence[float], azimuths: int, *, time: float) ->
 
     A low-discrepancy sequence fills the bands around `elevations_deg` evenly in space and, scan after scan, in time.
     """
-    middle = np.array(elevations_deg)
-    height = abs(middle[1] - middle[0])
-    azimuth, laser, scan = np.arange(azimuths), np.arange(len(middle))[:, None], time / TURN_S
-    part = (azimuth * STEPS[0] + laser * STEPS[1] + scan * STEPS[2]) % 1
-    return middle[:, None] + height * (part - 0.5)
+    band_middle = np.array(elevations_deg)
+    band_height = abs(band_middle[1] - band_middle[0])
+    azimuth, laser, scan = np.arange(azimuths), np.arange(len(band_middle))[:, None], time / TURN_S
+    fraction = (azimuth * STEPS[0] + laser * STEPS[1] + scan * STEPS[2]) % 1
+    return band_middle[:, None] + band_height * (fraction - 0.5)

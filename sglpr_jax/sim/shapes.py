@@ -51,51 +51,52 @@ Solid = Callable[[Vectors, Vectors], Interval]
 """Function of origins and directions in a solid's unit frame that returns the interval of each ray in the solid."""
 
 
-def at_time(shapes: Shapes, time: float, near: Float[np.ndarray, "3"], *, reach_m: float) -> Shapes:
-    """Returns the shapes present at `time` less than `reach_m` from `near`, at their positions at that time."""
+def at_time(shapes: Shapes, time: float, sensor_xyz: Float[np.ndarray, "3"], *, reach_m: float) -> Shapes:
+    """Returns the shapes present at `time` (seconds) within `reach_m` of the sensor, with the centres at that time."""
     velocity = np.asarray(shapes.velocity)
     centre = np.concatenate([shapes.centre[:, :2] + velocity * time, shapes.centre[:, 2:]], axis=1)
-    present = (shapes.since <= time) & (time < shapes.until)
-    close = np.linalg.norm(centre - near, axis=1) < reach_m + np.linalg.norm(shapes.half, axis=1)
-    chosen = np.flatnonzero(present & close)
-    return Shapes(*(np.asarray(values)[chosen] for values in shapes._replace(centre=centre)))
+    is_present = (shapes.since <= time) & (time < shapes.until)
+    is_near = np.linalg.norm(centre - sensor_xyz, axis=1) < reach_m + np.linalg.norm(shapes.half, axis=1)
+    rows = np.flatnonzero(is_present & is_near)
+    return Shapes(*(np.asarray(column)[rows] for column in shapes._replace(centre=centre)))
 
 
-def _slab(origin: AnyArray, direction: AnyArray) -> Interval:
-    """Interval of a ray with |origin + t direction| <= 1 along one axis."""
+def _interval_in_slab(origin: AnyArray, direction: AnyArray) -> Interval:
+    """Interval of t with |origin + t * direction| <= 1, for the coordinates of a ray along one axis."""
     inverse = 1 / jnp.where(jnp.abs(direction) < 1e-9, 1e-9, direction)
     return -origin * inverse - jnp.abs(inverse), -origin * inverse + jnp.abs(inverse)
 
 
-def _round(square: AnyArray, towards: AnyArray, discriminant: AnyArray) -> Interval:
-    """Interval of a ray with |o + t d| <= 1, from |d|^2, o.d and (o.d)^2 - |d|^2 (|o|^2 - 1)."""
+def _interval_in_ball(square: AnyArray, product: AnyArray, discriminant: AnyArray) -> Interval:
+    """Interval of t with |o + t d| <= 1, from |d|^2, the dot product o.d and (o.d)^2 - |d|^2 (|o|^2 - 1)."""
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
-    enter = jnp.where(discriminant < 0, jnp.inf, (-towards - root) / square)
-    return enter, (root - towards) / square
+    enter = jnp.where(discriminant < 0, jnp.inf, (-product - root) / square)
+    return enter, (root - product) / square
 
 
-def _both(a: Interval, b: Interval) -> Interval:
-    """Intersection of two intervals."""
+def _intersection(a: Interval, b: Interval) -> Interval:
     return jnp.maximum(a[0], b[0]), jnp.minimum(a[1], b[1])
 
 
 def cube(o: Vectors, d: Vectors) -> Interval:
-    """Intervals of rays inside |x|, |y|, |z| <= 1."""
-    return _both(_both(_slab(o.x, d.x), _slab(o.y, d.y)), _slab(o.z, d.z))
+    """Intervals of rays from the origin `o` in the direction `d` inside |x|, |y|, |z| <= 1."""
+    in_xy = _intersection(_interval_in_slab(o.x, d.x), _interval_in_slab(o.y, d.y))
+    return _intersection(in_xy, _interval_in_slab(o.z, d.z))
 
 
 def cylinder(o: Vectors, d: Vectors) -> Interval:
-    """Intervals of rays inside x^2 + y^2 <= 1, |z| <= 1."""
+    """Intervals of rays from the origin `o` in the direction `d` inside x^2 + y^2 <= 1, |z| <= 1."""
     square = jnp.maximum(d.x**2 + d.y**2, 1e-12)
     # Equal to the usual discriminant, but accurate in float32 even for a thin pole far away.
     discriminant = square - (o.x * d.y - o.y * d.x) ** 2
-    return _both(_round(square, o.x * d.x + o.y * d.y, discriminant), _slab(o.z, d.z))
+    in_xy = _interval_in_ball(square, o.x * d.x + o.y * d.y, discriminant)
+    return _intersection(in_xy, _interval_in_slab(o.z, d.z))
 
 
 def ball(o: Vectors, d: Vectors) -> Interval:
-    """Intervals of rays inside x^2 + y^2 + z^2 <= 1."""
-    square, towards = d.x**2 + d.y**2 + d.z**2, o.x * d.x + o.y * d.y + o.z * d.z
-    return _round(square, towards, towards**2 - square * (o.x**2 + o.y**2 + o.z**2 - 1))
+    """Intervals of rays from the origin `o` in the direction `d` inside x^2 + y^2 + z^2 <= 1."""
+    square, product = d.x**2 + d.y**2 + d.z**2, o.x * d.x + o.y * d.y + o.z * d.z
+    return _interval_in_ball(square, product, product**2 - square * (o.x**2 + o.y**2 + o.z**2 - 1))
 
 
 SOLIDS: tuple[Solid, Solid, Solid] = (cube, cylinder, ball)  # solids of boxes, cylinders and ellipsoids, in this order

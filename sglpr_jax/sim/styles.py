@@ -125,8 +125,8 @@ class Side:
     bays: bool  # whether cars park along the first strip
     occupied: float  # fraction of the bays that are occupied
     set_back: float  # distance of the common building line behind the last strip, metres
-    border: str
-    wood: bool
+    border: str  # border of the plots: "none" or a name in `frontage`
+    wood: bool  # whether a wood, banks or the slope of a hill stand there instead of plots, in this order
     bank: bool
     slope: bool
     tree_spacing: float  # distance between street trees, metres; 0 without street trees
@@ -139,43 +139,44 @@ class Side:
         return sum((strip.width for strip in self.strips), start=0.0)
 
 
-def draw_side(rng: np.random.Generator, style: Style, *, median: bool, look_alike: bool) -> Side:
-    """Draws one side of a stretch in the given style."""
-    width = rng.uniform(2.5, 9.0) if median else 0.0
-    bays = not median and rng.random() < style.bays
+def draw_side(rng: np.random.Generator, style: Style, *, has_median: bool, look_alike: bool) -> Side:
+    """Draws one side of a stretch in the given style. With `look_alike`, all of its houses are equal."""
+    median_width = rng.uniform(2.5, 9.0) if has_median else 0.0
+    has_bays = not has_median and rng.random() < style.bays
     strips = []
-    if median:
-        strips = [Strip(width, _planted(rng)), Strip(CARRIAGEWAY_M, ROAD)]
-    if bays:
+    if has_median:
+        strips = [Strip(median_width, _draw_planted_label(rng)), Strip(CARRIAGEWAY_M, ROAD)]
+    if has_bays:
         strips.append(Strip(BAY_M, int(rng.choice((PARKING, ROAD)))))
     if rng.random() < style.verge:
-        strips.append(Strip(rng.uniform(0.8, 2.2), _planted(rng)))
-    if style.walk[1]:
+        strips.append(Strip(rng.uniform(0.8, 2.2), _draw_planted_label(rng)))
+    if style.walk[1]:  # the style has sidewalks
         strips.append(Strip(rng.uniform(*style.walk), SIDEWALK))
     return Side(
         style=style,
         strips=tuple(strips),
-        median=width,
-        bays=bays,
+        median=median_width,
+        bays=has_bays,
         occupied=rng.uniform(0.25, 0.95),
         set_back=rng.uniform(*style.set_back),
         border=str(rng.choice(style.borders.split())),
         wood=rng.random() < style.wood,
         bank=rng.random() < style.banks,
         slope=style.slopes > 0 and rng.random() < style.slopes,
-        tree_spacing=rng.uniform(7, 16) if median or rng.random() < style.street_trees else 0.0,
+        tree_spacing=rng.uniform(7, 16) if has_median or rng.random() < style.street_trees else 0.0,
         row=draw_house(rng, style) if look_alike else None,
         post_spacing=rng.uniform(6, 14) if style.posts and rng.random() < style.posts else 0.0,
     )
 
 
-def _planted(rng: np.random.Generator) -> int:
+def _draw_planted_label(rng: np.random.Generator) -> int:
+    """Label of a planted strip of ground."""
     return TERRAIN if rng.random() < 0.7 else OTHER_GROUND
 
 
 def draw_house(rng: np.random.Generator, style: Style) -> House:
-    """Draws the size of a house of this style."""
-    return House(*(rng.uniform(*span) for span in (style.width, style.depth, style.height, style.glass)))
+    """Draws the size of a house of this style and the fraction of its facade that is window."""
+    return House(*(rng.uniform(*limits) for limits in (style.width, style.depth, style.height, style.glass)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -88,7 +88,7 @@ def benchmarks(monkeypatch):
 
 
 def test_every_program_is_tested(benchmarks, capsys):
-    named = {name for line in (*RUN, *PARSED) if (name := benchmarks.name_of(line.split()))}
+    named = {name for line in (*RUN, *PARSED) if (name := benchmarks.program_name(line.split()))}
     assert named == set(benchmarks.PROGRAMS)
     benchmarks.main([])
     assert set(benchmarks.PROGRAMS) == {line[:20].strip() for line in capsys.readouterr().out.splitlines()}

@@ -53,7 +53,7 @@ def test_command_lines_of_benchmarks_are_parsed(line, monkeypatch):
         importlib.import_module("benchmarks.gpu.__main__").parser().parse_args(words)
         return
     benchmarks = importlib.import_module("benchmarks.__main__")
-    name = benchmarks.name_of(words)
+    name = benchmarks.program_name(words)
     program = benchmarks.PROGRAMS[name].load()
     tyro.cli(functools.wraps(program)(lambda *values, **flags: flags), args=words[len(name.split()) :])
 

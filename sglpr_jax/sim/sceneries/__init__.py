@@ -1,4 +1,4 @@
-"""Surroundings where places repeat, by name."""
+"""Sceneries where different places look alike, by name, with parameters of the drives through them."""
 
 import dataclasses
 import functools
@@ -20,7 +20,7 @@ from sglpr_jax.sim.sceneries.walled import hall, yard
 
 @dataclasses.dataclass(frozen=True)
 class Repeating:
-    """Surroundings where places repeat, and parameters of the drive through them."""
+    """Scenery where different places look alike, and parameters of the drive through it."""
 
     site: Callable[[np.random.Generator, float, bool], Site]
     """Function of a random generator, the line's length in metres, and whether it is closed. It draws the scenery."""
@@ -31,17 +31,17 @@ class Repeating:
 
     Without revisits, all frames 30 s apart are farther apart than this.
     """
-    clearance_m: float = 1.2  # minimum horizontal distance of standing things from the path, in metres
+    clearance_m: float = 1.2  # minimum horizontal distance of standing objects from the path, in metres
     right_m: float = 0.4  # distance of the path to the right of the middle of the road or aisle, in metres
     sway_m: float = 0.3
     """Maximum deviation from `right_m`, in metres. The deviation varies along the path."""
     height_m: float | None = None
     """Height of the sensor above the ground, in metres. None uses the height of the given sensor."""
     crosses: bool = False
-    """Whether a drive with revisits in the opposite direction has a closed line, too, which crosses itself."""
+    """Whether the line is also closed for revisits in the opposite direction. Such a line crosses itself."""
 
     def is_closed(self, revisit: Revisit) -> bool:
-        """Whether the line of a drive is closed."""
+        """Whether the line of a drive with these revisits is closed."""
         return revisit == "same" or (self.crosses and revisit == "opposite")
 
 

@@ -1,4 +1,4 @@
-"""Open land and woods: a field with few things, and a forest."""
+"""Open land and woods: a field with few objects, and a forest."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -19,13 +19,11 @@ BEND_M = 25.0  # distance between two bends of the path through the forest, in m
 
 
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Track through fields, with posts or poles along it, some bushes, and single trees and sheds distant away."""
+    """Track through fields, with posts or poles along it, some bushes, and distant single trees and sheds."""
     road_line, path = road(rng, length_m, closed)
-    (every, thickness, height), offset = (
-        ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)],
-        rng.choice((-1, 1)) * 5.0,
-    )
-    posts = along(shifted(road_line, offset), ((post(POLE, thickness, height),), every))
+    spacing, thickness, height = (4.0, 0.12, 1.2) if rng.integers(2) == 0 else (35.0, 0.3, 8.0)
+    offset = rng.choice((-1, 1)) * 5.0
+    posts = along(shifted(road_line, offset), ((post(POLE, thickness, height),), spacing))
     bushes = _beside(rng, road_line, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
 
     def tree_or_shed() -> ObjectModel:
@@ -37,29 +35,29 @@ def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _beside(
-    rng: np.random.Generator, line: Line, every_m: float, away_m: Range, make: Callable[[], ObjectModel]
+    rng: np.random.Generator, line: Line, every_m: float, distance_m: Range, make: Callable[[], ObjectModel]
 ) -> Iterator[Spot]:
-    """Yields things at random positions beside a line, on average one per `every_m` metres."""
+    """Yields objects at random positions beside a line, on average one per `every_m` metres of the line."""
     for _ in range(round(len(line) * STEP_M / every_m)):
-        offset = np.array([rng.uniform(*away_m) * rng.choice((-1, 1))])
+        offset = np.array([rng.uniform(*distance_m) * rng.choice((-1, 1))])
         row = int(rng.integers(1, len(line) - 1))
-        x, y = shifted(line[row - 1 : row + 2], offset)[1].tolist()
+        x, y = shifted(line[row - 1 : row + 2], offset)[1].tolist()  # `shifted` needs the neighbours
         yield Spot(make(), x, y, rng.uniform(0, 2 * np.pi))
 
 
 def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Trees of one stand on slopes, 250 to 900 a hectare, with a bush for every 3 to 30 trunks."""
-    line = _path(rng, length_m, closed)
+    """Trees of similar size on slopes, 250 to 900 a hectare, with a bush for every 3 to 30 trunks."""
+    line = _winding_path(rng, length_m, closed)
     density, thickness = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
-    branches, shrubs = rng.uniform(3.0, 7.0), 1 / rng.uniform(3, 30)
-    spots = [Spot(_tree(rng, thickness, branches), x, y) for x, y in _scattered(rng, line, density)]
-    for x, y in _scattered(rng, line, shrubs * density):
+    crown_bottom, bushes_per_tree = rng.uniform(3.0, 7.0), 1 / rng.uniform(3, 30)
+    spots = [Spot(_tree(rng, thickness, crown_bottom), x, y) for x, y in _scattered(rng, line, density)]
+    for x, y in _scattered(rng, line, bushes_per_tree * density):
         spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
     relief = draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))
     return Site(line, spots, track(line, 0.6, relief))
 
 
-def _path(rng: np.random.Generator, length_m: float, closed: bool) -> Line:
+def _winding_path(rng: np.random.Generator, length_m: float, closed: bool) -> Line:
     """Path with a bend of up to 50 degrees every 25 m, or a closed one that winds around a circle."""
     if closed:
         angles = np.linspace(0, 2 * np.pi, max(round(length_m / BEND_M), 6), endpoint=False)
@@ -76,15 +74,15 @@ def _scattered(rng: np.random.Generator, line: Line, density: float) -> list[tup
     """Random positions within `WIDE_M` of a line, `density` per square metre."""
     low, high = line.min(axis=0) - WIDE_M, line.max(axis=0) + WIDE_M
     points = rng.uniform(low, high, (round(density * np.prod(high - low)), 2))
-    coarse = line[:: round(1 / STEP_M)]
-    is_near = [np.linalg.norm(coarse - point, axis=1).min() < WIDE_M for point in points]
+    coarse_line = line[:: round(1 / STEP_M)]  # one point per metre
+    is_near = [np.linalg.norm(coarse_line - point, axis=1).min() < WIDE_M for point in points]
     return [(float(x), float(y)) for x, y in points[is_near]]
 
 
-def _tree(rng: np.random.Generator, thickness: float, branches: float) -> ObjectModel:
-    """Trunk, and a crown that begins at about `branches` metres. The thickness has a log-normal distribution."""
-    thickness = float(thickness * np.exp(rng.normal(scale=0.35)))
-    width, bottom = 10 * thickness * rng.uniform(0.7, 1.3), branches * rng.uniform(0.7, 1.3)
+def _tree(rng: np.random.Generator, median_thickness: float, crown_bottom: float) -> ObjectModel:
+    """Tree with a log-normal thickness. Its crown begins at about `crown_bottom` metres above the ground."""
+    thickness = float(median_thickness * np.exp(rng.normal(scale=0.35)))
+    width, bottom = 10 * thickness * rng.uniform(0.7, 1.3), crown_bottom * rng.uniform(0.7, 1.3)
     height = width * rng.uniform(1.2, 2.0)
-    leaves = ball(VEGETATION, width, height, bottom=bottom, roughness=0.8, porosity=0.6)
-    return post(TRUNK, thickness, bottom + 0.4 * height), leaves
+    crown = ball(VEGETATION, width, height, bottom=bottom, roughness=0.8, porosity=0.6)
+    return post(TRUNK, thickness, bottom + 0.4 * height), crown

@@ -1,4 +1,4 @@
-"""Roads along which the same things repeat: between two walls, through a tunnel, a highway, and a bridge."""
+"""Roads along which the same objects repeat: between two walls, through a tunnel, a highway, and a bridge."""
 
 import numpy as np
 
@@ -37,14 +37,15 @@ def walls(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Tunnel of equal pieces of length TUNNEL_M with lamps. Every n-th piece has an emergency niche on the right."""
     road_line, path = road(rng, length_m, closed)
-    half, height, every = rng.uniform(3.8, 5.5), rng.uniform(4.8, 6.5), int(rng.integers(7, 16))
+    half, height, niche_every = rng.uniform(3.8, 5.5), rng.uniform(4.8, 6.5), int(rng.integers(7, 16))
     pieces = along(road_line, (_tube(half, height, 0.0), TUNNEL_M))
-    pieces[::every] = along(road_line, (_tube(half, height, NICHE_M), every * TUNNEL_M))
+    pieces[::niche_every] = along(road_line, (_tube(half, height, NICHE_M), niche_every * TUNNEL_M))
     lamp = (block(OTHER_OBJECT, 1.2, 0.4, 0.25, y=rng.choice((0.0, half - 1)), bottom=height - 0.3),)
     return Site(path, [*pieces, *along(road_line, (lamp, rng.uniform(8, 14)))], painted_ground(ROAD))
 
 
 def _tube(half: float, height: float, niche: float) -> ObjectModel:
+    """Walls and ceiling of a piece of tunnel. The right wall is `niche` metres farther out than `half`."""
     length, offset = OVERLAP * TUNNEL_M, half + THICK_M / 2
     wall = block(BUILDING, length, THICK_M, height + 0.5, y=offset, roughness=0.02)
     ceiling = block(BUILDING, length, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
@@ -52,22 +53,20 @@ def _tube(half: float, height: float, niche: float) -> ObjectModel:
 
 
 def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Deck that rays beyond it do not hit, with railings, lamps and pylons, half of the time with hangers."""
+    """Bridge with railings, lamps and pylons, half of the time with hangers. Beside its deck, rays do not return."""
     road_line, path = road(rng, length_m, closed)
-    half, rail, hang, lit, span = rng.uniform((5, 0.9, 8, 25, 120), (8, 1.3, 15, 45, 260)).tolist()
-    bars = [block(FENCE, OVERLAP * 2.0, 0.06, 0.08, y=half, bottom=z * rail) for z in (0.5, 0.95)]
+    half, rail_height, hangers_m, lamps_m, pylons_m = rng.uniform((5, 0.9, 8, 25, 120), (8, 1.3, 15, 45, 260)).tolist()
+    bars = [block(FENCE, OVERLAP * 2.0, 0.06, 0.08, y=half, bottom=z * rail_height) for z in (0.5, 0.95)]
     kerb = block(FENCE, OVERLAP * 2.0, 0.3, 0.25, y=half)
-    things = [(mirrored(*bars, kerb, post(FENCE, 0.1, rail, y=half)), 2.0)]
+    things = [(mirrored(*bars, kerb, post(FENCE, 0.1, rail_height, y=half)), 2.0)]  # pairs of object and spacing
     if rng.random() < 0.5:
-        things.append((mirrored(post(POLE, 0.16, 14.0, y=half + 0.6)), hang))
+        things.append((mirrored(post(POLE, 0.16, 14.0, y=half + 0.6)), hangers_m))
     lamp = post(POLE, 0.2, 8.0, y=half + 0.3)
-    things.append((mirrored(lamp) if rng.random() < 0.5 else (lamp,), lit))
+    things.append((mirrored(lamp) if rng.random() < 0.5 else (lamp,), lamps_m))
     legs = mirrored(block(BUILDING, 2.5, 2.0, 30.0, y=half + 1.8))
-    things.append(((*legs, block(BUILDING, 1.5, 2 * half + 2, 2.0, bottom=6.5)), span))
-    lines = [
-        Strip(road_line, 0.0, 0.2, LANE_MARKING, 4.0),
-        *(Strip(road_line, y, y + 0.2, LANE_MARKING) for y in (-3.6, 3.4)),
-    ]
+    things.append(((*legs, block(BUILDING, 1.5, 2 * half + 2, 2.0, bottom=6.5)), pylons_m))
+    lines = [Strip(road_line, 0.0, 0.2, LANE_MARKING, dash_m=4.0)]
+    lines += [Strip(road_line, y, y + 0.2, LANE_MARKING) for y in (-3.6, 3.4)]
     deck = Strip(road_line, -half - 0.3, half + 0.3, ROAD)
     return Site(path, along(road_line, *things), painted_ground(NO_RETURN, [deck, *lines]))
 
@@ -75,39 +74,44 @@ def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Four lanes between rails with posts, walls of equal panels, lamps and gantries. Slopes are at most 1.5 %."""
     road_line, path = road(rng, length_m, closed)
-    rail, wall, panel = rng.uniform(8, 9.5), rng.uniform(11, 17), rng.uniform(4, 5)
-    fence = mirrored(
-        block(FENCE, OVERLAP * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1)
-    )
-    beam = block(FENCE, OVERLAP * 4.0, 0.1, 0.32, y=rail, bottom=0.5)
-    rails = mirrored(beam, post(POLE, 0.12, 0.8, y=rail + 0.12))
-    lamps = mirrored(post(POLE, 0.2, 9.0, y=rail + 1))
-    gantry = (*mirrored(post(POLE, 0.4, 6.5, y=rail + 0.8)), block(TRAFFIC_SIGN, 0.4, 2 * rail + 2, 1.5, bottom=5.5))
+    rail_y, wall_y, panel_m = rng.uniform(8, 9.5), rng.uniform(11, 17), rng.uniform(4, 5)
+    panel = block(FENCE, OVERLAP * panel_m, 0.2, rng.uniform(2.5, 5), y=wall_y)
+    walls = mirrored(panel, post(FENCE, 0.35, 5.2, y=wall_y - 0.1))
+    beam = block(FENCE, OVERLAP * 4.0, 0.1, 0.32, y=rail_y, bottom=0.5)
+    rails = mirrored(beam, post(POLE, 0.12, 0.8, y=rail_y + 0.12))
+    lamps = mirrored(post(POLE, 0.2, 9.0, y=rail_y + 1))
+    sign = block(TRAFFIC_SIGN, 0.4, 2 * rail_y + 2, 1.5, bottom=5.5)
+    gantry = (*mirrored(post(POLE, 0.4, 6.5, y=rail_y + 0.8)), sign)
     lamps_m, gantries_m = rng.uniform(30, 60), rng.uniform(120, 250)
-    spots = along(road_line, (fence, panel), (rails, 4.0), (lamps, lamps_m), (gantry, gantries_m))
-    lines = [Strip(road_line, y, y + 0.2, LANE_MARKING, 4.0) for y in (-LANE_M, 0.0, LANE_M)]
+    spots = along(road_line, (walls, panel_m), (rails, 4.0), (lamps, lamps_m), (gantry, gantries_m))
+    lines = [Strip(road_line, y, y + 0.2, LANE_MARKING, dash_m=4.0) for y in (-LANE_M, 0.0, LANE_M)]
     edges = [Strip(road_line, y, y + 0.2, LANE_MARKING) for y in (-2 * LANE_M, 2 * LANE_M)]
-    ground = painted_ground(TERRAIN, [Strip(road_line, -rail, rail, ROAD), *lines, *edges], rolling(rng))
+    ground = painted_ground(TERRAIN, [Strip(road_line, -rail_y, rail_y, ROAD), *lines, *edges], rolling(rng))
     return Site(path, [*spots, *_traffic(rng, road_line, 1), *_traffic(rng, road_line, -1)], ground)
 
 
 def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]:
-    """Vehicles on the outer lane of one direction, one every few seconds."""
+    """Vehicles on the outer lane of one direction, one every few seconds. `direction` is 1 along the line, or -1."""
     lane = shifted(line, -1.5 * LANE_M)[:-1] if direction > 0 else shifted(line, 1.5 * LANE_M)[::-1][:-1]
-    length = len(lane) * STEP_M
-    spots, start = [], -length / 18
-    while start < length / 6:  # the vehicle is faster than 12 m/s, and may return
+    length_m = len(lane) * STEP_M
+    spots, start_s = [], -length_m / 18
+    while start_s < length_m / 6:  # the vehicle is faster than 12 m/s, and may return
         thing = moving((car, car, van, truck)[rng.integers(4)](rng))
-        spots += _drive(thing, lane, start, rng.uniform(20, 32) if direction > 0 else rng.uniform(18, 28))
-        start += rng.uniform(3, 14)
+        speed = rng.uniform(20, 32) if direction > 0 else rng.uniform(18, 28)
+        spots += _drive(thing, lane, start_s, speed)
+        start_s += rng.uniform(3, 14)
     return spots
 
 
-def _drive(thing: ObjectModel, lane: Line, start: float, speed: float) -> list[Spot]:
-    """Drive along the whole lane, as pieces of straight motion of 1.5 s."""
-    times = np.arange(start, start + len(lane) * STEP_M / speed, 1.5)
-    at = ((times - start) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)
-    velocity = np.diff(lane[at], axis=0) / 1.5
-    begin, headings = lane[at[:-1]] - velocity * times[:-1, None], np.arctan2(*velocity.T[::-1])
-    pieces = np.column_stack([begin, headings, velocity, times[:-1], times[1:]]).tolist()
-    return [Spot(thing, x, y, heading, 1, (vx, vy), *when) for x, y, heading, vx, vy, *when in pieces]
+def _drive(thing: ObjectModel, lane: Line, start_s: float, speed: float) -> list[Spot]:
+    """Drive of `thing` along the whole lane, as pieces of straight motion of 1.5 s."""
+    times = np.arange(start_s, start_s + len(lane) * STEP_M / speed, 1.5)
+    rows = ((times - start_s) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)
+    velocity = np.diff(lane[rows], axis=0) / 1.5
+    xy_at_0 = lane[rows[:-1]] - velocity * times[:-1, None]  # spots hold positions at time 0
+    headings = np.arctan2(*velocity.T[::-1])
+    pieces = np.column_stack([xy_at_0, headings, velocity, times[:-1], times[1:]]).tolist()
+    return [
+        Spot(thing, x, y, heading, velocity=(vx, vy), since=since, until=until)
+        for x, y, heading, vx, vy, since, until in pieces
+    ]
