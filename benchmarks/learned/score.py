@@ -35,7 +35,7 @@ from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights_file import LAST
+from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_search import search
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
@@ -87,7 +87,7 @@ def entry(name: str, runs: Path) -> Entry:
         params = init(jax.random.key(int(weights.removeprefix(RANDOM))), preset=method)
         return Entry(name, "images", lambda recording: network(params), params, 0, 0.0)
     folder = runs / name
-    folder = folder / LAST if (folder / LAST / "config.json").is_file() else folder
+    folder = folder / LAST_WEIGHTS if (folder / LAST_WEIGHTS / "config.json").is_file() else folder
     trained = method_with_weights(str(folder))
     return Entry(name, content_of(str(folder)), lambda recording: trained, None, *_seen(folder))
 
@@ -98,7 +98,7 @@ def _seen(folder: Path) -> tuple[int, float]:
     if "images" in about:
         return about["images"], about["seconds"]
     lines = [json.loads(line) for line in (folder.parent / SCORES_FILE).read_text().splitlines()]
-    named = folder.name.removeprefix(f"{LAST}-")
+    named = folder.name.removeprefix(f"{LAST_WEIGHTS}-")
     line = next((one for one in lines if str(one["images"]) == named), lines[-1])
     return line["images"], line["seconds"]
 

@@ -12,7 +12,8 @@ from scipy.cluster.vq import kmeans2
 
 from sglpr_jax.methods.learned.method import Variables
 from sglpr_jax.models import convolution
-from sglpr_jax.models.layers import l2_normalize, product, residual_sums
+from sglpr_jax.models.layers import l2_normalize, product
+from sglpr_jax.models.netvlad import residual_sums
 
 HE = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 """Initial values of the kernels, as in the residual networks of He et al. (2016)."""

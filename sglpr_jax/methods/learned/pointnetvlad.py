@@ -19,7 +19,8 @@ from sglpr_jax.methods.cells import voxel_means
 from sglpr_jax.methods.learned.layers import batch_norm
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rotate_clouds
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
-from sglpr_jax.models.layers import l2_normalize, maximum, residual_sums
+from sglpr_jax.models.layers import l2_normalize, maximum
+from sglpr_jax.models.netvlad import residual_sums
 
 POINTS = 4096
 RANGE_M = 40.0

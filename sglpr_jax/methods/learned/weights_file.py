@@ -14,7 +14,7 @@ from sglpr_jax.models.weights import as_tree, by_name, hash_of
 from sglpr_jax.models.weights_file import (
     CONFIG_FILE,
     WEIGHTS_FILE,
-    check_leaves,
+    check_arrays,
     last_weights,
     read_tensors,
     write_weights,
@@ -70,7 +70,7 @@ def load_variables(source: Path | str, method: LearnedMethod) -> Variables:
         raise ValueError(f"{folder}: expected weights of the method {method.name!r}, found those of {stored!r}")
     values, _ = read_tensors(folder / WEIGHTS_FILE)
     expected = by_name(jax.eval_shape(lambda: random_variables(method, seed=0)))
-    check_leaves(values, expected, source=folder / WEIGHTS_FILE)
+    check_arrays(values, expected, source=folder / WEIGHTS_FILE)
     return jax.device_put(as_tree(values))
 
 
