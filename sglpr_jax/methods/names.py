@@ -1,4 +1,4 @@
-"""Names of all methods, for modules that need them before they import the methods."""
+"""Names of all methods, for modules that must not import the methods."""
 
 from typing import TYPE_CHECKING, Literal
 

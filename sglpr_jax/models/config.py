@@ -193,9 +193,8 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 
     Every field is required, except the fields in `ADDED_LATER`.
 
-    Raises:
-      ValueError: If a field is missing, unknown or invalid. The message names `source`, the field, and the expected and
-        the found value.
+    Raises ValueError if a field is missing, unknown or invalid. The message names `source`, the field, and the expected
+    and the found value.
     """
     with naming(source):
         return _read_field(ModelConfig, values, field="")

@@ -29,8 +29,7 @@ def weight(module: nn.Module, name: str, init: Initializer, shape: tuple[int, ..
 
     This function replaces Flax's `param`, which takes half of the time of tracing a network.
 
-    Raises:
-      ValueError: If the weight has another shape.
+    Raises ValueError if the weight has another shape.
     """
     if not module.has_variable("params", name):
         if module.is_initializing() and module.is_mutable_collection("initial"):

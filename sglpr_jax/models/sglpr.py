@@ -92,9 +92,7 @@ class SGLPR(nn.Module):
 
 @jax.jit
 def describe(
-    params: Params,
-    bev: Num[Array, "*b h w"],
-    labels: Int[Array, "... h w"] | None = None,
+    params: Params, bev: Num[Array, "*b h w"], labels: Int[Array, "... h w"] | None = None
 ) -> Float[Array, "*b d"]:
     """Compute the descriptor of each bird's-eye-view image, also under jit, vmap and grad.
 

@@ -170,8 +170,7 @@ class SwinBlock(nn.Module):
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> Float[Array, "b h w c"]:
         """Returns a map of the same shape. `train` enables stochastic depth.
 
-        Raises:
-          ValueError: If windows do not tile the map.
+        Raises ValueError if windows do not tile the map.
         """
         attended = self._attend(LayerNorm(name="attention_norm")(x))
         x = x + DropPath(self.drop_path)(attended, train=train)

@@ -131,8 +131,7 @@ def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
 def from_torch_names(checkpoint: dict[str, np.ndarray], config: ModelConfig) -> dict[str, Any]:
     """Return the weights of a whole Swin-Unet, given by PyTorch's names, as the tree of this project's weights.
 
-    Raises:
-      ValueError: If a weight is missing, unknown or of the wrong shape. The message names the first one.
+    Raises ValueError if a weight is missing, unknown or of the wrong shape. The message names the first one.
     """
     expected = _expected_shapes(config)
     unknown = set(checkpoint) - {torch_name(name) for name in expected}

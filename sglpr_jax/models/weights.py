@@ -45,8 +45,7 @@ def graft(source: Params, target: Params) -> Params:
     A kernel of `target` may have more input channels. They come after those of `source` and start at 0, so the larger
     network initially computes the same. If `target` has no segmentation head, that of `source` is dropped.
 
-    Raises:
-      ValueError: If `source` has a weight that `target` lacks, or that differs in more than the input channels.
+    Raises ValueError if `source` has a weight that `target` lacks, or that differs in more than the input channels.
     """
     source = source if target.config.segments else for_places(source)
     weights = by_name(target.weights)
@@ -130,8 +129,7 @@ def fit_whitening(descriptors: Float[np.ndarray, "n d"], *, power: float = WHITE
     A principal component with spread s gets a spread proportional to s**(1 - power). Power 1 whitens fully. The spread
     is the root mean square, not the deviation from the mean, because whitened descriptors are scaled to length 1.
 
-    Raises:
-      ValueError: If all descriptors are equal.
+    Raises ValueError if all descriptors are equal.
     """
     x = np.asarray(descriptors, np.float64)
     if not np.ptp(x, axis=0).any():
