@@ -9,10 +9,7 @@ from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M, SAME_PASS_FRAMES
 
 @dataclasses.dataclass(frozen=True)
 class TupleConfig:
-    """Choice of the training tuples: an anchor, positives from the same place, and negatives from other places.
-
-    Distances are horizontal, because ground-truth heights drift by metres.
-    """
+    """Choice of anchors, positives and negatives. Distances are horizontal, because heights drift by metres."""
 
     positives: Count = 1
     """Number of positives of an anchor."""

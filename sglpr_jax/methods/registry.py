@@ -54,19 +54,13 @@ def method_beside(trained: Params, name: str, *, ready_made: bool, seed: int = 0
 
 
 def method_with_weights(weights: str) -> Method:
-    """Return the method of shipped weights, given their name, or of the weights in a folder of bin/train or bin/peers.
-
-    Raises the errors of `load` or `load_variables`.
-    """
+    """Return the method of shipped weights, by name, or of a folder of bin/train or bin/peers. Raises as `load`."""
     name = method_of(Path(weights))
     return trained_method(LEARNED[name], weights) if name in LEARNED else network(load(weights))
 
 
 def trained_method(method: LearnedMethod, weights: str) -> Method:
-    """Return a learned method with weights: a folder of weights or of a run, or `random:SEED`.
-
-    Raises the errors of `load_variables`.
-    """
+    """Return a learned method with the weights of a folder or of `random:SEED`. Raises as `load_variables`."""
     variables = load_variables(weights, method)
     sha256 = variables_hash(variables)
     return Method(

@@ -57,10 +57,7 @@ class CircularNet(nn.Module):
 
 
 class CircularDecoder(nn.Module):
-    """Decoder from the features to the resolution of the image after average pooling.
-
-    At each finer resolution, the last map that `CircularNet` computed at this resolution joins it (skip connection).
-    """
+    """Decoder to the size of the averaged image. At each finer size, the last map of `CircularNet` with it joins."""
 
     widths: tuple[int, ...]
     """Channels of the blocks of `CircularNet`."""

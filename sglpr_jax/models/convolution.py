@@ -22,10 +22,7 @@ RESULTS_PER_PATCH = 4
 
 
 class Convolution(nn.Module):
-    """Square convolution with He initialisation.
-
-    Images are padded by `size // 2` pixels on each side. If the strides equal the kernel size, they are not padded.
-    """
+    """Square convolution, padded by `size // 2` pixels on each side, or not if the strides equal the kernel size."""
 
     features: int
     size: int = 3
@@ -52,10 +49,7 @@ class Convolution(nn.Module):
 def convolve(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int], circular: bool
 ) -> Float[Array, "b _ _ f"]:
-    """Convolve padded images. `strides` are those of rows and columns. With `circular` the columns wrap around.
-
-    The derivative is computed by matrix products, and so is the result if the kernel has few inputs.
-    """
+    """Convolve padded images, with `strides` along rows and columns. The derivative is computed by matrix products."""
     if _has_few_inputs(kernel):
         return convolve_as_product(x, kernel, strides, circular)
     border = _border(kernel, strides)

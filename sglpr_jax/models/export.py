@@ -70,10 +70,7 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
 
 
 def stablehlo(params: Params) -> bytes:
-    """Return `describe` with these weights as serialised by `jax.export`, for any number of images.
-
-    Raises ImportError if flatbuffers is missing.
-    """
+    """Return `describe` with these weights, serialised by `jax.export`. Raises ImportError without flatbuffers."""
     try:
         import flatbuffers  # noqa: F401
     except ImportError as error:

@@ -137,10 +137,7 @@ def _maximum_derivative(axes: tuple[int, ...], primals: tuple[Array], tangents: 
 
 
 def l2_normalize(x: Float[Array, "*dims"], *, axis: int = -1) -> Float[Array, "*dims"]:
-    """Scale vectors along `axis` to length 1.
-
-    A vector shorter than 1e-12 becomes 0 with gradient 0. The gradient of x / |x| would be NaN at 0.
-    """
+    """Scale vectors along `axis` to length 1. Vectors shorter than 1e-12 become 0 with gradient 0 instead of NaN."""
     square = jnp.sum(x * x, axis=axis, keepdims=True)
     has_direction = square > NORM_FLOOR**2
     return x * jnp.where(has_direction, jax.lax.rsqrt(jnp.where(has_direction, square, 1.0)), 0.0)

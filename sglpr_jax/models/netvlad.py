@@ -40,10 +40,7 @@ class GatedNetVLAD(nn.Module):
 def residual_sums(
     features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[Array, "d k"]
 ) -> Float[Array, "b d k"]:
-    """Sum the residuals of local features for each cluster, and scale the sum of each cluster to length 1, in float32.
-
-    vlad[d, k] = sum over n of assignment[n, k] * (features[n, d] - centres[d, k])
-    """
+    """Return sum over n of assignment[n, k] * (features[n, d] - centres[d, k]), of length 1 over d, in float32."""
     assignment_in_type = assignment.astype(features.dtype)
     sums = jnp.einsum("bnd,bnk->bdk", features, assignment_in_type, preferred_element_type=jnp.float32)
     return l2_normalize(sums - assignment.sum(1)[:, None, :] * centres[None], axis=1)

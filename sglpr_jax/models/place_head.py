@@ -44,10 +44,7 @@ def input_without_backbone(
 
 
 class PlaceHead(nn.Module):
-    """CBAM, convolutions that reduce the map and add channels, NetVLAD, L2 normalisation.
-
-    `config` can leave out CBAM and the convolutions, and replace NetVLAD by a mean, as in table 4.
-    """
+    """CBAM, convolutions that reduce the map, NetVLAD or mean, L2 normalisation, and whitening if configured."""
 
     config: HeadConfig
     circular: bool = False

@@ -92,10 +92,7 @@ class WindowAttention(nn.Module):
         return Linear(c, name="projection")(mixed.reshape(n, t, c))
 
     def _position_bias(self, tokens: int) -> Float[Array, "heads t t"]:
-        """Return the learned bias of each (query, key), read from the table by a product with one-hot rows.
-
-        The gradient of a lookup would be a slow scatter.
-        """
+        """Return the bias of each (query, key), by a product with one-hot rows, whose gradient is faster than a lookup's."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
         table = weight(self, "position_bias", initial.normal(0.02), (rows, self.heads))
@@ -134,10 +131,7 @@ class PatchProjection(nn.Module):
 
 
 class DropPath(nn.Module):
-    """Stochastic depth: training replaces the branch by 0 in a random fraction `rate` of the samples.
-
-    It scales the other branches by 1 / (1 - rate). The random numbers are those of the stream `drop_path`.
-    """
+    """Stochastic depth: in training, a random fraction `rate` of the branches becomes 0; the others are scaled up."""
 
     rate: float
 
@@ -168,10 +162,7 @@ class SwinBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> Float[Array, "b h w c"]:
-        """Returns a map of the same shape. `train` enables stochastic depth.
-
-        Raises ValueError if windows do not tile the map.
-        """
+        """Return a map of the same shape. `train` enables stochastic depth. Raises ValueError if windows do not tile."""
         attended = self._attend(LayerNorm(name="attention_norm")(x))
         x = x + DropPath(self.drop_path)(attended, train=train)
         hidden = gelu(Linear(self.mlp_ratio * x.shape[-1], name="mlp_in")(LayerNorm(name="mlp_norm")(x)))
@@ -225,10 +216,7 @@ class SwinStage(nn.Module):
 
 
 class PatchMerging(nn.Module):
-    """Halves height and width and doubles the channels: joins 2 x 2 tokens, then norm, then a linear layer.
-
-    The tokens are joined in the order (y, x) = (0, 0), (1, 0), (0, 1), (1, 1).
-    """
+    """Joins 2 x 2 tokens, in the order (y, x) = (0, 0), (1, 0), (0, 1), (1, 1), then norm, then a linear layer."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h//2 w//2 2*c"]:
@@ -239,10 +227,7 @@ class PatchMerging(nn.Module):
 
 
 class PatchExpand(nn.Module):
-    """Expands each token to `factor` x `factor` tokens or pixels by a linear layer, then norm.
-
-    The outputs of the linear layer are in the order (row offset, column offset, channel).
-    """
+    """Expands each token to factor x factor tokens by a linear layer with outputs (row, column, channel), then norm."""
 
     factor: int
     channels: int

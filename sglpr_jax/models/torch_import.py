@@ -129,10 +129,7 @@ def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
 
 
 def from_torch_names(checkpoint: dict[str, np.ndarray], config: ModelConfig) -> dict[str, Any]:
-    """Return the weights of a whole Swin-Unet, given by PyTorch's names, as the tree of this project's weights.
-
-    Raises ValueError if a weight is missing, unknown or of the wrong shape. The message names the first one.
-    """
+    """Convert a whole Swin-Unet to this project's tree of weights. Raises ValueError if a name or shape differs."""
     expected = _expected_shapes(config)
     unknown = set(checkpoint) - {torch_name(name) for name in expected}
     if unknown:
@@ -156,10 +153,7 @@ def torch_name(name: str) -> str:
 
 
 def _expected_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of all weights that a Swin-Unet has, too: all except those of the place head.
-
-    Raises ValueError if the model has another backbone or none.
-    """
+    """Return the shapes of all weights except the place head's. Raises ValueError if the backbone is no Swin-Unet."""
     if not config.head.reads_features:
         raise ValueError(f"expected a model with a backbone, found a place head that reads {config.head.input}")
     if not isinstance(config.backbone, SwinConfig):

@@ -64,10 +64,7 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
 def write_weights(
     folder: Path, arrays: Mapping[str, Any], config: Mapping[str, Any], header: Mapping[str, str]
 ) -> None:
-    """Write arrays with a header that also gets their hash, and a configuration, to a folder: completely or not at all.
-
-    Raises OSError if the folder cannot be written or holds other files.
-    """
+    """Write arrays, their hash and a configuration, or nothing. Raises OSError if the folder holds other files."""
     # safetensors writes memory in its physical order, so a transposed view would be read in the wrong order.
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
@@ -106,10 +103,7 @@ def load(weights: Path | str) -> Params:
 
 
 def last_weights(folder: Path) -> Path:
-    """Return `folder` itself, or its subfolder of the last weights if `folder` is that of a training run.
-
-    Raises FileNotFoundError if a file of the weights is missing.
-    """
+    """Return `folder`, or its subfolder of the last weights if it has one. Raises FileNotFoundError without files."""
     folder = folder / LAST_WEIGHTS if (folder / LAST_WEIGHTS).is_dir() else folder
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
@@ -119,10 +113,7 @@ def last_weights(folder: Path) -> Path:
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read the arrays and the header of a safetensors file. The header is empty in files of earlier versions.
-
-    Raises ValueError if the file is damaged, or if its arrays do not have the hash in the header.
-    """
+    """Read the arrays and the header of a safetensors file. Raises ValueError if it is damaged or has another hash."""
     try:
         with safetensors.safe_open(path, framework="np") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
@@ -139,10 +130,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def check_arrays(arrays: Mapping[str, Any], expected: Mapping[str, Any], *, source: Path) -> None:
-    """Raise ValueError unless arrays have the names, shapes and types of those in `expected`, and are finite.
-
-    `jax.ShapeDtypeStruct` can stand for an array in both.
-    """
+    """Raise ValueError unless arrays (or `jax.ShapeDtypeStruct`) are finite and have the expected shapes and types."""
 
     def type_and_shape(array: Any) -> str:
         return "no array" if array is None else f"{array.dtype} {tuple(array.shape)}"

@@ -92,10 +92,7 @@ def lidar_iris_distance(
 
 
 def log_gabor_responses(image: Float64[np.ndarray, "80 360"]) -> Complex128[np.ndarray, "filters 80 360"]:
-    """Return the complex responses of every ring to the four log-Gabor filters.
-
-    A filter of wavelength w has the gain exp(-ln(f w)^2 / (2 ln(sigma)^2)) at frequencies f > 0, and 0 elsewhere.
-    """
+    """Return the complex responses of every ring to the log-Gabor filters exp(-ln(f w)^2 / (2 ln(sigma)^2)), f > 0."""
     frequency = np.fft.fftfreq(COLUMNS)
     is_positive = frequency > 0
     gains = np.zeros((len(WAVELENGTHS), COLUMNS))
@@ -123,10 +120,7 @@ def _prepare(descriptors: Float32[np.ndarray, "n 28800"]) -> tuple[Spectra, Bits
 def _hamming_distances(
     bits: Bits, faint: Bits, shifts: Int[np.ndarray, "n 2"], database_bits: Bits, database_faint: Bits
 ) -> Float[np.ndarray, " n"]:
-    """Return the distance of one query to each database image, at the best shift near the two estimated `shifts`.
-
-    The estimates are mostly one column apart, so most nearby shifts occur twice and are compared once.
-    """
+    """Return the distance of one query to each database image, at the best shift near the two estimated `shifts`."""
     nearby = shifts[..., None] + np.arange(-NEARBY_SHIFTS, NEARBY_SHIFTS + 1)
     candidates = np.sort(nearby.reshape(len(shifts), -1) % COLUMNS, axis=1)  # database image, shift
     is_first = np.diff(candidates, axis=1, prepend=-1) > 0

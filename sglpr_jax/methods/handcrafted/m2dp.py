@@ -49,10 +49,7 @@ def plane_axes() -> Float32[np.ndarray, "64 2 3"]:
 
 
 def _align(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Return the centred points in their principal axes, the longest first.
-
-    Of the two directions of the first and of the second axis, the one with a positive third moment is used.
-    """
+    """Return the centred points in their principal axes, longest first. The first two have a positive third moment."""
     centred = points - points.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)  # shortest first
     first, second = (axis if np.sum((centred @ axis) ** 3) >= 0 else -axis for axis in (axes[:, 2], axes[:, 1]))

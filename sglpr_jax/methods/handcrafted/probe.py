@@ -42,10 +42,7 @@ def probe(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "2400"]:
 
 
 def occupancy(heights: Cells) -> Float64[np.ndarray, "n 40 60"]:
-    """Return the probability that a cell is occupied: the occupied cells, blurred along the sectors by a Gaussian.
-
-    The Gaussian of each ring has the deviation in `AZIMUTH_DEVIATIONS`.
-    """
+    """Return probabilities of occupancy: the occupied cells, blurred along the sectors (`AZIMUTH_DEVIATIONS`)."""
     sector_angles = np.minimum(np.arange(SECTORS), SECTORS - np.arange(SECTORS)) * (2 * np.pi / SECTORS)
     kernel = np.exp(-((sector_angles[None] / AZIMUTH_DEVIATIONS[:, None]) ** 2) / 2)
     spectrum = np.fft.rfft(kernel / kernel.sum(axis=1, keepdims=True))
@@ -95,10 +92,7 @@ def _jaccard(
     database: tuple[Float[Array, "n 40 60"], ...],
     shifts: Int[Array, "q n"],
 ) -> Float[Array, "q n"]:
-    """Return the Jaccard index of each pair (`probe_distance`), with the sectors of the query shifted by `shifts`.
-
-    Queries and database have p, p' and log(p' / (1 - p')), as returned by `_prepare`.
-    """
+    """Return the Jaccard indices of p, p' and log(p' / (1 - p')) (`_prepare`), with the query's sectors shifted."""
     weights = np.exp(-AZIMUTH_DEVIATIONS * (SECTORS / (2 * np.pi))).astype(np.float32)[None, :, None]
     shifted_sectors = (np.arange(SECTORS)[None, :] - np.arange(SECTORS)[:, None]) % SECTORS  # shift, sector
     database_occupied, database_smoothed, database_logit = database

@@ -103,10 +103,7 @@ class REIN(nn.Module):
 
 
 def pad_to_odd_maps(images: Float[Array, "b h h"]) -> Float[Array, "b _ _"]:
-    """Add zeros on all sides, so that all maps of the encoder have a pixel at the centre.
-
-    Raises ValueError if the number of rows is even.
-    """
+    """Add zeros on all sides, so that all maps have a central pixel. Raises ValueError if the size is even."""
     size = images.shape[1]
     if size % 2 == 0:
         raise ValueError(f"expected images with an odd number of rows, found {size}")
@@ -130,10 +127,7 @@ def rotate_maps_back(maps: Float[Array, "8*b h h c"]) -> Float[Array, "8 b h h c
 
 @functools.cache
 def rotation_taps(size: int, degrees: int) -> Taps:
-    """Return the table of a counter-clockwise rotation of square images about their centre, with zeros outside.
-
-    Each pixel is a bicubic mean of 4 x 4 pixels.
-    """
+    """Return the bicubic table of a counter-clockwise rotation of square images, with zeros outside of the image."""
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     y, x = (np.mgrid[:size, :size] - (size - 1) / 2).reshape(2, -1)
     source = np.stack([cos * y + sin * x, cos * x - sin * y]) + (size - 1) / 2  # row and column before the rotation
@@ -170,10 +164,7 @@ def resize_maps(maps: Float[Array, "b h h c"], size: int) -> Float[Array, "b {si
 
 
 def grey_image(scan: Scan) -> UInt8[np.ndarray, "151 151"]:
-    """Return the density image of a scan, ready-made or from its points, as grey values.
-
-    Raises ValueError if the scan has no density image of 151 x 151 pixels, or if it shows no place (`check_cloud`).
-    """
+    """Return a scan's density image as grey values. Raises ValueError if it has another image or shows no place."""
     if scan.points is not None:
         check_cloud(scan.points, name=scan.name)
     check_ready_made(scan, "density")

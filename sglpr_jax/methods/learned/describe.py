@@ -34,10 +34,7 @@ def apply_network(variables: Variables, inputs: Shaped[Any, "b ..."], *, method:
 def describe_inputs(
     method: LearnedMethod, variables: Variables, inputs: Shaped[np.ndarray, "n ..."]
 ) -> Float32[np.ndarray, "n d"]:
-    """Return the descriptors of all inputs, which may be a memory-mapped file.
-
-    Raises ValueError if a descriptor is not finite or only zeros (`check_descriptors`).
-    """
+    """Return the descriptors of all inputs, perhaps a memory-mapped file. Raises ValueError as `check_descriptors`."""
     described = []
     for start in range(0, len(inputs), BATCH):
         batch = np.asarray(inputs[start : start + BATCH])

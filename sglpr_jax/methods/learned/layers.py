@@ -43,10 +43,7 @@ def max_pool(x: Float[Array, "b h w c"], *, size: int, border: int = 0) -> Float
 
 
 class NetVLAD(nn.Module):
-    """Soft assignment a = softmax(x W) of local features to clusters, and `residual_sums`, flattened and normalised.
-
-    The local features should have length 1. The result is flattened cluster by cluster.
-    """
+    """softmax(x W) assigns local features of length 1 to clusters. The `residual_sums` are flattened and normalised."""
 
     clusters: int = 64
 

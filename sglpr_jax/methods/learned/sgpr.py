@@ -82,10 +82,7 @@ def semantic_graph(scan: Scan) -> Float32[np.ndarray, "100 15"]:
 
 
 def cluster_of_points(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, " n"]:
-    """Return the index of each point's cluster. Neighbouring points of a cluster are at most `gap_m` apart.
-
-    The points of a voxel of `gap_m` / 4 count as one point, their mean.
-    """
+    """Return the index of each point's cluster. Neighbouring voxel means in a cluster are at most `gap_m` apart."""
     if len(points) == 0:
         return np.zeros(0, np.int64)
     voxel, counts = group_by_voxel(points, gap_m / VOXELS_PER_GAP)
@@ -107,10 +104,7 @@ def squared_distances(x: Float[Array, "b n c"]) -> Float[Array, "b n n"]:
 
 
 class EdgeConv(nn.Module):
-    """Maximum over the neighbours j of LeakyReLU(BN(W [x_j - x_i, x_i])), without bias.
-
-    W [x_j - x_i, x_i] = A x_j + (B - A) x_i, so each node is multiplied only once.
-    """
+    """Maximum over the neighbours j of LeakyReLU(BN(A x_j + (B - A) x_i)), where [A, B] act on [x_j - x_i, x_i]."""
 
     features: int
 
@@ -136,10 +130,7 @@ class GraphAttention(nn.Module):
 
 
 class TensorNetwork(nn.Module):
-    """Compares the vectors a and b of two graphs by relu(a T b + V [a, b] + bias), and two linear layers.
-
-    T are 16 matrices, and V is one matrix.
-    """
+    """Compares vectors a and b of two graphs by relu(a T_k b + V_k [a, b] + bias_k), k < 16, and two linear layers."""
 
     @nn.compact
     def __call__(self, queries: Float[Array, "q c"], others: Float[Array, "n c"]) -> Float[Array, "q n"]:
@@ -207,10 +198,7 @@ def compare(variables: Variables, queries: Float[Array, "q 32"], database: Float
 
 
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the mean binary cross-entropy of the pairs of an anchor with its positives (1) and negatives (0).
-
-    Each pair counts in both orders.
-    """
+    """Return the mean binary cross-entropy of each anchor with its positives (1) and negatives (0), in both orders."""
 
     def tuple_loss(vectors: Float[Array, "k d"]) -> Float[Array, ""]:
         anchor, others = vectors[:1], vectors[1:]

@@ -41,10 +41,7 @@ def random_variables(method: LearnedMethod, *, seed: int) -> Variables:
 
 
 def save_variables(folder: Path, method: LearnedMethod, variables: Variables, about: Mapping[str, Any]) -> None:
-    """Write the variables of a trained network, and the settings of its training (`about`) as JSON values.
-
-    Raises OSError if the folder cannot be written or holds other files than earlier weights (`write_weights`).
-    """
+    """Write the variables of a network, and the settings of its training as JSON values. Raises as `write_weights`."""
     write_weights(folder, by_name(variables), {"method": method.name, **about}, {})
 
 
