@@ -26,8 +26,7 @@ class HandcraftedMethod:
     """Publication of the method."""
     takes: Takes
     describe: Callable[..., Float32[np.ndarray, "..."]]
-    """Maps images (n, h, w) to descriptors (n, d), or the points (n, 3) of one scan to its descriptor (d,). If the
-    method takes labelled points, their classes (n,) are the second argument."""
+    """Maps images (n, h, w) to descriptors (n, d), or points (n, 3), and perhaps their classes (n,), to one (d,)."""
     distance: DistanceFn | None = None
     """Distance between descriptors. None: L2."""
     describe_ready_made: Callable[..., Float32[np.ndarray, "n d"]] | None = None
@@ -47,8 +46,7 @@ class Method:
     """JSON values for descriptor files: the name of the method, by the key `method`, and its configuration."""
     takes: Takes
     prepare: Callable[[Scan, float | None], Any]
-    """Returns the input of a scan that is first rotated about z by an angle in radians (None: not rotated). Called in
-    several threads."""
+    """Returns the input of a scan that is first rotated about z by an angle in radians. Runs in several threads."""
     describe: Callable[[Any], Float[Any, "b d"]]
     """Maps a batch of inputs, stacked along a new first axis, to descriptors."""
     distance: str = "l2"

@@ -24,8 +24,7 @@ class TupleConfig:
     revisit_gap: CountOrNone = SAME_PASS_FRAMES
     """Maximum difference of the frame numbers of two scans from the same visit."""
     cluster: Count = 1
-    """Number of consecutive tuples with anchors near each other. If tuples share negatives, these are then places of
-    the same street, which are harder to distinguish than random places."""
+    """Number of consecutive tuples with anchors near each other, so that shared negatives are from the same street."""
     cluster_m: NotNegative = 100.0
     """Maximum distance of the anchors of a cluster from its first anchor, in metres."""
     mining: Literal["none", "hardest"] = "none"

@@ -87,10 +87,7 @@ def network(params: Params) -> Method:
 
 
 def handcrafted(name: str, grid: Grid | None) -> Method:
-    """Return a handcrafted method. If it describes images, they are made on `grid`, or ready-made (None).
-
-    Raises ValueError if the name is not in `HANDCRAFTED`.
-    """
+    """Return a handcrafted method, for images on `grid` or ready-made ones (None). Raises ValueError if unknown."""
     if name not in HANDCRAFTED:
         raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
     method = HANDCRAFTED[name]

@@ -93,11 +93,9 @@ class CircularConfig:
 
     kind: Literal["circular"] = "circular"
     average: Size = 2
-    """Edge of the squares of polar pixels that are averaged before the first block. A polar image of the size after
-    averaging would skip cells of the grid."""
+    """Edge of the squares of polar pixels that are averaged first, because a smaller polar image would skip cells."""
     fine: Sizes = ()
-    """Channels of additional blocks at the full number of sectors. The output of block i joins the input of the block
-    with `widths[i]` channels."""
+    """Channels of additional blocks at the full number of sectors. Each joins the input of the block in `widths`."""
     widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
     """Channels of each block."""
     strides: Sizes = (2, 2, 1, 2, 1, 1, 1)

@@ -25,10 +25,7 @@ class ChannelGate(nn.Module):
 
 
 class SpatialGate(nn.Module):
-    """x * sigmoid(7 x 7 convolution of [maximum, mean] over channels).
-
-    The convolution has a bias. The published gate has a batch norm instead, which acts like a bias after training.
-    """
+    """x * sigmoid(7 x 7 convolution of [maximum, mean] over channels), with bias instead of Woo's batch norm."""
 
     circular: bool = False
 

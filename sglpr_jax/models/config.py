@@ -31,18 +31,13 @@ WHITENING_POWER = 0.4
 
 @dataclasses.dataclass(frozen=True)
 class HeadConfig:
-    """Place head: CBAM, three convolutions and NetVLAD (section 4.1.2).
-
-    The paper gives no kernel sizes, strides or channels. The preset `paper` is one interpretation
-    (docs/decisions.md).
-    """
+    """Place head: CBAM, three convolutions and NetVLAD (section 4.1.2). The paper gives no kernel sizes or channels."""
 
     input: Literal["features", "counts", "labels", "counts+labels"] = "features"
     """Input of the head (table 6): the features of the backbone (HS), the image of point counts (RB), its ground-truth
     semantic map (RS), or image and map (RB+RS). Only `features` has a backbone and a segmentation head."""
     tap: Literal["pixels", "tokens"] = "pixels"
-    """Feature map that the head reads. `pixels`: the output of the decoder, before the last linear layer. `tokens`: the
-    features from which the decoder starts."""
+    """Feature map that the head reads. `pixels`: the output of the decoder. `tokens`: the input of the decoder."""
     channels: Sizes = (128, 256, 512)
     """Channels of each convolution."""
     kernels: Sizes = (3, 3, 3)
@@ -95,8 +90,7 @@ class ModelConfig:
 
     grid: Grid = Grid()
     image: ImageKind = "points"
-    """Image that a scan is converted to: point counts (equation 1), or a density image like the ready-made ones of
-    KITTI (`density_bev`)."""
+    """Image that a scan is converted to: point counts (equation 1), or a density image as the ready-made of KITTI."""
     counts: Literal["raw", "log1p", "clipped"] = "log1p"
     """Conversion of point counts to network input: unchanged, log(1 + n), or min(n, 10) / 10."""
     field: Literal["square", "circle"] = "square"
@@ -107,8 +101,7 @@ class ModelConfig:
     """Whether a second input channel holds the distance of each cell from the sensor, which attention in windows cannot
     know. The number of points on bare ground depends on it."""
     polar: tuple[Size, Size] | None = None
-    """(radii, sectors) of a polar image for the backbone, in which a rotation of the scan is a shift. None: Cartesian
-    image."""
+    """(radii, sectors) of a polar image for the backbone, in which a rotation is a shift. None: Cartesian image."""
     backbone: BackboneConfig = SwinConfig()
     head: HeadConfig = HeadConfig()
     """Configuration of the place head."""
@@ -117,8 +110,7 @@ class ModelConfig:
     detail: SizeOrNone = 0
     """Width of a layer that adds the image to the features of the segmentation head. 0: no layer, as in the paper."""
     compute: Literal["float32", "bfloat16"] = "float32"
-    """Data type of matrix products and convolutions. Weights, norms, softmax, the sums of NetVLAD, the descriptor and
-    the losses are always float32."""
+    """Data type of matrix products and convolutions. Weights, norms, softmax, descriptors and losses are float32."""
 
     def __post_init__(self):
         check_fields(self)

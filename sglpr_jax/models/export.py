@@ -30,8 +30,7 @@ INPUT_FILE = "input.json"
 OPSET = 21
 NEEDS = "pip install 'sglpr-jax[export]'"
 NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
-"""jax2onnx is installed without its dependencies. They include an Orbax that is older than Flax's and that the
-conversion does not use."""
+"""jax2onnx is installed without its dependencies, which include an Orbax that is too old for Flax and not needed."""
 
 
 def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -> Path:

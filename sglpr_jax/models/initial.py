@@ -77,10 +77,7 @@ def normal(deviation: float) -> Initial:
 
 
 def truncated_normal(scale: float) -> Initial:
-    """Normal distribution truncated at 2 standard deviations, with variance `scale` / (number of inputs of an output).
-
-    The truncation narrows the distribution, so it is widened by the reciprocal factor before.
-    """
+    """Normal distribution, truncated at 2 standard deviations, of variance `scale` / (number of inputs) after that."""
     lowest_probability = ndtr(-TRUNCATED_AT)
     density = math.exp(-(TRUNCATED_AT**2) / 2) / math.sqrt(2 * math.pi)
     narrowing = math.sqrt(1 - 2 * TRUNCATED_AT * density / (1 - 2 * lowest_probability))

@@ -70,10 +70,8 @@ def cell_distance(grid: Grid) -> Float[np.ndarray, "h w"]:
 class Taps(NamedTuple):
     """Table for a resampling: each of n output pixels is a weighted sum of k pixels of the flattened input image."""
 
-    pixel: np.ndarray
-    """Indices of the input pixels, (k, n) int32."""
-    weight: np.ndarray
-    """Their weights, (k, n) float32."""
+    pixel: np.ndarray  # indices of the input pixels, (k, n) int32
+    weight: np.ndarray  # their weights, (k, n) float32
 
 
 def to_polar(

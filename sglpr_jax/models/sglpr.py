@@ -121,10 +121,7 @@ def describe(
 
 @jax.jit
 def is_describable(params: Params, bev: Num[Array, "*b h w"]) -> Bool[Array, "*b"]:
-    """Whether the counts of each image are finite, and at least 2 cells in the field of view hold points.
-
-    Other images show no place. `describe` gives every empty image the same descriptor.
-    """
+    """Whether each image shows a place: its counts are finite, and at least 2 cells in view have points."""
     occupied = jnp.where(field_of_view(params.config)[0], bev > 0, False)
     return (occupied.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS) & jnp.isfinite(bev).all((-2, -1))
 

@@ -22,10 +22,7 @@ BLOCKED = -100.0
 
 @cache
 def relative_position_index(window: int) -> Int[np.ndarray, "t t"]:
-    """Return the row of the bias table for each (query, key) of a window with t = window**2 tokens, row-major.
-
-    The table has one row for each offset (dy, dx) of a query from a key, each from -(window - 1) to window - 1.
-    """
+    """Return for each (query, key) of a window the row of the bias table, which has a row for each offset (dy, dx)."""
     y, x = np.divmod(np.arange(window**2), window)
     dy_from_0 = y[:, None] - y[None, :] + window - 1
     dx_from_0 = x[:, None] - x[None, :] + window - 1
@@ -92,7 +89,7 @@ class WindowAttention(nn.Module):
         return Linear(c, name="projection")(mixed.reshape(n, t, c))
 
     def _position_bias(self, tokens: int) -> Float[Array, "heads t t"]:
-        """Return the bias of each (query, key), by a product with one-hot rows, whose gradient is faster than a lookup's."""
+        """Return the bias of each (query, key), by a product with one-hot rows. The gradient of a lookup is slow."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
         table = weight(self, "position_bias", initial.normal(0.02), (rows, self.heads))
@@ -162,7 +159,7 @@ class SwinBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> Float[Array, "b h w c"]:
-        """Return a map of the same shape. `train` enables stochastic depth. Raises ValueError if windows do not tile."""
+        """Return a map of the same shape, with `DropPath` if `train`. Raises ValueError if windows do not tile it."""
         attended = self._attend(LayerNorm(name="attention_norm")(x))
         x = x + DropPath(self.drop_path)(attended, train=train)
         hidden = gelu(Linear(self.mlp_ratio * x.shape[-1], name="mlp_in")(LayerNorm(name="mlp_norm")(x)))

@@ -1,7 +1,4 @@
-"""Weights on disk: a folder with config.json and model.safetensors, so that weights and configuration stay together.
-
-The networks of other publications use the same files (`methods/learned/weights_file.py`).
-"""
+"""Weights and their configuration on disk: a folder with config.json and model.safetensors, for all networks."""
 
 import dataclasses
 import hashlib

@@ -24,8 +24,7 @@ WAVELENGTHS = tuple(18 * 1.6**scale for scale in range(4))
 SIGMA = 0.75
 """Width of a filter: its standard deviation divided by its frequency."""
 FAINT_AMPLITUDE = 1e-4 / COLUMNS
-"""Amplitude below which the sign of a response is unreliable. The published 1e-4 belongs to an inverse transform
-without the factor 1 / columns."""
+"""Amplitude below which a sign is unreliable. The published 1e-4 is for an inverse transform without 1 / columns."""
 NEARBY_SHIFTS = 2
 """Number of shifts to either side of each estimated shift that are also compared, in columns."""
 
@@ -197,10 +196,7 @@ def _phase_correlation(a: Complex[Array, "80 181"], b: Complex[Array, "80 181"])
 
 
 def _offset_of_peak(surface: Float[Array, "80 360"], roll: tuple[int, int]) -> Float[Array, "2"]:
-    """Roll the surface by `roll` rows and columns, and return the offset of its middle from its peak in both.
-
-    The peak is the centre of mass of the cells near the maximum. The borders of the rolled surface cut these cells.
-    """
+    """Return the offset (rows, columns) of a rolled surface's middle from the centre of mass around its maximum."""
     shape = np.array(surface.shape)
     # The index of the first maximum, in an eighth of the time of `jnp.argmax` on a CPU.
     index = jnp.where(surface.ravel() == surface.max(), jnp.arange(surface.size), surface.size).min()

@@ -12,10 +12,7 @@ NUMBERS = AZIMUTHS * ELEVATIONS + BINS
 
 
 def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
-    """Return the first left (64) and right (128) singular vector of the `signature`. No points give zeros.
-
-    The signature has no negative values, so the vectors can be chosen without negative values. This fixes their signs.
-    """
+    """Return the first left (64) and right (128) singular vector of the `signature`, without negative values."""
     if not len(points):
         return np.zeros(NUMBERS, np.float32)
     left, _, right = np.linalg.svd(signature(points), full_matrices=False)

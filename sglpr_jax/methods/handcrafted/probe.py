@@ -1,7 +1,4 @@
-"""PROBE (Lee et al., 2026), rebuilt from the abstract: probabilities of occupancy and heights on a polar grid.
-
-The abstract names the parts. The formulas that combine them, and all numbers, are choices of this project.
-"""
+"""PROBE (Lee et al., 2026), rebuilt from the abstract with own formulas: occupancy and heights on a polar grid."""
 
 import jax
 import jax.numpy as jnp
@@ -28,10 +25,7 @@ Cells = Float32[np.ndarray, "n 40 60"]
 
 
 def probe(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "2400"]:
-    """Return the height above the ground of the highest point in each of 40 rings x 60 sectors, or 0, flattened.
-
-    Points (metres, z up) at less than 0.3 m above the ground, or at 80 m or more from the sensor, are ignored.
-    """
+    """Return the maximum height above the ground, from 0.3 m on, in each of 40 rings x 60 sectors, or 0, flattened."""
     radius, angle, z = polar(points)
     height = z - GROUND_M
     valid = (radius < RADIUS_M) & (height > CLEARANCE_M)

@@ -15,8 +15,7 @@ HALF_WIDTH_M = 70.0
 LOWEST_M, HIGHEST_M = -1.0, 10.0
 """Heights of the points that count, in metres above the sensor: the published limits for KITTI."""
 ANGLES = 60
-"""Number of angles, from 0 to 177 degrees. The published 120 angles cover 360 degrees. Those from 180 degrees on have
-reversed rows, and therefore equal magnitudes."""
+"""Number of angles, from 0 to 177 degrees. The published angles from 180 degrees on have equal magnitudes again."""
 FREQUENCIES = SIDE // 2 + 1
 NUMBERS = ANGLES * FREQUENCIES
 
@@ -67,12 +66,9 @@ def ring_distance(
 
 
 def _standardise(descriptors: Float32[np.ndarray, "n 3660"]) -> Float32[np.ndarray, "n 61 60"]:
-    """Return magnitudes (frequency, angle) with mean 0 and length 1 over all 120 frequencies of the full spectrum.
-
-    The descriptor has 61 of them. All but the first and the last occur twice, so they are scaled by sqrt(2).
-    """
+    """Return magnitudes (frequency, angle) with mean 0 and length 1 over all 120 frequencies of the full spectrum."""
     occurrences = np.full(FREQUENCIES, 2.0)
-    occurrences[[0, -1]] = 1
+    occurrences[[0, -1]] = 1  # in the full spectrum, all but the first and the last of the 61 frequencies occur twice
     magnitudes = descriptors.reshape(-1, ANGLES, FREQUENCIES).astype(np.float64)
     mean = (magnitudes @ occurrences).sum(axis=1) / (ANGLES * SIDE)
     scaled = (magnitudes - mean[:, None, None]) * np.sqrt(occurrences)

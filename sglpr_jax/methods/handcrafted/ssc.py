@@ -39,8 +39,7 @@ PACKED = 6
 """Cells per number of a descriptor: float32 represents integers of 24 bits exactly."""
 
 ARCTAN = (0.0068117896, -0.033604209, 0.079623658, -0.13233341, 0.19807815, -0.33317368, 0.99999611)
-"""Coefficients of arctan(t) / t in t^2, for t from 0 to 1: the minimax polynomial, with a maximum error of 3e-7
-radians."""
+"""Minimax polynomial of arctan(t) / t in t^2, for t from 0 to 1, with a maximum error of 3e-7 radians."""
 
 BLOCK = 64
 WIDTH_STEP = 8192
@@ -163,10 +162,7 @@ def _occupied_cells(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _compare(grid: PolarGrid, queries: tuple[Array, ...], database: tuple[Array, ...]) -> Float[Array, "q n"]:
-    """Return the distances of queries (outlines, ranks) and a database (outlines, centres of cells, their ranks).
-
-    Pairs run one after the other, because each then runs only the iterations that it needs and stays in the cache.
-    """
+    """Return the distances of queries (outlines, ranks) to a database (outlines, centres of cells, their ranks)."""
 
     def distance(query, other):
         (outline, ranks), (other_outline, other_centres, ranks_of_centres) = query, other
@@ -176,6 +172,7 @@ def _compare(grid: PolarGrid, queries: tuple[Array, ...], database: tuple[Array,
         is_occupied = (ranks > 0) | (other_ranks > 0)
         return 1 - jnp.sum(is_occupied & (ranks == other_ranks)) / jnp.maximum(is_occupied.sum(), 1)
 
+    # One pair at a time stays in the cache and runs only the iterations that it needs.
     return jax.lax.map(lambda query: jax.lax.map(lambda other: distance(query, other), database), queries)
 
 

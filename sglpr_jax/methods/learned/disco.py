@@ -87,10 +87,7 @@ class DiSCO(nn.Module):
 
 
 def upsample(x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c"]:
-    """Double the rings and the sectors of maps bilinearly. The sectors wrap around.
-
-    The centres of the first and last ring stay. Each sector becomes two, a quarter of it left and right of its centre.
-    """
+    """Double the rings (between the centres of the first and last) and the sectors (which wrap around) bilinearly."""
     rings = x.shape[1]
     source_ring = np.linspace(0, rings - 1, 2 * rings)
     ring_weights = np.maximum(0, 1 - np.abs(source_ring[:, None] - np.arange(rings))).astype(np.float32)

@@ -23,8 +23,7 @@ from sglpr_jax.methods.recipe import Recipe, TupleConfig
 COLUMNS = 360
 RANGE_M = 50.0
 CLASSES = (1, *range(9, 20))
-"""Classes of the rows: car, road, parking, sidewalk, other ground, building, fence, vegetation, trunk, terrain, pole,
-sign."""
+"""Classes of the rows: car, road, parking, sidewalk, other ground, building, fence, vegetation, ..., traffic sign."""
 ROAD = 1
 """Row of the road, which holds the range of the farthest point. The other rows hold the nearest one."""
 STAGES = ((3, 16), (3, 32), (2, 32), (2, 64), (2, 128))
@@ -77,10 +76,7 @@ def rotate_with_lost_columns(key: Array, inputs: Float[Array, "b 12 360"]) -> Fl
 
 
 class RINet(nn.Module):
-    """The network of one scan. Rotations by whole degrees do not change its descriptor.
-
-    A rotation shifts the results of the layers, except for reductions of the ring, which keep the strongest phase.
-    """
+    """The network of one scan. Rotations by whole degrees do not change its descriptor (`strongest_phase`)."""
 
     @nn.compact
     def __call__(self, inputs: Float[Array, "b 12 360"], *, train: bool) -> Float[Array, "b 288"]:

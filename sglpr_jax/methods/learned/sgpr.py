@@ -44,8 +44,7 @@ CLUSTER_RULES = {
     18: (0.2, 100),  # pole
     19: (0.2, 50),  # traffic sign
 }
-"""Published rules for each class: the maximum gap between neighbouring points of a cluster, in metres, and the minimum
-number of points of a cluster. Other classes are ignored."""
+"""For each class that is used, the maximum gap in a cluster, in metres, and the minimum number of its points."""
 MAX_POINTS = 50_000
 """Maximum number of points of a cluster. Larger clusters are dropped."""
 VOXELS_PER_GAP = 4
