@@ -122,15 +122,15 @@ def _hamming_distances(
     """Return the distance of one query to each database image, at the best shift near the two estimated `shifts`."""
     nearby = shifts[..., None] + np.arange(-NEARBY_SHIFTS, NEARBY_SHIFTS + 1)
     candidates = np.sort(nearby.reshape(len(shifts), -1) % COLUMNS, axis=1)  # database image, shift
-    is_first = np.diff(candidates, axis=1, prepend=-1) > 0
+    is_first = np.diff(candidates, axis=1, prepend=-1) > 0  # most shifts occur twice, near both estimates
     smallest = np.ones(len(shifts))
     for i in range(candidates.shape[1]):
         images = np.flatnonzero(is_first[:, i])
         columns = (np.arange(COLUMNS) + candidates[images, i, None]) % COLUMNS
         shifted = images[:, None], columns
-        counts = ~(faint | database_faint[shifted])
-        unequal_bits = np.bitwise_count((bits ^ database_bits[shifted]) & counts).sum(axis=(1, 2), dtype=np.int64)
-        all_bits = np.bitwise_count(counts).sum(axis=(1, 2), dtype=np.int64)
+        is_counted = ~(faint | database_faint[shifted])
+        unequal_bits = np.bitwise_count((bits ^ database_bits[shifted]) & is_counted).sum(axis=(1, 2), dtype=np.int64)
+        all_bits = np.bitwise_count(is_counted).sum(axis=(1, 2), dtype=np.int64)
         distances = np.divide(unequal_bits, all_bits, out=np.ones(len(images)), where=all_bits > 0)
         smallest[images] = np.minimum(smallest[images], distances)
     return smallest
@@ -204,7 +204,7 @@ def _offset_of_peak(surface: Float[Array, "80 360"], roll: tuple[int, int]) -> F
     rolled_maximum = (maximum + np.array(roll)) % shape
     steps = np.arange(-PEAK_CELLS, PEAK_CELLS + 1)
     row, column = (maximum[:, None] + steps[None]) % shape[:, None]
-    rolled_cells = rolled_maximum[:, None] + steps[None]
+    rolled_cells = rolled_maximum[:, None] + steps[None]  # of these, only those within the rolled surface count
     row_is_inside, column_is_inside = (rolled_cells >= 0) & (rolled_cells < shape[:, None])
     window = jnp.where(row_is_inside[:, None] & column_is_inside[None], surface[row[:, None], column[None]], 0.0)
     total = window.sum()
