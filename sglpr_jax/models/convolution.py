@@ -89,7 +89,7 @@ def convolve_as_product(
 
 
 def _multiply_patches(
-    stacked_rows: Float[Array, "b h w k*c"], kernel: Float[Array, "k k c f"], stride: int, results_per_patch: int
+    stacked_rows: Float[Array, "b h w _"], kernel: Float[Array, "k k c f"], stride: int, results_per_patch: int
 ) -> Float[Array, "b h _ f"]:
     """Convolve along the columns: cut the image into patches and multiply each by a matrix.
 

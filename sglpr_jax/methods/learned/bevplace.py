@@ -118,7 +118,7 @@ def eight_rotations(images: Float[Array, "b h h"]) -> Float[Array, "8*b h h"]:
     return jnp.concatenate([jnp.rot90(x, k, (1, 2)) for x in (images, diagonal_images) for k in range(4)])
 
 
-def rotate_maps_back(maps: Float[Array, "8*b h h c"]) -> Float[Array, "8 b h h c"]:
+def rotate_maps_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
     """Undo the rotations of `eight_rotations`, given the encoder's maps of the rotated images."""
     quarters_undone = [jnp.rot90(x, -(k % 4), (1, 2)) for k, x in enumerate(jnp.split(maps, 8))]
     diagonal_maps = resample_maps(jnp.concatenate(quarters_undone[4:]), rotation_taps(maps.shape[1], -45))
