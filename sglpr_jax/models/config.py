@@ -90,7 +90,7 @@ class ModelConfig:
 
     grid: Grid = Grid()
     image: ImageKind = "points"
-    """Image that a scan is converted to: point counts (equation 1), or a density image as the ready-made of KITTI."""
+    """Image that a scan is converted to: point counts (equation 1), or a density image like KITTI's ready-made ones."""
     counts: Literal["raw", "log1p", "clipped"] = "log1p"
     """Conversion of point counts to network input: unchanged, log(1 + n), or min(n, 10) / 10."""
     field: Literal["square", "circle"] = "square"

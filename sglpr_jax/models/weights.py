@@ -52,9 +52,9 @@ def graft(source: Params, target: Params) -> Params:
     for name, value in by_name(source.weights).items():
         expected = weights[name].shape if name in weights else "no such weight"
         if value.shape != expected:
-            may_grow = name in weights and value.ndim == len(expected) and value.ndim in (2, 4)  # a kernel
-            added = np.subtract(expected, value.shape) if may_grow else np.zeros(2)
-            added_inputs = added[-2]  # the last axis but one
+            is_kernel = name in weights and value.ndim == len(expected) and value.ndim in (2, 4)
+            added = np.subtract(expected, value.shape) if is_kernel else np.zeros(2)
+            added_inputs = added[-2]  # inputs are the last axis but one of a kernel
             if added_inputs <= 0 or np.count_nonzero(added) > 1:
                 found = f"{name} has shape {value.shape}"
                 raise ValueError(f"cannot start from these weights: {found}, expected {expected}")

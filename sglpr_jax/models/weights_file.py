@@ -61,7 +61,7 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
 def write_weights(
     folder: Path, arrays: Mapping[str, Any], config: Mapping[str, Any], header: Mapping[str, str]
 ) -> None:
-    """Write arrays, their hash and a configuration, or nothing. Raises OSError if the folder holds other files."""
+    """Write arrays, their hash and a configuration: all or nothing. Raises OSError if the folder holds other files."""
     # safetensors writes memory in its physical order, so a transposed view would be read in the wrong order.
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
@@ -100,7 +100,7 @@ def load(weights: Path | str) -> Params:
 
 
 def last_weights(folder: Path) -> Path:
-    """Return `folder`, or its subfolder of the last weights if it has one. Raises FileNotFoundError without files."""
+    """Return `folder`, or its subfolder `weights` if it has one. Raises FileNotFoundError if files are missing."""
     folder = folder / LAST_WEIGHTS if (folder / LAST_WEIGHTS).is_dir() else folder
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():

@@ -16,6 +16,7 @@ def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
     if not len(points):
         return np.zeros(NUMBERS, np.float32)
     left, _, right = np.linalg.svd(signature(points), full_matrices=False)
+    # Both vectors of a signature without negative values have equal signs everywhere; `abs` chooses the positive ones.
     return np.abs(np.concatenate([left[:, 0], right[0]])).astype(np.float32)
 
 
