@@ -16,8 +16,7 @@ def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
     if not len(points):
         return np.zeros(NUMBERS, np.float32)
     left, _, right = np.linalg.svd(signature(points), full_matrices=False)
-    # Both vectors of a signature without negative values have equal signs everywhere; `abs` chooses the positive ones.
-    return np.abs(np.concatenate([left[:, 0], right[0]])).astype(np.float32)
+    return np.abs(np.concatenate([left[:, 0], right[0]])).astype(np.float32)  # -u1 and -v1 are singular vectors, too
 
 
 def signature(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "64 128"]:
