@@ -47,7 +47,7 @@ def sinogram(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "60 120"
     lower_bin, upper_weight = lower_offset + SIDE * np.arange(ANGLES)[:, None], offset - lower_offset
     lower_sums = np.bincount(lower_bin.ravel(), (1 - upper_weight).ravel(), minlength=ANGLES * SIDE)
     upper_sums = np.bincount((lower_bin + 1).ravel(), upper_weight.ravel(), minlength=ANGLES * SIDE)
-    return (lower_sums + upper_sums).reshape(ANGLES, SIDE)
+    return (lower_sums + upper_sums).reshape(ANGLES, SIDE).astype(np.float64)  # no points would give integers
 
 
 def ring_distance(
