@@ -2,7 +2,7 @@
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jax.typing import ArrayLike
+import numpy as np
 from jaxtyping import Array, Float
 
 from sglpr_jax.models import initial
@@ -39,7 +39,7 @@ class GatedNetVLAD(nn.Module):
 
 
 def residual_sums(
-    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[ArrayLike, "d k"]
+    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[Array | np.ndarray, "d k"]
 ) -> Float[Array, "b d k"]:
     """Return sum over n of assignment[n, k] * (features[n, d] - centres[d, k]), of length 1 over d, in float32."""
     assignment_in_type = assignment.astype(features.dtype)

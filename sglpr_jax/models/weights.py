@@ -53,7 +53,7 @@ def graft(source: Params, target: Params) -> Params:
         expected = weights[name].shape if name in weights else "no such weight"
         if value.shape != expected:
             is_kernel = name in weights and value.ndim == len(expected) and value.ndim in (2, 4)
-            added = np.subtract(expected, value.shape) if is_kernel else np.zeros(2)
+            added = np.subtract(expected, value.shape) if is_kernel else np.zeros(2, np.int64)
             added_inputs = added[-2]  # inputs are the last axis but one of a kernel
             if added_inputs <= 0 or np.count_nonzero(added) > 1:
                 found = f"{name} has shape {value.shape}"
