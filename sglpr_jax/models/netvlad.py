@@ -2,7 +2,7 @@
 
 import flax.linen as nn
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from sglpr_jax.models import initial
@@ -39,12 +39,12 @@ class GatedNetVLAD(nn.Module):
 
 
 def residual_sums(
-    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[Array | np.ndarray, "d k"]
+    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[ArrayLike, "d k"]
 ) -> Float[Array, "b d k"]:
     """Return sum over n of assignment[n, k] * (features[n, d] - centres[d, k]), of length 1 over d, in float32."""
     assignment_in_type = assignment.astype(features.dtype)
     sums = jnp.einsum("bnd,bnk->bdk", features, assignment_in_type, preferred_element_type=jnp.float32)
-    return l2_normalize(sums - assignment.sum(1)[:, None, :] * centres[None], axis=1)
+    return l2_normalize(sums - assignment.sum(1)[:, None, :] * jnp.asarray(centres)[None], axis=1)
 
 
 class MeanPooling(nn.Module):
