@@ -35,7 +35,7 @@ from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights_file import LAST
+from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_search import search
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
@@ -89,7 +89,7 @@ def entry(name: str, runs: Path) -> Entry:
         params = init(jax.random.key(int(weights.removeprefix(RANDOM))), preset=method)
         return Entry(name, "images", lambda recording: network(params), params, 0, 0.0)
     folder = runs / name
-    folder = folder / LAST if (folder / LAST / "config.json").is_file() else folder
+    folder = folder / LAST_WEIGHTS if (folder / LAST_WEIGHTS / "config.json").is_file() else folder
     trained = method_with_weights(str(folder))
     images, seconds = _training_effort(folder)
     return Entry(name, content_of(str(folder)), lambda recording: trained, images=images, seconds=seconds)
@@ -101,8 +101,13 @@ def _training_effort(folder: Path) -> tuple[int, float]:
     if "images" in config:
         return config["images"], config["seconds"]
     lines = [json.loads(line) for line in (folder.parent / SCORES_FILE).read_text().splitlines()]
-    snapshot = folder.name.removeprefix(f"{LAST}-")  # number of images, or the last weights
+<<<<<<< HEAD
+    snapshot = folder.name.removeprefix(f"{LAST_WEIGHTS}-")  # number of images, or the last weights
     line = next((line for line in lines if str(line["images"]) == snapshot), lines[-1])
+=======
+    named = folder.name.removeprefix(f"{LAST_WEIGHTS}-")
+    line = next((one for one in lines if str(one["images"]) == named), lines[-1])
+>>>>>>> 405c4155d7afc1ffed24f94f0ba4f1533760072e
     return line["images"], line["seconds"]
 
 

@@ -1,4 +1,4 @@
-"""Cells of a scan: polar coordinates, extreme values in cells, and voxels."""
+"""Points in cells, for several methods: polar coordinates, extreme values of cells, and voxels."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,39 +13,41 @@ def polar(points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 n"]:
     return np.stack([np.hypot(x, y), np.arctan2(y, x), z])
 
 
-def extreme(
-    choose: np.ufunc, shape: Sequence[int], at: Any, values: Float[np.ndarray, " n"]
+def extreme_of_cells(
+    extreme: np.ufunc, shape: Sequence[int], cells: Any, values: Float[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "..."]:
-    """Return the largest (`np.maximum`) or the smallest value (`np.minimum`) of each cell, 0 in empty cells.
+    """Return an image with the largest or the smallest of the values in each cell, and 0 in empty cells.
 
     Arguments:
-      choose: Function of two values.
-      shape: Numbers of cells along the axes.
-      at: Index of each value in the image.
+      extreme: `np.maximum` or `np.minimum`.
+      shape: Shape of the image.
+      cells: Cell of each value, as an index of the image: an array (n,), or one array for each axis.
       values: Finite values.
     """
-    image = np.full(shape, np.inf if choose is np.minimum else -np.inf)
-    choose.at(image, at, values)
+    image = np.full(shape, np.inf if extreme is np.minimum else -np.inf)
+    extreme.at(image, cells, values)
     return np.where(np.isfinite(image), image, 0)
 
 
 def voxel_means(points: Float[np.ndarray, "n 3"], side_m: float) -> Float64[np.ndarray, "voxels 3"]:
-    """Return the mean of the finite points of each occupied voxel, in the order of the voxels."""
-    return means(points, *voxels(points, side_m))
+    """Return the mean of the points, which must be finite, in each occupied voxel, sorted by the voxels' x, y and z."""
+    voxel, counts = group_by_voxel(points, side_m)
+    return group_means(points, voxel, counts)
 
 
-def voxels(
+def group_by_voxel(
     points: Float[np.ndarray, "n 3"], side_m: float
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " voxels"]]:
-    """Return the number of the voxel of each point, and the number of points in each voxel."""
-    cells = np.floor(points / side_m).astype(np.int64)
-    _, voxel, counts = np.unique(cells @ [1 << 40, 1 << 20, 1], return_inverse=True, return_counts=True)
+    """Return the index of each point's voxel among the occupied voxels, and the number of points in each of these."""
+    voxels = np.floor(points / side_m).astype(np.int64)
+    voxel_keys = voxels @ [1 << 40, 1 << 20, 1]  # unique and sorted by x, y, z for up to 2**20 voxels along an axis
+    _, voxel, counts = np.unique(voxel_keys, return_inverse=True, return_counts=True)
     return voxel, counts
 
 
-def means(
+def group_means(
     points: Float[np.ndarray, "n 3"], group: Int64[np.ndarray, " n"], counts: Int64[np.ndarray, " groups"]
 ) -> Float64[np.ndarray, "groups 3"]:
     """Return the mean of the points of each group, given the group of each point and the sizes of the groups."""
-    sums = [np.bincount(group, weights=axis, minlength=len(counts)) for axis in points.T]
+    sums = [np.bincount(group, weights=coordinate, minlength=len(counts)) for coordinate in points.T]
     return np.stack(sums, axis=1) / counts[:, None]

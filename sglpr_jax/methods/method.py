@@ -1,4 +1,4 @@
-"""Interface of a method: how it describes scans or images, its inputs, and how its descriptors are compared."""
+"""Interfaces of a method: its input, how it describes the input, and how its descriptors are compared."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,16 +18,15 @@ DistanceFn = Callable[[Float32[np.ndarray, "q d"], Float32[np.ndarray, "n d"]], 
 
 @dataclass(frozen=True)
 class HandcraftedMethod:
-    """A method without training, an entry of the table in `handcrafted/`."""
+    """A method without training. `HANDCRAFTED` in `handcrafted/__init__.py` lists all of them."""
 
     name: str
     """Name on the command line."""
     source: str
     """Publication of the method."""
     takes: Takes
-    """Input: images (n, h, w), described as (n, d), or the points (n, 3) of one scan, described as (d,). Labelled
-    points have classes (n,)."""
     describe: Callable[..., Float32[np.ndarray, "..."]]
+    """Maps images (n, h, w) to descriptors (n, d), or points (n, 3), and perhaps their classes (n,), to one (d,)."""
     distance: DistanceFn | None = None
     """Distance between descriptors. None: L2."""
     describe_ready_made: Callable[..., Float32[np.ndarray, "n d"]] | None = None
@@ -44,15 +43,14 @@ class Method:
     """A method as `retrieval.embed` runs it: it prepares the input of each scan and describes inputs in batches."""
 
     about: dict[str, Any]
-    """Name of the method (`method`) and its configuration, as JSON values."""
+    """JSON values for descriptor files: the name of the method, by the key `method`, and its configuration."""
     takes: Takes
     prepare: Callable[[Scan, float | None], Any]
-    """Returns the input of a scan that is first rotated about z by an angle in radians (None: not rotated). Called in
-    several threads."""
+    """Returns the input of a scan that is first rotated about z by an angle in radians. Runs in several threads."""
     describe: Callable[[Any], Float[Any, "b d"]]
     """Maps a batch of inputs, stacked along a new first axis, to descriptors."""
     distance: str = "l2"
-    """Name of a distance in `retrieval.distances`. A learned distance also names its weights."""
+    """Name of the distance, as `retrieval.distances` reads it. The name of a learned distance includes its weights."""
     weights_hash: str = ""
 
     @property
@@ -62,10 +60,12 @@ class Method:
 
 
 def check_descriptors(method: str, descriptors: np.ndarray, names: Sequence[str]) -> None:
-    """Raise ValueError unless each of the scans called `names` has a descriptor (d,) that is finite and not zero."""
+    """Raise ValueError unless each scan in `names` has a row of `descriptors` that is finite and not only zeros."""
     if descriptors.ndim != 2 or len(descriptors) != len(names):
         raise ValueError(f"{method}: expected {len(names)} descriptors ({len(names)}, d), found {descriptors.shape}")
-    infinite, empty = ~np.isfinite(descriptors).all(axis=1), ~descriptors.any(axis=1)
-    for is_bad, found in ((infinite, "values that are not finite"), (empty, "only zeros")):
-        if is_bad.any():
-            raise ValueError(f"{method}: expected a descriptor of {names[int(is_bad.argmax())]}, found {found}")
+    is_infinite = ~np.isfinite(descriptors).all(axis=1)
+    is_zero = ~descriptors.any(axis=1)
+    for is_invalid, found in ((is_infinite, "values that are not finite"), (is_zero, "only zeros")):
+        if is_invalid.any():
+            first_invalid = names[int(is_invalid.argmax())]
+            raise ValueError(f"{method}: expected a descriptor of {first_invalid}, found {found}")

@@ -1,4 +1,4 @@
-"""Names of all methods, for modules that need them before they import the methods."""
+"""Names of all methods, for modules that must not import the methods."""
 
 from typing import TYPE_CHECKING, Literal
 
@@ -7,8 +7,7 @@ HANDCRAFTED_NAMES = ("scan-context", "m2dp", "lidar-iris", "ssc", "ssc-24", "sol
 LEARNED_NAMES = ("rinet", "bevplace++", "resnet34-netvlad", "disco", "overlap-transformer", "pointnetvlad", "sgpr")
 """Names of the networks of other publications. Their weights are trained by the user."""
 UNTRAINED, SHIPPED = "untrained", "shipped"
-"""Methods for comparison with a newly trained network: the same network with random weights, and the default
-weights."""
+"""Methods for comparison with a newly trained network: the same network with random and with the default weights."""
 BESIDE = (UNTRAINED, "polar-fft")
 """Default methods for comparison with a newly trained network."""
 

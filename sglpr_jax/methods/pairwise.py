@@ -1,4 +1,4 @@
-"""Unit vectors, and distances between all pairs of two sets of descriptors, in blocks and for all shifts."""
+"""Distances and correlations between all pairs of two sets of descriptors, and unit vectors."""
 
 import os
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32
 
 Rows = Float32[np.ndarray, "rows d"]
 BLOCK = 1024
-"""Number of descriptors on each side of a block of L2 and cosine distances."""
+"""Number of queries, and of database descriptors, in a block of L2 or cosine distances."""
 
 
 def in_blocks(
@@ -28,20 +28,22 @@ def in_blocks(
     `prepare_database` replaces `prepare` for the database. `threads` is the number of blocks at the same time (None:
     the number of cores), which helps if `compare` uses only one core.
     """
-    out = np.empty((len(queries), len(database)), np.float32)
+    distances = np.empty((len(queries), len(database)), np.float32)
 
-    def fill(column: int) -> None:
-        prepared = (prepare_database or prepare)(database[column : column + block])
-        for row in range(0, len(queries), block):
-            out[row : row + block, column : column + block] = compare(prepare(queries[row : row + block]), prepared)
+    def fill_columns(start: int) -> None:
+        columns = slice(start, start + block)
+        prepared_database = (prepare_database or prepare)(database[columns])
+        for first_row in range(0, len(queries), block):
+            rows = slice(first_row, first_row + block)
+            distances[rows, columns] = compare(prepare(queries[rows]), prepared_database)
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        list(pool.map(fill, range(0, len(database), block)))  # raises the errors of the blocks
-    return out
+        list(pool.map(fill_columns, range(0, len(database), block)))  # `list` raises the errors of the threads
+    return distances
 
 
 def l2(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
-    """Return the Euclidean distances |q - d|. Sums are in float64, because the squares cancel near zero."""
+    """Return the Euclidean distances |q - d|, from sums in float64, because the squares of similar vectors cancel."""
 
     def compare(queries, database):
         squares = np.sum(queries**2, axis=1)[:, None] + np.sum(database**2, axis=1)[None, :]
@@ -51,7 +53,7 @@ def l2(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]
 
 
 def cosine(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
-    """Return 1 - q . d / (|q| |d|), from 0 to 2. The result is 1 if either vector is zero."""
+    """Return the distances 1 - q . d / (|q| |d|), from 0 to 2. The distance of a zero vector from any other is 1."""
 
     def unit(rows):
         lengths = np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True)
@@ -64,9 +66,10 @@ def correlate(
     queries: Float32[np.ndarray, "q rings sectors"], database: Float32[np.ndarray, "n rings sectors"]
 ) -> Float32[np.ndarray, "q n sectors"]:
     """Return the sums over rings r and sectors j of queries[r, j] * database[r, j + shift], for all circular shifts."""
-    spectra = (np.moveaxis(np.fft.rfft(scans), -1, 0) for scans in (queries, database))
-    by_frequency = next(spectra).conj() @ next(spectra).swapaxes(1, 2)
-    return np.fft.irfft(np.moveaxis(by_frequency, 0, -1), n=queries.shape[-1])
+    query_spectra = np.moveaxis(np.fft.rfft(queries), -1, 0)  # frequency, query, ring
+    database_spectra = np.moveaxis(np.fft.rfft(database), -1, 0)
+    products = query_spectra.conj() @ database_spectra.swapaxes(1, 2)  # frequency, query, database
+    return np.fft.irfft(np.moveaxis(products, 0, -1), n=queries.shape[-1])
 
 
 def unit_length(vectors: Float[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:

@@ -1,4 +1,4 @@
-"""Recipe of a training as plain values: its tuples, its learning rates. Presets and learned methods set them."""
+"""Settings of a training: the choice of its tuples (anchor, positives, negatives), and the recipe of a method."""
 
 import dataclasses
 from typing import Literal
@@ -9,7 +9,7 @@ from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M, SAME_PASS_FRAMES
 
 @dataclasses.dataclass(frozen=True)
 class TupleConfig:
-    """Configuration of the training tuples. Distances are horizontal, because ground-truth heights drift by metres."""
+    """Choice of anchors, positives and negatives. Distances are horizontal, because heights drift by metres."""
 
     positives: Count = 1
     """Number of positives of an anchor."""
@@ -22,21 +22,20 @@ class TupleConfig:
     revisit_fraction: Share = 0.5
     """Fraction of tuples with positives from another visit. In the other tuples, positives are neighbouring frames."""
     revisit_gap: CountOrNone = SAME_PASS_FRAMES
-    """Maximum difference of the frame numbers within one visit."""
+    """Maximum difference of the frame numbers of two scans from the same visit."""
     cluster: Count = 1
-    """Number of consecutive tuples with anchors near each other. If tuples share negatives, neighbouring places of a
-    street are harder to distinguish than random places."""
+    """Number of consecutive tuples with anchors near each other, so that shared negatives are from the same street."""
     cluster_m: NotNegative = 100.0
     """Maximum distance of the anchors of a cluster from its first anchor, in metres."""
     mining: Literal["none", "hardest"] = "none"
     """`none`: random negatives, as in the paper. `hardest`: negatives whose descriptors are most similar to the
     anchor's (BEVPlace++). The anchors of a cluster then have similar descriptors instead of being near each other."""
     hardest: CountOrNone = 10
-    """Number of most similar places beyond the negative distance, from which negatives are drawn."""
+    """Number of most similar places beyond `negative_m`, from which negatives are drawn."""
     refresh_steps: CountOrNone = 1000
     """Number of steps after which mining recomputes the descriptors."""
     mined_places: CountOrNone = 0
-    """Number of random places that mining describes each time, and draws anchors from; 0: all."""
+    """Number of random places that mining then describes and draws anchors from. 0: all places."""
 
     def __post_init__(self):
         check_fields(self)
@@ -56,11 +55,11 @@ class TupleConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Training of a learned method, besides its loss."""
+    """Settings of the training of a learned method, besides its loss."""
 
     sampling: TupleConfig
     tuples: int
     """Number of tuples in a step."""
     learning_rates: tuple[float, float, float]
-    """Learning rates of the search, smallest first. The second one is the published one, if that is known."""
+    """Learning rates that the search tries, smallest first. The second is the published one, if it is known."""
     weight_decay: float = 0.0

@@ -4,8 +4,8 @@ Besides its fields, each has the following properties:
 
     token        rows and columns of the image that one feature represents
     width        channels of the features
-    multiple     the image's rows and columns must be a multiple of this: the size of one feature of the coarsest map
-    needs_polar  whether the backbone requires a polar image, because its layers wrap around
+    multiple     required divisors of the image's rows and columns: the size of one feature of the coarsest map
+    needs_polar  whether the backbone requires a polar image, because its columns wrap around
     pictures     maps to draw as heat maps: from the title of each picture to a name in `Outputs.intermediates`
 """
 
@@ -17,15 +17,16 @@ from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
 
 
 def check_lengths(owner: str, **lists: tuple[int, ...]) -> None:
-    """Raise ValueError if the lists, given by name, have different lengths."""
-    if len({len(values) for values in lists.values()}) > 1:
-        *names, last = lists
-        found = ", ".join(f"{name} {values}" for name, values in lists.items())
-        raise ValueError(f"expected equal numbers of {', '.join(names)} and {last} of {owner}, found {found}")
+    """Raise ValueError if the fields of `owner`, for example `widths=(16, 32)`, have different lengths."""
+    lengths = {len(entries) for entries in lists.values()}
+    if len(lengths) > 1:
+        *names, last_name = lists
+        found = ", ".join(f"{name} {entries}" for name, entries in lists.items())
+        raise ValueError(f"expected equal numbers of {', '.join(names)} and {last_name} of {owner}, found {found}")
 
 
-class _Stages:
-    """Backbone of Swin stages. Stage i has `embed_dim` * 2**i channels."""
+class _SwinStages:
+    """Properties and checks of `SwinConfig` and `SglprConfig`. Stage i has `embed_dim` * 2**i channels."""
 
     embed_dim: int
     depths: tuple[int, ...]
@@ -34,12 +35,11 @@ class _Stages:
     def __post_init__(self):
         check_fields(self)
         if not self.depths or len(self.depths) != len(self.heads):
-            raise ValueError(
-                "expected at least one stage, and a number of heads for each, found "
-                f"depths {self.depths}, heads {self.heads}"
-            )
+            found = f"depths {self.depths}, heads {self.heads}"
+            raise ValueError(f"expected at least one stage, and a number of heads for each, found {found}")
         for i, heads in enumerate(self.heads):
-            if (channels := self.embed_dim * 2**i) % heads:
+            channels = self.embed_dim * 2**i
+            if channels % heads:
                 raise ValueError(f"heads: expected a divisor of the {channels} channels of stage {i}, found {heads}")
 
     @property
@@ -52,17 +52,18 @@ class _Stages:
 
     @property
     def multiple(self) -> tuple[int, int]:
-        coarsest = 2 ** (len(self.depths) - 1)
-        return self.token[0] * coarsest, self.token[1] * coarsest
+        tokens_per_feature = 2 ** (len(self.depths) - 1)  # along rows and columns of the last stage
+        return self.token[0] * tokens_per_feature, self.token[1] * tokens_per_feature
 
     @property
     def pictures(self) -> dict[str, str]:
-        last = len(self.depths) - 1  # of the maps before normalisation, which makes all positions equally strong
+        last = len(self.depths) - 1
+        # The maps before the last layer norm, which makes all positions equally strong.
         return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
 
 
 @dataclasses.dataclass(frozen=True)
-class SwinConfig(_Stages):
+class SwinConfig(_SwinStages):
     """Swin-Unet with the paper's values as defaults. Stage i has `embed_dim` * 2**i channels."""
 
     kind: Literal["swin"] = "swin"
@@ -76,8 +77,7 @@ class SwinConfig(_Stages):
     window: Size = 7
     """Edge of an attention window, in tokens."""
     drop_path: Share = 0.2
-    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
-    block."""
+    """Stochastic depth: fraction of samples that skip the last block in training. It is 0 for the first block."""
 
     mlp_ratio = 4
     needs_polar = False
@@ -93,11 +93,9 @@ class CircularConfig:
 
     kind: Literal["circular"] = "circular"
     average: Size = 2
-    """Edge of the squares of polar pixels that are averaged before the first block. Without averaging, the resampling
-    skips cells."""
+    """Edge of the squares of polar pixels that are averaged first, because a smaller polar image would skip cells."""
     fine: Sizes = ()
-    """Channels of additional blocks at the full number of sectors. The output of the i-th joins the input of the i-th
-    block of `widths`."""
+    """Channels of additional blocks at the full number of sectors. Each joins the input of the block in `widths`."""
     widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
     """Channels of each block."""
     strides: Sizes = (2, 2, 1, 2, 1, 1, 1)
@@ -129,12 +127,13 @@ class CircularConfig:
 
     @property
     def pictures(self) -> dict[str, str]:
-        last = len(self.widths) - 1  # the first, the middle and the last block
-        return {f"block {i + 1}": f"circular_block{i}" for i in sorted({0, last // 2, last})}
+        last = len(self.widths) - 1
+        first_middle_and_last = sorted({0, last // 2, last})
+        return {f"block {i + 1}": f"circular_block{i}" for i in first_middle_and_last}
 
 
 @dataclasses.dataclass(frozen=True)
-class SglprConfig(_Stages):
+class SglprConfig(_SwinStages):
     """Swin-Unet whose tokens come from circular convolutions on the polar image."""
 
     kind: Literal["sglpr"] = "sglpr"
@@ -150,8 +149,7 @@ class SglprConfig(_Stages):
     mlp_ratio: Size = 2
     """Hidden units of a block's MLP per channel; 4 in the paper."""
     drop_path: Share = 0.0
-    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
-    block."""
+    """Stochastic depth: fraction of samples that skip the last block in training. It is 0 for the first block."""
 
     needs_polar = True
 

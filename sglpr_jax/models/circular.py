@@ -1,12 +1,10 @@
 """Backbone of circular convolutions on the polar image: a rotation of the scan only shifts its features.
 
-Along the radius, strides reduce the image, because a rotation moves nothing in this direction. Along the sectors,
-average pooling reduces it, because pooling skips no sector. A rotation by a whole number of the last map's sectors is
-therefore a shift of that map. It is exact up to the resampling of the image.
+Strides reduce the radius, along which a rotation moves nothing. Average pooling reduces the sectors, because it skips
+none. A rotation by whole sectors of the last map therefore shifts this map, exactly up to the resampling of the image.
 """
 
 import functools
-import itertools
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -34,59 +32,59 @@ class CircularBlock(nn.Module):
 class CircularNet(nn.Module):
     """Network from the polar image to the features of the place head and all intermediate maps.
 
-    Average pooling loses details that are smaller than its window. Therefore, a second branch of blocks keeps all
-    sectors. Each of its maps is averaged to the size of a map of the main branch, to which it is joined.
+    Average pooling loses small details. With `config.fine`, a second branch of blocks keeps all sectors. Each of its
+    maps is averaged to the size of a map of the main branch, whose channels it extends.
     """
 
     config: CircularConfig
 
     @nn.compact
     def __call__(self, polar: Float[Array, "b p q c"]) -> list[Float[Array, "b _ _ _"]]:
-        """Returns the averaged image and the map of each block, with the fine maps. The last map is the features."""
-        config, fine = self.config, polar
+        """Return the averaged image and the map of each block. The last map holds the features."""
+        config = self.config
+        fine_map = polar
         maps = [block_means(polar, config.average, config.average)]
         for i, (width, stride, sectors) in enumerate(zip(config.widths, config.strides, config.means, strict=True)):
             if i < len(config.fine):
-                stride_of_fine = config.strides[i - 1] if i else config.average
-                fine = CircularBlock(config.fine[i], stride_of_fine, name=f"fine_{i}")(fine)
-                averaged = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
+                # The same stride along the radius as the main branch had to reach `maps[-1]`.
+                fine_stride = config.average if i == 0 else config.strides[i - 1]
+                fine_map = CircularBlock(config.fine[i], fine_stride, name=f"fine_{i}")(fine_map)
+                averaged = block_means(fine_map, 1, fine_map.shape[2] // maps[-1].shape[2])
                 maps[-1] = jnp.concatenate([maps[-1], averaged], axis=-1)
-            maps.append(block_means(CircularBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
+            block = CircularBlock(width, stride, name=f"block_{i}")(maps[-1])
+            maps.append(block_means(block, 1, sectors))
         return maps
 
 
 class CircularDecoder(nn.Module):
-    """Decoder from the features to the resolution of the image after average pooling.
-
-    At each finer resolution it joins the last map that the network computed there (skip connection).
-    """
+    """Decoder to the size of the averaged image. At each finer size, the last map of `CircularNet` with it joins."""
 
     widths: tuple[int, ...]
-    """Channels of the blocks that made the maps."""
+    """Channels of the blocks of `CircularNet`."""
 
     @nn.compact
     def __call__(self, maps: list[Array]) -> Float[Array, "b p q _"]:
-        """Returns pixels with the channels of the first block."""
-        skips = [i for i, (fine, coarse) in enumerate(itertools.pairwise(maps)) if fine.shape[:3] != coarse.shape[:3]]
+        """Return pixels, given the averaged image and the maps of the blocks of `CircularNet`."""
+        last_of_each_resolution = [i for i in range(len(maps) - 1) if maps[i].shape[:3] != maps[i + 1].shape[:3]]
         x = maps[-1]
-        for i, row in enumerate(reversed(skips)):
-            skip, width = maps[row], self.widths[max(row - 1, 0)]
-            x = Linear(width, name=f"narrow_{i}")(x)
+        for step, i in enumerate(reversed(last_of_each_resolution)):
+            skip, width = maps[i], self.widths[max(i - 1, 0)]  # map i comes from block i - 1, map 0 is the image
+            x = Linear(width, name=f"narrow_{step}")(x)
             x = x.repeat(skip.shape[1] // x.shape[1], axis=1).repeat(skip.shape[2] // x.shape[2], axis=2)
-            x = CircularBlock(width, name=f"block_{i}")(jnp.concatenate([x, skip], axis=-1))
+            x = CircularBlock(width, name=f"block_{step}")(jnp.concatenate([x, skip], axis=-1))
         return x
 
 
 def block_means(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
-    """Average blocks of `radii` x `sectors` pixels, one direction after the other, so that no array has six axes."""
+    """Average blocks of `radii` x `sectors` pixels. Radii come first, then sectors, so that no array has six axes."""
     b, r, s, c = x.shape
-    rows = _mean_of_parts(x.reshape(b, r // radii, radii * s * c), radii)
-    blocks = _mean_of_parts(rows.reshape(b, r // radii * (s // sectors), sectors * c), sectors)
+    over_radii = _mean_of_parts(x.reshape(b, r // radii, radii * s * c), radii)
+    blocks = _mean_of_parts(over_radii.reshape(b, r // radii * (s // sectors), sectors * c), sectors)
     return blocks.reshape(b, r // radii, s // sectors, c)
 
 
 def _mean_of_parts(x: Float[Array, "b n k"], parts: int) -> Float[Array, "b n _"]:
-    """Average equal parts of each row. They are added, because XLA's CPU backend reduces a few numbers slowly."""
+    """Split the last axis into equal parts and average them by additions, which are faster on a CPU than a mean."""
     if parts == 1:
         return x
     return functools.reduce(jnp.add, jnp.split(x, parts, axis=-1)) * (1 / parts)

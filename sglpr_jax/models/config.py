@@ -31,26 +31,20 @@ WHITENING_POWER = 0.4
 
 @dataclasses.dataclass(frozen=True)
 class HeadConfig:
-    """Place head: CBAM, three convolutions and NetVLAD (section 4.1.2).
-
-    The paper gives no kernel sizes, strides or channels. The preset `paper` is one interpretation
-    (docs/decisions.md).
-    """
+    """Place head: CBAM, three convolutions and NetVLAD (section 4.1.2). The paper gives no kernel sizes or channels."""
 
     input: Literal["features", "counts", "labels", "counts+labels"] = "features"
     """Input of the head (table 6): the features of the backbone (HS), the image of point counts (RB), its ground-truth
-    semantic map (RS), or both (RB+RS). Only with `features` does the model have a backbone and a segmentation head."""
+    semantic map (RS), or image and map (RB+RS). Only `features` has a backbone and a segmentation head."""
     tap: Literal["pixels", "tokens"] = "pixels"
-    """Feature map that the head reads. `pixels`: the output of the decoder, before the last linear layer. `tokens`: the
-    features from which the decoder starts."""
+    """Feature map that the head reads. `pixels`: the output of the decoder. `tokens`: the input of the decoder."""
     channels: Sizes = (128, 256, 512)
     """Channels of each convolution."""
     kernels: Sizes = (3, 3, 3)
     strides: Sizes = (2, 2, 2)
     means: Sizes = ()
-    """Number of neighbouring sectors of a polar map that are averaged into one after each convolution. With averaging,
-    the strides apply to the radius only, and the convolutions and CBAM use circular padding. A rotation of the scan is
-    then a shift. (): no averaging, as in the paper."""
+    """Number of neighbouring sectors of a polar map that are averaged into one after each convolution. The strides then
+    apply to the radius only, and CBAM uses circular padding. (): no averaging, as in the paper."""
     cbam: bool = True
     """Whether CBAM first weights the map by channel and by position."""
     cbam_reduction: Size = 16
@@ -61,8 +55,7 @@ class HeadConfig:
     """Number of NetVLAD clusters."""
     descriptor_size: Size = 256
     whiten: bool = False
-    """Whether a last linear layer equalises the spread of the descriptors over their directions
-    (`bin/export --whiten`)."""
+    """Whether a last linear layer equalises the spread of the descriptors in all directions (`bin/export --whiten`)."""
 
     def __post_init__(self):
         check_fields(self)
@@ -85,7 +78,7 @@ class HeadConfig:
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Maps of the head to draw as heat maps: from the title of each picture to the name of its map."""
+        """Intermediate maps to draw as heat maps: from the title of each picture to the name of its map."""
         if self.cbam:
             return {"CBAM": "cbam"}
         return {"place head, first": "head_convolution0"} if self.channels else {}
@@ -97,20 +90,18 @@ class ModelConfig:
 
     grid: Grid = Grid()
     image: ImageKind = "points"
-    """Kind of image that raw scans are converted to: point counts (equation 1), or density images like the ready-made
-    ones of KITTI (`density_bev`). Ready-made images are not converted."""
+    """Image that a scan is converted to: point counts (equation 1), or a density image like KITTI's ready-made ones."""
     counts: Literal["raw", "log1p", "clipped"] = "log1p"
     """Conversion of point counts to network input: unchanged, log(1 + n), or min(n, 10) / 10."""
     field: Literal["square", "circle"] = "square"
-    """`circle` blanks the cells outside the largest circle, so that a rotation moves nothing in or out of view."""
+    """`circle` sets the cells outside the largest circle to 0, so that a rotation moves nothing in or out of view."""
     blind_m: NotNegative = 0.0
-    """Radius around the sensor in which cells are blanked, in metres. These cells show the vehicle itself."""
+    """Radius around the sensor in which cells are set to 0, in metres. These cells show the vehicle itself."""
     range_channel: bool = False
-    """Whether a second input channel holds the distance of each cell. The number of points on bare ground depends on
-    the distance, and windowed attention knows only relative positions."""
+    """Whether a second input channel holds the distance of each cell from the sensor, which attention in windows cannot
+    know. The number of points on bare ground depends on it."""
     polar: tuple[Size, Size] | None = None
-    """(radii, sectors) of a polar image for the backbone, in which a rotation of the scan is a shift. None: Cartesian
-    image."""
+    """(radii, sectors) of a polar image for the backbone, in which a rotation is a shift. None: Cartesian image."""
     backbone: BackboneConfig = SwinConfig()
     head: HeadConfig = HeadConfig()
     """Configuration of the place head."""
@@ -119,8 +110,7 @@ class ModelConfig:
     detail: SizeOrNone = 0
     """Width of a layer that adds the image to the features of the segmentation head. 0: no layer, as in the paper."""
     compute: Literal["float32", "bfloat16"] = "float32"
-    """Data type of matrix products and convolutions. Weights, norms, softmax, the sums of NetVLAD, the descriptor and
-    the losses are always float32."""
+    """Data type of matrix products and convolutions. Weights, norms, softmax, descriptors and losses are float32."""
 
     def __post_init__(self):
         check_fields(self)
@@ -142,8 +132,8 @@ class ModelConfig:
             )
         if self.head.means and not self.polar:
             raise ValueError("head.means requires a polar image: expected model.polar (radii, sectors), found none")
-        rows_and_columns = zip(self.image_size, self.backbone.multiple, strict=True)
-        if any(size % step for size, step in rows_and_columns):
+        (rows, columns), (row_multiple, column_multiple) = self.image_size, self.backbone.multiple
+        if rows % row_multiple or columns % column_multiple:
             raise ValueError(
                 f"the backbone requires an image size that is a multiple of {self.backbone.multiple} cells, "
                 f"found {self.image_size}"
@@ -166,28 +156,28 @@ class ModelConfig:
 
     @property
     def channels(self) -> int:
-        """Channels of the image that the network sees."""
+        """Number of channels of the network's input."""
         return 2 if self.range_channel else 1
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the image that the backbone sees."""
+        """Rows and columns of the backbone's input."""
         return self.polar or (self.grid.height, self.grid.width)
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Maps to draw as heat maps: from the title of each picture to the name of its map."""
+        """Intermediate maps to draw as heat maps: from the title of each picture to the name of its map."""
         if self.head.reads_features:
             return {**self.backbone.pictures, **self.head.pictures}
         return self.head.pictures or {"input of the place head": "raw_input"}
 
 
-RENAMED = {"rings": "circular"}
-"""Kinds of backbones in files of earlier versions, and their names today."""
+RENAMED_KINDS = {"rings": "circular"}
+"""Kinds of backbones: from the name in files of earlier versions to today's name."""
 REMOVED = (("backbone.stem", []),)
-"""Fields, with their values, that files of earlier versions have and today's configuration has not."""
+"""Fields of earlier versions, with their values, that the configuration no longer has. They are ignored in files."""
 ADDED_LATER = {"head.means": (), "head.whiten": False, "backbone.fine": (), "backbone.stem.fine": ()}
-"""Values of fields that are missing in files of earlier versions."""
+"""Fields that files of earlier versions lack, and the values that these files imply."""
 
 
 def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
@@ -195,43 +185,47 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 
     Every field is required, except the fields in `ADDED_LATER`.
 
-    Raises:
-      ValueError: If a field is missing, unknown or invalid. The message names `source`, the field, and the expected and
-        the found value.
+    Raises ValueError if a field is missing, unknown or invalid. The message names `source`, the field, and the expected
+    and the found value.
     """
     with naming(source):
-        return _read(ModelConfig, values, field="")
+        return _read_field(ModelConfig, values, field="")
 
 
-def _read(annotation: Any, value: Any, field: str) -> Any:
-    """Convert a value to a field's type, and dictionaries to dataclasses, of a union by their `kind`."""
-    configs = [member for member in (annotation, *typing.get_args(annotation)) if is_config(member)]
-    if not configs:
+def _read_field(annotation: Any, value: Any, field: str) -> Any:
+    """Return the value of a field, converted to its type. A dictionary becomes a configuration class.
+
+    If the annotation is a union of classes, the entry `kind` of the dictionary selects one. `field` is the path of the
+    field, for example `backbone.stem`, or "" for the whole configuration. Raises ValueError if the value is invalid.
+    """
+    classes = [member for member in (annotation, *typing.get_args(annotation)) if is_config(member)]
+    if not classes:
         return read_value(value, annotation, field)
-    require(value, isinstance(value, dict), f"the fields of a {' or '.join(c.__name__ for c in configs)}", field)
-    prefix, config = f"{field}." if field else "", configs[0]
+    require(value, isinstance(value, dict), f"the fields of a {' or '.join(c.__name__ for c in classes)}", field)
+    prefix = f"{field}." if field else ""
     values = {name: entry for name, entry in value.items() if (prefix + name, entry) not in REMOVED}
-    if isinstance(kind := values.get("kind"), str):
-        values["kind"] = kind = RENAMED.get(kind, kind)
-    if len(configs) > 1:
-        by_kind: dict[Any, Any] = {config.kind: config for config in configs}
+    kind = values.get("kind")
+    if isinstance(kind, str):
+        values["kind"] = kind = RENAMED_KINDS.get(kind, kind)
+    config_class = classes[0]
+    if len(classes) > 1:
+        by_kind: dict[Any, Any] = {member.kind: member for member in classes}
         require(kind, isinstance(kind, str) and kind in by_kind, f"a kind, {' or '.join(by_kind)}", field)
-        config = by_kind[kind]
-    types = field_types(config)
+        config_class = by_kind[kind]
+    types = field_types(config_class)
     values = {name: ADDED_LATER[prefix + name] for name in types if prefix + name in ADDED_LATER} | values
     unknown = min(map(str, set(values) - set(types)), default=None)
     missing = min(set(types) - set(values), default=None)
-    expected = f"the fields of a {config.__name__} ({', '.join(types)})"
+    expected = f"the fields of a {config_class.__name__} ({', '.join(types)})"
     require(unknown, unknown is None, expected, field)
     if missing is not None:
         raise ValueError(f"{f'{field}: ' if field else ''}expected {expected}, found no {missing!r}")
-    read = {name: _read(types[name], entry, prefix + name) for name, entry in values.items()}
-    with naming(field) if field else contextlib.nullcontext():  # the fields may be inconsistent
-        return config(**read)
+    converted = {name: _read_field(types[name], entry, prefix + name) for name, entry in values.items()}
+    with naming(field) if field else contextlib.nullcontext():  # the class raises if its fields are inconsistent
+        return config_class(**converted)
 
 
-_PAPER = ModelConfig()
-_POLAR = ModelConfig(
+_SGLPR = ModelConfig(
     grid=Grid(resolution_m=0.4, height=128, width=128),
     image="density",
     field="circle",
@@ -246,18 +240,18 @@ _POLAR = ModelConfig(
 MODELS: dict[str, ModelConfig] = {
     # The default: the paper's parts in a form that follows rotations. Circular convolutions, then windows, CBAM and
     # NetVLAD, on polar images of the window of the ready-made KITTI images (+-25.6 m).
-    "sglpr": _POLAR,
+    "sglpr": _SGLPR,
     # A circular CNN with NetVLAD: less computation, without CBAM and attention.
     "circular": dataclasses.replace(
-        _POLAR,
+        _SGLPR,
         backbone=CircularConfig(),
         head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=()),
     ),
     # The paper's model with a literal head: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
-    "paper": _PAPER,
+    "paper": ModelConfig(),
     # All stages of the paper's Swin-Unet and its window, with cells of 0.4 m as in the ready-made KITTI images.
-    "paper-112": dataclasses.replace(
-        _PAPER, grid=Grid(resolution_m=0.4, height=112, width=112), image="density", backbone=SwinConfig(patch=2)
+    "paper-112": ModelConfig(
+        grid=Grid(resolution_m=0.4, height=112, width=112), image="density", backbone=SwinConfig(patch=2)
     ),
     # For tests: every part of the model, with little computation.
     "tiny": ModelConfig(
@@ -269,11 +263,7 @@ MODELS: dict[str, ModelConfig] = {
 
 
 def model_preset(name: str) -> ModelConfig:
-    """Return the model configuration with this name.
-
-    Raises:
-      ValueError: If there is no preset with this name. The message lists all names.
-    """
+    """Return the model configuration with this name. Raises ValueError if there is none."""
     if name not in MODELS:
         raise ValueError(f"expected a model preset ({', '.join(MODELS)}), found {name!r}")
     return MODELS[name]

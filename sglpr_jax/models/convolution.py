@@ -16,17 +16,13 @@ from sglpr_jax.models.initial import Initializer
 from sglpr_jax.models.layers import product, weight
 
 FEW_INPUTS = 16
-"""Maximum kernel height times channels for which a matrix product takes half the time of XLA's convolution."""
+"""Maximum kernel height times channels for which a matrix product is faster than XLA's convolution."""
 RESULTS_PER_PATCH = 4
-"""Number of output columns in one row of the matrix product for few channels."""
+"""Number of neighbouring output columns that one patch gives if the kernel has few inputs."""
 
 
 class Convolution(nn.Module):
-    """Square convolution with He initialisation. With `circular=True` the columns wrap around.
-
-    Images are padded by kernel // 2 pixels on each side, as in PyTorch. If the stride equals the kernel size, they are
-    not padded.
-    """
+    """Square convolution, padded by `size // 2` pixels on each side, or not if the strides equal the kernel size."""
 
     features: int
     size: int = 3
@@ -34,6 +30,7 @@ class Convolution(nn.Module):
     strides: tuple[int, int] = (1, 1)
     """Strides along rows and columns."""
     circular: bool = False
+    """Whether the columns wrap around, as in a polar image."""
     kernel_init: Initializer = initial.he_normal
     use_bias: bool = True
 
@@ -52,12 +49,9 @@ class Convolution(nn.Module):
 def convolve(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int], circular: bool
 ) -> Float[Array, "b _ _ f"]:
-    """Convolve padded images. The derivative is computed by matrix products.
-
-    Convolutions with few input channels are computed by `as_product`, all others by XLA.
-    """
-    if _few_inputs(kernel):
-        return as_product(x, kernel, strides, circular)
+    """Convolve padded images, with `strides` along rows and columns. The derivative is computed by matrix products."""
+    if _has_few_inputs(kernel):
+        return convolve_as_product(x, kernel, strides, circular)
     border = _border(kernel, strides)
     padding, axes = ((border, border), (0, 0)), ("NHWC", "HWIO", "NHWC")
     x = _pad_columns(x, border, circular)
@@ -65,43 +59,57 @@ def convolve(
 
 
 @convolve.defjvp
-def _(strides: tuple[int, int], circular: bool, primals: tuple[Array, Array], tangents: tuple[Array, Array]):
+def _convolve_derivative(
+    strides: tuple[int, int], circular: bool, primals: tuple[Array, Array], tangents: tuple[Array, Array]
+):
     (x, kernel), (x_tangent, kernel_tangent) = primals, tangents
-    by_x = as_product(x_tangent, kernel, strides, circular)
-    return convolve(x, kernel, strides, circular), by_x + as_product(x, kernel_tangent, strides, circular)
+    change_by_x = convolve_as_product(x_tangent, kernel, strides, circular)
+    change_by_kernel = convolve_as_product(x, kernel_tangent, strides, circular)
+    return convolve(x, kernel, strides, circular), change_by_x + change_by_kernel
 
 
-def as_product(
+def convolve_as_product(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int], circular: bool
 ) -> Float[Array, "b _ _ f"]:
-    """Compute the same convolution as one matrix product.
+    """Compute the same as `convolve` by one matrix product.
 
-    With column stride 1 and an odd kernel, the product gives the contributions of each column, of k pixels above each
-    other, to itself and to its neighbours. Otherwise it multiplies whole patches, which copies k times the data. For
-    few channels, the patches are wide enough for several results side by side, and the kernel is mostly zeros: memory
-    access limits this small product.
+    With column stride 1, an odd kernel and many channels, the whole image is multiplied by every column of the kernel,
+    and the k results are shifted and added. Otherwise `_multiply_patches` copies the k x k pixels under the kernel.
     """
-    size, border, f = len(kernel), _border(kernel, strides), kernel.shape[-1]
-    x = jnp.pad(x, ((0, 0), (border, border), (0, 0), (0, 0)))
-    columns = _side_by_side(x, 1, size, strides[0])
-    few = _few_inputs(kernel)
-    if strides[1] == 1 and size % 2 and not few:
-        parts = jnp.split(_product(columns, kernel.swapaxes(1, 2).reshape(-1, size * f)), size, axis=-1)
-        return functools.reduce(jnp.add, [_shift(part, border - j, circular) for j, part in enumerate(parts)])
-    columns, results_per_patch = _pad_columns(columns, border, circular), RESULTS_PER_PATCH if few else 1
-    stride = results_per_patch * strides[1]
-    beyond = stride - strides[1]
-    kernels = [jnp.pad(kernel, ((0, 0), (j, beyond - j), (0, 0), (0, 0))) for j in range(0, beyond + 1, strides[1])]
-    wide_kernel = jnp.concatenate(kernels, axis=-1)
-    results = (columns.shape[2] - size) // strides[1] + 1
-    missing = -results % results_per_patch * strides[1]
-    columns = jnp.pad(columns, ((0, 0), (0, 0), (0, missing), (0, 0)))
-    patches = _side_by_side(columns, 2, wide_kernel.shape[1], stride)
-    y = _product(patches, wide_kernel.swapaxes(0, 1).reshape(-1, results_per_patch * f))
-    return y.reshape(*y.shape[:2], -1, f)[:, :, :results]
+    size, border = len(kernel), _border(kernel, strides)
+    rows_padded = jnp.pad(x, ((0, 0), (border, border), (0, 0), (0, 0)))
+    stacked_rows = _stack_under_kernel(rows_padded, 1, size, strides[0])
+    few_inputs = _has_few_inputs(kernel)
+    if strides[1] == 1 and size % 2 == 1 and not few_inputs:
+        matrix = kernel.swapaxes(1, 2).reshape(-1, size * kernel.shape[-1])  # (k * c, k * f)
+        results = jnp.split(_multiply_channels(stacked_rows, matrix), size, axis=-1)
+        return functools.reduce(jnp.add, [_shift(result, border - j, circular) for j, result in enumerate(results)])
+    stacked_rows = _pad_columns(stacked_rows, border, circular)
+    return _multiply_patches(stacked_rows, kernel, strides[1], RESULTS_PER_PATCH if few_inputs else 1)
 
 
-def _few_inputs(kernel: Float[Array, "k k c f"]) -> bool:
+def _multiply_patches(
+    stacked_rows: Float[Array, "b h w _"], kernel: Float[Array, "k k c f"], stride: int, results_per_patch: int
+) -> Float[Array, "b h _ f"]:
+    """Convolve along the columns: cut the image into patches and multiply each by a matrix.
+
+    The matrix holds the kernel at `results_per_patch` neighbouring positions, with zeros around it. Several positions
+    pay for few channels, because memory access limits such a small product.
+    """
+    size, features = len(kernel), kernel.shape[-1]
+    extra_columns = (results_per_patch - 1) * stride
+    offsets = range(0, extra_columns + 1, stride)
+    kernels = [jnp.pad(kernel, ((0, 0), (left, extra_columns - left), (0, 0), (0, 0))) for left in offsets]
+    matrix = jnp.concatenate(kernels, axis=-1).swapaxes(0, 1).reshape(-1, results_per_patch * features)
+    results = (stacked_rows.shape[2] - size) // stride + 1
+    missing_columns = -results % results_per_patch * stride  # to complete the last patch
+    padded = jnp.pad(stacked_rows, ((0, 0), (0, 0), (0, missing_columns), (0, 0)))
+    patches = _stack_under_kernel(padded, 2, size + extra_columns, results_per_patch * stride)
+    y = _multiply_channels(patches, matrix)
+    return y.reshape(*y.shape[:2], -1, features)[:, :, :results]
+
+
+def _has_few_inputs(kernel: Float[Array, "k k c f"]) -> bool:
     return len(kernel) * kernel.shape[2] <= FEW_INPUTS
 
 
@@ -117,8 +125,8 @@ def _pad_columns(x: Float[Array, "b h w c"], border: int, circular: bool) -> Flo
     return jnp.pad(x, sides, mode="wrap") if circular else jnp.pad(x, sides)
 
 
-def _side_by_side(x: Float[Array, "b h w c"], axis: int, size: int, stride: int) -> Float[Array, "b _ _ _"]:
-    """Stack the pixels along the axis that the kernel covers at each position, as channels."""
+def _stack_under_kernel(x: Float[Array, "b h w c"], axis: int, size: int, stride: int) -> Float[Array, "b _ _ _"]:
+    """For each position of a kernel along `axis`, stack the `size` pixels that it covers as channels."""
     end = (x.shape[axis] - size) // stride * stride + 1
     return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + end, stride, axis) for i in range(size)], axis=-1)
 
@@ -130,5 +138,6 @@ def _shift(x: Float[Array, "b h w c"], columns: int, circular: bool) -> Float[Ar
     return jax.lax.pad(x, x.dtype.type(0), ((0, 0, 0), (0, 0, 0), (columns, -columns, 0), (0, 0, 0)))
 
 
-def _product(x: Float[Array, "b h w c"], matrix: Float[Array, "c f"]) -> Float[Array, "b h w f"]:
+def _multiply_channels(x: Float[Array, "b h w c"], matrix: Float[Array, "c f"]) -> Float[Array, "b h w f"]:
+    """Multiply the channels of every pixel by a matrix."""
     return product(x.reshape(-1, x.shape[-1]), matrix).reshape(*x.shape[:3], -1)

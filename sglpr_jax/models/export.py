@@ -30,15 +30,14 @@ INPUT_FILE = "input.json"
 OPSET = 21
 NEEDS = "pip install 'sglpr-jax[export]'"
 NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
-"""jax2onnx is installed without its dependencies. They include an Orbax that is older than Flax's and that the
-conversion does not use."""
+"""jax2onnx is installed without its dependencies, which include an Orbax that is too old for Flax and not needed."""
 
 
 def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -> Path:
     """Export `describe` with its weights as a program from images (b, h, w) in float32 to descriptors (b, d).
 
-    The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`. The latter
-    describes how a scan becomes the program's input, and holds the SHA-256 of the program.
+    The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`, which says how
+    a scan becomes the program's input and holds the SHA-256 of the program.
 
     Arguments:
       params: Model that reads images only.
@@ -70,7 +69,7 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
 
 
 def stablehlo(params: Params) -> bytes:
-    """Return `describe` with these weights as serialised by `jax.export`, for any number of images."""
+    """Return `describe` with these weights, serialised by `jax.export`. Raises ImportError without flatbuffers."""
     try:
         import flatbuffers  # noqa: F401
     except ImportError as error:
@@ -78,20 +77,21 @@ def stablehlo(params: Params) -> bytes:
     grid = params.config.grid
     shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
     program = jax.jit(lambda bev: describe(params, bev))
-    limit = "jax_traceback_in_locations_limit"
-    before = getattr(jax.config, limit)
-    jax.config.update(limit, 0)  # without source locations, the bytes are the same on every machine
+    setting = "jax_traceback_in_locations_limit"
+    previous_limit = getattr(jax.config, setting)
+    jax.config.update(setting, 0)  # without source locations, the bytes are the same on every machine
     try:
         exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32))
         return bytes(exported.serialize())
     finally:
-        jax.config.update(limit, before)
+        jax.config.update(setting, previous_limit)
 
 
 def onnx(params: Params) -> bytes:
     """Return `describe` with these weights as an ONNX model.
 
-    The conversion changes JAX, so it needs a process of its own, which runs this file (`convert`).
+    A new process runs `convert` of this file, because jax2onnx changes JAX. Raises ImportError if a package is missing
+    there, or RuntimeError if the conversion fails.
     """
     with tempfile.TemporaryDirectory() as temporary:
         weights, program = Path(temporary, "weights"), Path(temporary, "describe.onnx")
@@ -115,11 +115,12 @@ def input_description(config: ModelConfig) -> dict[str, str]:
         "points": "finite ones, metres in the LiDAR frame: x forward, y left, z up, of an upright sensor "
         f"{MODEL_HEIGHT_M} m above the ground; of one that is h m above it, with the direction n of up in its frame "
         f"(length 1): R p + (0, 0, h - {MODEL_HEIGHT_M}), R being the smallest rotation that turns n to (0, 0, 1)",
-        **(_counts_of_points(grid) if config.image == "points" else _counts_of_voxels(grid)),
+        **(_point_count_texts(grid) if config.image == "points" else _density_texts(grid)),
     }
 
 
-def _counts_of_points(grid: Grid) -> dict[str, str]:
+def _point_count_texts(grid: Grid) -> dict[str, str]:
+    """Return the part of `input_description` for images of point counts, by keys of input.json."""
     r, u, v = grid.resolution_m, grid.width // 2, grid.height // 2 - 1
     return {
         "cells": f"{r} m wide; a point lies in bev[i, v, u] with u = floor(x / {r}) + {u}, v = {v} - floor(y / {r})",
@@ -127,9 +128,9 @@ def _counts_of_points(grid: Grid) -> dict[str, str]:
     }
 
 
-def _counts_of_voxels(grid: Grid) -> dict[str, str]:
-    """Describe the steps of `density_bev`, `even_cells` and `centre_crop`."""
-    u, v = grid.width // 2, grid.height // 2
+def _density_texts(grid: Grid) -> dict[str, str]:
+    """Return the part for density images: the steps of `density_bev`, `even_cells` and `centre_crop` in words."""
+    u, v = grid.width // 2, grid.height // 2  # column and row of the first cell right of, and below, the sensor
     return {
         "voxels": f"points with |x| < {REACH_M}, |y| < {REACH_M}, {FLOOR_M} < z < {CEILING_M} are sorted into voxels, "
         f"floor(point / edge); the edge is the smallest of {FIRST_EDGE_M}, {FIRST_EDGE_M + EDGE_STEP_M}, ... m that "
@@ -144,7 +145,7 @@ def _counts_of_voxels(grid: Grid) -> dict[str, str]:
 
 
 def convert(weights: Path, file: Path) -> None:
-    """Write `describe` as an ONNX model, with the description of its input in the metadata."""
+    """Write `describe` with the weights in folder `weights` as an ONNX file, with `input_description` as metadata."""
     from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]  (an optional package)
 
     params = load(weights)

@@ -18,13 +18,13 @@ from scipy.special import ndtr, ndtri
 
 Draw = Callable[[np.random.Generator, tuple[int, ...]], Float32[np.ndarray, "*shape"]]
 TRUNCATED_AT = 2.0
-"""Deviations at which a truncated normal distribution ends."""
+"""Number of standard deviations at which a truncated normal distribution ends."""
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Initial:
-    """Distribution of the initial values of a weight. It can be called as an initializer of Flax."""
+    """Distribution of the initial values of a weight. `initial(key, shape)` draws them, as Flax expects."""
 
     draw: Draw
 
@@ -40,29 +40,31 @@ def draw_all(key: Array, initials: Any, shapes: Any) -> Any:
     """Draw the values of all weights of a tree. The key may be traced.
 
     Arguments:
-      key: Key of JAX.
+      key: Random key of JAX, new style or old.
       initials: An `Initial` for each weight, in nested dictionaries.
       shapes: Shape and data type of each weight, in the same dictionaries.
 
     Raises:
       KeyError: If a weight has no initial values.
     """
-    leaves, tree = jax.tree_util.tree_flatten_with_path(shapes)
+    shape_by_path, tree = jax.tree_util.tree_flatten_with_path(shapes)
 
-    def draw(words: Any) -> list[np.ndarray]:
-        seed, values = [int(word) for word in np.asarray(words).reshape(-1)], []
-        for path, leaf in leaves:
+    def draw(key_integers: Any) -> list[np.ndarray]:
+        seed = [int(integer) for integer in np.asarray(key_integers).reshape(-1)]
+        values = []
+        for path, shape in shape_by_path:
             name = jax.tree_util.keystr(path, simple=True, separator="/")
-            initial = functools.reduce(lambda node, step: node[step.key], path, initials)
+            initial = functools.reduce(lambda node, step: node[step.key], path, initials)  # follows the path
             rng = np.random.default_rng([*seed, *name.encode()])
-            values.append(initial.draw(rng, leaf.shape).astype(leaf.dtype))
+            values.append(initial.draw(rng, shape.shape).astype(shape.dtype))
         return values
 
-    words = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
-    if isinstance(words, jax.core.Tracer):
-        values = jax.pure_callback(draw, [leaf for _, leaf in leaves], words, vmap_method="sequential")
-    else:  # a callback would be compiled
-        values = jax.device_put(draw(words))
+    key_integers = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
+    if isinstance(key_integers, jax.core.Tracer):
+        results = [shape for _, shape in shape_by_path]
+        values = jax.pure_callback(draw, results, key_integers, vmap_method="sequential")
+    else:  # without a callback, which JAX would compile
+        values = jax.device_put(draw(key_integers))
     return jax.tree_util.tree_unflatten(tree, values)
 
 
@@ -75,14 +77,15 @@ def normal(deviation: float) -> Initial:
 
 
 def truncated_normal(scale: float) -> Initial:
-    """Normal distribution, truncated at two deviations, with variance `scale` / number of inputs after truncation."""
-    low = ndtr(-TRUNCATED_AT)
+    """Normal distribution, truncated at 2 standard deviations, of variance `scale` / (number of inputs) after that."""
+    lowest_probability = ndtr(-TRUNCATED_AT)
     density = math.exp(-(TRUNCATED_AT**2) / 2) / math.sqrt(2 * math.pi)
-    after_truncation = math.sqrt(1 - 2 * TRUNCATED_AT * density / (1 - 2 * low))
+    narrowing = math.sqrt(1 - 2 * TRUNCATED_AT * density / (1 - 2 * lowest_probability))
 
     def draw(rng: np.random.Generator, shape: tuple[int, ...]) -> Float32[np.ndarray, "*shape"]:
-        deviation = math.sqrt(scale / math.prod(shape[:-1])) / after_truncation
-        return np.float32(deviation) * ndtri(rng.uniform(low, 1 - low, shape)).astype(np.float32)
+        deviation = math.sqrt(scale / math.prod(shape[:-1])) / narrowing
+        probability = rng.uniform(lowest_probability, 1 - lowest_probability, shape)
+        return np.float32(deviation) * ndtri(probability).astype(np.float32)
 
     return Initial(draw)
 

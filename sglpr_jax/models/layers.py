@@ -1,7 +1,7 @@
-"""Layers that all networks share: linear layer, layer norm, maximum, NetVLAD's residuals and unit length.
+"""Layers that all networks share: linear layer, GELU, layer norm, maximum and L2 normalisation.
 
-Weights are float32. Layers multiply in the data type of their input. A network therefore computes in the type of its
-image (`ModelConfig.compute`), except where a module requests float32.
+Weights are float32. Layers multiply in the data type of their input, so a network computes in the type of its image
+(`ModelConfig.compute`).
 """
 
 import functools
@@ -19,17 +19,17 @@ from sglpr_jax.models.initial import Initial, Initializer
 EPSILON = 1e-5
 """PyTorch's epsilon of a layer norm."""
 NORM_FLOOR = 1e-12
+"""Length below which `l2_normalize` gives 0."""
 ROUNDING = 1e-6
 """Relative difference from the maximum below which an entry counts as equal to it."""
 
 
 def weight(module: nn.Module, name: str, init: Initializer, shape: tuple[int, ...]) -> Any:
-    """Return a weight of the calling module. At initialisation, create it and store its distribution for `draw_all`.
+    """Return a weight of the calling module. At initialisation, create it and store `init` for `draw_all`.
 
-    Flax's `param` traces `init` in every call to find the shape. This takes half of the time of tracing a network.
+    This function replaces Flax's `param`, which takes half of the time of tracing a network.
 
-    Raises:
-      ValueError: If the weight has another shape.
+    Raises ValueError if the weight has another shape.
     """
     if not module.has_variable("params", name):
         if module.is_initializing() and module.is_mutable_collection("initial"):
@@ -42,10 +42,7 @@ def weight(module: nn.Module, name: str, init: Initializer, shape: tuple[int, ..
 
 
 class Linear(nn.Module):
-    """Dense layer with weights N(0, 0.02) and bias 0, computed as one product of two matrices.
-
-    XLA's CPU backend is three times slower if the leading axes are kept separate.
-    """
+    """Dense layer with initial weights N(0, 0.02) and bias 0. One product for all leading axes is fast on a CPU."""
 
     features: int
     use_bias: bool = True
@@ -63,32 +60,30 @@ class Linear(nn.Module):
 
 @jax.custom_jvp
 def product(x: Float[Array, "n c"], matrix: Float[Array, "c f"]) -> Float[Array, "n f"]:
-    """Multiply many rows by a matrix.
-
-    For a matrix with more rows than columns, the derivative exchanges the factors of its sum over the rows, because
-    XLA's CPU backend rearranges the first one. The barrier keeps XLA from exchanging them again.
-    """
+    """Return x @ matrix, for many rows x, with a derivative that is fast on a CPU."""
     return x @ matrix
 
 
 @product.defjvp
-def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]):
+def _product_derivative(primals: tuple[Array, Array], tangents: tuple[Array, Array]):
     (x, matrix), (x_tangent, matrix_tangent) = primals, tangents
     if len(x) > len(matrix) > matrix.shape[1]:
+        # The same as x @ matrix_tangent. Its gradient has the narrow factor first, which XLA's CPU backend rearranges.
+        # The barrier keeps XLA from undoing the transposition.
         transposed = jax.lax.optimization_barrier(matrix_tangent.T)
-        by_matrix = jax.lax.dot_general(x, transposed, (((1,), (1,)), ((), ())))
+        change_by_matrix = jax.lax.dot_general(x, transposed, (((1,), (1,)), ((), ())))
     else:
-        by_matrix = x @ matrix_tangent
-    return product(x, matrix), x_tangent @ matrix + by_matrix
+        change_by_matrix = x @ matrix_tangent
+    return product(x, matrix), x_tangent @ matrix + change_by_matrix
 
 
 def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
-    """Exact GELU: x times the normal distribution function. It uses erf, `jax.nn.gelu` the slower erfc."""
+    """Return x times the normal distribution function. This uses erf; `jax.nn.gelu` uses the slower erfc."""
     return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
 
 
 class LayerNorm(nn.Module):
-    """Layer norm over channels with the arithmetic of Flax, computed in float32."""
+    """Layer norm over channels, computed in float32."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
@@ -100,23 +95,24 @@ class LayerNorm(nn.Module):
 
 @jax.custom_jvp
 def layer_norm(x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"]) -> Float[Array, "n c"]:
-    """Normalise every row. XLA passes over the rows more often for the derivative of JAX than for this one."""
-    mean, per_deviation = _statistics(x)
-    return (x - mean) * (per_deviation * scale[None]) + bias[None]
+    """Normalise every row, with a derivative for which XLA reads the rows less often than for JAX's own."""
+    mean, reciprocal_deviation = _mean_and_reciprocal_deviation(x)
+    return (x - mean) * (reciprocal_deviation * scale[None]) + bias[None]
 
 
 @layer_norm.defjvp
-def _(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]):
+def _layer_norm_derivative(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]):
     (x, scale, bias), (x_tangent, scale_tangent, bias_tangent) = primals, tangents
-    mean, per_deviation = _statistics(x)
-    normed = (x - mean) * per_deviation
-    along = x_tangent - x_tangent.mean(-1, keepdims=True) - normed * (normed * x_tangent).mean(-1, keepdims=True)
-    tangent = along * (per_deviation * scale[None]) + normed * scale_tangent[None] + bias_tangent[None]
+    mean, reciprocal_deviation = _mean_and_reciprocal_deviation(x)
+    normed = (x - mean) * reciprocal_deviation
+    centred = x_tangent - x_tangent.mean(-1, keepdims=True)
+    across = centred - normed * (normed * x_tangent).mean(-1, keepdims=True)  # without the part along `normed`
+    tangent = across * (reciprocal_deviation * scale[None]) + normed * scale_tangent[None] + bias_tangent[None]
     return layer_norm(x, scale, bias), tangent
 
 
-def _statistics(x: Float[Array, "n c"]) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
-    """Mean and reciprocal standard deviation of each row."""
+def _mean_and_reciprocal_deviation(x: Float[Array, "n c"]) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
+    """Return the mean of each row, and 1 / (its standard deviation)."""
     mean = x.mean(-1, keepdims=True)
     variance = jnp.maximum((x * x).mean(-1, keepdims=True) - mean * mean, 0.0)
     return mean, jax.lax.rsqrt(variance + EPSILON)
@@ -124,39 +120,24 @@ def _statistics(x: Float[Array, "n c"]) -> tuple[Float[Array, "n 1"], Float[Arra
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def maximum(x: Float[Array, "*dims"], axes: tuple[int, ...]) -> Float[Array, "*rest"]:
-    """Maximum over some axes. All entries within rounding of the maximum share its gradient.
+    """Return the maximum over some axes. All entries within `ROUNDING` of the maximum share its gradient.
 
-    The gradient of `jnp.max` goes to the entries equal to the maximum. XLA may compute `x` again for the gradient and
-    round it differently. Then no entry is equal, and the gradient is 0 / 0.
+    With `jnp.max`, the entries equal to the maximum share it. XLA may compute `x` again for the gradient and round it
+    differently. Then no entry is equal, and the gradient is 0 / 0.
     """
     return x.max(axes)
 
 
 @maximum.defjvp
-def _(axes: tuple[int, ...], primals: tuple[Array], tangents: tuple[Array]):
+def _maximum_derivative(axes: tuple[int, ...], primals: tuple[Array], tangents: tuple[Array]):
     (x,), (x_tangent,) = primals, tangents
     y = x.max(axes, keepdims=True)
-    equal = x >= y - ROUNDING * (1 + jnp.abs(y))
-    return y.squeeze(axes), jnp.where(equal, x_tangent, 0).sum(axes) / jnp.maximum(equal.sum(axes), 1)
-
-
-def residual_sums(
-    features: Float[Array, "b n d"], assignment: Float[Array, "b n k"], centres: Float[ArrayLike, "d k"]
-) -> Float[Array, "b d k"]:
-    """Sum the residuals of local features per cluster, as in NetVLAD, each sum L2-normalised over d, in float32.
-
-    vlad[d, k] = sum over n of assignment[n, k] * (features[n, d] - centres[d, k])
-    """
-    weights = assignment.astype(features.dtype)
-    sums = jnp.einsum("bnd,bnk->bdk", features, weights, preferred_element_type=jnp.float32)
-    return l2_normalize(sums - assignment.sum(1)[:, None, :] * jnp.asarray(centres)[None], axis=1)
+    is_maximum = x >= y - ROUNDING * (1 + jnp.abs(y))
+    return y.squeeze(axes), jnp.where(is_maximum, x_tangent, 0).sum(axes) / jnp.maximum(is_maximum.sum(axes), 1)
 
 
 def l2_normalize(x: Float[Array, "*dims"], *, axis: int = -1) -> Float[Array, "*dims"]:
-    """Scale vectors along `axis` to length 1.
-
-    A vector shorter than 1e-12 becomes 0 with gradient 0. The gradient of the plain quotient is NaN at 0.
-    """
+    """Scale vectors along `axis` to length 1. Vectors shorter than 1e-12 become 0 with gradient 0 instead of NaN."""
     square = jnp.sum(x * x, axis=axis, keepdims=True)
     has_direction = square > NORM_FLOOR**2
     return x * jnp.where(has_direction, jax.lax.rsqrt(jnp.where(has_direction, square, 1.0)), 0.0)

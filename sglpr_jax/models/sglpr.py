@@ -14,7 +14,7 @@ from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.place_head import PlaceHead, raw_input
+from sglpr_jax.models.place_head import PlaceHead, input_without_backbone
 from sglpr_jax.models.segmentation_head import segmentation_head
 from sglpr_jax.models.swin import PatchExpand
 from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
@@ -23,21 +23,22 @@ from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
 def _encode(
     config: BackboneConfig, image: Float[Array, "b p q c"], *, circular: bool, train: bool
 ) -> tuple[list[Array], dict[str, Array]]:
-    """Return the maps that the decoder uses, the last of which are the features, and all maps by name.
+    """Run the backbone, in layers of the calling Flax module.
 
-    The layers belong to the calling Flax module.
+    Returns:
+      The maps for `_decode`, with the features as the last one, and all intermediate maps by name.
     """
     if isinstance(config, SwinConfig):
-        tokens, named = SwinUnet(config, config.patch, circular, name="backbone")(image, train=train)
-        return [tokens], named
+        tokens, maps_by_name = SwinUnet(config, config.patch, circular, name="backbone")(image, train=train)
+        return [tokens], maps_by_name
     if isinstance(config, SglprConfig):
         return CircularSwin(config, name="backbone")(image, train=train)
-    maps = CircularNet(config, name="rings")(image)  # the name in weight files
+    maps = CircularNet(config, name="rings")(image)  # "rings" is the name in weight files
     return maps, {f"circular_block{i}": block for i, block in enumerate(maps[1:])}
 
 
 def _decode(config: BackboneConfig, maps: list[Array]) -> Float[Array, "b _ _ _"]:
-    """Compute pixels from the maps of `_encode`. The layers belong to the calling Flax module."""
+    """Compute features of pixels from the maps of `_encode`, in layers of the calling Flax module."""
     if isinstance(config, SwinConfig):
         return PatchExpand(config.patch, maps[-1].shape[-1], name="expand")(maps[-1])
     widths = config.stem.widths if isinstance(config, SglprConfig) else config.widths
@@ -69,31 +70,29 @@ class SGLPR(nn.Module):
         segment: int = 1,
         train: bool = False,
     ) -> Outputs:
-        """Compute descriptors, and logits for every `segment`-th image (0: for none)."""
+        """Compute descriptors, and logits of every `segment`-th image (0: no logits)."""
         config = self.config
-        place_head = PlaceHead(config.head, circular=config.polar is not None, name="place_head")
-        if not config.head.reads_features:  # such a model has no backbone (table 6)
-            features = raw_input(image, labels, config)
-            descriptor, maps = place_head(features)
-            return Outputs(descriptor, None, {"raw_input": features, **maps})
         circular = config.polar is not None
-        maps, named = _encode(config.backbone, backbone_view(image, config), circular=circular, train=train)
-        pixels = _decode(config.backbone, maps) if config.head.tap == "pixels" else None
-        descriptor, head_maps = place_head(maps[-1] if pixels is None else pixels)
-        named = {**named, **head_maps}
-        if not (segment and config.segments):
-            return Outputs(descriptor, None, named)
-        # If the place head did not need the pixels, only those of the images with logits are computed.
-        pixels = _decode(config.backbone, [x[::segment] for x in maps]) if pixels is None else pixels[::segment]
+        place_head = PlaceHead(config.head, circular=circular, name="place_head")
+        if not config.head.reads_features:  # such a model has no backbone (table 6)
+            raw_input = input_without_backbone(image, labels, config)
+            descriptor, head_maps = place_head(raw_input)
+            return Outputs(descriptor, None, {"raw_input": raw_input, **head_maps})
+        maps, maps_by_name = _encode(config.backbone, backbone_view(image, config), circular=circular, train=train)
+        all_pixels = _decode(config.backbone, maps) if config.head.tap == "pixels" else None
+        descriptor, head_maps = place_head(maps[-1] if all_pixels is None else all_pixels)
+        maps_by_name = {**maps_by_name, **head_maps}
+        if segment == 0 or not config.segments:
+            return Outputs(descriptor, None, maps_by_name)
+        # If the place head does not need the pixels, only those of the images with logits are computed.
+        pixels = _decode(config.backbone, [x[::segment] for x in maps]) if all_pixels is None else all_pixels[::segment]
         logits = segmentation_head(pixels, image[::segment], config)
-        return Outputs(descriptor, logits, {**named, "pixels": pixels})
+        return Outputs(descriptor, logits, {**maps_by_name, "pixels": pixels})
 
 
 @jax.jit
 def describe(
-    params: Params,
-    bev: Num[Array, "*b h w"],
-    labels: Int[Array, "... h w"] | None = None,
+    params: Params, bev: Num[Array, "*b h w"], labels: Int[Array, "... h w"] | None = None
 ) -> Float[Array, "*b d"]:
     """Compute the descriptor of each bird's-eye-view image, also under jit, vmap and grad.
 
@@ -114,28 +113,21 @@ def describe(
       ValueError: If the images have another size than `params.config.grid`, if a density image has another integer
         type, if labels are missing, or if the head does not read labels.
     """
-    _check_array(bev)
-    if 0 in bev.shape[:-2]:
+    _check_is_array(bev)
+    if 0 in bev.shape[:-2]:  # no images, which `forward` rejects
         return jnp.zeros((*bev.shape[:-2], params.config.head.descriptor_size))
     return forward(params, bev, labels, segment=0).descriptor.reshape(*bev.shape[:-2], -1)
 
 
 @jax.jit
 def is_describable(params: Params, bev: Num[Array, "*b h w"]) -> Bool[Array, "*b"]:
-    """Whether each image shows a place: all counts are finite, and at least 2 cells in the field of view hold points.
-
-    `describe` gives every empty image the same descriptor.
-    """
+    """Whether each image shows a place: its counts are finite, and at least 2 cells in view have points."""
     occupied = jnp.where(field_of_view(params.config)[0], bev > 0, False)
     return (occupied.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS) & jnp.isfinite(bev).all((-2, -1))
 
 
 def segment(params: Params, bev: Num[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
-    """Compute the semantic logits of each image with the segmentation head of the training.
-
-    Raises:
-      ValueError: If the model has no segmentation head.
-    """
+    """Compute the semantic logits of each image. Raises ValueError if the model has no segmentation head."""
     if not params.config.segments:
         raise ValueError("expected a model with a segmentation head, found one without (for place recognition only)")
     return forward(params, bev).logits.reshape(*bev.shape, -1)
@@ -163,7 +155,7 @@ def forward(
     """
     config = params.config
     grid = config.grid
-    _check_array(bev)
+    _check_is_array(bev)
     if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):
         raise ValueError(f"expected images [..., H, W] of {grid.height} x {grid.width} cells, found shape {bev.shape}")
     if 0 in bev.shape:
@@ -183,31 +175,28 @@ def forward(
     return outputs
 
 
-def _check_array(bev: Any) -> None:
-    """Raise TypeError for a list. JAX would treat each of its numbers as an argument."""
+def _check_is_array(bev: Any) -> None:
+    """Raise TypeError if the images are no array. JAX would treat each number of a list as an argument."""
     if not hasattr(bev, "shape"):
         raise TypeError(f"expected images as an array of numpy or JAX, found a {type(bev).__name__}; use np.asarray")
 
 
 def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelConfig) -> None:
-    """Raise ValueError if the head reads labels and they are missing, or if it reads no labels and they are given."""
-    reads, found = config.head.reads_labels, None if labels is None else labels.shape
-    if found != (shape if reads else None):
-        expected = f"class maps of shape {shape}, one for each image" if reads else "no labels"
-        raise ValueError(
-            f"the place head of this model reads {config.head.input}: expected {expected}, found "
-            f"{'none' if labels is None else f'shape {found}'}"
-        )
+    """Raise ValueError if the head reads labels and none have the `shape` of the images, or if it reads no labels."""
+    expected_shape = shape if config.head.reads_labels else None
+    found_shape = None if labels is None else labels.shape
+    if found_shape != expected_shape:
+        expected = "no labels" if expected_shape is None else f"class maps of shape {shape}, one for each image"
+        found = "none" if found_shape is None else f"shape {found_shape}"
+        raise ValueError(f"the place head of this model reads {config.head.input}: expected {expected}, found {found}")
 
 
 def init(key: Array, *, preset: str = "sglpr", config: ModelConfig | None = None) -> Params:
-    """Initialise the weights of a named preset, or of `config` if it is given.
-
-    Only the weights that the configuration needs are created. No program is compiled.
-    """
+    """Initialise the weights of a named preset, or of `config` if it is given, without compiling a program."""
     config = model_preset(preset) if config is None else config
     shape = (1, config.grid.height, config.grid.width)
     image = jax.ShapeDtypeStruct((*shape, config.channels), jnp.float32)
     labels = jax.ShapeDtypeStruct(shape, jnp.int32) if config.head.reads_labels else None
-    created = jax.eval_shape(SGLPR(config).init, key, image, labels)
-    return Params(draw_all(key, created["initial"], created["params"]), config)
+    traced = jax.eval_shape(SGLPR(config).init, key, image, labels)
+    distributions, shapes = traced["initial"], traced["params"]
+    return Params(draw_all(key, distributions, shapes), config)

@@ -17,8 +17,7 @@ def weights_folder(weights: Path | str) -> Path:
 
     A name of shipped weights takes precedence. For your own folder with the same name, pass the string `./NAME`.
 
-    Raises:
-      FileNotFoundError: If neither exists. The message lists the names.
+    Raises FileNotFoundError if neither exists. The message lists the names.
     """
     folder = FOLDER / weights if str(weights) in shipped_weights() else Path(weights)
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""Import of the published PyTorch Swin-Unet and Swin-T from safetensors files, by the names of the weights."""
+"""Import of the published PyTorch weights of Swin-Unet and Swin-T from safetensors files."""
 
 import dataclasses
 import re
@@ -16,7 +16,7 @@ from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import as_tree, by_name, weight_shapes
 
-_RULES = (
+_NAME_REPLACEMENTS = (
     (r"^backbone/", ""),
     (r"^encoder_(\d+)_merge/", r"layers.\1.downsample/"),
     (r"^encoder_(\d+)/block_(\d+)/", r"layers.\1.blocks.\2/"),
@@ -36,7 +36,7 @@ _RULES = (
     (r"/(kernel|scale)$", "/weight"),
     (r"/", "."),
 )
-"""Replacements that convert the weight names of this project to PyTorch's, applied in order."""
+"""Replacements that convert a weight name of this project to PyTorch's, applied in this order."""
 
 _BUFFERS = ("relative_position_index", "attn_mask")
 """Tables that PyTorch stores with the weights. Here they follow from the configuration."""
@@ -49,9 +49,10 @@ _SWIN_T_ONLY = re.compile(r"head\.(weight|bias)|layers\.\d+\.(blocks\.\d+|downsa
 
 
 def import_swin_unet(params: Params, path: Path | str) -> Params:
-    """Load the backbone, the expansion and the segmentation head from a Swin-Unet checkpoint. The place head is kept.
+    """Return `params` with backbone, pixel expansion and segmentation head of a Swin-Unet checkpoint.
 
-    A patch embedding of three channels is summed into one, because PyTorch's network repeats a grey image three times.
+    The place head is kept. The three input channels of the patch embedding are summed into one, because PyTorch's
+    network repeats a grey image three times.
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -63,30 +64,35 @@ def import_swin_unet(params: Params, path: Path | str) -> Params:
 
 
 def import_swin_t(params: Params, path: Path | str) -> tuple[Params, tuple[str, ...], tuple[str, ...]]:
-    """Load the encoder from an ImageNet Swin-T, and copy its blocks to the mirrored decoder stages.
+    """Return `params` with the encoder of an ImageNet Swin-T, whose blocks also go to the mirrored decoder stages.
 
-    Swin-Unet's own code does the same. Weights of another shape, and weights without a counterpart in Swin-T, are kept.
+    Swin-Unet's own code does the same. Weights without a counterpart of the same shape in Swin-T are kept.
 
     Returns:
-      The new parameters, the names of their copied weights, and the names of the unused weights of the checkpoint.
+      The new parameters, the names of their replaced weights, and the names of the unused weights of the checkpoint.
 
     Raises:
       FileNotFoundError: If the file does not exist.
       ValueError: If the file is not a safetensors file, or if no weight fits.
     """
     with naming(path):
-        state, shapes = read_checkpoint(Path(path)), _expected_shapes(params.config)
+        checkpoint, shapes = read_checkpoint(Path(path)), _expected_shapes(params.config)
         backbone = params.config.backbone
         assert isinstance(backbone, SwinConfig)  # checked by `_expected_shapes`
-        last = len(backbone.depths) - 1
+        last_stage = len(backbone.depths) - 1
 
-        def encoder_name(name: str) -> str:
-            return re.sub(r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last - int(m[1])}.blocks", torch_name(name))
+        def swin_t_name(name: str) -> str:
+            """Return PyTorch's name of a weight, and for a block of the decoder that of the mirrored encoder block."""
 
-        sources = {name: source for name in shapes if (source := encoder_name(name)) in state}
-        converted = {name: _flax_layout(name, state[source]) for name, source in sources.items()}
+            def mirrored_stage(match: re.Match) -> str:
+                return f"layers.{last_stage - int(match[1])}.blocks"
+
+            return re.sub(r"^layers_up\.(\d+)\.blocks", mirrored_stage, torch_name(name))
+
+        sources = {name: source for name in shapes if (source := swin_t_name(name)) in checkpoint}
+        converted = {name: _flax_layout(name, checkpoint[source]) for name, source in sources.items()}
         fitting = {name: weight for name, weight in converted.items() if weight.shape == shapes[name]}
-        unused = sorted(set(state) - {sources[name] for name in fitting})
+        unused = sorted(set(checkpoint) - {sources[name] for name in fitting})
         unknown = [name for name in unused if name not in sources.values() and not _SWIN_T_ONLY.fullmatch(name)]
         if unknown:
             raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
@@ -97,9 +103,9 @@ def import_swin_t(params: Params, path: Path | str) -> tuple[Params, tuple[str, 
 
 
 def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
-    """Read the weights of a .safetensors file by PyTorch's names, as float32, without buffers and prefixes.
+    """Read the weights of a .safetensors file as float32, by PyTorch's names without the prefixes of wrappers.
 
-    A .pth file is a pickle, which can run code, so it is not opened.
+    A .pth file is a pickle, which can run code. It is not opened.
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -110,8 +116,8 @@ def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
     try:
         content = safetensors.numpy.load_file(path)
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
-        pickled = path.suffix in PICKLES or zipfile.is_zipfile(path)
-        found = "a pickle of PyTorch's, which this project does not open" if pickled else f"none ({in_short(error)})"
+        is_pickle = path.suffix in PICKLES or zipfile.is_zipfile(path)
+        found = "a pickle of PyTorch's, which this project does not open" if is_pickle else f"none ({in_short(error)})"
         raise ValueError(
             f"expected a .safetensors file, found {found}; to convert it see docs/guides/weights.md"
         ) from error
@@ -122,42 +128,32 @@ def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
     }
 
 
-def from_torch_names(state: dict[str, np.ndarray], config: ModelConfig) -> dict[str, Any]:
-    """Convert a whole Swin-Unet with PyTorch's names to the tree of weights without the place head.
-
-    Raises:
-      ValueError: If a weight is missing, unknown or of the wrong shape. The message names the first one.
-    """
+def from_torch_names(checkpoint: dict[str, np.ndarray], config: ModelConfig) -> dict[str, Any]:
+    """Convert a whole Swin-Unet to this project's tree of weights. Raises ValueError if a name or shape differs."""
     expected = _expected_shapes(config)
-    unknown = set(state) - {torch_name(name) for name in expected}
+    unknown = set(checkpoint) - {torch_name(name) for name in expected}
     if unknown:
         raise ValueError(f"not a weight of Swin-Unet: {min(unknown)} ({len(unknown)} unknown names)")
     weights = {}
     for name, shape in expected.items():
         source = torch_name(name)
-        if source not in state:
+        if source not in checkpoint:
             raise ValueError(f"expected a weight {source}, found none")
-        weights[name] = _flax_layout(name, state[source])
+        weights[name] = _flax_layout(name, checkpoint[source])
         if weights[name].shape != shape:
             raise ValueError(f"{source}: expected shape {shape} (in Flax's axis order), found {weights[name].shape}")
     return as_tree(weights)
 
 
 def torch_name(name: str) -> str:
-    """Return PyTorch's name of a weight.
-
-    For `backbone/encoder_0/block_1/mlp_in/kernel` it is `layers.0.blocks.1.mlp.fc1.weight`.
-    """
-    for pattern, replacement in _RULES:
+    """Return `layers.0.blocks.1.mlp.fc1.weight` for `backbone/encoder_0/block_1/mlp_in/kernel`."""
+    for pattern, replacement in _NAME_REPLACEMENTS:
         name = re.sub(pattern, replacement, name)
     return name
 
 
 def _expected_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of all weights but those of the place head, which a Swin-Unet has, too.
-
-    Raises ValueError if the model has another backbone or none.
-    """
+    """Return the shapes of all weights except the place head's. Raises ValueError if the backbone is no Swin-Unet."""
     if not config.head.reads_features:
         raise ValueError(f"expected a model with a backbone, found a place head that reads {config.head.input}")
     if not isinstance(config.backbone, SwinConfig):
@@ -166,11 +162,11 @@ def _expected_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _flax_layout(name: str, weight: np.ndarray) -> np.ndarray:
-    """Convert PyTorch's (out, in, ...) to Flax's (..., in, out). The bias tables are (rows, heads) in both."""
+    """Convert a kernel from PyTorch's axes (out, in, ...) to Flax's (..., in, out). Other weights stay."""
     if name == "backbone/patch_embed/projection/kernel":
-        weight = weight.sum(1, keepdims=True)
+        weight = weight.sum(1, keepdims=True)  # three equal colours become one channel
     if name == "segmentation_head/kernel":
-        weight = weight[..., 0, 0]
+        weight = weight[..., 0, 0]  # a 1 x 1 convolution becomes a linear layer
     if not name.endswith("kernel"):
         return weight
     return weight.transpose(*range(2, weight.ndim), 1, 0)

@@ -45,9 +45,9 @@ def distance_function(name: str) -> DistanceFn:
     method = name.partition(":")[0]
     if method in LEARNED_NAMES:
         from sglpr_jax.methods.learned import LEARNED  # slow import: the networks
-        from sglpr_jax.methods.learned.describe import distance_of_weights
+        from sglpr_jax.methods.learned.describe import distance_named
 
-        return distance_of_weights(LEARNED[method], name)
+        return distance_named(LEARNED[method], name)
     if name not in DISTANCES:
         near = difflib.get_close_matches(name, DISTANCES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""

@@ -20,7 +20,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from sglpr_jax.files import in_short, read_json, replacing, write_json
-from sglpr_jax.models.weights_file import check_leaves
+from sglpr_jax.models.weights_file import check_arrays
 from sglpr_jax.training.devices import is_first_host, on_all_hosts
 from sglpr_jax.training.step import TrainState
 
@@ -129,10 +129,10 @@ def _read(path: Path, like: TrainState) -> TrainState:
     expected = _by_path(like)
     with _orbax() as orbax:
         stored: Any = orbax.metadata(path / _STATE).item_metadata
-        check_leaves(stored.tree, expected, source=path)
+        check_arrays(stored.tree, expected, source=path)
         empty = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
         values = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
-    check_leaves(values, expected, source=path)
+    check_arrays(values, expected, source=path)
     return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in expected])
 
 

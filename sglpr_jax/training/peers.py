@@ -19,7 +19,7 @@ from sglpr_jax.files import read_json, write_json
 from sglpr_jax.methods.learned.describe import describe_inputs, learned_distance
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
 from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
-from sglpr_jax.models.weights_file import LAST
+from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.training.batch_source import TupleBatches
 from sglpr_jax.training.batches import positions_of
@@ -187,12 +187,12 @@ def train_learned(
             mesh=Mesh(np.array(jax.devices()[:1]), (AXIS,), axis_types=(AxisType.Auto,)),
             begin=functools.partial(_first_state, network, data, pool, settings.learning_rate),
             score=lambda state: {} if score is None else score(variables_of(state)),
-            save_snapshot=lambda run, images: save(run, f"{LAST}-{images}"),
+            save_snapshot=lambda run, images: save(run, f"{LAST_WEIGHTS}-{images}"),
             resume=resume,
             callback=_Report(report, show),
         )
         run = trainer.train(stopped)
-        save(run, LAST)
+        save(run, LAST_WEIGHTS)
         return run
 
 

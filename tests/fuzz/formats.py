@@ -29,7 +29,7 @@ from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, config_from_dict
 from sglpr_jax.models.weights import hash_of, weight_shapes
-from sglpr_jax.models.weights_file import CHECKSUM, CONFIG_FILE, WEIGHTS_FILE, load
+from sglpr_jax.models.weights_file import CONFIG_FILE, VALUES_HASH, WEIGHTS_FILE, load
 from sglpr_jax.pose_graph import files as loop_files
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index import Index
@@ -210,7 +210,7 @@ FORMATS = {
     "configuration": Format(CONFIG_FILE, CONFIG_JSON, lambda path: config_from_dict(read_json(path), source=path)),
     "weights": Format(
         WEIGHTS_FILE,
-        safetensors.numpy.save(WEIGHTS, {CHECKSUM: hash_of(WEIGHTS)}),
+        safetensors.numpy.save(WEIGHTS, {VALUES_HASH: hash_of(WEIGHTS)}),
         lambda path: load(path.parent),
         {CONFIG_FILE: CONFIG_JSON},
     ),

@@ -14,12 +14,12 @@ from sglpr_jax.methods.learned.bevplace import (
     REIN,
     Encoder,
     eight_rotations,
-    resampled_maps,
-    resized,
-    rotated_back,
+    resample_maps,
+    resize_maps,
+    rotate_maps_back,
     rotation_taps,
 )
-from sglpr_jax.methods.learned.layers import FEATURES, LOCAL, NetVLAD, with_clusters
+from sglpr_jax.methods.learned.layers import FEATURES, LOCAL, NetVLAD, fit_clusters
 from sglpr_jax.methods.learned.weights_file import random_variables
 from sglpr_jax.models.layers import l2_normalize
 
@@ -41,7 +41,7 @@ class Points(nn.Module):
 def test_clusters_start_at_those_of_the_features():
     inputs = np.random.default_rng(0).integers(0, 8, (20, 30))
     before = {"params": Points().init(jax.random.key(0), inputs[:1], train=False)["params"]}
-    after = with_clusters(Points(), before, inputs)
+    after = fit_clusters(Points(), before, inputs)
     layer = after["params"]["NetVLAD_0"]
     nearest = np.linalg.norm(DIRECTIONS[:, None] - layer["centres"][None], axis=-1)
     assert nearest.min(1).max() < 0.1 and sorted(nearest.argmin(1)) == list(range(8))
@@ -97,8 +97,8 @@ def test_a_rotation_and_a_new_size_are_bicubic(degrees):
         larger[i, j] = sample(grey, i / 2, j / 2)
     taps = rotation_taps(9, degrees)
     maps = jnp.stack([image, 2 * image], axis=-1)[None]
-    np.testing.assert_allclose(resampled_maps(maps, taps)[0, ..., 1], 2 * turned, atol=1e-5)
-    np.testing.assert_allclose(resized(maps, 17)[0, ..., 1], 2 * larger, atol=1e-5)
+    np.testing.assert_allclose(resample_maps(maps, taps)[0, ..., 1], 2 * turned, atol=1e-5)
+    np.testing.assert_allclose(resize_maps(maps, 17)[0, ..., 1], 2 * larger, atol=1e-5)
 
 
 def test_eight_rotations_and_back():
@@ -108,5 +108,5 @@ def test_eight_rotations_and_back():
     for turn, degrees in zip(turns, (0, 90, 180, 270, 45, 135, 225, 315), strict=True):
         expected = rotate_image(smooth, jnp.float32([math.radians(degrees)]))[0]
         np.testing.assert_allclose(turn, expected, atol=0.04)
-    back = rotated_back(jnp.asarray(turns)[..., None])[..., 0]
+    back = rotate_maps_back(jnp.asarray(turns)[..., None])[..., 0]
     np.testing.assert_allclose(back, np.broadcast_to(smooth, back.shape), atol=0.04)

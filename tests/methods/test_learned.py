@@ -16,7 +16,7 @@ from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.bevplace import grey_image
 from sglpr_jax.methods.learned.describe import describe_inputs, learned_distance
 from sglpr_jax.methods.learned.method import Tuples
-from sglpr_jax.methods.learned.sgpr import clusters
+from sglpr_jax.methods.learned.sgpr import cluster_of_points
 from sglpr_jax.methods.learned.weights_file import random_variables
 from sglpr_jax.methods.names import LEARNED_NAMES
 
@@ -329,4 +329,4 @@ def test_clusters_link_points_within_the_gap(gap):
     linked = np.linalg.norm(points[:, None] - points[None], axis=2) <= gap
     for _ in range(8):
         linked = linked @ linked
-    np.testing.assert_array_equal(linked, np.equal.outer(*[clusters(points, gap)] * 2))
+    np.testing.assert_array_equal(linked, np.equal.outer(*[cluster_of_points(points, gap)] * 2))

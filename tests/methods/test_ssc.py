@@ -141,5 +141,5 @@ def test_scans_without_landmarks_can_be_compared(classes):
 
 def test_rows_of_other_rings_are_refused():
     rows = np.zeros((2, NEWEST.numbers), np.float32)
-    with pytest.raises(ValueError, match=r"expected rows of 31680 numbers \(50 rings\), found 17280"):
+    with pytest.raises(ValueError, match=r"expected descriptors of 31680 numbers \(50 rings\), found 17280"):
         ssc_distance(rows, rows)

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sglpr_jax.models.cbam import CBAM, ChannelGate
 from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.place_head import CBAM, ChannelGate, GatedNetVLAD, PlaceHead
+from sglpr_jax.models.netvlad import GatedNetVLAD
+from sglpr_jax.models.place_head import PlaceHead
 
 SPATIAL = "SpatialGate.spatial"
 LAYERS = {

@@ -1,4 +1,4 @@
-"""Methods without training. A new method is a file here, an entry in the table, and its name in `methods/names.py`."""
+"""Methods without training. A new one needs a file here, an entry in `_METHODS`, and its name in `methods/names.py`."""
 
 from functools import partial
 

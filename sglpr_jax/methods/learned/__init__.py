@@ -10,14 +10,6 @@ from sglpr_jax.methods.learned.sgpr import SGPR
 
 LEARNED: dict[str, LearnedMethod] = {
     method.name: method
-    for method in (
-        RINET,
-        BEVPLACE,
-        RESNET34_NETVLAD,
-        DISCO,
-        OVERLAP_TRANSFORMER,
-        POINTNETVLAD,
-        SGPR,
-    )
+    for method in (RINET, BEVPLACE, RESNET34_NETVLAD, DISCO, OVERLAP_TRANSFORMER, POINTNETVLAD, SGPR)
 }
 """All learned methods by their names on the command line."""

@@ -29,70 +29,71 @@ FREQUENCIES = 32
 
 
 def occupancy(scan: Scan) -> UInt8[np.ndarray, "40 120 20"]:
-    """Return the occupied cells of a polar grid as 1: rings of 1.75 m, sectors of 3 degrees and layers of 0.5 m.
+    """Return 1 in the occupied cells of a polar grid: rings of 1.75 m, sectors of 3 degrees and layers of 0.5 m.
 
-    Sectors are counter-clockwise from x. The layers reach from 0.23 m to 10.23 m above the ground of a sensor at 1.73
-    m; the published ones are 2 m high and begin 2 m above the zero of NCLT's vehicle. Points beyond 70 m are dropped;
-    the published grid adds the corners of a square to its last ring. Raises ValueError if the scan shows no place.
+    Sectors are counter-clockwise from x. Points beyond 70 m are dropped; the published grid adds them to its last ring,
+    up to a square. The layers begin 0.23 m above the ground of a sensor at 1.73 m. The published ones are 2 m high and
+    begin 2 m above the zero of NCLT's vehicle. Raises ValueError if the scan shows no place (`check_cloud`).
     """
     radius, angle, z = polar(finite_points(scan))
+    ring = radius * (RINGS / FARTHEST_M)
+    sector = angle % (2 * np.pi) * (SECTORS / (2 * np.pi)) % SECTORS
     layer = np.floor((z - LOWEST_M) / LAYER_M)
     inside = (radius >= NEAREST_M) & (radius < FARTHEST_M) & (layer >= 0) & (layer < LAYERS)
-    ring, sector = radius * (RINGS / FARTHEST_M), angle % (2 * np.pi) * (SECTORS / (2 * np.pi))
-    cells = np.zeros((RINGS, SECTORS, LAYERS), np.uint8)
-    at = (part[inside].astype(np.int64) for part in (ring, sector % SECTORS, layer))
-    cells[tuple(at)] = 1
-    return cells
+    occupied_cells = tuple(index[inside].astype(np.int64) for index in (ring, sector, layer))
+    grid = np.zeros((RINGS, SECTORS, LAYERS), np.uint8)
+    grid[occupied_cells] = 1
+    return grid
 
 
 class DoubleConvolution(nn.Module):
-    """Two convolutions 3 x 3 with batch normalisation. The sectors wrap around, and zeros surround the rings."""
+    """Two 3 x 3 convolutions with batch normalisation. The sectors wrap around, and zeros surround the rings."""
 
     features: int
-    last: str = "relu"
-    """Last activation: "relu" or "sigmoid"."""
+    last_activation: str = "relu"
+    """Activation after the second convolution: "relu" or "sigmoid"."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w {self.features}"]:
-        for activation in ("relu", self.last):
+        for activation in ("relu", self.last_activation):
             x = Convolution(self.features, circular=True, use_bias=True)(x)
             x = getattr(nn, activation)(batch_norm(train)(x))
         return x
 
 
 class DiSCO(nn.Module):
-    """U-Net of a polar occupancy grid, and the amplitudes of the 32 x 32 lowest frequencies of its map, from -16 to 15.
+    """U-Net on a polar occupancy grid, and the amplitudes of the 32 x 32 lowest frequencies of its map, from -16 to 15.
 
     The sectors wrap around in all layers; the published network pads them with zeros. A rotation by 24 degrees (8
-    sectors) therefore does not change the descriptor. Other rotations change it a little, because three poolings by 2
-    keep the phase of the sectors.
+    sectors) therefore does not change the descriptor. Other rotations change it a little, because of the pooling of 8
+    neighbouring sectors.
     """
 
     @nn.compact
     def __call__(self, cells: Shaped[Array, "b 40 120 20"], *, train: bool = False) -> Float[Array, "b 1024"]:
-        x, skips = cells.astype(jnp.float32), []
+        x = cells.astype(jnp.float32)
+        skips = []
         for i, features in enumerate((64, 128, 256, 512, 256, 128, 64)):
-            if i > 3:
-                x = jnp.concatenate([skips.pop(), doubled(x)], axis=-1)
+            if i > 3:  # the decoder
+                x = jnp.concatenate([skips.pop(), upsample(x)], axis=-1)
             last_activation = "sigmoid" if i == 6 else "relu"
             x = DoubleConvolution(features, last_activation, name=f"Block_{i}")(x, train=train)  # as in weight files
-            if i < 3:
+            if i < 3:  # the encoder
                 skips.append(x)
                 x = max_pool(x, size=2)
         amplitudes = jnp.abs(jnp.fft.fft2(nn.Dense(1)(x)[..., 0], norm="ortho"))
-        centred = jnp.roll(amplitudes, (FREQUENCIES // 2, FREQUENCIES // 2), axis=(1, 2))
-        return centred[:, :FREQUENCIES, :FREQUENCIES].reshape(len(cells), -1)
+        from_lowest = jnp.roll(amplitudes, (FREQUENCIES // 2, FREQUENCIES // 2), axis=(1, 2))  # from frequency -16
+        return from_lowest[:, :FREQUENCIES, :FREQUENCIES].reshape(len(cells), -1)
 
 
-def doubled(x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c"]:
-    """Double the rings and the sectors of maps, bilinearly. The corners of the rings coincide. A sector becomes two
-    sectors a quarter to its left and right, and the sectors wrap around."""
+def upsample(x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c"]:
+    """Double the rings (between the centres of the first and last) and the sectors (which wrap around) bilinearly."""
     rings = x.shape[1]
-    at = np.linspace(0, rings - 1, 2 * rings)
-    along = np.maximum(0, 1 - np.abs(at[:, None] - np.arange(rings))).astype(np.float32)
-    x = jnp.einsum("ip,bpwc->biwc", along, x)
-    left, right = (0.75 * x + 0.25 * jnp.roll(x, shift, axis=2) for shift in (1, -1))
-    return jnp.stack([left, right], axis=3).reshape(*x.shape[:2], -1, x.shape[3])
+    source_ring = np.linspace(0, rings - 1, 2 * rings)
+    ring_weights = np.maximum(0, 1 - np.abs(source_ring[:, None] - np.arange(rings))).astype(np.float32)
+    x = jnp.einsum("ip,bpwc->biwc", ring_weights, x)
+    left_half, right_half = (0.75 * x + 0.25 * jnp.roll(x, shift, axis=2) for shift in (1, -1))
+    return jnp.stack([left_half, right_half], axis=3).reshape(*x.shape[:2], -1, x.shape[3])
 
 
 DISCO = LearnedMethod(

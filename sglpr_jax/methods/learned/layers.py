@@ -1,4 +1,4 @@
-"""Layers of the learned methods: convolution, normalisation, pooling, and NetVLAD with its clusters at the start."""
+"""Layers of the learned methods: convolution, normalisation, pooling, and NetVLAD with the fit of its clusters."""
 
 import functools
 from typing import Any
@@ -12,18 +12,19 @@ from scipy.cluster.vq import kmeans2
 
 from sglpr_jax.methods.learned.method import Variables
 from sglpr_jax.models import convolution
-from sglpr_jax.models.layers import l2_normalize, product, residual_sums
+from sglpr_jax.models.layers import l2_normalize, product
+from sglpr_jax.models.netvlad import residual_sums
 
 HE = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 """Initial values of the kernels, as in the residual networks of He et al. (2016)."""
 LOCAL, FEATURES = "local", "features"
-"""Collection and name in which a network sows the local features that it gives to NetVLAD."""
-VLAD = "NetVLAD_0"
-"""Name of the parameters of NetVLAD."""
-POSITIONS, ITERATIONS = 100, 100
-"""Number of features of each image, and of iterations of k-means."""
+"""Collection and name in Flax under which a network stores (sows) the local features that it gives to NetVLAD."""
+NETVLAD_NAME = "NetVLAD_0"
+"""Name of the parameters of NetVLAD in a network."""
+FEATURES_PER_IMAGE, ITERATIONS = 100, 100
+"""Number of local features of each image, and number of iterations, for k-means."""
 BATCH = 4
-"""Number of images that are described at a time. Batch normalisation uses the statistics of these, as in a training."""
+"""Number of images at a time for k-means. Batch normalisation uses their statistics, as in a training."""
 SECOND_WEIGHT = 0.01
 """Weight of the second-nearest cluster, divided by that of the nearest one, for the average feature."""
 
@@ -36,17 +37,13 @@ def batch_norm(train: bool, *, epsilon: float = 1e-5) -> nn.BatchNorm:
 
 
 def max_pool(x: Float[Array, "b h w c"], *, size: int, border: int = 0) -> Float[Array, "b _ _ c"]:
-    """Return the maximum of each square of `size` pixels, with stride 2. `border` is the padding on each side."""
-    padding: Any = ((border, border), (border, border))  # Flax declares the type of the names alone.
+    """Return the maximum of each square of `size` x `size` pixels, with stride 2 and padding `border` on each side."""
+    padding: Any = ((border, border), (border, border))  # Flax declares only the type of named paddings
     return nn.max_pool(x, (size, size), (2, 2), padding)
 
 
 class NetVLAD(nn.Module):
-    """Soft assignment a = softmax(x W) of local features to clusters, and sums of their residuals. There are no biases.
-
-    The result is `residual_sums`, flattened cluster by cluster and L2-normalised. Local features should have unit
-    length.
-    """
+    """softmax(x W) assigns local features of length 1 to clusters. The `residual_sums` are flattened and normalised."""
 
     clusters: int = 64
 
@@ -60,27 +57,30 @@ class NetVLAD(nn.Module):
         return l2_normalize(vlad.swapaxes(1, 2).reshape(len(x), -1))
 
 
-def with_clusters(network: nn.Module, variables: Variables, inputs: Shaped[np.ndarray, "n ..."]) -> Variables:
-    """Return the variables with clusters from the local features of some inputs, which the network sows.
+def fit_clusters(network: nn.Module, variables: Variables, inputs: Shaped[np.ndarray, "n ..."]) -> Variables:
+    """Return the variables with clusters of NetVLAD fitted to the local features of some inputs (sown by the network).
 
-    The centres are those of k-means (Arandjelović et al., 2016). The assignment is a * x · centre / |centre|, with the
-    factor a at which the second-nearest cluster gets 0.01 of the weight of the nearest one.
+    The centres are those of k-means (Arandjelović et al., 2016). The logit of a cluster is a * x · centre / |centre|,
+    with the factor a for which the second-nearest cluster gets `SECOND_WEIGHT` times the weight of the nearest one.
     """
 
     @jax.jit
     def local_features(images: Any) -> Any:
         mutable = [LOCAL, *(name for name in variables if name != "params")]
-        return network.apply(variables, images, train=True, mutable=mutable)[1][LOCAL][FEATURES][0]
+        _, changed = network.apply(variables, images, train=True, mutable=mutable)
+        return changed[LOCAL][FEATURES][0]
 
-    rng, samples = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    samples = []
     for start in range(0, len(inputs) - len(inputs) % BATCH, BATCH):
-        for rows in np.asarray(local_features(inputs[start : start + BATCH])):
-            samples.append(rows[rng.choice(len(rows), min(POSITIONS, len(rows)), replace=False)])
-    features = np.concatenate(samples)
-    clusters = len(variables["params"][VLAD]["centres"])
-    centres, _ = kmeans2(features, clusters, iter=ITERATIONS, minit="++", rng=np.random.default_rng(0))
-    units = centres / np.linalg.norm(centres, axis=1, keepdims=True)
-    second, first = np.sort(features @ units.T, axis=1)[:, -2:].T
-    factor = -np.log(SECOND_WEIGHT) / np.mean(first - second)
-    layer = {"assignment": jnp.asarray((factor * units).T), "centres": jnp.asarray(centres)}
-    return {**variables, "params": {**variables["params"], VLAD: layer}}
+        for features in np.asarray(local_features(inputs[start : start + BATCH])):
+            size = min(FEATURES_PER_IMAGE, len(features))
+            samples.append(features[rng.choice(len(features), size, replace=False)])
+    sample = np.concatenate(samples)
+    clusters = len(variables["params"][NETVLAD_NAME]["centres"])
+    centres, _ = kmeans2(sample, clusters, iter=ITERATIONS, minit="++", rng=np.random.default_rng(0))
+    unit_centres = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    second_similarity, first_similarity = np.sort(sample @ unit_centres.T, axis=1)[:, -2:].T
+    factor = -np.log(SECOND_WEIGHT) / np.mean(first_similarity - second_similarity)
+    layer = {"assignment": jnp.asarray((factor * unit_centres).T), "centres": jnp.asarray(centres)}
+    return {**variables, "params": {**variables["params"], NETVLAD_NAME: layer}}

@@ -13,7 +13,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32
 
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.methods.cells import extreme, polar
+from sglpr_jax.methods.cells import extreme_of_cells, polar
 from sglpr_jax.methods.learned.layers import HE, NetVLAD
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, roll_azimuths, triplet
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
@@ -24,8 +24,8 @@ HIGHEST_DEG, LOWEST_DEG = 15.0, -25.0
 """Elevations of the upper border of row 0 and of the lower border of row 63."""
 FARTHEST_M = 80.0
 """Distance at which the range image is 1. Points farther away are dropped."""
-HEIGHTS = ((4, 2, 16), (4, 2, 32), (4, 2, 64), (4, 2, 128), (2, 1, 256))
-"""Kernel height, stride and channels of each convolution. The rows become 31, 14, 6, 2 and 1."""
+CONVOLUTIONS = ((4, 2, 16), (4, 2, 32), (4, 2, 64), (4, 2, 128), (2, 1, 256))
+"""Kernel height, stride and channels of each convolution along the rows. The rows become 31, 14, 6, 2 and 1."""
 CHANNELS, HEADS, HIDDEN, CLUSTERS = 256, 4, 1024, 64
 """Outputs of the last convolution and of NetVLAD, heads and hidden units of the transformer, clusters of NetVLAD."""
 MARGIN = 0.5
@@ -34,9 +34,9 @@ MARGIN = 0.5
 def range_image(scan: Scan) -> Float32[np.ndarray, "64 900"]:
     """Return the distance of the nearest point of each pixel, divided by 80 m. Pixels without points are 0.
 
-    Rows are elevations from 15 degrees down to -25, in steps of 0.625 degrees. They contain the beams of HDL-64E and
-    VLP-16, and all but the lowest beams of HDL-32E. Points at other elevations are dropped. Columns are azimuths of 0.4
-    degrees, counter-clockwise from x. Raises ValueError if the scan shows no place.
+    Rows are elevations from 15 degrees down to -25 degrees, which have all beams of HDL-64E and VLP-16, and all but the
+    lowest beams of HDL-32E. Points at other elevations are dropped. Columns are azimuths, counter-clockwise from x.
+    Raises ValueError if the scan shows no place (`check_cloud`).
     """
     points = finite_points(scan)
     radius, angle, z = polar(points)
@@ -44,26 +44,27 @@ def range_image(scan: Scan) -> Float32[np.ndarray, "64 900"]:
     row = np.floor((HIGHEST_DEG - np.degrees(np.arctan2(z, radius))) * (ROWS / (HIGHEST_DEG - LOWEST_DEG)))
     inside = (distance > 0) & (distance <= FARTHEST_M) & (row >= 0) & (row < ROWS)
     column = np.floor(angle % (2 * np.pi) * (COLUMNS / (2 * np.pi))) % COLUMNS
-    at = tuple(part[inside].astype(np.int64) for part in (row, column))
-    return extreme(np.minimum, (ROWS, COLUMNS), at, distance[inside] / FARTHEST_M).astype(np.float32)
+    pixels = (row[inside].astype(np.int64), column[inside].astype(np.int64))
+    return extreme_of_cells(np.minimum, (ROWS, COLUMNS), pixels, distance[inside] / FARTHEST_M).astype(np.float32)
 
 
 class OverlapTransformer(nn.Module):
     """Convolutions along the rows, one transformer layer between the columns, and NetVLAD: 256 numbers of unit length.
 
     No layer knows the position of a column, so a rotation by whole columns (0.4 degrees) does not change the
-    descriptor. The paper gives the order of the layers and the sizes of the transformer and of NetVLAD. The heights of
-    the kernels, the normalisations and the context gating are choices of this project.
+    descriptor. The heights of the kernels, the normalisations and the context gating are choices of this project. The
+    paper gives the order of the layers and the sizes of the transformer and of NetVLAD.
     """
 
     @nn.compact
     def __call__(self, images: Float[Array, "b 64 900"], *, train: bool = False) -> Float[Array, "b 256"]:
         x = images[..., None]
-        for height, stride, features in HEIGHTS:
-            x = nn.relu(dense(features, stacked(x, height=height, stride=stride)))
-        x = nn.relu(dense(CHANNELS, x[:, 0]))
-        x = jnp.concatenate([x, Transformer()(x)], axis=-1)
-        y = nn.Dense(CHANNELS)(NetVLAD(CLUSTERS)(l2_normalize(x)))
+        for height, stride, features in CONVOLUTIONS:
+            x = nn.relu(dense(features, stack_rows(x, height=height, stride=stride)))
+        columns = nn.relu(dense(CHANNELS, x[:, 0]))
+        columns = jnp.concatenate([columns, Transformer()(columns)], axis=-1)
+        vlad = NetVLAD(CLUSTERS)(l2_normalize(columns))
+        y = nn.Dense(CHANNELS)(vlad)
         return l2_normalize(y * nn.sigmoid(nn.Dense(CHANNELS)(y)))
 
 
@@ -76,14 +77,14 @@ class Transformer(nn.Module):
         return nn.LayerNorm()(x + dense(x.shape[-1], nn.relu(dense(HIDDEN, x))))
 
 
-def stacked(x: Float[Array, "b h w c"], *, height: int, stride: int) -> Float[Array, "b _ w {height}*c"]:
-    """Stack the rows below a kernel of one column as channels. A linear layer then acts as the convolution."""
-    last = (x.shape[1] - height) // stride * stride + 1
-    return jnp.concatenate([x[:, i : i + last : stride] for i in range(height)], axis=-1)
+def stack_rows(x: Float[Array, "b h w c"], *, height: int, stride: int) -> Float[Array, "b _ w {height}*c"]:
+    """Stack the rows that a kernel of one column covers as channels. A linear layer then acts as the convolution."""
+    end = (x.shape[1] - height) // stride * stride + 1
+    return jnp.concatenate([x[:, i : i + end : stride] for i in range(height)], axis=-1)
 
 
 def dense(features: int, x: Float[Array, "*b c"]) -> Float[Array, "*b {features}"]:
-    """Apply a new linear layer as one product of two matrices, which is faster on a CPU."""
+    """Apply a linear layer of the calling module as one product of two matrices, which is faster on a CPU."""
     y = nn.Dense(features, kernel_init=HE)(x.reshape(-1, x.shape[-1]))
     return y.reshape(*x.shape[:-1], features)
 

@@ -1,4 +1,4 @@
-"""PointNetVLAD (Uy and Lee, 2018): features of points, pooled by NetVLAD. The TensorFlow form of its authors.
+"""PointNetVLAD (Uy and Lee, 2018): features of points, pooled by NetVLAD, as in its authors' TensorFlow code.
 
 Published recipe: Adam 5e-5, times 0.9 every 5 epochs, at least 1e-5; lazy quadruplet with margins 0.5 and 0.2 on
 squared L2; 2 tuples of 2 positives within 10 m, 18 negatives beyond 50 m and 1 other negative; 20 epochs; hard
@@ -19,26 +19,28 @@ from sglpr_jax.methods.cells import voxel_means
 from sglpr_jax.methods.learned.layers import batch_norm
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, quadruplet, rotate_clouds
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
-from sglpr_jax.models.layers import l2_normalize, maximum, residual_sums
+from sglpr_jax.models.layers import l2_normalize, maximum
+from sglpr_jax.models.netvlad import residual_sums
 
 POINTS = 4096
 RANGE_M = 40.0
-"""Points farther than this are dropped, and coordinates are divided by it."""
+"""Points farther than this distance, in metres, are dropped. Coordinates are divided by it."""
 GROUND_M = -1.4
 """Points at or below this height above the sensor count as ground, in metres. The ground is at -1.73 m."""
 VOXEL_M = 0.4
 """Side of the voxels whose means replace the points, as in the authors' submaps."""
 CLUSTERS = 64
-NUMBERS = 256
+DESCRIPTOR_SIZE = 256
 EPSILON = 1e-3
 """TensorFlow's epsilon of batch normalisation."""
 
 
 class Mlp(nn.Module):
-    """Linear layers with ReLU, applied to every row. With `normalised`, each has batch normalisation before ReLU."""
+    """Linear layers with ReLU, applied to every row."""
 
     widths: Sequence[int]
     normalised: bool = False
+    """Whether each layer has batch normalisation before ReLU."""
 
     @nn.compact
     def __call__(self, rows: Float[Array, "n c"], *, train: bool) -> Float[Array, "n _"]:
@@ -51,14 +53,15 @@ class Mlp(nn.Module):
 
 
 class TNet(nn.Module):
-    """Predicts a matrix from all points of a scan and multiplies each point by it. It starts as the identity."""
+    """Predicts a matrix from all points of a scan and multiplies each point by it. It starts as the unit matrix."""
 
     @nn.compact
     def __call__(self, points: Float[Array, "b n c"], *, train: bool) -> Float[Array, "b n c"]:
         b, n, c = points.shape
         features = Mlp((64, 128, 1024), normalised=True)(points.reshape(b * n, c), train=train)
-        whole = Mlp((512, 256), normalised=True)(maximum(features.reshape(b, n, -1), (1,)), train=train)
-        matrix = nn.Dense(c * c, kernel_init=nn.initializers.zeros)(whole).reshape(b, c, c)
+        scan_features = maximum(features.reshape(b, n, -1), (1,))
+        scan_features = Mlp((512, 256), normalised=True)(scan_features, train=train)
+        matrix = nn.Dense(c * c, kernel_init=nn.initializers.zeros)(scan_features).reshape(b, c, c)
         return points @ (matrix + jnp.eye(c)[None])
 
 
@@ -78,9 +81,13 @@ class Vlad(nn.Module):
         assignment = nn.softmax(batch_norm(train, epsilon=EPSILON)(logits)).reshape(b, n, CLUSTERS)
         centres = self.param("centres", init, (d, CLUSTERS))
         vlad = l2_normalize(residual_sums(features, assignment, centres).reshape(b, -1))
-        hidden = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(CLUSTERS**-0.5), name="hidden")
+        hidden = nn.Dense(
+            DESCRIPTOR_SIZE, use_bias=False, kernel_init=nn.initializers.normal(CLUSTERS**-0.5), name="hidden"
+        )
         y = batch_norm(train, epsilon=EPSILON)(hidden(vlad))
-        gate = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(NUMBERS**-0.5), name="gate")
+        gate = nn.Dense(
+            DESCRIPTOR_SIZE, use_bias=False, kernel_init=nn.initializers.normal(DESCRIPTOR_SIZE**-0.5), name="gate"
+        )
         return y * nn.sigmoid(batch_norm(train, epsilon=EPSILON)(gate(y)))
 
 
@@ -98,19 +105,18 @@ class PointNetVlad(nn.Module):
 
 
 def scaled_points(scan: Scan) -> Float32[np.ndarray, "4096 3"]:
-    """Return 4096 points above the ground, divided by 40 m, so that coordinates are between -1 and 1.
+    """Return 4096 points above the ground within 40 m, divided by 40 m, so that coordinates are between -1 and 1.
 
-    They are drawn without replacement from the means of the voxels of 0.4 m, with the same seed for every scan. If a
-    scan has fewer voxels, some are drawn again. Raises ValueError if the scan shows no place, or has no points above
-    the ground within 40 m.
+    The points are means of voxels of 0.4 m, drawn without replacement with the same seed for every scan. If a scan has
+    fewer voxels, some are drawn again. Raises ValueError if it has no such points, or shows no place (`check_cloud`).
     """
     points = finite_points(scan)
-    near = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]
-    if len(near) == 0:
-        raise ValueError(
-            f"{scan.name}: expected points within {RANGE_M:g} m and above {GROUND_M:g} m, found none of {len(points)}"
-        )
-    means, rng = voxel_means(near, VOXEL_M), np.random.default_rng(0)
+    points_in_range = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]
+    if len(points_in_range) == 0:
+        expected = f"points within {RANGE_M:g} m and above {GROUND_M:g} m"
+        raise ValueError(f"{scan.name}: expected {expected}, found none of {len(points)}")
+    means = voxel_means(points_in_range, VOXEL_M)
+    rng = np.random.default_rng(0)
     if len(means) >= POINTS:
         rows = rng.choice(len(means), POINTS, replace=False)
     else:

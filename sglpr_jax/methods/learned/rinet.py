@@ -1,8 +1,8 @@
-"""RINet (Li et al., 2022): rings of 360 degrees, one for each of 12 classes, and a learned distance. Variant attention.
+"""RINet (Li et al., 2022), variant with attention: a ring of ranges for each of 12 classes, and a learned distance.
 
 Published recipe: Adam 0.02, weight decay 1e-6; cross entropy of a soft label and contrastive loss; 1024 pairs, 20
 epochs. Differences: 512 tuples of one positive and one negative, that is 1024 pairs, and half of the positives from
-another visit. Each scan has its own draw of the lost columns. Scans are not paired with themselves.
+another visit. Each scan loses its own random columns. Scans are not paired with themselves.
 """
 
 import jax
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Float32
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.losses import descriptor_distance
-from sglpr_jax.methods.cells import extreme, polar
+from sglpr_jax.methods.cells import extreme_of_cells, polar
 from sglpr_jax.methods.learned.layers import batch_norm
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
@@ -23,64 +23,64 @@ from sglpr_jax.methods.recipe import Recipe, TupleConfig
 COLUMNS = 360
 RANGE_M = 50.0
 CLASSES = (1, *range(9, 20))
-"""Classes of the rows: car, road, parking, sidewalk, other ground, building, fence, vegetation, trunk, terrain, pole,
-sign."""
+"""Classes of the rows: car, road, parking, sidewalk, other ground, building, fence, vegetation, ..., traffic sign."""
 ROAD = 1
-"""Row of the road, which holds the farthest point. The other rows hold the nearest one."""
+"""Row of the road, which holds the range of the farthest point. The other rows hold the nearest one."""
 STAGES = ((3, 16), (3, 32), (2, 32), (2, 64), (2, 128))
-"""Factor of the reduction and number of channels of each stage after the first one."""
+"""Factor by which the ring is reduced, and number of channels, of each stage after the first one."""
 NUMBERS = 288
 SLOPE = 0.1
 """Slope of the leaky ReLU for negative numbers."""
 SAME_M, HALF_M, WIDTH_M = 3.0, 10.0, 1.5
-"""The label of a pair is 1 below 3 m. Beyond, it is a sigmoid that is 0.5 at 10 m, with a width of 1.5 m."""
+"""The label of a pair of scans is 1 up to a distance of 3 m, then a sigmoid: 0.5 at 10 m, with a width of 1.5 m."""
 LIMIT_M = 13.3
 """Distance at which the label is 0.1, in metres: the limit between positives and negatives."""
 MARGIN = 0.2
 LOST_COLUMNS = 60
+"""Maximum number of columns that training removes from a scan, as if an obstacle hid them."""
 
 
 def ring_image(scan: Scan) -> Float32[np.ndarray, "12 360"]:
-    """Return the horizontal range of one point of each of the `CLASSES` in each degree, divided by 50 m.
+    """Return the horizontal range of the nearest point of each of the `CLASSES` in each degree, divided by 50 m.
 
-    Columns are degrees from -180, counter-clockwise. Cells without points within 50 m are 0. Raises ValueError if the
-    scan has no labels.
+    For the road, it is the farthest point. Columns are degrees from -180, counter-clockwise. Cells without points
+    within 50 m are 0. Raises ValueError if the scan has no labels.
     """
     points, classes = scan.upright_points, classes_of(scan, 20)
-    row_of = np.full(20, -1)
-    row_of[list(CLASSES)] = np.arange(len(CLASSES))
-    radius, angle, _ = polar(np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.inf))
-    row = row_of[classes]
+    row_of_class = np.full(20, -1)
+    row_of_class[list(CLASSES)] = np.arange(len(CLASSES))
+    is_finite = np.isfinite(points).all(axis=1, keepdims=True)
+    radius, angle, _ = polar(np.where(is_finite, points, np.inf))  # infinite points are dropped by their range
+    row = row_of_class[classes]
     inside = (radius <= RANGE_M) & (row >= 0)
-    # Exactly 180 degrees would be column 360. The authors drop such points; here they are those of -180 degrees.
+    # The remainder moves exactly 180 degrees from column 360 to column 0, -180 degrees. The authors drop such points.
     column = np.floor((angle[inside] + np.pi) * (COLUMNS / (2 * np.pi))).astype(np.int64) % COLUMNS
     cells, shape = (row[inside], column), (len(CLASSES), COLUMNS)
-    image = extreme(np.minimum, shape, cells, radius[inside])
-    image[ROAD] = extreme(np.maximum, shape, cells, radius[inside])[ROAD]
+    image = extreme_of_cells(np.minimum, shape, cells, radius[inside])
+    image[ROAD] = extreme_of_cells(np.maximum, shape, cells, radius[inside])[ROAD]
     return (image / RANGE_M).astype(np.float32)
 
 
-def rotate_with_losses(key: Array, inputs: Float[Array, "b 12 360"]) -> Float[Array, "b 12 360"]:
-    """Rotate each input by its own whole number of degrees. Half of them lose up to 60 neighbouring columns first."""
+def rotate_with_lost_columns(key: Array, inputs: Float[Array, "b 12 360"]) -> Float[Array, "b 12 360"]:
+    """Rotate each input by a random number of columns. Before, half of them lose up to 60 neighbouring columns."""
 
     def rotate(key, image):
-        chance, size, place, angle = jax.random.split(key, 4)
-        lost = jax.random.randint(size, (), 0, LOST_COLUMNS + 1) * jax.random.bernoulli(chance)
-        start = jax.random.randint(place, (), 0, COLUMNS + 1 - lost)
+        loses_key, size_key, start_key, angle_key = jax.random.split(key, 4)
+        lost_columns = jax.random.randint(size_key, (), 0, LOST_COLUMNS + 1) * jax.random.bernoulli(loses_key)
+        start = jax.random.randint(start_key, (), 0, COLUMNS + 1 - lost_columns)
         column = jnp.arange(COLUMNS)
-        visible = (column < start) | (column >= start + lost)
-        return jnp.roll(image * visible[None], jax.random.randint(angle, (), 0, COLUMNS), axis=1)
+        is_kept = (column < start) | (column >= start + lost_columns)
+        return jnp.roll(image * is_kept[None], jax.random.randint(angle_key, (), 0, COLUMNS), axis=1)
 
     return jax.vmap(rotate)(jax.random.split(key, len(inputs)), inputs)
 
 
 class RINet(nn.Module):
-    """The network of one scan, exactly invariant to rotations by whole degrees: every layer is equivariant, and a
-    reduction keeps the strongest phase."""
+    """The network of one scan. Rotations by whole degrees do not change its descriptor (`strongest_phase`)."""
 
     @nn.compact
     def __call__(self, inputs: Float[Array, "b 12 360"], *, train: bool) -> Float[Array, "b 288"]:
-        """Return the means over the ring after each of the six stages. They are not normalised."""
+        """Return the means over the ring after each of the six stages, without normalisation."""
         x = Attention()(inputs.swapaxes(1, 2))
         x = Attention()(RingConvolution(12)(x, train=train))
         x = Attention()(RingConvolution(16)(x, train=train))
@@ -90,7 +90,7 @@ class RINet(nn.Module):
             means.append(x.mean(1))
         descriptors = jnp.concatenate(means, axis=-1)
         if self.is_initializing():
-            Score(name="score")(descriptors)  # its weights belong to those of the network
+            Score(name="score")(descriptors)  # creates the weights for `compare`
         return descriptors
 
 
@@ -101,8 +101,8 @@ class RingConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b l c"], *, train: bool) -> Float[Array, "b l {self.channels}"]:
-        around = jnp.concatenate([x, x[:, :2]], axis=1)
-        x = nn.Conv(self.channels, (3,), padding="VALID")(around)
+        padded_ring = jnp.concatenate([x, x[:, :2]], axis=1)
+        x = nn.Conv(self.channels, (3,), padding="VALID")(padded_ring)
         return nn.leaky_relu(batch_norm(train)(x), SLOPE)
 
 
@@ -115,7 +115,7 @@ class Attention(nn.Module):
 
 
 class Score(nn.Module):
-    """Score of the absolute difference of two descriptors. Its sigmoid is the probability of one place."""
+    """Score of the absolute difference of two descriptors. Its sigmoid is the probability that they show one place."""
 
     @nn.compact
     def __call__(self, difference: Float[Array, "*b 288"]) -> Float[Array, "*b"]:
@@ -124,7 +124,7 @@ class Score(nn.Module):
 
 
 def strongest_phase(x: Float[Array, "b l c"], factor: int) -> Float[Array, "b l/{factor} c"]:
-    """Keep every `factor`-th column, from the start that gives the largest sum of absolute values."""
+    """Keep every `factor`-th column, from the start (phase) that gives the largest sum of absolute values."""
     batch, length, channels = x.shape
     phases = x.reshape(batch, length // factor, factor, channels)
     best = jnp.argmax(jnp.abs(phases).sum((1, 3)), axis=-1)
@@ -132,24 +132,24 @@ def strongest_phase(x: Float[Array, "b l c"], factor: int) -> Float[Array, "b l/
 
 
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the cross entropy of the scores plus the contrastive loss of the descriptors, for the pairs of anchors."""
-    anchors, others, apart_m = tuples.descriptors[:, :1], tuples.descriptors[:, 1:], tuples.apart_m[:, 1:]
+    """Return cross entropy of the scores plus contrastive loss, for the pairs of an anchor and another place."""
+    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
+    apart_m = tuples.apart_m[:, 1:]
     label = jnp.where(apart_m < SAME_M, 1.0, nn.sigmoid((HALF_M - apart_m) / WIDTH_M))
-    entropy = optax.sigmoid_binary_cross_entropy(_logits(variables, jnp.abs(anchors - others)), label)
-    apart = descriptor_distance(jnp.broadcast_to(anchors, others.shape), others)
-    contrast = label * apart**2 + (1 - label) * nn.relu(MARGIN - apart) ** 2
+    entropy = optax.sigmoid_binary_cross_entropy(_scores(variables, jnp.abs(anchors - others)), label)
+    distance = descriptor_distance(jnp.broadcast_to(anchors, others.shape), others)
+    contrast = label * distance**2 + (1 - label) * nn.relu(MARGIN - distance) ** 2
     return entropy.mean() + contrast.mean()
 
 
 def compare(
     variables: Variables, queries: Float[Array, "q 288"], database: Float[Array, "n 288"]
 ) -> Float[Array, "q n"]:
-    """Return one minus the probability that two descriptors show one place."""
+    """Return the distances: one minus the probability that two descriptors show one place."""
+    return jax.lax.map(lambda query: 1 - nn.sigmoid(_scores(variables, jnp.abs(query[None] - database))), queries)
 
-    return jax.lax.map(lambda query: 1 - nn.sigmoid(_logits(variables, jnp.abs(query[None] - database))), queries)
 
-
-def _logits(variables: Variables, difference: Float[Array, "*b 288"]) -> Float[Array, "*b"]:
+def _scores(variables: Variables, difference: Float[Array, "*b 288"]) -> Float[Array, "*b"]:
     return jnp.asarray(Score().apply({"params": variables["params"]["score"]}, difference))
 
 
@@ -162,7 +162,7 @@ RINET = LearnedMethod(
     weights=98_765,
     network=RINet(),
     prepare=ring_image,
-    rotate_inputs=rotate_with_losses,
+    rotate_inputs=rotate_with_lost_columns,
     loss=loss,
     compare=compare,
     recipe=Recipe(

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.data.views import classes_of
-from sglpr_jax.methods.cells import means, voxels
+from sglpr_jax.methods.cells import group_by_voxel, group_means
 from sglpr_jax.methods.learned.layers import batch_norm
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables, rotate_clouds
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
@@ -24,13 +24,13 @@ from sglpr_jax.models.layers import maximum
 
 NEIGHBOURS = 10
 WIDTHS = (64, 64, 32)
-NUMBERS = WIDTHS[-1]
-TENSORS = 16
+"""Channels of the three layers of EdgeConv. The last is the length of a descriptor."""
+BILINEAR_FORMS = 16
 """Number of bilinear forms that compare two graphs."""
-TIE = 1e-4
-"""Weight of the distance in space, per metre, among nodes whose classes are equally near."""
+TIE_BREAKER = 1e-4
+"""Weight of the distance in space, per metre, that orders nodes with equally near classes."""
 NODES = 100
-RULES = {
+CLUSTER_RULES = {
     1: (0.5, 100),  # car
     4: (0.5, 100),  # truck
     5: (0.5, 100),  # other vehicle
@@ -44,70 +44,66 @@ RULES = {
     18: (0.2, 100),  # pole
     19: (0.2, 50),  # traffic sign
 }
-"""Published rules of the 12 classes of nodes: the maximum distance of neighbouring points of a cluster, in metres, and
-the minimum number of points of a cluster. Other classes are ignored."""
+"""For each class that is used, the maximum gap in a cluster, in metres, and the minimum number of its points."""
 MAX_POINTS = 50_000
-"""Larger clusters are dropped."""
+"""Maximum number of points of a cluster. Larger clusters are dropped."""
 VOXELS_PER_GAP = 4
 """Points are first merged into voxels whose side is the gap divided by this number."""
 
 
 def semantic_graph(scan: Scan) -> Float32[np.ndarray, "100 15"]:
-    """Return up to 100 nodes: x, y, z of the centre in metres, and the class as 12 numbers, one 1 and eleven 0.
+    """Return 100 nodes of a graph: each is x, y, z of the centre of a cluster, in metres, and its one-hot class.
 
-    Missing nodes are zeros. Of more than 100 clusters, those with the most points remain. The published graph has 100
-    random ones, and takes clusters from the instances of SemanticKITTI where a scan has them. Raises ValueError if the
-    scan shows no place, or has no labels or no cluster.
+    Missing nodes are zeros. Of more than 100 clusters, those with the most points remain; the published graph has 100
+    random ones, and takes clusters from the instances of SemanticKITTI if a scan has them. Raises ValueError if the
+    scan shows no place (`check_cloud`), or has no labels or no cluster.
     """
     points, classes = scan.upright_points, classes_of(scan, 20)
     check_cloud(points, name=scan.name)
-    finite = np.isfinite(points).all(axis=1)
-    points, classes = points[finite], classes[finite]
+    is_finite = np.isfinite(points).all(axis=1)
+    points, classes = points[is_finite], classes[is_finite]
     sizes, nodes = [], []
-    for one_hot, (class_number, (gap_m, min_points)) in zip(np.eye(len(RULES)), RULES.items(), strict=True):
+    one_hot_classes = np.eye(len(CLUSTER_RULES))
+    for i, (class_number, (gap_m, min_points)) in enumerate(CLUSTER_RULES.items()):
         class_points = points[classes == class_number]
-        cluster = clusters(class_points, gap_m)
+        cluster = cluster_of_points(class_points, gap_m)
         counts = np.bincount(cluster)
-        valid = (counts >= min_points) & (counts <= MAX_POINTS)
-        centres = means(class_points, cluster, counts)[valid]
-        sizes.append(counts[valid])
-        nodes.append(np.concatenate([centres, np.broadcast_to(one_hot, (len(centres), len(RULES)))], axis=1))
+        is_valid = (counts >= min_points) & (counts <= MAX_POINTS)
+        centres = group_means(class_points, cluster, counts)[is_valid]
+        sizes.append(counts[is_valid])
+        nodes.append(np.concatenate([centres, np.repeat(one_hot_classes[i : i + 1], len(centres), axis=0)], axis=1))
     largest = np.sort(np.argsort(-np.concatenate(sizes), kind="stable")[:NODES])
     if len(largest) == 0:
-        raise ValueError(f"{scan.name}: expected clusters of {len(RULES)} classes, found none in {len(points)} points")
+        expected = f"clusters of {len(CLUSTER_RULES)} classes"
+        raise ValueError(f"{scan.name}: expected {expected}, found none in {len(points)} points")
     graph = np.concatenate(nodes)[largest].astype(np.float32)
     return np.pad(graph, ((0, NODES - len(largest)), (0, 0)))
 
 
-def clusters(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, " n"]:
-    """Return the number of the cluster of each point. Neighbouring points of a cluster are at most `gap_m` apart.
-
-    The points of a voxel of `gap_m` / 4 count as one point, their mean.
-    """
+def cluster_of_points(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, " n"]:
+    """Return the index of each point's cluster. Neighbouring voxel means in a cluster are at most `gap_m` apart."""
     if len(points) == 0:
         return np.zeros(0, np.int64)
-    voxel, counts = voxels(points, gap_m / VOXELS_PER_GAP)
-    pairs = KDTree(means(points, voxel, counts)).query_pairs(gap_m, output_type="ndarray")
+    voxel, counts = group_by_voxel(points, gap_m / VOXELS_PER_GAP)
+    pairs = KDTree(group_means(points, voxel, counts)).query_pairs(gap_m, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(counts), len(counts)))
-    return connected_components(links, directed=False)[1][voxel].astype(np.int64)
+    _, cluster_of_voxel = connected_components(links, directed=False)
+    return cluster_of_voxel[voxel].astype(np.int64)
 
 
-def nearest(squares: Float[Array, "b n n"]) -> Int[Array, "b n 10"]:
-    """Return the numbers of the 10 nearest nodes of each node, itself included."""
+def nearest_nodes(squares: Float[Array, "b n n"]) -> Int[Array, "b n 10"]:
+    """Return the indices of the 10 nearest nodes of each node, including itself, given all squared distances."""
     return jax.lax.top_k(-squares, NEIGHBOURS)[1]
 
 
 def squared_distances(x: Float[Array, "b n c"]) -> Float[Array, "b n n"]:
-    """Return the squared distances of all pairs of nodes."""
+    """Return the squared distances between all pairs of the n nodes of each graph."""
     square = jnp.square(x).sum(-1)
     return square[:, :, None] + square[:, None, :] - 2 * x @ x.swapaxes(1, 2)
 
 
 class EdgeConv(nn.Module):
-    """Maximum over the neighbours j of LeakyReLU(BN(W [x_j - x_i, x_i])), without bias.
-
-    W [x_j - x_i, x_i] = A x_j + (B - A) x_i, so each node is multiplied only once.
-    """
+    """Maximum over the neighbours j of LeakyReLU(BN(A x_j + (B - A) x_i)), where [A, B] act on [x_j - x_i, x_i]."""
 
     features: int
 
@@ -115,9 +111,9 @@ class EdgeConv(nn.Module):
     def __call__(
         self, x: Float[Array, "b n c"], neighbours: Int[Array, "b n 10"], *, train: bool
     ) -> Float[Array, "b n {self.features}"]:
-        relative = nn.Dense(self.features, use_bias=False, name="relative")(x)
-        own = nn.Dense(self.features, use_bias=False, name="own")(x) - relative
-        edges = jax.vmap(lambda nodes, numbers: nodes[numbers])(relative, neighbours) + own[:, :, None]
+        neighbour_part = nn.Dense(self.features, use_bias=False, name="relative")(x)
+        node_part = nn.Dense(self.features, use_bias=False, name="own")(x) - neighbour_part
+        edges = jax.vmap(lambda parts, indices: parts[indices])(neighbour_part, neighbours) + node_part[:, :, None]
         return maximum(nn.leaky_relu(batch_norm(train)(edges), 0.2), (2,))
 
 
@@ -133,52 +129,53 @@ class GraphAttention(nn.Module):
 
 
 class TensorNetwork(nn.Module):
-    """Compares vectors a and b of two graphs by relu(a T b + V [a, b] + bias), and two linear layers."""
+    """Compares vectors a and b of two graphs by relu(a T_k b + V_k [a, b] + bias_k), k < 16, and two linear layers."""
 
     @nn.compact
     def __call__(self, queries: Float[Array, "q c"], others: Float[Array, "n c"]) -> Float[Array, "q n"]:
         """Return log(p / (1 - p)) of the probability p that two graphs show the same place, for all pairs."""
         c = queries.shape[1]
         init = nn.initializers.glorot_uniform()
-        tensor = self.param("tensor", init, (c, c, TENSORS))
-        linear = self.param("linear", init, (2 * c, TENSORS))
-        bias = self.param("bias", init, (TENSORS, 1))[:, 0]
-        bilinear = jnp.einsum("qc,cdk,nd->qnk", queries, tensor, others)
-        plain = (queries @ linear[:c])[:, None] + (others @ linear[c:])[None]
-        hidden = nn.relu(nn.Dense(16, name="hidden")(nn.relu(bilinear + plain + bias[None, None])))
+        tensor = self.param("tensor", init, (c, c, BILINEAR_FORMS))
+        linear = self.param("linear", init, (2 * c, BILINEAR_FORMS))
+        bias = self.param("bias", init, (BILINEAR_FORMS, 1))[:, 0]
+        bilinear_part = jnp.einsum("qc,cdk,nd->qnk", queries, tensor, others)
+        linear_part = (queries @ linear[:c])[:, None] + (others @ linear[c:])[None]
+        hidden = nn.relu(nn.Dense(16, name="hidden")(nn.relu(bilinear_part + linear_part + bias[None, None])))
         return nn.Dense(1, name="score")(hidden)[..., 0]
 
 
 class Sgpr(nn.Module):
-    """Three layers of EdgeConv on positions and on classes, and attention: a vector of 32 numbers.
+    """Three layers of EdgeConv on the positions and three on the classes of nodes, then attention: 32 numbers.
 
-    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others. Among
+    The neighbours of a layer are the nearest nodes by the layer's input. Missing nodes take part like others. Among
     equal classes, nodes that are nearer in space come first; the published choice depends on the order of the nodes.
     """
 
     def setup(self):
         self.space = [EdgeConv(width) for width in WIDTHS]
         self.kinds = [EdgeConv(width) for width in WIDTHS]
-        self.joint = nn.Dense(NUMBERS, use_bias=False)
+        self.joint = nn.Dense(WIDTHS[-1], use_bias=False)
         self.norm = nn.BatchNorm(momentum=0.9, epsilon=1e-5)
         self.attention = GraphAttention()
         self.comparison = TensorNetwork()
 
     def __call__(self, graphs: Float[Array, "b n 15"], *, train: bool = False) -> Float[Array, "b 32"]:
-        """Return the vectors of graphs: nodes with x, y, z in metres and a class as 12 numbers."""
+        """Return a vector of each graph, whose nodes have x, y, z in metres and a one-hot class (12 numbers)."""
         space, kinds = graphs[..., :3], graphs[..., 3:]
-        ties = TIE * jnp.sqrt(jnp.maximum(squared_distances(space), 0))
+        ties = TIE_BREAKER * jnp.sqrt(jnp.maximum(squared_distances(space), 0))
         for depth, (space_layer, kind_layer) in enumerate(zip(self.space, self.kinds, strict=True)):
-            space = space_layer(space, nearest(squared_distances(space)), train=train)
+            space = space_layer(space, nearest_nodes(squared_distances(space)), train=train)
             kind_distances = squared_distances(kinds) + (ties if depth == 0 else 0)
-            kinds = kind_layer(kinds, nearest(kind_distances), train=train)
+            kinds = kind_layer(kinds, nearest_nodes(kind_distances), train=train)
         joint = self.joint(jnp.concatenate([space, kinds], axis=-1))
         vectors = self.attention(nn.leaky_relu(self.norm(joint, use_running_average=not train), 0.2))
         if self.is_initializing():
-            self.comparison(vectors, vectors)
+            self.comparison(vectors, vectors)  # creates its weights
         return vectors
 
     def logits(self, queries: Float[Array, "q 32"], others: Float[Array, "n 32"]) -> Float[Array, "q n"]:
+        """Return log(p / (1 - p)) of all pairs, as `TensorNetwork`."""
         return self.comparison(queries, others)
 
 
@@ -191,9 +188,10 @@ def _logits(variables: Variables, queries: Float[Array, "q 32"], others: Float[A
 
 @jax.jit
 def compare(variables: Variables, queries: Float[Array, "q 32"], database: Float[Array, "n 32"]) -> Float[Array, "q n"]:
-    """Return -log(p) of the probability p that two graphs show the same place. The query is the first graph of a pair.
+    """Return the distances -log(p), where p is the probability that two graphs show the same place.
 
     The published score is p. Its negative logarithm has the same order, and distinguishes pairs whose p rounds to 1.
+    The query is the first graph of a pair, which is not symmetric.
     """
     return jax.lax.map(lambda query: nn.softplus(-_logits(variables, query[None], database)[0]), queries)
 
@@ -204,7 +202,9 @@ def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     def tuple_loss(vectors: Float[Array, "k d"]) -> Float[Array, ""]:
         anchor, others = vectors[:1], vectors[1:]
         is_positive = jnp.arange(len(others)) < tuples.positives
-        logits = jnp.stack([_logits(variables, anchor, others)[0], _logits(variables, others, anchor)[:, 0]])
+        logits_anchor_first = _logits(variables, anchor, others)[0]
+        logits_anchor_second = _logits(variables, others, anchor)[:, 0]
+        logits = jnp.stack([logits_anchor_first, logits_anchor_second])
         return nn.softplus(jnp.where(is_positive[None], -logits, logits)).mean()
 
     return jax.vmap(tuple_loss)(tuples.descriptors).mean()

@@ -14,19 +14,20 @@ from sglpr_jax.models.weights import as_tree, by_name, hash_of
 from sglpr_jax.models.weights_file import (
     CONFIG_FILE,
     WEIGHTS_FILE,
-    check_leaves,
+    check_arrays,
     last_weights,
     read_tensors,
     write_weights,
 )
 
-KINDS = ["params", "batch_stats"]
+COLLECTIONS = ["params", "batch_stats"]
+"""Collections of a network's variables in Flax."""
 RANDOM = "random:"
-"""Prefix of a seed that stands for weights: `random:0` are those of an untrained network."""
+"""Prefix of a name of weights: `random:0` names those of an untrained network, drawn from the seed 0."""
 
 
 def example_inputs(method: LearnedMethod) -> np.ndarray:
-    """Return the input (1, ...) of an artificial scan, which defines the shapes of the weights."""
+    """Return the input (1, ...) of an artificial scan, whose shape defines the shapes of the weights."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-40, -40, -1.5), (40, 40, 5), (5000, 3)).astype(np.float32)
     labels = np.full(len(points), 50, np.int32)  # buildings
@@ -35,15 +36,12 @@ def example_inputs(method: LearnedMethod) -> np.ndarray:
 
 def random_variables(method: LearnedMethod, *, seed: int) -> Variables:
     """Return the variables of an untrained network, drawn from `seed`."""
-    init = jax.jit(lambda key, inputs: method.network.init(key, inputs, train=False, mutable=KINDS))
+    init = jax.jit(lambda key, inputs: method.network.init(key, inputs, train=False, mutable=COLLECTIONS))
     return init(jax.random.key(seed), example_inputs(method))
 
 
 def save_variables(folder: Path, method: LearnedMethod, variables: Variables, about: Mapping[str, Any]) -> None:
-    """Write the variables of a trained network, and the settings of its training (`about`) as JSON values.
-
-    Raises OSError if the folder cannot be written or holds other files than earlier weights.
-    """
+    """Write the variables of a network, and the settings of its training as JSON values. Raises as `write_weights`."""
     write_weights(folder, by_name(variables), {"method": method.name, **about}, {})
 
 
@@ -65,17 +63,17 @@ def load_variables(source: Path | str, method: LearnedMethod) -> Variables:
             raise ValueError(f"expected a seed after {RANDOM!r}, found {seed!r}")
         return random_variables(method, seed=int(seed))
     folder = last_weights(Path(source))
-    stored = method_of(folder) or "sglpr"
-    if stored != method.name:
-        raise ValueError(f"{folder}: expected weights of the method {method.name!r}, found those of {stored!r}")
-    values, _ = read_tensors(folder / WEIGHTS_FILE)
+    stored_method = method_of(folder) or "sglpr"
+    if stored_method != method.name:
+        raise ValueError(f"{folder}: expected weights of the method {method.name!r}, found those of {stored_method!r}")
+    arrays, _ = read_tensors(folder / WEIGHTS_FILE)
     expected = by_name(jax.eval_shape(lambda: random_variables(method, seed=0)))
-    check_leaves(values, expected, source=folder / WEIGHTS_FILE)
-    return jax.device_put(as_tree(values))
+    check_arrays(arrays, expected, source=folder / WEIGHTS_FILE)
+    return jax.device_put(as_tree(arrays))
 
 
 def method_of(folder: Path) -> str | None:
-    """Return the name of the learned method of a run or of weights, or None if the folder has none."""
+    """Return the name of the learned method in the config.json of a folder of a run or of weights, or None."""
     about = read_json(folder / CONFIG_FILE) if (folder / CONFIG_FILE).is_file() else None
     name = about.get("method") if isinstance(about, dict) else None
     return name if isinstance(name, str) else None
