@@ -10,10 +10,11 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import DetectorFlags
-from sglpr_jax.cli.runtime import print_error, stop_on_signal
+from sglpr_jax.cli.runtime import print_error
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
     from sglpr_jax.live.endpoints import Sink, Source

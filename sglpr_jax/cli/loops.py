@@ -16,13 +16,13 @@ from sglpr_jax.cli.recording import (
     open_with_odometry,
     report_bad_scan,
 )
-from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import stop_on_signal
 
 UNFINISHED = "unfinished"
 """Checkpoint directory of a running command, inside the output folder."""

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
-from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.files import exclusive_lock, naming
@@ -16,6 +15,7 @@ from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
     import numpy as np

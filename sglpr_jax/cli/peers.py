@@ -9,10 +9,11 @@ import tyro
 from rich.table import Table
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import StopRequest, cache_folder, console, print_error, stop_on_signal
+from sglpr_jax.cli.runtime import cache_folder, console, print_error
 from sglpr_jax.fields import CountOrNone, NotNegative, Positive
 from sglpr_jax.methods.names import LearnedName
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import StopRequest, stop_on_signal
 
 if TYPE_CHECKING:
     from sglpr_jax.methods.learned.method import LearnedMethod

@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import (
     Gravity,
     PoseChoice,
@@ -26,6 +25,7 @@ from sglpr_jax.odometry.config import (
 )
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

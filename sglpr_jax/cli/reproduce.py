@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import console, stop_on_signal
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.cli.train import exit_unless_finished
 from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.reproduce.experiments import EXPERIMENTS
+from sglpr_jax.stop_request import stop_on_signal
 from sglpr_jax.training.config import TrainConfig
 
 if TYPE_CHECKING:

@@ -1,6 +1,5 @@
-"""Common parts of all commands: compilation cache, orderly interruption, one-line errors."""
+"""Common parts of all commands: command line, compilation cache, one-line errors."""
 
-import contextlib
 import dataclasses
 import functools
 import gc
@@ -10,11 +9,10 @@ import json
 import logging
 import os
 import re
-import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -188,42 +186,3 @@ def print_error(text: str) -> None:
 def console() -> Console:
     """Return a console for standard output. Without a terminal it is wide enough for the tables."""
     return Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, highlight=False)
-
-
-@dataclasses.dataclass
-class StopRequest:
-    """Callable that returns whether the work was asked to stop. It also stores the signal."""
-
-    signal: int | None = None
-
-    def __call__(self) -> bool:
-        return self.signal is not None
-
-    @property
-    def exit_status(self) -> int:
-        """130 after Ctrl-C, as in shells. 0 after SIGTERM, which ends a run that will be resumed later."""
-        return 130 if self.signal == signal.SIGINT else 0
-
-    def exit(self, text: str) -> None:
-        """Print a text on stderr and exit."""
-        print_error(text)
-        sys.exit(self.exit_status)
-
-
-@contextlib.contextmanager
-def stop_on_signal() -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a stop request, so that work ends without losses. A second one kills it."""
-    request = StopRequest()
-
-    def ask(number, _frame):
-        if request():
-            raise KeyboardInterrupt
-        request.signal = number
-        print("stopping after this step; repeat to stop at once", file=sys.stderr)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield request
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.recording import report_bad_scan
-from sglpr_jax.cli.runtime import StopRequest, console, stop_on_signal
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.files import file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import StopRequest, stop_on_signal
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 
 if TYPE_CHECKING:

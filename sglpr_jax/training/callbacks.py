@@ -12,7 +12,7 @@ from rich.console import Console
 
 from sglpr_jax.files import writing
 from sglpr_jax.progress import progress_bar
-from sglpr_jax.training.loss import TERM_NAMES
+from sglpr_jax.training.loss_terms import TERM_NAMES
 
 EVENTS = "tensorboard"
 _SHOWN = ("loss", *TERM_NAMES, "violations", "steps_per_second")

@@ -53,7 +53,7 @@ class LossConfig:
     def segments(self) -> bool:
         """Whether any term uses the segmentation head. A term with weight 0 is not computed (table 7).
 
-        A new term of the class logits must be added here too, because the table in `training/loss.py` needs JAX.
+        A new term of the class logits must be added here too, because the table in `training/loss_terms.py` needs JAX.
         """
         return self.ce_weight != 0 or self.dice_weight != 0
 

@@ -24,7 +24,7 @@ from sglpr_jax.models.weights import freeze_descriptor_layers
 from sglpr_jax.training.batches import Batch, in_network_order, views
 from sglpr_jax.training.config import LossConfig, OcclusionConfig, TrainConfig
 from sglpr_jax.training.devices import keep_placed, on_own_rows
-from sglpr_jax.training.loss import Summary, joint_loss, segmentation_sums
+from sglpr_jax.training.loss_terms import Summary, joint_loss, segmentation_sums
 from sglpr_jax.training.step import Gradient, Metrics, TrainState
 
 

@@ -16,7 +16,7 @@ from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
 from sglpr_jax.training.config import LossConfig, OcclusionConfig
 from sglpr_jax.training.image_network import ImageNetwork, _angles, _chunks, gradients, summarize, visible
-from sglpr_jax.training.loss import Summary, joint_loss
+from sglpr_jax.training.loss_terms import Summary, joint_loss
 from sglpr_jax.training.step import train_step
 
 from .conftest import FAST_COMPILE, SWIN

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.training import loss
+from sglpr_jax.training import loss_terms
 from sglpr_jax.training.config import LossConfig
-from sglpr_jax.training.loss import SegmentationTerm, Summary, joint_loss, segmentation_sums
+from sglpr_jax.training.loss_terms import SegmentationTerm, Summary, joint_loss, segmentation_sums
 
 UNIT = np.eye(8, dtype=np.float32)
 
@@ -18,7 +18,7 @@ def test_an_entry_of_classes_is_summed_over_chunks_and_left_out_without_weight(m
         return counted.sum()
 
     term = SegmentationTerm(lambda config: config.margin, count, lambda total, images: total / images)
-    monkeypatch.setitem(loss.SEGMENTATION_TERMS, "pixels", term)
+    monkeypatch.setitem(loss_terms.SEGMENTATION_TERMS, "pixels", term)
     rng, config = np.random.default_rng(0), LossConfig(margin=2.0)
     logits = jnp.asarray(rng.normal(size=(8, 4, 4, 20)), jnp.float32)
     classes, counted = jnp.asarray(rng.integers(0, 20, (8, 4, 4))), jnp.asarray(rng.random((8, 4, 4)) < 0.5)
