@@ -58,7 +58,7 @@ def replicate(tree: Tree, mesh: Mesh) -> Tree:
     return _place(tree, NamedSharding(mesh, PartitionSpec()))
 
 
-def own_copy(tree: Tree) -> Tree:
+def host_copy(tree: Tree) -> Tree:
     """Return this host's copy of replicated arrays, from its first device. It can be used without the other hosts."""
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
@@ -124,7 +124,7 @@ def is_first_host() -> bool:
     return jax.process_index() == 0
 
 
-def own_part(tuples: int) -> slice:
+def host_slice(tuples: int) -> slice:
     """Return the slice of a step's tuples that this host reads: equal parts, in the order of the hosts."""
     host_tuples = tuples // jax.process_count()
     return slice(jax.process_index() * host_tuples, (jax.process_index() + 1) * host_tuples)

@@ -130,7 +130,7 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     """Return the batch as the network sees it, cut into chunks along a new leading axis."""
     angles = _angles(angle_key, config) if config.rotate else None
     make_views = functools.partial(views, grid=config.model.grid)
-    make_views = make_views if batch.also is not None else on_own_rows(make_views)  # a mixed batch is on one device
+    make_views = make_views if batch.second is not None else on_own_rows(make_views)  # a mixed batch is on one device
     images, maps = make_views(batch, angles)
     visible_cells = field_of_view(config.model)
     if config.occlusion.share:

@@ -33,7 +33,7 @@ class TrainingInputs:
 
     def of(self, pool: TuplePool, places: Int[np.ndarray, " n"]) -> Shaped[np.ndarray, "n ..."]:
         """Return the inputs of places, given as frame numbers of a pool over these recordings."""
-        return np.stack([self.inputs[pool.recording[place]][pool.frame[place]] for place in places])
+        return np.stack([self.inputs[pool.recording_of[place]][pool.frame_of[place]] for place in places])
 
 
 def prepare_inputs(

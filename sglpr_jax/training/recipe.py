@@ -17,12 +17,12 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import graft, without_whitening
 from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.training.batch_source import TupleBatches, batches_of
+from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.batches import positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.checkpoint import CHECKPOINTS, checkpoint_steps
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
-from sglpr_jax.training.devices import data_mesh, is_first_host, on_all_hosts, own_copy
+from sglpr_jax.training.devices import data_mesh, host_copy, is_first_host, on_all_hosts
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
 from sglpr_jax.training.run_folder import lock_run
@@ -143,7 +143,7 @@ def train(
         on_all_hosts(lambda: is_first_host() and opened.enter_context(lock))
         options = {"start_from": start_from, "resume": resume, "callback": follower, "stopped": stopped}
         state = run_network(config, source, folder, score=score, **options).state
-        steps, params, speed = int(state.step), own_copy(state.params), None
+        steps, params, speed = int(state.step), host_copy(state.params), None
         if is_first_host():
             save(params, folder / WEIGHTS)
             speed = throughput(read_metrics(folder / METRICS_FILE))
@@ -200,7 +200,7 @@ def _source_and_score(
         score = validation_score(recordings, [held_out for _, held_out in splits], config)
     else:
         score = training_recall(recordings, pool, config)
-    return batches_of(recordings, pool, config, also=also, describe=describe, run=folder), score
+    return training_batches(recordings, pool, config, also=also, describe=describe, run=folder), score
 
 
 def _require_usable(

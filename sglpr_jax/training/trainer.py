@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from sglpr_jax.training.batch_source import TupleBatches, batches_in_order
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.checkpoint import CHECKPOINTS, Checkpoints
-from sglpr_jax.training.devices import is_first_host, on_all_hosts, on_any_host, own_copy, replicate, split
+from sglpr_jax.training.devices import host_copy, is_first_host, on_all_hosts, on_any_host, replicate, split
 from sglpr_jax.training.metrics_log import MetricsLog
 from sglpr_jax.training.step import PlaceNetwork, TrainState, train_step
 
@@ -119,7 +119,7 @@ class Trainer:
         self._logs = {name: MetricsLog(folder / name, start_step=start) for name in names}
         self._batches = batches_in_order(
             source,
-            lambda: own_copy(self._run.state),
+            lambda: host_copy(self._run.state),
             start=start,
             stop=schedule.steps,
             place=lambda batch: split(batch, mesh),
@@ -175,7 +175,7 @@ class Trainer:
             for images in schedule.snapshots(before, self._run):
                 self._save_snapshot(self._run, images)
             state = self._run.state
-            scores = on_all_hosts(lambda: self._compute_score(own_copy(state)) if is_first_host() else {})
+            scores = on_all_hosts(lambda: self._compute_score(host_copy(state)) if is_first_host() else {})
             if scores:
                 self._callback.on_score(step, self._log(self._scores_file, scores))
             self._save()
@@ -207,7 +207,7 @@ class Trainer:
         for log in self._logs.values():
             log.sync()
         about = {"unlogged": self._unlogged, "images": self._run.images, "seconds": self._run.seconds}
-        self._checkpoints.save(own_copy(self._run.state), about)
+        self._checkpoints.save(host_copy(self._run.state), about)
         self._saved_s = self._run.seconds
 
     def _require_finite(self) -> None:

@@ -42,7 +42,7 @@ def training_recall(
     """
     frames = pool.draw(seed=_SEED, step=0, tuples=PLACES)[:, :2]
     offset = pool.positions[frames[:, :1], :2] - pool.positions[None, frames[:, 1], :2]
-    same_recording = pool.recording[frames[:, :1]] == pool.recording[None, frames[:, 1]]
+    same_recording = pool.recording_of[frames[:, :1]] == pool.recording_of[None, frames[:, 1]]
     same_place = same_recording & (np.linalg.norm(offset, axis=-1) < pool.config.positive_m)
     angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, frames.shape).astype(np.float32)
 
@@ -93,8 +93,8 @@ def retrieval(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: 
     places and wrong beyond the negative one.
     """
     queries = np.arange(len(pool))
-    same_recording = pool.recording[:, None] == pool.recording[None]
-    same_visit = same_recording & (np.abs(pool.frame[:, None] - pool.frame[None]) <= gap)
+    same_recording = pool.recording_of[:, None] == pool.recording_of[None]
+    same_visit = same_recording & (np.abs(pool.frame_of[:, None] - pool.frame_of[None]) <= gap)
     distance_m = cdist(pool.positions[:, :2], pool.positions[:, :2])
     matches = same_recording & ~same_visit & (distance_m < pool.config.positive_m)
     descriptor_distance = np.where(same_visit, np.inf, cdist(descriptors, descriptors))

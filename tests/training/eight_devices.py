@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.training import recipe, trainer
-from sglpr_jax.training.devices import data_mesh, own_copy, replicate, split
+from sglpr_jax.training.devices import data_mesh, host_copy, replicate, split
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.recipe import run_network
@@ -41,7 +41,7 @@ def make_steps(config, params, batches, devices):
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before.params))
     for leaf in jax.tree.leaves(state):
         assert leaf.sharding.is_fully_replicated and len(leaf.sharding.device_set) == len(devices)
-    return jax.device_get(own_copy(state.params.weights)), measured
+    return jax.device_get(host_copy(state.params.weights)), measured
 
 
 def assert_same_weights(found, expected):

@@ -17,7 +17,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.recipe import TupleConfig
-from sglpr_jax.training.batch_source import batches_of
+from sglpr_jax.training.batch_source import training_batches
 from sglpr_jax.training.batches import Batch, mix, read_batch, tuple_pool, views
 from sglpr_jax.training.tuples import TuplePool
 
@@ -196,7 +196,7 @@ def test_scans_become_density_images_of_all_their_points(recordings, pool):
     np.testing.assert_allclose(views(batch, jnp.zeros(4), GRID)[0], middle, atol=1e-4)
     labelled = read_batch(recordings, pool, FRAMES, max_points=9, share_negatives=False, image="density")
     for row, frame in enumerate(FRAMES.reshape(-1)):
-        recording, number = recordings[int(pool.recording[frame])], int(pool.frame[frame])
+        recording, number = recordings[int(pool.recording_of[frame])], int(pool.frame_of[frame])
         assert labelled.labelled[row] == (recording.labels(number) is not None)
         if labelled.labelled[row]:
             classes = to_classes(recording.labels(number))
@@ -260,11 +260,11 @@ def straight(name: str) -> Recording:
 def test_the_places_of_both_datasets_are_named(config, triplets):
     config = dataclasses.replace(config, also_tuples=1, also_triplets=triplets)
     main, also = [straight("00")], [straight("town")]
-    batches = batches_of(main, tuple_pool(main, config), config, also=also)
+    batches = training_batches(main, tuple_pool(main, config), config, also=also)
     pool = tuple_pool(also, config)
     draw = pool.draw if triplets else pool.draw_places
     for step in range(3):
-        first, second = batches.places(step).split("; ")
+        first, second = batches.scan_names(step).split("; ")
         assert first.startswith("recording 00 frames 00-")
         frames = np.unique(draw(seed=config.seed, step=step, tuples=1))
         assert second == f"recording town frames {' '.join(f'town-{frame}' for frame in frames)}"

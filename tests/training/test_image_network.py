@@ -253,5 +253,5 @@ def test_labelled_places_come_where_the_segmentation_head_looks_and_go_back(mixe
     np.testing.assert_array_equal(in_batch_order(order, mixed, every=every), places)
     seen = np.asarray(order)[::every]
     assert (seen >= 4).sum() == min(len(seen), 4)
-    alone = mixed.replace(also=None)
+    alone = mixed.replace(second=None)
     np.testing.assert_array_equal(in_network_order(places, alone, every=every), places)

@@ -112,7 +112,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_at_its_step(run, config, make_ba
     fake_step(broken=3)
     words = r"^step 3: loss not finite \(batch: the one read for 2\); the last checkpoint is intact$"
     with pytest.raises(FloatingPointError, match=words):
-        run(make=Made(make_batch, places="the one read for {}".format))
+        run(make=Made(make_batch, scan_names="the one read for {}".format))
     assert [line["step"] for line in logged(tmp_path)] == [1, 2, 2]
     like = jax.eval_shape(ImageNetwork(config).new_state)
     found, _ = Checkpoints(tmp_path / CHECKPOINTS).restore(like)

@@ -44,10 +44,10 @@ def test_positives_are_near_and_negatives_far(seed, step, positives, negatives, 
     assert rows.shape == (6, 1 + positives + negatives)
     anchors, near, far = columns(rows, config)
     assert (horizontal(pool, anchors, near) < 3).all()
-    assert (pool.recording[anchors] == pool.recording[near]).all()
+    assert (pool.recording_of[anchors] == pool.recording_of[near]).all()
     assert (anchors != near).all()
-    assert ((horizontal(pool, anchors, far) > 20) | (pool.recording[anchors] != pool.recording[far])).all()
-    gap = np.abs(pool.frame[anchors] - pool.frame[near])
+    assert ((horizontal(pool, anchors, far) > 20) | (pool.recording_of[anchors] != pool.recording_of[far])).all()
+    gap = np.abs(pool.frame_of[anchors] - pool.frame_of[near])
     if revisit_fraction == 1:
         assert (gap > config.revisit_gap).all()
     if revisit_fraction == 0:
@@ -59,7 +59,7 @@ def test_all_pairs_within_three_metres_are_found_and_no_other():
     recordings = [circuit(3), circuit(2, seed=1)]
     pool = TuplePool(recordings, config)
     for anchor in range(5 * LAP):
-        recording, frame = pool.recording[anchor], pool.frame[anchor]
+        recording, frame = pool.recording_of[anchor], pool.frame_of[anchor]
         near = np.flatnonzero(np.linalg.norm((recordings[recording] - recordings[recording][frame])[:, :2], axis=1) < 3)
         found = [
             np.sort(group.frames[group.starts[anchor] : group.starts[anchor + 1]]) - (0 if recording == 0 else 3 * LAP)
@@ -111,10 +111,10 @@ def test_the_anchors_of_a_cluster_lie_near_each_other_and_the_others_anywhere():
     pool = TuplePool([street, street], config)
     anchors = pool.draw(seed=0, step=0, tuples=40)[:, 0].reshape(10, 4)
     assert (horizontal(pool, anchors[:, :1], anchors) <= 60).all()
-    assert (pool.recording[anchors[:, :1]] == pool.recording[anchors]).all()
-    assert np.ptp(pool.frame[anchors[:, 0]]) > 1000
+    assert (pool.recording_of[anchors[:, :1]] == pool.recording_of[anchors]).all()
+    assert np.ptp(pool.frame_of[anchors[:, 0]]) > 1000
     single = TuplePool([street, street], TupleConfig(negatives=0)).draw(seed=0, step=0, tuples=40)[:, 0]
-    assert (np.abs(np.diff(pool.frame[single])) > 40).mean() > 0.8
+    assert (np.abs(np.diff(pool.frame_of[single])) > 40).mean() > 0.8
 
 
 def described(pool: TuplePool, places: np.ndarray | None = None) -> DescriptorCache:
@@ -129,7 +129,7 @@ def test_mined_negatives_are_the_nearest_far_frames_of_brute_force():
     anchors, near, far = columns(pool.draw(seed=0, step=0, tuples=20, cache=cache), config)
     assert (horizontal(pool, anchors, near) < 3).all()
     for anchor, row in zip(anchors[:, 0], far, strict=True):
-        apart = (pool.recording != pool.recording[anchor]) | (
+        apart = (pool.recording_of != pool.recording_of[anchor]) | (
             horizontal(pool, np.array(anchor), np.arange(len(pool))) > 20
         )
         distance = np.linalg.norm(cache.descriptors - cache.descriptors[anchor], axis=1)
@@ -143,7 +143,7 @@ def test_mined_clusters_look_alike_and_lie_far_apart():
     cache = described(pool)
     for row in pool.draw(seed=0, step=0, tuples=40, cache=cache)[:, 0].reshape(10, 4):
         apart = horizontal(pool, row[:, None], row[None]) + 100 * (
-            pool.recording[row][:, None] != pool.recording[row][None]
+            pool.recording_of[row][:, None] != pool.recording_of[row][None]
         )
         assert (apart[~np.eye(4, dtype=bool)] > 20).all()
         distance = np.linalg.norm(cache.descriptors - cache.descriptors[row[0]], axis=1)
@@ -164,13 +164,13 @@ def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
     config = TupleConfig(negatives=2, revisit_gap=LAP // 2)
     recordings = [circuit(3), circuit(1, seed=1)]
     pool = TuplePool(recordings, config, frames=[kept, np.arange(LAP)])
-    np.testing.assert_array_equal(pool.frame, np.r_[kept, 0:LAP])
+    np.testing.assert_array_equal(pool.frame_of, np.r_[kept, 0:LAP])
     np.testing.assert_array_equal(pool.positions, np.concatenate([recordings[0][kept], recordings[1]]))
     rows = pool.draw(seed=0, step=0, tuples=200)
     assert rows.max() < len(pool)
     for group, other_visit in ((pool.neighbours, False), (pool.revisits, True)):
         anchors = np.repeat(np.arange(len(pool)), np.diff(group.starts))
-        assert ((np.abs(pool.frame[anchors] - pool.frame[group.frames]) > LAP // 2) == other_visit).all()
+        assert ((np.abs(pool.frame_of[anchors] - pool.frame_of[group.frames]) > LAP // 2) == other_visit).all()
 
 
 SAMPLING = TupleConfig(revisit_gap=20)

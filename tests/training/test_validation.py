@@ -36,8 +36,8 @@ def by_hand(descriptors: np.ndarray, pool: TuplePool, gap: int) -> tuple[float, 
     """Recall@1, and the best F1 over all thresholds, query by query."""
     answers = []
     for i in range(len(pool)):
-        same = pool.recording == pool.recording[i]
-        open_ = ~(same & (np.abs(pool.frame - pool.frame[i]) <= gap))
+        same = pool.recording_of == pool.recording_of[i]
+        open_ = ~(same & (np.abs(pool.frame_of - pool.frame_of[i]) <= gap))
         apart = np.where(same, np.linalg.norm((pool.positions - pool.positions[i])[:, :2], axis=1), np.inf)
         distance = np.where(open_, np.linalg.norm(descriptors - descriptors[i], axis=1), np.inf)
         best = int(distance.argmin())
@@ -55,7 +55,7 @@ def by_hand(descriptors: np.ndarray, pool: TuplePool, gap: int) -> tuple[float, 
 @pytest.mark.parametrize("gap", [0, 20])
 @pytest.mark.parametrize("noise", [0.05, 3.0, 30.0])
 def test_recall_and_f1max_are_those_by_hand(pool, gap, noise):
-    places = pool.positions[:, :2] + 300 * pool.recording[:, None]
+    places = pool.positions[:, :2] + 300 * pool.recording_of[:, None]
     descriptors = (places + np.random.default_rng(5).normal(scale=noise, size=places.shape)).astype(np.float32)
     np.testing.assert_allclose(retrieval(descriptors, pool, gap=gap), by_hand(descriptors, pool, gap), atol=1e-12)
 
