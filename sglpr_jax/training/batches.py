@@ -100,7 +100,7 @@ def read_batch(
         cloud_or_image, place_classes = _read_place(recording, frame, categories if has_labels else 0, image)
         if gives_images and clouds_or_images and cloud_or_image.shape != clouds_or_images[0].shape:
             first_recording = recordings[int(pool.recording_of[read_places[0]])]
-            expected, found = ("{} x {}".format(*image.shape) for image in (clouds_or_images[0], cloud_or_image))
+            expected, found = ("{} x {}".format(*array.shape) for array in (clouds_or_images[0], cloud_or_image))
             raise ValueError(
                 f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of {expected} pixels, "
                 f"as in {first_recording.name}, found {found}"

@@ -62,7 +62,7 @@ def test_all_pairs_within_three_metres_are_found_and_no_other():
         recording, frame = pool.recording_of[anchor], pool.frame_of[anchor]
         near = np.flatnonzero(np.linalg.norm((recordings[recording] - recordings[recording][frame])[:, :2], axis=1) < 3)
         found = [
-            np.sort(group.frames[group.starts[anchor] : group.starts[anchor + 1]]) - (0 if recording == 0 else 3 * LAP)
+            np.sort(group.places[group.starts[anchor] : group.starts[anchor + 1]]) - (0 if recording == 0 else 3 * LAP)
             for group in (pool.neighbours, pool.revisits)
         ]
         same_visit = np.abs(near - frame) <= config.revisit_gap
@@ -74,7 +74,7 @@ def test_three_metres_are_too_far_for_a_positive_and_twenty_too_near_for_a_negat
     recording = np.zeros((5, 3))
     recording[:, 0] = [0, 3, 20, np.nextafter(3, 0), np.nextafter(20, 21)]
     pool = TuplePool([recording], TupleConfig())
-    np.testing.assert_array_equal(pool.neighbours.frames[: pool.neighbours.starts[1]], [3])
+    np.testing.assert_array_equal(pool.neighbours.places[: pool.neighbours.starts[1]], [3])
     np.testing.assert_array_equal(pool.far_apart(np.array(0), np.arange(5)), [False, False, False, False, True])
 
 
@@ -170,7 +170,7 @@ def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
     assert rows.max() < len(pool)
     for group, other_visit in ((pool.neighbours, False), (pool.revisits, True)):
         anchors = np.repeat(np.arange(len(pool)), np.diff(group.starts))
-        assert ((np.abs(pool.frame_of[anchors] - pool.frame_of[group.frames]) > LAP // 2) == other_visit).all()
+        assert ((np.abs(pool.frame_of[anchors] - pool.frame_of[group.places]) > LAP // 2) == other_visit).all()
 
 
 SAMPLING = TupleConfig(revisit_gap=20)

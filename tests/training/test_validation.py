@@ -14,7 +14,7 @@ from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.training import validation
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.tuples import TuplePool
-from sglpr_jax.training.validation import recall_at_1, retrieval, validation_score
+from sglpr_jax.training.validation import recall_and_f1_max, recall_at_1, validation_score
 
 PARAMS = Params({}, ModelConfig())
 
@@ -57,7 +57,9 @@ def by_hand(descriptors: np.ndarray, pool: TuplePool, gap: int) -> tuple[float, 
 def test_recall_and_f1max_are_those_by_hand(pool, gap, noise):
     places = pool.positions[:, :2] + 300 * pool.recording_of[:, None]
     descriptors = (places + np.random.default_rng(5).normal(scale=noise, size=places.shape)).astype(np.float32)
-    np.testing.assert_allclose(retrieval(descriptors, pool, gap=gap), by_hand(descriptors, pool, gap), atol=1e-12)
+    np.testing.assert_allclose(
+        recall_and_f1_max(descriptors, pool, gap=gap), by_hand(descriptors, pool, gap), atol=1e-12
+    )
 
 
 def sequence(positions: np.ndarray) -> Recording:
