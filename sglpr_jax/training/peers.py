@@ -185,7 +185,7 @@ def train_learned(
                 costs=True,
             ),
             mesh=Mesh(np.array(jax.devices()[:1]), (AXIS,), axis_types=(AxisType.Auto,)),
-            begin=functools.partial(_first_state, network, data, pool, settings.learning_rate),
+            first_state=functools.partial(_first_state, network, data, pool, settings.learning_rate),
             score=lambda state: {} if score is None else score(variables_of(state)),
             save_snapshot=lambda run, images: save(run, f"{LAST}-{images}"),
             resume=resume,

@@ -178,7 +178,7 @@ def run_network(
         folder,
         Schedule(config.log_every, config.score_every, steps=config.steps),
         mesh=data_mesh(config),
-        begin=functools.partial(network.new_state, start_from),
+        first_state=functools.partial(network.new_state, start_from),
         score=lambda state: score(state.params),
         resume=resume,
         callback=callback,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.training import recipe, trainer
-from sglpr_jax.training.devices import data_mesh, host_copy, replicate, split
+from sglpr_jax.training.devices import data_mesh, host_copy, replicate, split_over_devices
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.recipe import run_network
@@ -36,7 +36,7 @@ def make_steps(config, params, batches, devices):
     for batch in batches:
         before = state
         with jax.set_mesh(mesh):
-            state, metrics = FAST_STEP(before, split(batch, mesh), network=network)
+            state, metrics = FAST_STEP(before, split_over_devices(batch, mesh), network=network)
         measured.append(jax.device_get(metrics))
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before.params))
     for leaf in jax.tree.leaves(state):

@@ -29,6 +29,6 @@ def test_hosts_that_do_not_divide_a_step_are_refused(config):
 
 
 def test_an_error_of_another_host_ends_this_one(monkeypatch):
-    monkeypatch.setattr(devices, "on_any_host", lambda failed: True)
+    monkeypatch.setattr(devices, "any_host", lambda failed: True)
     with pytest.raises(ConnectionError, match="another host ended with an error"):
         on_all_hosts(lambda: 1)

@@ -15,7 +15,14 @@ from sglpr_jax.models.sglpr import forward
 from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
 from sglpr_jax.training.config import LossConfig, OcclusionConfig
-from sglpr_jax.training.image_network import ImageNetwork, _angles, _chunks, gradients, summarize, visible
+from sglpr_jax.training.image_network import (
+    ImageNetwork,
+    _network_input,
+    _random_angles,
+    gradients,
+    summarize,
+    unoccluded_cells,
+)
 from sglpr_jax.training.loss_terms import Summary, joint_loss
 from sglpr_jax.training.step import train_step
 
@@ -28,7 +35,7 @@ def gradients_of(params, batch, config):
 
 
 def chunks_of(batch, config):
-    return _chunks(batch, *jax.random.split(jax.random.key(0)), config)
+    return _network_input(batch, *jax.random.split(jax.random.key(0)), config)
 
 
 def assert_same(found, expected):
@@ -184,7 +191,7 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
 def test_of_a_share_of_the_places_the_rotation_is_a_quarter_turn_or_more(config, make_batch):
     config = dataclasses.replace(config, quarter_turns=0.5)
     keys = jax.random.split(jax.random.key(0), 60)
-    quarters = np.stack([_angles(key, config) for key in keys]) / (np.pi / 2)
+    quarters = np.stack([_random_angles(key, config) for key in keys]) / (np.pi / 2)
     whole = np.abs(quarters - np.round(quarters)) < 1e-5
     assert 0.4 < whole.mean() < 0.6
     assert np.bincount(np.round(quarters[whole]).astype(int), minlength=4).min() > whole.sum() / 6
@@ -196,7 +203,7 @@ IMAGES = 400
 
 
 def test_a_sector_of_each_chosen_image_is_hidden():
-    shown = np.asarray(visible(jax.random.key(3), IMAGES, GRID, OcclusionConfig(share=0.5, widest_deg=180.0)))
+    shown = np.asarray(unoccluded_cells(jax.random.key(3), IMAGES, GRID, OcclusionConfig(share=0.5, widest_deg=180.0)))
     x, y = np.mgrid[: GRID.height, : GRID.width] + 0.5
     bearing = np.angle((x - GRID.height / 2) + 1j * (y - GRID.width / 2))
     of_bearing = ~shown[:, *np.unravel_index(np.argsort(bearing, axis=None), bearing.shape)]  # around the sensor
@@ -217,7 +224,7 @@ def test_what_is_hidden_has_neither_counts_nor_labels(config, make_batch):
     angle_key, model_key = jax.random.split(jax.random.key(0))
 
     def chunk(occlusion):
-        chunks = _chunks(batch, angle_key, model_key, dataclasses.replace(config, occlusion=occlusion))
+        chunks = _network_input(batch, angle_key, model_key, dataclasses.replace(config, occlusion=occlusion))
         return np.asarray(chunks.images[0]), np.asarray(chunks.maps[0])
 
     whole, labels = chunk(OcclusionConfig())
