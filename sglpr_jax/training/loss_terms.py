@@ -1,7 +1,4 @@
-"""Terms of the training loss and their weights, in two tables. A new term is an entry there (`docs/concepts/extend.md`).
-
-`losses.py` has the functions of descriptors and logits that the terms use.
-"""
+"""Terms of the training loss and their weights, in two tables. `losses.py` has the functions that the terms use."""
 
 import dataclasses
 from collections.abc import Callable
