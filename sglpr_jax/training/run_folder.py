@@ -29,7 +29,7 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 def lock_run(
     folder: Path, settings: Mapping[str, Any], *, seed: int, resume: bool, limits: Collection[str] = ()
 ) -> Iterator[None]:
-    """Lock the folder of a run during the block. Before it, write settings and environment, and remove unfinished files.
+    """Lock the folder of a run during the block. First write settings and environment, and remove unfinished files.
 
     Arguments:
       folder: Folder of the run.
