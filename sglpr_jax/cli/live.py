@@ -59,17 +59,17 @@ def live(command: LiveCommand) -> int:
     from sglpr_jax.live.endpoints import open_sink, open_source
     from sglpr_jax.live.messages import Reports
 
-    _check(command)
+    _check_endpoints(command)
     report = Reports()
 
-    def source(live_map: "LiveMap") -> "Source":
+    def open_source_of(live_map: "LiveMap") -> "Source":
         return open_source(command.source, command, report, taken=live_map.names.__contains__)
 
-    def sinks() -> Iterator["Sink"]:
-        return (open_sink(text, command, report) for text in command.sinks)
+    def open_sinks() -> Iterator["Sink"]:
+        return (open_sink(sink, command, report) for sink in command.sinks)
 
     with stop_on_signal() as stop:
-        run_node(command, source, sinks, report=report, say=print_error, should_stop=stop)
+        run_node(command, open_source_of, open_sinks, report=report, say=print_error, should_stop=stop)
     return stop.exit_status
 
 
@@ -82,28 +82,35 @@ def run_node(
     say: Callable[[str], object],
     should_stop: Callable[[], bool],
 ) -> None:
-    """Find loops until the source ends or `should_stop` is true, and write the results.
+    """Find loops until the source ends or `should_stop()` is true, and write the results.
 
-    The functions open the source for a map and the sinks. `report` receives trouble, `say` lines about the progress.
+    Arguments:
+      command: Flags of the command.
+      open_source: Opens the source of scans, which skips the scans that the map already contains.
+      open_sinks: Opens the receivers of loops and status.
+      report: Receives errors that do not end the command.
+      say: Receives lines about the progress.
+      should_stop: Asked after every scan.
 
-    Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
-    cannot be written.
+    Raises:
+      ValueError: A setting is invalid, or the folder has a map of other settings.
+      WriteError: The folder cannot be written.
     """
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.results import write_results
 
-    with exclusive_lock(command.out), contextlib.ExitStack() as opened:
+    with exclusive_lock(command.out), contextlib.ExitStack() as exit_stack:
         live_map = _open_map(command, report)
-        opened.callback(live_map.close)
-        missed = live_map.recall()
+        exit_stack.callback(live_map.close)
+        unpublished = live_map.recall()
         sinks = []
         for sink in open_sinks():
-            opened.callback(_close, sink, report)
+            exit_stack.callback(_close_sink, sink, report)
             sinks.append(sink)
         source = open_source(live_map)
-        opened.callback(source.close)
+        exit_stack.callback(source.close)
         node = Node(live_map, sinks, report=report, say=say)
-        node.publish(missed)
+        node.publish(unpublished)
         say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
         try:
             node.run(source, should_stop=should_stop)
@@ -113,16 +120,16 @@ def run_node(
             say(f"{command.out}: {', '.join(path.name for path in paths)}")
 
 
-def _check(command: LiveCommand) -> None:
-    """Raises ValueError before any work for an unknown source or sink, or if an input would be overwritten."""
+def _check_endpoints(command: LiveCommand) -> None:
+    """Raise ValueError before any work if --poses would be overwritten. `check_name` raises it for unknown names."""
     from sglpr_jax.live.endpoints import SINKS, SOURCES, check_name
     from sglpr_jax.live.results import CORRECTED, TRAJECTORY
 
     check_name(command.source, SOURCES, kind="sources")
-    for text in command.sinks:
-        check_name(text, SINKS, kind="sinks")
-    written = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
-    if command.poses is not None and command.poses.resolve() in written:
+    for sink in command.sinks:
+        check_name(sink, SINKS, kind="sinks")
+    output_files = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
+    if command.poses is not None and command.poses.resolve() in output_files:
         raise ValueError(
             f"{command.poses}: expected odometry that this run does not overwrite, found an output file; "
             "choose another --out"
@@ -130,7 +137,7 @@ def _check(command: LiveCommand) -> None:
 
 
 def _open_map(command: LiveCommand, report: "Report") -> "LiveMap":
-    """Open the map, with all programs compiled."""
+    """Open the map in the output folder, and compile all programs before the first scan arrives."""
     from sglpr_jax.live.live_map import LiveMap
     from sglpr_jax.live.node import warm_up
     from sglpr_jax.loops.detector import LoopDetector
@@ -143,8 +150,8 @@ def _open_map(command: LiveCommand, report: "Report") -> "LiveMap":
     return live_map
 
 
-def _close(sink: "Sink", report: "Report") -> None:
-    """Close a sink, and report if it fails: the other results are still written."""
+def _close_sink(sink: "Sink", report: "Report") -> None:
+    """Close a sink. An error is only reported, so that the other results are still written."""
     try:
         sink.close()
     except Exception as error:  # a sink may use any library

@@ -80,7 +80,7 @@ def run_peers(command: PeersCommand) -> None:
         raise ValueError("expected bin/peers train METHOD DATA... --out RUN, found no METHOD, DATA or --out")
     method, out = LEARNED[command.method], command.out
     resume = _has_run(out, resume=command.resume)
-    data, score = _inputs(command, method)
+    data, score = _training_inputs(command, method)
     with stop_on_signal() as stopped:
         rate = _learning_rate(command, method, data, score, out, stopped)
         settings = RunSettings(rate, seed=command.seed, seconds=command.seconds, images=command.images)
@@ -94,9 +94,10 @@ def run_peers(command: PeersCommand) -> None:
 
 
 def _has_run(out: Path, *, resume: bool) -> bool:
-    """Return whether the folder has a training, which is more than a stopped search of the learning rate.
+    """Return whether the folder has a training to resume. A stopped search of the learning rate is none.
 
-    Raises FileExistsError or FileNotFoundError if the folder does not fit `resume`.
+    Raises FileExistsError if there is a training but `resume` is false, and FileNotFoundError if `resume` is true but
+    there is neither a training nor a search.
     """
     has_run = (out / "config.json").exists()
     if has_run and not resume:
@@ -106,8 +107,11 @@ def _has_run(out: Path, *, resume: bool) -> bool:
     return has_run
 
 
-def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
-    """Prepare the training recordings and the held-out ones. Raises ValueError if one of them does not fit."""
+def _training_inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
+    """Prepare the training recordings. Also returns the score on the recordings of --held-out, or None without them.
+
+    `prepare_inputs` raises ValueError if a recording does not fit the method.
+    """
     from sglpr_jax.cli.datasets import all_recordings
     from sglpr_jax.training.peer_inputs import prepare_inputs
     from sglpr_jax.training.peers import held_out_score
@@ -121,8 +125,8 @@ def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingIn
         return prepare_inputs(method, recordings, cache, progress=progress_bar), None
     held_out = all_recordings(command.held_out, title="held out")
     require_revisits(held_out)
-    tested = prepare_inputs(method, held_out, cache, progress=progress_bar)
-    return prepare_inputs(method, recordings, cache, progress=progress_bar), held_out_score(method, tested)
+    held_out_inputs = prepare_inputs(method, held_out, cache, progress=progress_bar)
+    return prepare_inputs(method, recordings, cache, progress=progress_bar), held_out_score(method, held_out_inputs)
 
 
 def _learning_rate(
@@ -133,13 +137,13 @@ def _learning_rate(
     out: Path,
     stopped: StopRequest,
 ) -> float:
-    """Return the stated learning rate, the best of a search, or the published one."""
+    """Return --learning-rate, or else the best rate of a search if there is a score, or else the published rate."""
     from sglpr_jax.training.peers import Stopped, best_rate
 
     if command.learning_rate is not None:
         return command.learning_rate
     if score is None:
-        return method.recipe.learning_rates[1]
+        return method.recipe.learning_rates[1]  # the published one
     options = {"stopped": stopped, "report": print_error, "progress": progress_bar}
     try:
         return best_rate(method, data, score, out / RATES, seconds=command.search_seconds, seed=command.seed, **options)

@@ -10,7 +10,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.cli import runtime
-from sglpr_jax.cli.runtime import own_names, parse_command
+from sglpr_jax.cli.runtime import parse_command, with_installed_names
 from sglpr_jax.fields import NotNegative, Size
 
 
@@ -34,7 +34,7 @@ class Example:
 )
 def test_commands_have_the_names_that_are_installed_and_paths_stay(text, expected, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/home/me/.local/bin/sglpr-evaluate", "08.npz"])
-    assert own_names(text) == expected
+    assert with_installed_names(text) == expected
 
 
 @pytest.mark.parametrize(
