@@ -84,17 +84,11 @@ def run_node(
 ) -> None:
     """Find loops until the source ends or `should_stop()` is true, and write the results.
 
-    Arguments:
-      command: Flags of the command.
-      open_source: Opens the source of scans, which skips the scans that the map already contains.
-      open_sinks: Opens the receivers of loops and status.
-      report: Receives errors that do not end the command.
-      say: Receives lines about the progress.
-      should_stop: Asked after every scan.
+    `open_source` opens the source, which skips the scans that the map already contains, and `open_sinks` the receivers
+    of loops and status. `report` receives errors that do not end the command, `say` lines about the progress.
 
-    Raises:
-      ValueError: A setting is invalid, or the folder has a map of other settings.
-      WriteError: The folder cannot be written.
+    Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
+    cannot be written.
     """
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.results import write_results

@@ -94,10 +94,9 @@ def run_peers(command: PeersCommand) -> None:
 
 
 def _has_run(out: Path, *, resume: bool) -> bool:
-    """Return whether the folder has a training to resume. A stopped search of the learning rate is none.
+    """Return whether the folder has a training. A stopped search of the learning rate is none.
 
-    Raises FileExistsError if there is a training but `resume` is false, and FileNotFoundError if `resume` is true but
-    there is neither a training nor a search.
+    Raises FileExistsError for a training without `resume`, and FileNotFoundError if there is nothing to resume.
     """
     has_run = (out / "config.json").exists()
     if has_run and not resume:

@@ -17,12 +17,7 @@ from sglpr_jax.data.choices import (
 )
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorConfig
-from sglpr_jax.odometry.config import (
-    DRIFT_DEG_PER_100M,
-    DRIFT_PERCENT,
-    DriftModel,
-    OdometryFormat,
-)
+from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_PERCENT, DriftModel, OdometryFormat
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.stop_request import stop_on_signal

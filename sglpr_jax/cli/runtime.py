@@ -67,16 +67,13 @@ def with_installed_names(text: str) -> str:
 def parse_command(command: type[T], name: str, arguments: list[str] | None = None) -> T:
     """Parse the flags of a command. With --dump-config, print their values and exit.
 
-    Flags override the file of --config, the file overrides the preset, and the preset overrides the defaults.
+    Flags override the file of --config, the file overrides the preset, and the preset overrides the defaults. Raises
+    ValueError if a number is outside the bounds of its annotation (`fields.py`), or if the file is invalid.
 
     Arguments:
       command: Dataclass of the command.
       name: Name of the command in `bin/`.
       arguments: Command line without the name. None: that of this process.
-
-    Raises:
-      ValueError: If a number is outside the bounds of its annotation (`fields.py`), or if the file of --config is
-        invalid.
     """
     command_line_type = dataclasses.make_dataclass(
         "Line",

@@ -26,12 +26,11 @@ DescribeFn = Callable[[TrainState, Int[np.ndarray, "n"]], Float32[np.ndarray, "n
 class TupleBatches:
     """Batches of the tuples (anchor, positives, negatives) that a pool draws.
 
-    A batch depends only on the seed, the step and the descriptors that select hard negatives.
+    A batch depends only on the seed, the step and the descriptors that select hard negatives (`refresh`).
     """
 
     refresh_steps: int = 0
-    """Number of steps between calls of `refresh`, or 0 for no refresh. Batches from a refresh step on may only be
-    requested after that call."""
+    """Number of steps between calls of `refresh`, or 0. A call precedes the batches from its step on."""
 
     def __init__(
         self,
@@ -45,14 +44,10 @@ class TupleBatches:
         run: Path | None = None,
         random_places: bool = False,
     ):
-        """Define the batches.
+        """Define batches with `tuples` tuples of the pool, which has places of the `recordings`.
 
         Arguments:
-          recordings: Recordings of the pool.
-          pool: Pool of the tuples.
           read: Reads the scans of place numbers (tuple, place of the tuple) and returns their batch.
-          seed: Seed of the tuples.
-          tuples: Number of tuples per step.
           describe: Computes the descriptors that select hard negatives, if `pool.config.mining` is "hardest".
           run: Folder of the run, which stores these descriptors.
           random_places: Draw any places instead of tuples.
@@ -73,9 +68,8 @@ class TupleBatches:
         """Recompute the descriptors that select hard negatives, with the weights in `state`, which precedes `step`."""
         assert self._describe is not None and self._run is not None
         describe = functools.partial(self._describe, state)
-        self._descriptor_cache = refresh_cache(
-            step, describe, len(self._pool), self._pool.config, self._run, seed=self._seed
-        )
+        pool = self._pool
+        self._descriptor_cache = refresh_cache(step, describe, len(pool), pool.config, self._run, seed=self._seed)
 
     def scan_names(self, step: int) -> str:
         """Return the recordings and scan ids of the batch of a step, as text for an error message."""
@@ -118,15 +112,10 @@ def training_batches(
     describe: DescribeFn | None = None,
     run: Path | None = None,
 ) -> TupleBatches:
-    """Return the batches of a configuration.
+    """Return the batches of a configuration, with tuples of `recordings` from the pool.
 
-    Arguments:
-      recordings: Training recordings.
-      pool: Pool of their tuples.
-      config: Configuration of the training.
-      also: Recordings of a second dataset, which provide `config.also_tuples` of the tuples of each step.
-      describe: Computes the descriptors that select hard negatives, if the configuration mines them.
-      run: Folder of the run, which stores these descriptors.
+    `also` are recordings of a second dataset, which provide `config.also_tuples` of the tuples of each step. If the
+    configuration mines hard negatives, `describe` computes their descriptors, which the folder `run` stores.
     """
     read = functools.partial(
         read_batch,

@@ -70,7 +70,7 @@ def read_batch(
 
     Arguments:
       recordings: Recordings of the pool.
-      pool: Pool of the tuples.
+      pool: Pool of the places.
       places: Place numbers of the pool, one row (anchor, positives, negatives) per tuple, from `TuplePool.draw`.
       max_points: Maximum number of points of a scan. Larger scans are thinned evenly.
       share_negatives: Whether every place of the batch that is far enough from an anchor is its negative. Otherwise
@@ -120,10 +120,7 @@ def read_batch(
 def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
     """Return the model input of all places, inside jit on the device: images, and maps of classes if there are labels.
 
-    Arguments:
-      batch: Batch of images or points. The places of `batch.second` follow its own.
-      angles: Rotation angle of each place in radians, or None.
-      grid: Grid of the model.
+    `angles` rotate each place, in radians. The places of `batch.second` follow those of the batch itself.
     """
     if batch.second is None and batch.images is not None:
         return image_view(batch.images, batch.maps, grid, angles)
@@ -178,12 +175,8 @@ def _pad_clouds(
 def mix(first: Batch, second: Batch, *, triplets: bool, share_negatives: bool) -> Batch:
     """Return one batch with the places of `first`, followed by those of `second`, which is from another dataset.
 
-    Arguments:
-      first: First batch.
-      second: Second batch.
-      triplets: Whether the triplet loss counts the tuples of both batches. Otherwise it counts only those of `first`.
-      share_negatives: With `triplets`, whether the places of each batch are negatives of the anchors in the other one.
-        The datasets must not share a place.
+    With `triplets`, the triplet loss counts the tuples of both batches, otherwise only those of `first`. With
+    `share_negatives`, too, the places of each batch are negatives of the anchors in the other one.
     """
     negatives = first.negatives
     if triplets:
@@ -220,10 +213,7 @@ def _network_order(batch: Batch, every: int) -> Int[np.ndarray, "b"]:
 def tuple_pool(
     recordings: Sequence[Recording], config: TrainConfig, *, frames: Sequence[Int[np.ndarray, "_"]] | None = None
 ) -> TuplePool:
-    """Return the pool of all frames of the recordings, or of the `frames` of each one.
-
-    `TuplePool` raises ValueError if no frame has a positive.
-    """
+    """Return the pool of all frames, or of the `frames` of each recording. Raises ValueError without positives."""
     return TuplePool([positions_of(recording) for recording in recordings], config.sampling, frames=frames)
 
 

@@ -83,25 +83,21 @@ class ProgressBar(Callback):
         self._show: Callable[..., None] = lambda done, text="": None
 
     def on_pack(self, recording: str, done: int, scans: int) -> None:
-        """Show how many scans of the recording are packed."""
         self._open_once(f"pack {recording}", scans)
         self._show(done)
 
     def on_start(self, step: int, steps: int) -> None:
-        """Show the number of finished steps."""
         self._steps = steps
         self._open_once("train", steps)
         self._show(step)
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Show the step and its measurements."""
         text = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
         self._show(step, text)
         if not Console(stderr=True).is_terminal:
             print(f"step {step} of {self._steps}: {text}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Stop the bar and leave it on the screen."""
         self._open_bar.close()
         self._title = ""
 
@@ -127,14 +123,12 @@ class EventFiles(Callback):
         self._writer: Any = None
 
     def close(self) -> None:
-        """Close the file."""
         if self._writer is not None:
             with writing(self._folder):
                 self._writer.close()
             self._writer = None
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Write the measurements of a step."""
         from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - generated
         from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -145,7 +139,6 @@ class EventFiles(Callback):
             self._writer.flush()
 
     def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        """Write the scores after a step."""
         self.on_step(step, scores)
 
 

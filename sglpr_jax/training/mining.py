@@ -75,8 +75,8 @@ def refresh_cache(
     Arguments:
       step: Next step of the run.
       describe: Describes places, given as numbers of the pool, with the weights before `step`.
-      pool_size: Number of places of the pool.
-      config: Number of described places, and steps between two refreshes.
+      pool_size: Number of places of the pool. `config.mined_places` of them are described.
+      config: Configuration of the tuples.
       run: Folder of the run.
       seed: Seed of the selection of places.
 

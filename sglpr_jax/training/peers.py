@@ -140,15 +140,13 @@ def train_learned(
 ) -> Trained:
     """Train a method until its time or its number of images is reached, whichever is first.
 
-    The folder gets the settings, the measurements (`metrics.jsonl`), snapshots of the weights (`weights-1000`,
+    The folder `out` gets the settings, the measurements (`metrics.jsonl`), snapshots of the weights (`weights-1000`,
     `weights-2000`, `weights-4000`, ...), the last weights (`weights`) and checkpoints for resuming. A resumed run has
     the batches and the weights of an uninterrupted one.
 
     Arguments:
       method: Method to train, from random weights.
       data: Training recordings and their inputs.
-      settings: Settings of the run.
-      out: Folder of the run.
       score: Scores each snapshot, for `scores.jsonl`.
       resume: Continue the run in the folder.
       stopped: Asked after every step. If it returns True, the state is saved and the training stops.

@@ -31,12 +31,7 @@ def lock_run(
 ) -> Iterator[None]:
     """Lock the folder of a run during the block. First write settings and environment, and remove unfinished files.
 
-    Arguments:
-      folder: Folder of the run.
-      settings: Content of config.json.
-      seed: Seed of the run, for environment.json.
-      resume: Continue the run in the folder.
-      limits: Settings that may differ in a resumed run, such as `config.steps`.
+    With `resume`, the folder must have a run with these settings, except for `limits` such as `config.steps`.
 
     Raises:
       FileExistsError: The folder already has a run, and `resume` is false.
@@ -116,10 +111,7 @@ def note_environment(folder: Path, *, seed: int) -> None:
 
 
 def git_commit(checkout: Path) -> dict[str, Any] | None:
-    """Return the commit of a Git checkout and whether its files differ from it (`dirty`).
-
-    Without a checkout, or if Git fails, the result is None.
-    """
+    """Return the commit of a Git checkout and whether its files differ (`dirty`). None without Git or a checkout."""
     if not (checkout / ".git").exists():
         return None
 

@@ -49,8 +49,7 @@ class Schedule:
     seconds: float = math.inf
     """Limits of the run. The first one that is reached ends it."""
     costs: bool = False
-    """Write `images` and `seconds` of `Trained` in every line of metrics and scores, and the scores in their own
-    file."""
+    """Write images and seconds of `Trained` in every line of metrics and scores, and scores to a file of their own."""
 
     def is_over(self, run: Trained) -> bool:
         """Whether a limit is reached."""
@@ -73,8 +72,7 @@ class Schedule:
 class Trainer:
     """A run in progress: its state, its open files, and the measurements since the last line of the metrics.
 
-    A checkpoint also stores the measurements since the last line. A resumed run thus writes the lines of an
-    uninterrupted one.
+    A checkpoint also stores these measurements, so a resumed run writes the lines of an uninterrupted one.
     """
 
     def __init__(
@@ -91,19 +89,15 @@ class Trainer:
         resume: bool = False,
         callback: Callback | None = None,
     ):
-        """Open a run.
+        """Open a run in a folder, for metrics and checkpoints.
 
         Arguments:
-          network: Network to train.
           source: Source of this host's part of each batch.
-          folder: Folder for metrics and checkpoints.
-          schedule: Limits, and moments of measurements, scores and checkpoints.
           mesh: Devices, which share a step.
           first_state: Returns the state of a new run.
           score: Scores the weights of a state. Only the first host calls it.
           save_snapshot: `(run, images)`: saves the weights of the snapshot with this number of images.
           resume: Continue from the newest checkpoint, if there is one.
-          callback: Receives the measurements.
         """
         self._network, self._source, self._schedule, self._mesh = network, source, schedule, mesh
         self._compute_score, self._save_snapshot = score, save_snapshot
@@ -228,6 +222,5 @@ class Trainer:
         if broken:
             scan_names = self._source.scan_names(step - 1)
             batch = f" (batch: {scan_names})" if scan_names else ""
-            raise FloatingPointError(
-                f"step {step}: {', '.join(broken)} not finite{batch}; the last checkpoint is intact"
-            )
+            names = ", ".join(broken)
+            raise FloatingPointError(f"step {step}: {names} not finite{batch}; the last checkpoint is intact")
