@@ -42,10 +42,7 @@ def flag_values(command: Any) -> dict[str, Any]:
 
 
 def record_command(command: Any, folder: Path) -> Path:
-    """Write the values of all flags to command.json in `folder`, and return its path.
-
-    `write_json` raises WriteError if the file cannot be written.
-    """
+    """Write the values of all flags to command.json in `folder`, and return its path. Raises WriteError on failure."""
     write_json(folder / COMMAND_FILE, flag_values(command))
     return folder / COMMAND_FILE
 
@@ -61,9 +58,7 @@ def split_settings(command: type[T], arguments: Sequence[str] | None = None) -> 
       The command with the values of preset, --config file and these settings, and the other arguments. Required fields
       without a value are `tyro.MISSING`.
 
-    Raises:
-      FileNotFoundError: If there is no file.
-      ValueError: If the file, the preset or a setting is invalid. The message names the file or the setting.
+    Raises FileNotFoundError if there is no file, and ValueError, which names the file or setting that is invalid.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # these flags set defaults of the others

@@ -105,10 +105,9 @@ def embed_recording(command: EmbedCommand) -> None:
 
 
 def _load_weights(command: EmbedCommand) -> "tuple[Method | None, Params | None]":
-    """Load --weights: those of a learned method, with the method, or those of this package's network.
+    """Load --weights: a learned method, or weights of this package's network. Both are None without --weights.
 
-    Without --weights, and for handcrafted methods, both results are None. Raises ValueError if --weights do not fit
-    --method.
+    Raises ValueError if --weights do not fit --method.
     """
     from sglpr_jax.methods.learned import LEARNED
     from sglpr_jax.methods.registry import trained_method

@@ -107,10 +107,7 @@ def loops_of_recording(command: LoopsCommand) -> int:
 
 
 def _check_flags(command: LoopsCommand) -> None:
-    """Raise ValueError before the search if flags are inconsistent or an input would be overwritten.
-
-    `check_installed` and `gtsam_library` raise ImportError if an extra is missing.
-    """
+    """Raise ValueError if flags are inconsistent or an input would be overwritten, ImportError without an extra."""
     from sglpr_jax.pose_graph.factor_graph import gtsam_library
     from sglpr_jax.pose_graph.folder import TRAJECTORIES
 

@@ -158,8 +158,7 @@ def _merge_maps(
 ) -> "PlaceMap":
     """Return the existing map with the places of the new one, aligned if --frame says so.
 
-    `drive` has the pose of every scan of the new recording, by its id. `check_one_frame` raises ValueError if common
-    places disagree.
+    `drive` has the pose of every scan of the new recording, by its id.
     """
     from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
 

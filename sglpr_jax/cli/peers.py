@@ -107,10 +107,7 @@ def _has_run(out: Path, *, resume: bool) -> bool:
 
 
 def _training_inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
-    """Prepare the training recordings. Also returns the score on the recordings of --held-out, or None without them.
-
-    `prepare_inputs` raises ValueError if a recording does not fit the method.
-    """
+    """Prepare the training recordings. Also returns the score on the recordings of --held-out, or None without them."""
     from sglpr_jax.cli.datasets import all_recordings
     from sglpr_jax.training.peer_inputs import prepare_inputs
     from sglpr_jax.training.peers import held_out_score

@@ -227,8 +227,7 @@ def open_with_odometry(
       checkpoint: Returns the checkpoint file of the odometry of a recording, given its number.
 
     Returns:
-      The command with the values that replace `auto`, the recordings, and the odometry of each one. The last list is
-      empty without odometry.
+      The command with the values that replace `auto`, the recordings, and a list of their odometry or an empty list.
     """
     from sglpr_jax.data.deskew import has_point_times  # slow imports, not needed for --help
     from sglpr_jax.odometry.kiss_icp import check_installed

@@ -1,8 +1,4 @@
-"""A batch of training tuples: read from files on the host, rotated and rasterised on the device.
-
-A batch may have a second one from another dataset, such as simulated scans with labels beside real images without
-labels. The segmentation head sees only every n-th image, so the images of both batches are reordered for the network.
-"""
+"""A batch of training tuples: read from files on the host, rotated and rasterised on the device."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -47,7 +43,7 @@ class Batch:
     classes: Any = None
     """Classes of the points (b, n)."""
     second: Any = None
-    """Batch of a second dataset, whose places follow the places of this batch, or None."""
+    """None, or the batch of a second dataset, such as simulated scans with labels beside real images without labels."""
 
     @property
     def places(self) -> int:
@@ -79,8 +75,7 @@ def read_batch(
       image: Kind of image. "density" computes density images from all points of a scan.
       part: Tuples to read. Their negatives come from the whole batch.
 
-    Raises:
-      ValueError: If the batch mixes scans and images, images differ in size, or a scan has no usable points.
+    Raises ValueError if the batch mixes scans and images, images differ in size, or a scan has no usable points.
     """
     tuples, tuple_size = places.shape
     negatives = pool.far_apart(places[:, :1], places.reshape(1, -1))
@@ -128,10 +123,8 @@ def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
         return cloud_view(batch.points, batch.classes, batch.count, grid, angles)
     first_angles = None if angles is None else angles[: batch.places]
     second_angles = None if angles is None else angles[batch.places :]
-    both = [
-        views(dataclasses.replace(batch, second=None), first_angles, grid),
-        views(batch.second, second_angles, grid),
-    ]
+    first = dataclasses.replace(batch, second=None)
+    both = (views(first, first_angles, grid), views(batch.second, second_angles, grid))
     images = jnp.concatenate([view.image for view in both])
     if all(view.classes is None for view in both):
         return View(images)
@@ -190,13 +183,14 @@ def mix(first: Batch, second: Batch, *, triplets: bool, share_negatives: bool) -
 def in_network_order(x: Shaped[Array, "b *_"], batch: Batch, *, every: int) -> Shaped[Array, "b *_"]:
     """Reorder values of the places of a batch for the network, whose segmentation head sees every `every`-th image.
 
-    Places of `batch.second`, which have labels, come to these positions. Without a second batch, the order stays.
+    Places of `batch.second`, which have labels, come to these positions, so that the head spends no time on images
+    without labels. Without a second batch, the order stays.
     """
     return x if batch.second is None else x[_network_order(batch, every)]
 
 
 def in_batch_order(x: Shaped[Array, "b *_"], batch: Batch, *, every: int) -> Shaped[Array, "b *_"]:
-    """Inverse of `in_network_order`."""
+    """Undo `in_network_order`."""
     return x if batch.second is None else x[np.argsort(_network_order(batch, every))]
 
 

@@ -55,9 +55,7 @@ class Checkpoints:
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
         """Return the newest state, in host memory, and the JSON values about it.
 
-        The state must have the names, shapes and types of the arrays of `like`.
-
-        Raises ValueError if there is no checkpoint, or if it belongs to another model.
+        Raises ValueError if there is no checkpoint, or if its arrays differ from those of `like` in name or shape.
         """
         if self.latest_step is None:
             raise ValueError(f"{self._folder}: expected a checkpoint to resume from, found none")

@@ -35,16 +35,15 @@ def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh
     for device in jax.devices() if devices is None else devices:
         devices_by_host.setdefault(device.process_index, []).append(device)
     hosts, available = len(devices_by_host), min(map(len, devices_by_host.values()))
-    batch_text = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
+    work = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
     divisible = math.gcd(config.tuples, config.images_at_once)
     if config.also_tuples:  # a batch of two datasets stays on one device
         divisible = 1
     used = max((n for n in range(1, available + 1) if divisible % (n * hosts) == 0), default=0)
     if not used:
-        raise ValueError(f"expected {batch_text} to be divisible by the number of hosts, found {hosts} hosts")
+        raise ValueError(f"expected {work} to be divisible by the number of hosts, found {hosts} hosts")
     if used < available and is_first_host():
-        message = f"using {used} of {available} devices of each host: their number must divide {batch_text}"
-        print(message, file=sys.stderr)
+        print(f"using {used} of {available} devices of each host: their number must divide {work}", file=sys.stderr)
     row = [device for host in sorted(devices_by_host) for device in devices_by_host[host][:used]]
     return Mesh(np.array(row), (AXIS,), axis_types=(AxisType.Auto,))
 
@@ -78,7 +77,8 @@ def keep_sharding(tree: Tree, *, axis: int | None = None) -> Tree:
     """Under jit: keep `axis` of the arrays split over the devices. None: keep the arrays replicated on each device."""
     if not _has_several_devices():
         return tree
-    spec = PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, AXIS)
+    unsplit_axes = [None] * (axis or 0)
+    spec = PartitionSpec() if axis is None else PartitionSpec(*unsplit_axes, AXIS)
     return jax.lax.with_sharding_constraint(tree, spec)
 
 
@@ -94,7 +94,7 @@ def _to_devices(tree: Tree, sharding: NamedSharding) -> Tree:
 
 @contextlib.contextmanager
 def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterator[None]:
-    """Connect the processes of `hosts` hosts to one JAX cluster, before any other use of JAX. All hosts must leave it.
+    """Connect the processes of `hosts` hosts to one JAX cluster, before any other use of JAX. The end waits for all.
 
     Raises ValueError if the index or the address (HOST:PORT) is invalid, and ConnectionError if the hosts do not find
     each other, or if another host ends.

@@ -1,7 +1,4 @@
-"""Training of the network of this package: input images of a step, loss and gradient.
-
-The images of a step may pass through the network in chunks, to save memory (`gradients`).
-"""
+"""Training of the network of this package: input images of a step, in chunks to save memory, loss and gradient."""
 
 import dataclasses
 import functools
@@ -33,12 +30,10 @@ class ImageNetwork:
 
     @property
     def seed(self) -> int:
-        """Seed of the weights and of the random choices of a step."""
         return self.config.seed
 
     @property
     def images(self) -> int:
-        """Images per step."""
         return self.config.images
 
     @property
@@ -64,7 +59,7 @@ class ImageNetwork:
         return TrainState(jnp.zeros((), jnp.int32), weights, self.optimizer.init(weights))
 
     def gradient(self, state: TrainState, batch: Batch, key: Array) -> Gradient:
-        """Return the gradient of equation 8 for the rotated batch, and the metrics of the loss."""
+        """Return the gradient of the joint loss (equation 8) for the rotated batch, and the metrics of the loss."""
         angle_key, model_key = jax.random.split(key)
         chunks = _network_input(batch, angle_key, model_key, self.config)
         gradient, metrics = gradients(state.params, chunks, batch, self.config.loss)
@@ -72,20 +67,20 @@ class ImageNetwork:
 
 
 class Chunk(NamedTuple):
-    """Images that pass through the network at a time."""
+    """Images (c, h, w) that pass through the network at a time.
+
+    `maps` are the classes of their pixels (c, h, w), or None without labels. `labelled` (c,) is True for images with
+    labels. `key` draws the branches that stochastic depth drops.
+    """
 
     images: Any
-    """Images (c, h, w)."""
     maps: Any
-    """Class of every pixel (c, h, w), or None without labels."""
     labelled: Any
-    """Whether each image has labels (c,)."""
     key: Any
-    """Random key of stochastic depth."""
 
 
 def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -> tuple[Any, Metrics]:
-    """Return the gradient of equation 8 at `params.weights`, and the metrics of the loss.
+    """Return the gradient of the joint loss (equation 8) at `params.weights`, and the metrics of the loss.
 
     Arrays of `chunks` have a leading chunk axis. The triplet and Dice losses span the batch, so the gradient of a chunk
     depends on all other chunks. The first pass computes the inputs of the loss: descriptors and a few sums per chunk.
@@ -123,9 +118,9 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
 
 
 def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
-    """Run one chunk through the network. Returns its descriptors and its sums for the segmentation losses.
+    """Run a chunk through the network. Returns its descriptors and, with labels, its sums for the segmentation losses.
 
-    The segmentation head runs only if there are labels, on every `config.segment_every`-th image.
+    The segmentation head runs on every `config.segment_every`-th image.
     """
     params = freeze_descriptor_layers(params) if config.segmentation_alone else params
     if chunk.maps is None or not (params.config.segments and config.segments):

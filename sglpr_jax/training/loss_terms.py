@@ -24,10 +24,7 @@ class DescriptorTerm:
 
 @dataclasses.dataclass(frozen=True)
 class SegmentationTerm:
-    """Term of the loss that depends on class logits.
-
-    Each chunk of images gives sums. The sums of all chunks are added, and `value` computes the term from them.
-    """
+    """Term of the loss that depends on class logits: `value` of the sums over all chunks of images of a batch."""
 
     weight: Callable[[LossConfig], float]
     sums: Callable[[Float[Array, "c h w k"], Int[Array, "c h w"], Bool[Array, "c h w"], LossConfig], Array]
@@ -93,7 +90,7 @@ def segmentation_sums(
 
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
-    """Return equation 8 for a whole batch, and the metrics by name: its terms, `violations` and the loss itself.
+    """Return the joint loss (equation 8), and the metrics by name: its terms, `violations` and the loss itself.
 
     `summary` has the images in network order, in which the head saw the first of every `config.segment_every`.
     """

@@ -72,16 +72,9 @@ def refresh_cache(
     The folder of the run stores them. A run that is resumed between two refreshes loads them, so its batches are those
     of an uninterrupted run. Files that no checkpoint needs are deleted.
 
-    Arguments:
-      step: Next step of the run.
-      describe: Describes places, given as numbers of the pool, with the weights before `step`.
-      pool_size: Number of places of the pool. `config.mined_places` of them are described.
-      config: Configuration of the tuples.
-      run: Folder of the run.
-      seed: Seed of the selection of places.
-
-    Raises:
-      FileNotFoundError: The last refresh was at an earlier step, and its file is missing.
+    `describe` describes places, given as numbers of the pool, with the weights before `step`, the next step of the run.
+    Of the `pool_size` places, `config.mined_places` random ones are described. `DescriptorCache.load` raises
+    FileNotFoundError if the last refresh was at an earlier step and its file is missing.
     """
     folder, last_refresh = run / MINING, step - step % config.refresh_steps
     path = folder / f"{last_refresh}.npz"

@@ -42,12 +42,8 @@ def prepare_inputs(
     """Compute the inputs of all scans, or read them from the cache.
 
     Each recording becomes one file in the folder `cache`, which is complete or does not exist. A repeated call
-    continues with the missing recordings.
-
-    Raises:
-      ValueError: If a recording has no poses or lacks what the method needs, if a scan is invalid, or if inputs differ
-        in shape or type.
-      OSError: If the cache cannot be written.
+    continues with the missing recordings. Raises ValueError if a recording has no poses or lacks what the method needs,
+    if a scan is invalid, or if inputs differ in shape or type, and OSError if the cache cannot be written.
     """
     for recording in recordings:
         require_content(method.name, method.takes, recording, every_label=True)
@@ -100,10 +96,9 @@ def _require_same_shape(inputs: np.ndarray, expected: np.ndarray, *, name: str) 
 
 
 def _cache_key(method: LearnedMethod, recording: Recording) -> str:
-    """Return a hash of everything that determines the inputs.
+    """Return a hash of what determines the inputs: method, source file of `prepare`, and scan files with their options.
 
-    That is the method with the source file of its `prepare`, and the files, read options and mountings of the
-    recording. A simulated recording has no files; its positions stand for them.
+    A simulated recording has no files; its positions stand for them.
     """
     files: list[tuple[str, tuple[int, int] | None]] = []
     for path in (*recording.paths, *recording.label_paths, *recording.containers):

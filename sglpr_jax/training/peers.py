@@ -43,7 +43,7 @@ LOG_EVERY = 10
 """Number of steps between two lines of the metrics."""
 SAVE_EVERY_S, REPORT_EVERY_S = 60.0, 30.0
 """Training time between two saved states, and between two lines of progress, in seconds."""
-DESCRIBED = 256
+PLACES_IN_MEMORY = 256
 """Number of places whose inputs are in memory at a time."""
 
 ScoreFn = Callable[[Variables], dict[str, float]]
@@ -86,7 +86,6 @@ class PeerNetwork:
 
     @property
     def images(self) -> int:
-        """Images per step."""
         sampling = self.method.recipe.sampling
         return self.method.recipe.tuples * (1 + sampling.positives + sampling.negatives)
 
@@ -122,7 +121,7 @@ class PeerNetwork:
 
 
 def variables_of(state: TrainState) -> Variables:
-    """Return the variables of a learned method."""
+    """Return the parameters and statistics of a state as variables of a learned method."""
     return {"params": state.params, **state.statistics}
 
 
@@ -234,7 +233,7 @@ def _peer_batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, o
 
     def describe(state: TrainState, places: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
         variables = variables_of(state)
-        blocks = np.array_split(places, math.ceil(len(places) / DESCRIBED))
+        blocks = np.array_split(places, math.ceil(len(places) / PLACES_IN_MEMORY))
         descriptors = [describe_inputs(network.method, variables, data.at_places(pool, block)) for block in blocks]
         return np.concatenate(descriptors)
 
@@ -279,11 +278,7 @@ def best_rate(
 
     The folder `out` gets the trainings, of `seconds` each, and `rates.json` with all scores. Finished trainings are not
     repeated. A rate whose loss is not finite has no score. If scores are equal, the smaller rate is returned.
-    `options` are passed to `train_learned`.
-
-    Raises:
-      FloatingPointError: The loss is not finite with any rate.
-      Stopped: The search was asked to stop.
+    `options` are those of `train_learned`. Raises FloatingPointError if no loss is finite, and `Stopped` after a stop.
     """
     recalls: dict[float, float | None] = {}
     for rate in method.recipe.learning_rates:
@@ -296,7 +291,7 @@ def best_rate(
             if not score_file.is_file():
                 write_json(score_file, score(variables_of(run.state)))
             recalls[rate] = float(read_json(score_file)[RECALL])
-        except FloatingPointError:  # the loss is not finite
+        except FloatingPointError:
             recalls[rate] = None
         report(f"learning rate {rate:g}: {RECALL} {recalls[rate]}")
     finite = {rate: recall for rate, recall in recalls.items() if recall is not None}

@@ -169,9 +169,9 @@ def run_network(
     callback: Callback | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Trained:
-    """Train the network of a configuration with the batches of `source`. The arguments are those of `Trainer`.
+    """Train the network of a configuration with the batches of `source`. The other arguments are those of `Trainer`.
 
-    `data_mesh` raises ValueError if the devices cannot share a step. `Trainer` raises all other errors.
+    `data_mesh` raises ValueError if the devices cannot share a step.
     """
     network = ImageNetwork(config)
     trainer = Trainer(
@@ -191,10 +191,7 @@ def run_network(
 def _batches_and_score(
     recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
 ) -> tuple[TupleBatches, ScoreFn]:
-    """Hold out a part of each recording by `config.validation`. Returns the batches of the other parts, and the score.
-
-    The score is computed on the held-out parts or, if nothing is held out, on training places.
-    """
+    """Return batches of the training places, and a score, on held-out places or, without them, on training places."""
     splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
     pool = tuple_pool(recordings, config, frames=[training for training, _ in splits])
 
@@ -244,26 +241,20 @@ def _require_usable(
 def _packed(
     recordings: Sequence[Recording], cache: Path | None, callback: Callback, stopped: Callable[[], bool]
 ) -> Sequence[Recording]:
-    """Return the same recordings, whose scans are read from one file each in the folder `cache`.
-
-    Missing files are written first. Meanwhile a stop raises KeyboardInterrupt.
-    """
+    """Return the recordings, each read from one file in the folder `cache`. Missing files are written first."""
     if cache is None:
         return recordings
 
-    def report_progress(recording: Recording, done: int) -> None:
+    def report(recording: Recording, done: int) -> None:
         callback.on_pack(recording.name, done, len(recording))
         if stopped():
             raise KeyboardInterrupt
 
-    return [packed(scans, cache, on_progress=functools.partial(report_progress, scans)) for scans in recordings]
+    return [packed(recording, cache, on_progress=functools.partial(report, recording)) for recording in recordings]
 
 
 def _initial_weights(weights: Params | Path | str, config: TrainConfig) -> Params:
-    """Return weights for the model of a configuration. Those that `weights` lacks are random.
-
-    A whitening layer is kept only if the model has one.
-    """
+    """Return the weights with random values for missing ones, and with a whitening layer only if the model has one."""
     params = weights if isinstance(weights, Params) else load(weights)
     if config.loss.segmentation_alone and params.config.head.whiten and not config.model.head.whiten:
         raise ValueError(

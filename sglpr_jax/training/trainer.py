@@ -131,9 +131,8 @@ class Trainer:
 
         Writes measurements, scores and checkpoints by the schedule and a checkpoint at the end, and closes the files.
 
-        Raises:
-          FloatingPointError: The loss is not finite. The message names the step and the scans of its batch.
-          OSError: Metrics or a checkpoint cannot be written.
+        Raises FloatingPointError, with the step and the scans of its batch, if the loss is not finite, and OSError if a
+        file cannot be written.
         """
         try:
             self._restart_clock()

@@ -45,15 +45,9 @@ class TuplePool:
         *,
         frames: Sequence[Int[np.ndarray, "_"]] | None = None,
     ):
-        """Number the places and find their positives.
+        """Number the places and find their positives. Raises ValueError if no place has a positive.
 
-        Arguments:
-          positions: Positions of each recording, in metres.
-          config: Configuration of the tuples.
-          frames: Frames of each recording to use, or None for all.
-
-        Raises:
-          ValueError: If no place has a positive.
+        `positions` has those of each recording, in metres, and `frames` the frames to use of each one (default: all).
         """
         self.config = config
         frames = [np.arange(len(recording)) for recording in positions] if frames is None else frames
@@ -75,11 +69,8 @@ class TuplePool:
     ) -> Int[np.ndarray, "{tuples} k"]:
         """Draw the place numbers of one batch, with one row (anchor, positives, negatives) per tuple.
 
-        The result is a pure function of the arguments. With a cache of descriptors, anchors are among its places, and
-        negatives and the anchors of a cluster have similar descriptors.
-
-        Raises:
-          ValueError: If an anchor has no negatives.
+        The result is a pure function of the arguments. With a cache, anchors are among its places, and negatives and
+        the anchors of a cluster have similar descriptors. Raises ValueError if an anchor has no negatives.
         """
         rng = np.random.default_rng([seed, step])
         anchors_and_positives: list[list[int]] = []
@@ -98,7 +89,11 @@ class TuplePool:
     def _draw_anchor_and_positives(
         self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None
     ) -> list[int]:
-        """Draw an anchor and its positives. `cluster` contains the earlier anchors of the same cluster."""
+        """Draw an anchor and its positives, either of other visits or of the same visit (`config.revisit_fraction`).
+
+        `cluster` contains the earlier anchors of the same cluster. The new anchor is near the first of them or, with a
+        cache of descriptors, similar to the first and far from all.
+        """
         wants_revisit = rng.random() < self.config.revisit_fraction
         prefers_revisits = wants_revisit and len(self.revisits.anchors) > 0
         source = self.revisits if prefers_revisits or not len(self.neighbours.anchors) else self.neighbours
@@ -132,8 +127,7 @@ class TuplePool:
         return ~self._are_within(a, b, self.config.negative_m)
 
     def distances_from_anchors(self, places: Int[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
-        """Return the horizontal distance of each place from the anchor of its tuple, in metres. Infinite between
-        recordings."""
+        """Return the horizontal distance of each place from its anchor, in metres. Infinite between recordings."""
         anchors = places[:, :1]
         offset_m = self.positions[places, :2] - self.positions[anchors, :2]
         same_recording = self.recording_of[places] == self.recording_of[anchors]

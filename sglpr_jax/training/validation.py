@@ -162,13 +162,8 @@ def recall_at_1(
 ) -> float:
     """Return the fraction of the revisits whose nearest descriptor, among frames older than 30 s, is within 5 m.
 
-    Descriptors are compared only with earlier frames of the same recording. See `revisits.database_end` for the rule.
-
-    Arguments:
-      descriptors: Descriptor of each frame.
-      positions: Position of each frame in metres. Distances are horizontal.
-      times: Time of each frame in seconds. None: 290 frames replace 30 s.
-      distance: Distance between descriptors.
+    All frames are of one recording. `positions` are in metres, and distances between them are horizontal. `times` are
+    in seconds; without them, 290 frames replace 30 s (`revisits.database_end`). `distance` compares descriptors.
     """
     plane = positions[:, :2]
     queries = np.flatnonzero(revisits(plane, times=times, radius_m=FOUND_M))
