@@ -190,7 +190,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     if optimized is not None:
         print(optimized)
     print(f"{out}: {', '.join(path.name for path in paths)}")
-    if not result.whole:
+    if not result.whole:  # a signal stopped the search
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     if len(recordings) > 1:

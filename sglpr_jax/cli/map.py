@@ -90,7 +90,10 @@ def write_map(command: MapCommand) -> int:
 
 
 def _build_and_write(command: MapCommand, params: "Params") -> int:
-    """Build the map, with the places of --add-to, and write it unless it is worse. Returns the exit status."""
+    """Build the map, with the places of --add-to, and write it. Returns the exit status.
+
+    After a stop, an existing map with more places is not replaced.
+    """
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id

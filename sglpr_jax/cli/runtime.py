@@ -126,9 +126,9 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
 
             jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-        ended = work(command)
-        if isinstance(ended, int):
-            sys.exit(ended)
+        exit_status = work(command)
+        if isinstance(exit_status, int):
+            sys.exit(exit_status)
     except BrokenPipeError:
         sys.exit(_BROKEN_PIPE_STATUS)
     except (ValueError, OSError, FloatingPointError, ImportError) as error:

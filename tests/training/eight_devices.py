@@ -1,4 +1,4 @@
-"""Tests for eight devices, which `test_devices.py` runs in a process that has them."""
+"""Tests on eight devices. `test_devices.py` runs them in a process that has them."""
 
 import dataclasses
 
@@ -91,7 +91,7 @@ def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, mo
             np.testing.assert_allclose(found[name], expected[name], rtol=1e-4)
 
 
-def test_as_many_devices_as_divide_the_step(config, capsys):
+def test_the_mesh_has_the_largest_number_of_devices_that_divides_the_step(config, capsys):
     assert data_mesh(config).size == 8 and capsys.readouterr().err == ""
     for tuples, chunk, size in ((6, 0, 6), (20, 0, 5), (8, 4, 4), (1, 0, 1)):
         assert data_mesh(dataclasses.replace(config, tuples=tuples, chunk=chunk)).size == size

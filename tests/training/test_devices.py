@@ -1,4 +1,4 @@
-"""Several devices and hosts share a step. Eight devices are tested in a process of their own."""
+"""Several devices and hosts share a step. Tests on eight devices run in a separate process."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""What a step sees, and its gradient: a step in chunks is the step of the whole batch, and it learns."""
+"""Input and gradient of a step: a step in chunks equals a step of the whole batch, and the loss falls."""
 
 import dataclasses
 import functools
@@ -111,7 +111,7 @@ def test_segmenting_every_second_image_is_as_if_the_others_had_no_labels(config,
 
 
 @pytest.mark.slow
-def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(config, random_params, make_batch):
+def test_training_the_segmentation_alone_keeps_the_descriptors(config, random_params, make_batch):
     head = dataclasses.replace(config.model.head, tap="pixels")
     loss = dataclasses.replace(config.loss, segmentation_alone=True)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head, detail=4), loss=loss)
@@ -127,7 +127,7 @@ def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(con
     assert {"segmentation_head/kernel", "narrow/kernel"} <= set(by_name(found)) - set(described)
 
 
-def test_a_segmentation_that_learns_alone_needs_a_loss_of_its_own_and_moves_nothing_else(config):
+def test_segmentation_alone_needs_a_segmentation_loss_and_no_weight_decay(config):
     with pytest.raises(ValueError, match="leaves no loss: expected ce_weight or dice_weight above 0"):
         LossConfig(segmentation_alone=True, ce_weight=0.0, dice_weight=0.0)
     loss = dataclasses.replace(config.loss, segmentation_alone=True)
@@ -188,7 +188,7 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     assert run(steps=1, start=1)[1][0]["loss"] != losses[0]  # each step has its own rotations
 
 
-def test_of_a_share_of_the_places_the_rotation_is_a_quarter_turn_or_more(config, make_batch):
+def test_a_fraction_of_the_rotations_are_quarter_turns(config, make_batch):
     config = dataclasses.replace(config, quarter_turns=0.5)
     keys = jax.random.split(jax.random.key(0), 60)
     quarters = np.stack([_random_angles(key, config) for key in keys]) / (np.pi / 2)
@@ -202,7 +202,7 @@ GRID = Grid(resolution_m=1.0, height=64, width=48)
 IMAGES = 400
 
 
-def test_a_sector_of_each_chosen_image_is_hidden():
+def test_occluded_images_have_one_hidden_sector():
     shown = np.asarray(unoccluded_cells(jax.random.key(3), IMAGES, GRID, OcclusionConfig(share=0.5, widest_deg=180.0)))
     x, y = np.mgrid[: GRID.height, : GRID.width] + 0.5
     bearing = np.angle((x - GRID.height / 2) + 1j * (y - GRID.width / 2))
@@ -215,7 +215,7 @@ def test_a_sector_of_each_chosen_image_is_hidden():
     assert np.ptp([part.mean() for part in np.split(of_bearing[chosen], 4, axis=1)]) < 0.06  # each bearing as often
 
 
-def test_what_is_hidden_has_neither_counts_nor_labels(config, make_batch):
+def test_hidden_cells_have_neither_counts_nor_labels(config, make_batch):
     batch = make_batch(0, images=True)
     batch = batch.replace(
         images=batch.images + 1, maps=np.ones(batch.images.shape, np.int32), labelled=np.ones(config.images, bool)
@@ -254,7 +254,7 @@ def mixed(make_batch):
 
 
 @pytest.mark.parametrize("every", [1, 2, 4])
-def test_labelled_places_come_where_the_segmentation_head_looks_and_go_back(mixed, every):
+def test_labelled_places_are_moved_to_segmented_positions_and_back(mixed, every):
     places = jnp.arange(8)
     order = in_network_order(places, mixed, every=every)
     np.testing.assert_array_equal(in_batch_order(order, mixed, every=every), places)

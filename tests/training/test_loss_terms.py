@@ -1,4 +1,4 @@
-"""The loss is a table: an entry is a term of it, a metric and a curve, and costs nothing without a weight."""
+"""A table entry is a term of the loss and a metric. Without a weight it is not computed."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from sglpr_jax.training.loss_terms import SegmentationTerm, Summary, joint_loss,
 UNIT = np.eye(8, dtype=np.float32)
 
 
-def test_an_entry_of_classes_is_summed_over_chunks_and_left_out_without_weight(make_batch, monkeypatch):
+def test_a_segmentation_term_is_summed_over_chunks_and_skipped_without_weight(make_batch, monkeypatch):
     def count(logits, classes, counted, config):
         return counted.sum()
 

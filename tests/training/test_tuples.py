@@ -1,4 +1,4 @@
-"""Every tuple is what its configuration says, and a pure function of seed and step; held-out places are apart."""
+"""Tuples follow their configuration and are a pure function of seed and step. Held-out places are far apart."""
 
 import numpy as np
 import pytest
@@ -87,7 +87,7 @@ def test_a_batch_is_a_pure_function_of_seed_and_step():
         assert (pool.draw(seed=other[0], step=other[1], tuples=4) != rows).any()
 
 
-def test_without_a_revisit_the_positives_are_neighbours_and_the_other_way_round():
+def test_positives_are_neighbours_without_revisits_and_revisits_without_neighbours():
     config = TupleConfig(revisit_fraction=1.0)
     once = TuplePool([circuit(1)], config)
     assert len(once.draw(seed=0, step=0, tuples=5)) == 5
@@ -137,7 +137,7 @@ def test_mined_negatives_are_the_nearest_far_frames_of_brute_force():
         assert set(row.tolist()) == set(expected.tolist())
 
 
-def test_mined_clusters_look_alike_and_lie_far_apart():
+def test_mined_clusters_have_similar_descriptors_and_are_far_apart():
     config = TupleConfig(negatives=0, cluster=4, mining="hardest", hardest=5, revisit_gap=LAP // 2)
     pool = TuplePool([circuit(3), circuit(2, seed=1)], config)
     cache = described(pool)
@@ -151,7 +151,7 @@ def test_mined_clusters_look_alike_and_lie_far_apart():
         assert (np.argsort(np.argsort(distance))[row[1:]] < 60).all()
 
 
-def test_where_only_some_places_are_described_the_anchors_and_negatives_are_among_them():
+def test_anchors_and_negatives_are_among_the_described_places():
     config = TupleConfig(negatives=2, mining="hardest", revisit_gap=LAP // 2)
     pool = TuplePool([circuit(3)], config)
     some = np.arange(0, 3 * LAP, 4)
@@ -159,7 +159,7 @@ def test_where_only_some_places_are_described_the_anchors_and_negatives_are_amon
     assert np.isin(rows[:, [0, 2, 3]], some).all() and not np.isin(rows[:, 1], some).all()
 
 
-def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
+def test_excluded_frames_are_in_no_tuple_and_the_others_keep_their_numbers():
     kept = np.r_[0:40, 100:180]
     config = TupleConfig(negatives=2, revisit_gap=LAP // 2)
     recordings = [circuit(3), circuit(1, seed=1)]
@@ -202,7 +202,7 @@ def test_no_training_frame_lies_within_the_negative_distance_of_a_validation_fra
         assert apart(positions[left_out], positions[validation]).min(1).max() <= SAMPLING.negative_m
 
 
-def test_the_stretch_comes_with_its_revisits_and_its_fair_share_of_them():
+def test_the_held_out_stretch_contains_its_revisits_and_a_proportional_share_of_them():
     out_and_back = np.r_[np.arange(0, 600, 2.0), np.arange(600, 300, -2.0)]  # the second half of the way out comes back
     positions = np.column_stack([out_and_back, np.zeros((len(out_and_back), 2))])
     training, validation = hold_out(positions, ValidationConfig(share=0.1), SAMPLING)
@@ -213,7 +213,7 @@ def test_the_stretch_comes_with_its_revisits_and_its_fair_share_of_them():
     assert (positions[rows, 0] > 300).sum() > 60  # most of what is revisited is still trained on
 
 
-def test_a_drive_without_revisits_gives_its_first_frames_and_share_0_nothing():
+def test_without_revisits_the_first_frames_are_held_out_and_with_share_0_none():
     positions = np.column_stack([np.arange(0, 400, 2.0), np.zeros((200, 2))])
     training, validation = hold_out(positions, ValidationConfig(share=0.25), SAMPLING)
     np.testing.assert_array_equal(validation, np.arange(51))  # and the one frame less than 3 m further on

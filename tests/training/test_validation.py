@@ -1,4 +1,4 @@
-"""The score on held-out places is that of a search by hand."""
+"""The scores of weights equal those of a search by hand."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def by_hand(descriptors: np.ndarray, pool: TuplePool, gap: int) -> tuple[float, 
 
 @pytest.mark.parametrize("gap", [0, 20])
 @pytest.mark.parametrize("noise", [0.05, 3.0, 30.0])
-def test_recall_and_f1max_are_those_by_hand(pool, gap, noise):
+def test_recall_and_f1_max_equal_a_search_by_hand(pool, gap, noise):
     places = pool.positions[:, :2] + 300 * pool.recording_of[:, None]
     descriptors = (places + np.random.default_rng(5).normal(scale=noise, size=places.shape)).astype(np.float32)
     np.testing.assert_allclose(
@@ -68,7 +68,7 @@ def sequence(positions: np.ndarray) -> Recording:
     return of_images(dict.fromkeys(paths, np.zeros((4, 4))), name="00", positions=positions)
 
 
-def test_revisits_count_where_there_are_any_and_neighbours_elsewhere(monkeypatch):
+def test_the_score_uses_revisits_if_there_are_any_and_neighbours_otherwise(monkeypatch):
     def positions_with_noise(params, recordings, pool, places, angles, config):
         assert len(places) == len(angles) == len(pool) and np.ptp(angles) > 3
         return pool.positions[places].astype(np.float32)
@@ -86,13 +86,13 @@ def test_revisits_count_where_there_are_any_and_neighbours_elsewhere(monkeypatch
     assert set(validation_score([sequence(street)], [np.arange(40)], config)(PARAMS)) == {"score", "recall_neighbours"}
 
 
-def test_a_part_without_two_frames_of_one_place_is_refused():
+def test_a_held_out_part_without_two_frames_of_one_place_is_refused():
     street = np.column_stack([np.arange(60.0) * 10, np.zeros((60, 2))])
     with pytest.raises(ValueError, match=r"validation\.share is too small: expected frames within 3\.0 m"):
         validation_score([sequence(street)], [np.arange(5)], TrainConfig())
 
 
-def test_recall_is_counted_by_hand():
+def test_recall_at_1_equals_a_count_by_hand():
     rng = np.random.default_rng(0)
     positions, descriptors = rng.uniform(0, 20, (120, 3)), rng.normal(size=(120, 4)).astype(np.float32)
     times = np.arange(120) * 1.0
