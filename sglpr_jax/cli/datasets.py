@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 
 
 def dataset_root(data: Path | None, *, sessions: bool = False, write: bool = True) -> Path:
-    """Return the folder of the dataset: `data`, or that of simulated recordings in the user's cache.
+    """Return the folder `data`, or else one of simulated recordings or sessions of NCLT's layout in the user's cache.
 
-    The simulated ones are created on first use: recordings in KITTI's layout or, with `sessions`, sessions in NCLT's.
-    Raises FileNotFoundError if they do not exist and `write` is false.
+    They are created on first use. Raises FileNotFoundError if they do not exist and `write` is false.
     """
     if data is not None:
         return data

@@ -39,7 +39,6 @@ class DemoCommand:
 
 
 def demo(command: DemoCommand) -> None:
-    """Run the command."""
     from sglpr_jax.cli.datasets import simulate  # slow imports, not needed for --help
     from sglpr_jax.cli.train import TrainCommand, train_and_test
     from sglpr_jax.evaluation.evaluation_page import PAGE

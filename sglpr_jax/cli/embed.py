@@ -65,7 +65,6 @@ class EmbedCommand:
 
 
 def embed_recording(command: EmbedCommand) -> None:
-    """Run the command."""
     from sglpr_jax.data.corruption import ROTATION, corrupted, corruption_named  # slow imports, not needed for --help
     from sglpr_jax.data.scaled import scaled
     from sglpr_jax.methods.registry import method_named

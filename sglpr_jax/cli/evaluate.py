@@ -67,7 +67,6 @@ class EvaluateCommand:
 
 
 def evaluate_file(command: EvaluateCommand) -> None:
-    """Run the command."""
     from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_evaluation  # slow imports, not needed for --help
     from sglpr_jax.evaluation.sessions import evaluate_sessions
     from sglpr_jax.files import check_writable

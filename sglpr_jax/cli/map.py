@@ -90,10 +90,7 @@ def write_map(command: MapCommand) -> int:
 
 
 def _build_and_write(command: MapCommand, params: "Params") -> int:
-    """Build the map, with the places of --add-to, and write it. Returns the exit status.
-
-    After a stop, an existing map with more places is not replaced.
-    """
+    """Build the map and write it, unless a stopped run would replace a larger map. Returns the exit status."""
     from sglpr_jax.loops.checkpoint import remove
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
@@ -159,10 +156,7 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
 def _merge_maps(
     command: MapCommand, existing: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]
 ) -> "PlaceMap":
-    """Return the existing map with the places of the new one, aligned if --frame says so.
-
-    `drive` has the pose of every scan of the new recording, by its id.
-    """
+    """Return the existing map with the places of the new one. `drive` has the pose of every new scan, by its id."""
     from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
 
     print("comparing up to 300 of the new places with the existing map", file=sys.stderr)

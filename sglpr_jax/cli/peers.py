@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from sglpr_jax.training.peer_inputs import TrainingInputs
     from sglpr_jax.training.peers import ScoreFn
 
-
 RATES = "rates"
 """Folder of the search of the learning rate, in the folder of the run."""
 

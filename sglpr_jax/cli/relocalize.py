@@ -61,7 +61,6 @@ class RelocalizeCommand:
 
 
 def relocalize(command: RelocalizeCommand) -> None:
-    """Run the command."""
     from sglpr_jax.files import check_writable, naming, write_json  # slow imports, not needed for --help
     from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.maps.query import query_of, read_query

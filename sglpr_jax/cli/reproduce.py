@@ -70,7 +70,6 @@ class ReproduceCommand:
 
 
 def reproduce(command: ReproduceCommand) -> None:
-    """Run the command."""
     from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
     from sglpr_jax.data.readers import recording_names
     from sglpr_jax.reproduce.plan import check, make_plan, time_a_step

@@ -45,7 +45,6 @@ class SegmentCommand:
 
 
 def segment(command: SegmentCommand) -> None:
-    """Run the command."""
     from sglpr_jax.evaluation.segmentation import segment_recording  # slow imports, not needed for --help
     from sglpr_jax.files import check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load

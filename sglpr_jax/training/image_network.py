@@ -67,15 +67,11 @@ class ImageNetwork:
 
 
 class Chunk(NamedTuple):
-    """Images (c, h, w) that pass through the network at a time.
+    """Images that pass through the network at a time. `key` draws the branches that stochastic depth drops."""
 
-    `maps` are the classes of their pixels (c, h, w), or None without labels. `labelled` (c,) is True for images with
-    labels. `key` draws the branches that stochastic depth drops.
-    """
-
-    images: Any
-    maps: Any
-    labelled: Any
+    images: Any  # (c, h, w)
+    maps: Any  # class of every pixel (c, h, w), or None without labels
+    labelled: Any  # whether each image has labels (c,)
     key: Any
 
 
@@ -169,7 +165,7 @@ def _random_angles(key: Array, config: TrainConfig) -> Array:
 def unoccluded_cells(key: Array, images: int, grid: Grid, config: OcclusionConfig) -> Bool[Array, "b h w"]:
     """Return a mask of the visible cells of each image. In a random fraction of the images, a sector is hidden.
 
-    The width of the sector is uniform between 0 and `config.widest_deg`. A cell is hidden if its centre is.
+    The width of the sector is uniform from 0 to `config.widest_deg`. A cell is hidden if its centre is.
     """
     occluded_key, width_key, start_key = jax.random.split(key, 3)
     is_occluded = jax.random.bernoulli(occluded_key, config.share, (images,))

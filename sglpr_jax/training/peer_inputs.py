@@ -96,10 +96,7 @@ def _require_same_shape(inputs: np.ndarray, expected: np.ndarray, *, name: str) 
 
 
 def _cache_key(method: LearnedMethod, recording: Recording) -> str:
-    """Return a hash of what determines the inputs: method, source file of `prepare`, and scan files with their options.
-
-    A simulated recording has no files; its positions stand for them.
-    """
+    """Return a hash of what determines the inputs: method, source file of `prepare`, scan files and read options."""
     files: list[tuple[str, tuple[int, int] | None]] = []
     for path in (*recording.paths, *recording.label_paths, *recording.containers):
         if path is not None:
@@ -108,6 +105,6 @@ def _cache_key(method: LearnedMethod, recording: Recording) -> str:
     mountings = [str(recording.mounting_of(row)) for row in range(len(recording))]
     code = hashlib.sha256(Path(inspect.getfile(method.prepare)).read_bytes()).hexdigest()
     content = [method.name, code, recording.name, recording.read_options, files, mountings]
-    if not recording.on_disk and recording.positions is not None:
+    if not recording.on_disk and recording.positions is not None:  # a simulated recording has no files
         content.append(recording.positions.tolist())
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

@@ -244,8 +244,7 @@ def _peer_batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, o
 def held_out_score(method: LearnedMethod, held_out: TrainingInputs) -> ScoreFn:
     """Return a function that scores weights on held-out recordings.
 
-    The entries of a score are `recall_at_1`, the mean, and `recall_at_1 NAME` for each recording. `require_revisits`
-    raises ValueError if a recording has no revisits.
+    The entries are `recall_at_1 NAME` for each recording and the mean, `recall_at_1`. Each recording needs revisits.
     """
     require_revisits(held_out.recordings)
 

@@ -62,10 +62,8 @@ class TrainResult:
         lines = [f"{self.folder}: {self.steps} of {self.config.steps} steps, weights in {self.folder / WEIGHTS}"]
         if self.throughput is not None:
             steps, waiting = self.throughput.steps_per_second, self.throughput.data_wait
-            lines.append(
-                f"{steps:.3g} steps/s, {steps * self.config.tuples:.3g} tuples/s, "
-                f"{waiting:.1%} of the time waiting for data"
-            )
+            speed = f"{steps:.3g} steps/s, {steps * self.config.tuples:.3g} tuples/s"
+            lines.append(f"{speed}, {waiting:.1%} of the time waiting for data")
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -138,9 +136,8 @@ def train(
         last_step = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
         start_from = None if weights is None or last_step else _initial_weights(weights, config)
         if config.steps < last_step:
-            raise ValueError(
-                f"{folder}: expected at least the {last_step} steps that are already done, found {config.steps}"
-            )
+            expected = f"at least the {last_step} steps that are already done"
+            raise ValueError(f"{folder}: expected {expected}, found {config.steps}")
         lock = lock_run(folder, run_settings(config, settings), seed=config.seed, resume=resume, limits=LIMITS)
         on_all_hosts(lambda: is_first_host() and exit_stack.enter_context(lock))
         options = {"start_from": start_from, "resume": resume, "callback": host_callback, "stopped": stopped}
@@ -211,10 +208,9 @@ def _require_usable(
     """Raise ValueError if the recordings do not fit the configuration. `also` are those of a second dataset."""
     if not recordings:
         raise ValueError("expected recordings to train on, found none")
-    if jax.process_count() > 1 and (also or config.sampling.mining != "none"):
-        raise ValueError(
-            f"mined negatives and a second dataset work on one host only, found {jax.process_count()} hosts"
-        )
+    hosts = jax.process_count()
+    if hosts > 1 and (also or config.sampling.mining != "none"):
+        raise ValueError(f"mined negatives and a second dataset work on one host only, found {hosts} hosts")
     if bool(also) != bool(config.also_tuples):
         raise ValueError(
             "also_tuples is the number of tuples per step from the second dataset: expected both or neither, "

@@ -70,10 +70,7 @@ class Schedule:
 
 
 class Trainer:
-    """A run in progress: its state, its open files, and the measurements since the last line of the metrics.
-
-    A checkpoint also stores these measurements, so a resumed run writes the lines of an uninterrupted one.
-    """
+    """A run in progress. A resumed run continues with the weights and the lines of the log of an uninterrupted one."""
 
     def __init__(
         self,
@@ -109,7 +106,7 @@ class Trainer:
             state, about = first_state(), {}
         self._run = Trained(replicate(state, mesh), about.get("images", 0), about.get("seconds", 0.0))
         self._unlogged_metrics: list[dict[str, float]] = about.get("unlogged", [])
-        """Metrics of each step since the last line of the log."""
+        """Metrics of each step since the last line of the log. Checkpoints store them, too."""
         self._last_checkpoint_s = self._run.seconds
         self._has_logged = False
         """Whether this process has logged a line. Until then, its time includes the compilation of the step."""

@@ -119,10 +119,7 @@ def describe_places(
     angles: Float[np.ndarray, "n"],
     config: TrainConfig,
 ) -> Float32[np.ndarray, "n d"]:
-    """Describe places of training recordings, given as numbers of the pool. `angles` rotate them about z, in radians.
-
-    `read_batch` raises errors if a scan cannot be read.
-    """
+    """Describe places of training recordings, given as numbers of the pool, after rotations about z in radians."""
     descriptors = []
     for start in range(0, len(places), CHUNK):
         # The last chunk repeats its last place, so that every chunk has one shape and compiles once.
