@@ -45,20 +45,25 @@ class PlaceNetwork(Protocol):
     @property
     def seed(self) -> int:
         """Seed of the random choices of a step."""
+        ...
 
     @property
     def images(self) -> int:
         """Images per step."""
+        ...
 
     @property
     def optimizer(self) -> optax.GradientTransformation:
         """Optimiser of the parameters."""
+        ...
 
     def new_state(self) -> TrainState:
         """Return the state before the first step, with random weights."""
+        ...
 
     def gradient(self, state: TrainState, batch: Any, key: Array) -> Gradient:
         """Return the gradient of the loss of a batch. `key` differs from step to step."""
+        ...
 
 
 @functools.partial(jax.jit, static_argnames="network", donate_argnames="state")
