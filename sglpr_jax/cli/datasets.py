@@ -81,7 +81,7 @@ def all_recordings(root: Path, *, title: str = "also training on", **options: An
 def without_bad_scans(
     recordings: Sequence[Recording], *, on_bad_scan: Callable[[str, Exception], None]
 ) -> list[Recording]:
-    """Read all scans and return the recordings without unreadable scans, each of which is passed to `on_bad_scan`."""
+    """Read all scans and return the recordings without unreadable scans. `on_bad_scan` receives each of these."""
     with progress_bar("read all scans", sum(map(len, recordings))) as show:
         readable_recordings, scans_before = [], 0
         for recording in recordings:

@@ -93,7 +93,7 @@ def run_peers(command: PeersCommand) -> None:
 
 
 def _has_run(out: Path, *, resume: bool) -> bool:
-    """Return whether the folder has a training. A stopped search of the learning rate is none.
+    """Return whether the folder has a training. A stopped search of the learning rate does not count.
 
     Raises FileExistsError for a training without `resume`, and FileNotFoundError if there is nothing to resume.
     """

@@ -60,7 +60,7 @@ class RecordingOptions:
     contradict this, and ignores row numbers (0, 1, 2, ...)."""
 
     def open(self, root: Path, **more_options: Any) -> "Recording":
-        """Open the recording with the flags, some of which `more_options` replace, and describe it on stderr."""
+        """Open the recording with the flags, which `more_options` override, and describe it on stderr."""
         from sglpr_jax.data.readers import open_recording  # slow import, not needed for --help
 
         flags: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "seq"}
@@ -103,7 +103,7 @@ class SubmapOptions:
     def deskewed_submaps(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
         """Return the recording with deskewed scans and with submaps, as far as the flags ask for them.
 
-        Without `poses`, those of the recording's bag are used. Raises ValueError if there are none.
+        Without `poses`, those of the recording's bag are used. Raises ValueError if both are missing.
         """
         if self.flag is None:
             return recording
