@@ -104,7 +104,7 @@ def embed_recording(command: EmbedCommand) -> None:
 
 
 def _load_weights(command: EmbedCommand) -> "tuple[Method | None, Params | None]":
-    """Load --weights: a learned method, or weights of this package's network. Both results are missing (None) without --weights.
+    """Load --weights: a learned method, or weights of this package's network. Returns None twice without --weights.
 
     Raises ValueError if --weights do not fit --method.
     """

@@ -23,7 +23,7 @@ class Batch:
     """Training tuples as arrays: t tuples of k = 1 + k_p + k_n places, flattened to b = t k places.
 
     k_p and k_n are the numbers of positives and negatives of an anchor. A batch has either `images` with `maps`, or
-    `points` with `count` and `classes`. `maps` and `classes` are None without labels.
+    `points` with `count` and `classes`. Batches without labels have neither `maps` nor `classes`.
     """
 
     labelled: Any

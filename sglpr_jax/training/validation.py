@@ -89,8 +89,8 @@ def recall_and_f1_max(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, 
     """Return Recall@1 and top-1 F1max. Every place of the pool is a query, and `descriptors` are those of its places.
 
     The database of a query has all places of other recordings, and those of its own more than `gap` frames away. A
-    match is in the same recording and within the positive distance. Recall@1 counts queries with a match; there
-    must be at least one. F1max accepts the nearest place up to a threshold on the descriptor distance: a match is right, a
+    match is in the same recording and within the positive distance. Recall@1 counts queries with a match; there must be
+    at least one. F1max accepts the nearest place up to a threshold on the descriptor distance: a match is right, a
     place beyond the negative distance is wrong.
     """
     queries = np.arange(len(pool))
