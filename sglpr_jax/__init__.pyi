@@ -1,20 +1,10 @@
 """Public API: the module of each name. Read by type checkers, and by `lazy_loader` when a name is first used."""
 
-from .bev import (
-    count_outside as count_outside,
-)
-from .bev import (
-    rasterize as rasterize,
-)
-from .bev import (
-    rasterize_labels as rasterize_labels,
-)
-from .bev import (
-    rotate_image as rotate_image,
-)
-from .bev import (
-    rotate_points as rotate_points,
-)
+from .bev import count_outside as count_outside
+from .bev import rasterize as rasterize
+from .bev import rasterize_labels as rasterize_labels
+from .bev import rotate_image as rotate_image
+from .bev import rotate_points as rotate_points
 from .data.density_image import density_bev as density_bev
 from .data.deskew import deskew as deskew
 from .data.deskew import deskewed as deskewed
@@ -49,24 +39,12 @@ from .models.config import ModelConfig as ModelConfig
 from .models.config import model_preset as model_preset
 from .models.export import save_program as save_program
 from .models.params import Params as Params
-from .models.sglpr import (
-    Outputs as Outputs,
-)
-from .models.sglpr import (
-    describe as describe,
-)
-from .models.sglpr import (
-    forward as forward,
-)
-from .models.sglpr import (
-    init as init,
-)
-from .models.sglpr import (
-    is_describable as is_describable,
-)
-from .models.sglpr import (
-    segment as segment,
-)
+from .models.sglpr import Outputs as Outputs
+from .models.sglpr import describe as describe
+from .models.sglpr import forward as forward
+from .models.sglpr import init as init
+from .models.sglpr import is_describable as is_describable
+from .models.sglpr import segment as segment
 from .models.shipped import shipped_weights as shipped_weights
 from .models.weights import average as average
 from .models.weights import for_places as for_places

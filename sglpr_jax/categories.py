@@ -6,7 +6,7 @@ from typing import Literal
 Categories = Literal[0, 6, 15, 20, 25, 34]
 """Number of categories of each setting of figure 9. 0: no semantics."""
 
-_STANDING: dict[int, tuple[str, tuple[int, ...]]] = {
+_NOT_MOVING: dict[int, tuple[str, tuple[int, ...]]] = {
     0: ("unlabeled", (0, 0, 0)),
     1: ("outlier", (110, 110, 110)),
     10: ("car", (100, 150, 245)),
@@ -34,32 +34,33 @@ _STANDING: dict[int, tuple[str, tuple[int, ...]]] = {
     81: ("traffic-sign", (255, 0, 0)),
     99: ("other-object", (50, 255, 255)),
 }
-"""Name and colour (red, green, blue) of each raw id, as in SemanticKITTI except outlier and on-rails."""
+"""Name and colour (red, green, blue) of the raw ids other than moving objects, as in SemanticKITTI. The colours of
+outlier and on-rails differ."""
 _MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
-"""Standing variant of each raw id of a moving object."""
-RAW_NAMES = {raw: name for raw, (name, _) in _STANDING.items()}
+"""Raw id of the standing object of the same type for each raw id of a moving object."""
+RAW_NAMES = {raw: name for raw, (name, _) in _NOT_MOVING.items()}
 RAW_NAMES |= {moving: f"moving-{RAW_NAMES[raw]}" for moving, raw in _MOVING.items()}
 """Names of the 34 raw ids."""
-RAW_COLORS = {raw: color for raw, (_, color) in _STANDING.items()}
+RAW_COLORS = {raw: color for raw, (_, color) in _NOT_MOVING.items()}
 RAW_COLORS |= {moving: tuple((channel + 255) // 2 for channel in RAW_COLORS[raw]) for moving, raw in _MOVING.items()}
-"""Red, green and blue of each raw id. Moving objects have the colour of their standing variant, mixed half with white,
+"""Red, green and blue of each raw id. Moving objects have the colour of the standing object, mixed half with white,
 because SemanticKITTI draws them in the colours of other ids."""
 
-_NOTHING = (0, 1)
+_UNLABELED = (0, 1)
 _MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, *_MOVING)
-_STILL = tuple(raw for raw in RAW_NAMES if raw not in (*_NOTHING, *_MOVING))
-_SCENE = tuple(raw for raw in _STILL if raw not in _MOVABLE)
+_STANDING = tuple(raw for raw in RAW_NAMES if raw not in (*_UNLABELED, *_MOVING))
+_IMMOVABLE = tuple(raw for raw in _STANDING if raw not in _MOVABLE)
 
 
-def _named(raw_ids: Iterable[int]) -> dict[str, tuple[int, ...]]:
-    """A separate class for each of these ids."""
+def _class_per_id(raw_ids: Iterable[int]) -> dict[str, tuple[int, ...]]:
+    """A class for each raw id, with the name of the id."""
     return {RAW_NAMES[raw]: (raw,) for raw in raw_ids}
 
 
 RAW_IDS: dict[int, dict[str, tuple[int, ...]]] = {
     # The six groups of similar attributes in SemanticKITTI's paper.
     6: {
-        "unlabeled": _NOTHING,
+        "unlabeled": _UNLABELED,
         "ground": (40, 44, 48, 49, 60),
         "structure": (50, 51, 52),
         "vehicle": (10, 11, 13, 15, 16, 18, 20, 252, 256, 257, 258, 259),
@@ -68,7 +69,7 @@ RAW_IDS: dict[int, dict[str, tuple[int, ...]]] = {
         "object": (80, 81, 99),
     },
     # Everything that can move is unlabelled, whether it moves or not.
-    15: {"unlabeled": (*_NOTHING, *_MOVABLE), **_named(_SCENE)},
+    15: {"unlabeled": (*_UNLABELED, *_MOVABLE), **_class_per_id(_IMMOVABLE)},
     # The classes of RINet, which are the dataset's own `learning_map`. Moving and standing objects share a class.
     20: {
         "unlabeled": (0, 1, 52, 99),
@@ -93,7 +94,7 @@ RAW_IDS: dict[int, dict[str, tuple[int, ...]]] = {
         "traffic-sign": (81,),
     },
     # All moving objects are one class.
-    25: {"unlabeled": _NOTHING, **_named(_STILL), "moving": tuple(_MOVING)},
-    34: _named(RAW_NAMES),
+    25: {"unlabeled": _UNLABELED, **_class_per_id(_STANDING), "moving": tuple(_MOVING)},
+    34: _class_per_id(RAW_NAMES),
 }
 """Classes of each setting, in order, with their raw ids. The first raw id gives a class its colour."""

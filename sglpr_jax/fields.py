@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 
 class Bounds(NamedTuple):
-    """Range of numbers that a field accepts."""
+    """Range of numbers that a field accepts: from `least` to `most`, and greater than `above`."""
 
     least: float = -math.inf
     most: float = math.inf
@@ -25,12 +25,13 @@ class Bounds(NamedTuple):
         return self.least <= value <= self.most and value > self.above
 
     def __str__(self) -> str:
-        words = {"above ": self.above, "from ": self.least, "up to ": self.most}
-        return "a number " + " ".join(f"{word}{value:.12g}" for word, value in words.items() if math.isfinite(value))
+        limits = {"above": self.above, "from": self.least, "up to": self.most}
+        texts = [f"{word} {limit:.12g}" for word, limit in limits.items() if math.isfinite(limit)]
+        return " ".join(["a number", *texts])
 
 
 Size = Annotated[int, Bounds(1, 2**20)]
-"""Number of cells, channels or tokens. The upper bound, beyond any memory, catches typing errors."""
+"""Number of cells, channels or tokens. The upper bound rejects typing errors: such sizes fit into no memory."""
 SizeOrNone = Annotated[int, Bounds(0, 2**20)]
 Sizes = tuple[Size, ...]
 Depths = tuple[Annotated[int, Bounds(1, 64)], ...]
@@ -66,7 +67,7 @@ def has_bounds(annotation: Any) -> bool:
 
 
 def check_value(value: Any, annotation: Any, field: str) -> None:
-    """Raise ValueError, whose message begins with `field`, if a field with this annotation rejects the value."""
+    """Raise ValueError, whose message begins with the name `field`, if the value does not fit the annotation."""
     read_value(value, annotation, field, json=False)
 
 
@@ -76,40 +77,40 @@ def read_value(value: Any, annotation: Any, field: str, *, json: bool = True) ->
     With `json=False`, the value must have the type already, and numbers without bounds must be finite. Raises
     ValueError, with the name of the `field`, if the value does not fit the annotation.
     """
-    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
-        read = read_value(value, parts[0], field, json=json)
-        for bounds in parts[1:]:
-            if isinstance(bounds, Bounds):
-                require(value, abs(read) <= sys.float_info.max, "a finite number", field)
-                require(value, read in bounds, str(bounds), field)
-        return read
+        result = read_value(value, arguments[0], field, json=json)
+        for metadata in arguments[1:]:
+            if isinstance(metadata, Bounds):
+                require(value, abs(result) <= sys.float_info.max, "a finite number", field)
+                require(value, result in metadata, str(metadata), field)
+        return result
     if origin in (typing.Union, types.UnionType):
-        return _read_union(value, parts, field, json=json)
+        return _read_union(value, arguments, field, json=json)
     if origin is tuple:
         require(value, isinstance(value, list | tuple if json else tuple), "a list", field)
-        items = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-        require(value, len(value) == len(items), f"a list of {len(items)}", field)
-        return tuple(read_value(element, item, field, json=json) for element, item in zip(value, items, strict=True))
+        item_types = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        require(value, len(value) == len(item_types), f"a list of {len(item_types)}", field)
+        return tuple(read_value(item, type_, field, json=json) for item, type_ in zip(value, item_types, strict=True))
     if annotation is float:
         require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
-        finite = abs(value) <= sys.float_info.max  # works for integers of any size
-        require(value, finite or (json and isinstance(value, float)), "a finite number", field)
+        is_finite = abs(value) <= sys.float_info.max  # works for integers of any size
+        require(value, is_finite or (json and isinstance(value, float)), "a finite number", field)
         return float(value) if json else value
     if origin is Literal:
-        fits = any(type(value) is type(choice) and value == choice for choice in parts)
-        require(value, fits, f"one of {', '.join(map(repr, parts))}", field)
+        is_choice = any(type(value) is type(choice) and value == choice for choice in arguments)
+        require(value, is_choice, f"one of {', '.join(map(repr, arguments))}", field)
     elif is_config(annotation):
         require(value, isinstance(value, annotation), f"the fields of a {annotation.__name__}", field)
     else:
-        kind = str if annotation is Path else annotation
-        expected = "null" if kind is types.NoneType else f"a value of type {kind.__name__}"
-        require(value, type(value) is kind, expected, field)
+        value_type = str if annotation is Path else annotation
+        expected = "null" if value_type is types.NoneType else f"a value of type {value_type.__name__}"
+        require(value, type(value) is value_type, expected, field)
     return Path(value) if annotation is Path else value
 
 
 def require(value: Any, fits: bool, expected: str, field: str) -> None:
-    """Raise ValueError with the field, the expected and the found value, unless `fits` is True."""
+    """Raise ValueError with the field, what is expected, and the value in at most 60 characters, unless `fits`."""
     if not fits:
         found = repr(value)
         shown = found if len(found) <= 60 else f"{found[:57]}..."
@@ -117,16 +118,19 @@ def require(value: Any, fits: bool, expected: str, field: str) -> None:
 
 
 def _read_union(value: Any, members: tuple[Any, ...], field: str, *, json: bool) -> Any:
-    """Convert a value by the first member that accepts it. The message has what each member but None expects."""
+    """Convert a value to the first type of a union that accepts it.
+
+    If none does, raise ValueError. The message "FIELD: expected A or B, found VALUE" joins those of the types but None.
+    """
     if value is None and types.NoneType in members:
         return None
-    expected, before, found = [], "", ""
+    expected, prefix, found = [], "", ""
     for member in (member for member in members if member is not types.NoneType):
         try:
             return read_value(value, member, field, json=json)
         except ValueError as error:
-            before, _, after = str(error).partition("expected ")
-            kind, _, found = after.rpartition(", found ")
-            expected.append(kind)
-    kinds = " or ".join(expected).replace("or the fields of a ", "or ")
-    raise ValueError(f"{before}expected {kinds}, found {found}")
+            prefix, _, rest = str(error).partition("expected ")
+            expected_type, _, found = rest.rpartition(", found ")
+            expected.append(expected_type)
+    expected_types = " or ".join(expected).replace("or the fields of a ", "or ")
+    raise ValueError(f"{prefix}expected {expected_types}, found {found}")

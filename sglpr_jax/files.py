@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, reading of JSON, and errors that name their file."""
+"""Atomic writing of files and folders, reading of JSON, and errors and warnings that name their file."""
 
 import contextlib
 import errno
@@ -9,6 +9,7 @@ import re
 import shutil
 import tempfile
 import uuid
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,21 @@ class WriteError(OSError):
         self.path, self.reason = path, reason
 
 
+class DataWarning(UserWarning):
+    """Data can be read but looks wrong. The message names the file, what was expected and what was found."""
+
+
+def warn(message: str) -> None:
+    """Issue a `DataWarning` at the line that called the function which calls `warn`."""
+    warnings.warn(message, DataWarning, stacklevel=3)
+
+
 @contextlib.contextmanager
 def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
     """Write `path`, a file or a folder, completely or not at all. Missing parent folders are created.
 
-    The block writes to the hidden path beside `path` that it receives, which replaces `path` at the end of the block.
-    After an error, it is removed. With `keep`, a folder that another process has put at `path` meanwhile stays.
+    The block receives a hidden path in the same folder and writes to it. After the block, the hidden path replaces
+    `path`, or after an error it is removed. With `keep`, a folder that another process has put at `path` stays.
 
     Raises WriteError if `path` cannot be written.
 
@@ -35,12 +45,12 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
       with replacing(path) as temporary:
           temporary.write_bytes(content)
     """
-    temporary = _hidden(path)
+    temporary = _hidden_path(path)
     try:
         with writing(path, temporary, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
-            _put(temporary, path, keep=keep)
+            _rename(temporary, path, keep=keep)
     finally:
         _remove(temporary)
 
@@ -52,19 +62,19 @@ def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> li
 
     Raises WriteError if a file cannot be written. All files in the folder then stay as they were.
     """
-    with contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as replacements:
         for name, write in files.items():
-            write(opened.enter_context(replacing(folder / name)))
+            write(replacements.enter_context(replacing(folder / name)))
     return [folder / name for name in files]
 
 
 def check_holds_only(folder: Path, names: Collection[str]) -> None:
-    """Raise FileExistsError if a folder that will be replaced holds other files than these."""
-    others = sorted({path.name for path in folder.iterdir()} - set(names)) if folder.is_dir() else []
-    if others:
+    """Raise FileExistsError if a folder that will be replaced holds other files than those with these names."""
+    other_names = sorted({path.name for path in folder.iterdir()} - set(names)) if folder.is_dir() else []
+    if other_names:
         raise FileExistsError(
             f"{folder}: expected a new folder, or one with only {', '.join(names)} (which are replaced), "
-            f"found {others[0]}{' and more' if len(others) > 1 else ''}"
+            f"found {other_names[0]}{' and more' if len(other_names) > 1 else ''}"
         )
 
 
@@ -74,7 +84,7 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
 
     The lock is a file in the system's temporary folder. It ends with the process.
 
-    Raises BlockingIOError if another process holds the lock, NotADirectoryError if the path leads through a file.
+    Raises BlockingIOError if another process holds the lock, NotADirectoryError if a part of the path is a file.
     """
     import filelock  # slow import
 
@@ -84,13 +94,13 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
         raise NotADirectoryError(f"{existing}: expected a folder to write into, found a file")
     with writing(folder, *folder.parents):
         folder.mkdir(parents=True, exist_ok=True)
-    name = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
+    digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
     try:
-        with filelock.FileLock(Path(tempfile.gettempdir()) / f"sglpr-jax-{name}.lock", timeout=0):
+        with filelock.FileLock(Path(tempfile.gettempdir()) / f"sglpr-jax-{digest}.lock", timeout=0):
             try:
                 yield
             finally:
-                with contextlib.suppress(OSError):  # not empty
+                with contextlib.suppress(OSError):  # `rmdir` fails at the first folder that is not empty
                     for path in missing or [folder]:
                         path.rmdir()
     except filelock.Timeout as error:
@@ -109,17 +119,17 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def text_bytes(text: str) -> bytes:
-    """Encode a text in UTF-8. Names of files that are not UTF-8 are escaped."""
+    """Encode a text in UTF-8. Characters that UTF-8 cannot encode, as in some file names, are escaped."""
     return text.encode(errors="backslashreplace")
 
 
 def json_text(value: Any) -> str:
-    """Return the content of the JSON file of a value."""
+    """Return a value as indented JSON, with a line break at the end."""
     return json.dumps(value, indent=2) + "\n"
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises FileNotFoundError, or ValueError if it is damaged. Both messages name the file."""
+    """Read a JSON file. Raises FileNotFoundError, or ValueError if it is invalid (`parse_json`)."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a JSON file, found none")
     return parse_json(path.read_bytes(), source=path)
@@ -128,12 +138,13 @@ def read_json(path: Path) -> Any:
 def parse_json(text: str | bytes, *, source: Path | str) -> Any:
     """Parse JSON. Raises ValueError, naming `source`, if the text is not valid JSON or repeats a name in an object."""
     try:
-        return json.loads(text, object_pairs_hook=_without_doubles)
+        return json.loads(text, object_pairs_hook=_object_with_unique_names)
     except (ValueError, RecursionError) as error:  # not JSON, not text, or too deeply nested
         raise ValueError(f"{source}: expected JSON, found invalid JSON ({in_short(error)})") from error
 
 
-def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object_with_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the names and values of a JSON object as a dictionary. Raises ValueError if a name appears twice."""
     names = [name for name, _ in pairs]
     if len(set(names)) < len(names):
         raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} appears twice")
@@ -142,7 +153,7 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def naming(source: Path | str) -> Iterator[None]:
-    """Put the name of a file before the message of a ValueError of the block."""
+    """Context manager that puts the name of a file before the message of a ValueError."""
     try:
         yield
     except ValueError as error:
@@ -151,29 +162,32 @@ def naming(source: Path | str) -> Iterator[None]:
 
 def in_short(error: Exception | str, *, most: int = 100) -> str:
     """Return the message of another library's error, on one line of at most `most` characters."""
-    return _cut(" ".join(str(error).split()) or type(error).__name__, most=most)
+    return _shortened(" ".join(str(error).split()) or type(error).__name__, most=most)
 
 
 def json_in_short(value: Any) -> str:
     """Return a value as JSON, or a text without quotes, in at most 80 characters."""
-    return _cut(value if isinstance(value, str) else json.dumps(value), most=80)
+    return _shortened(value if isinstance(value, str) else json.dumps(value), most=80)
 
 
-def _cut(text: str, *, most: int) -> str:
+def _shortened(text: str, *, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 @contextlib.contextmanager
-def writing(path: Path, *others: Path) -> Iterator[None]:
-    """Raise WriteError for an OSError of the block that names no file, e.g. of a full disk, or one of `others`."""
+def writing(path: Path, *replaced: Path) -> Iterator[None]:
+    """Context manager that raises WriteError with `path` for an OSError that names no file, as of a full disk.
+
+    An error that names one of the paths `replaced` is converted, too. Other errors are unchanged.
+    """
     try:
         yield
     except WriteError as error:
-        if error.path not in others:
+        if error.path not in replaced:
             raise
         raise WriteError(path, error.reason) from error
     except OSError as error:
-        if error.filename is not None and Path(str(error.filename)) not in others:
+        if error.filename is not None and Path(str(error.filename)) not in replaced:
             raise
         raise WriteError(path, error.strerror or str(error)) from error
 
@@ -183,7 +197,7 @@ def check_writable(path: Path) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file to write, found a folder")
     existing = next(folder for folder in path.absolute().parents if folder.exists())
-    trial = _hidden(existing / path.name)
+    trial = _hidden_path(existing / path.name)
     try:
         with writing(path, trial, *trial.parents):
             trial.touch()
@@ -192,7 +206,7 @@ def check_writable(path: Path) -> None:
 
 
 def half_written(folder: Path) -> list[Path]:
-    """Return the unfinished files and folders of `replacing` in `folder` and below, left by killed processes."""
+    """Return the unfinished files and folders that killed processes left in `folder` and below (see `replacing`)."""
     # `Path.rglob` would raise FileNotFoundError if another process removes a folder meanwhile.
     paths = (Path(parent, name) for parent, folders, files in os.walk(folder) for name in (*folders, *files))
     return [path for path in paths if path.match(".*.tmp")]
@@ -204,31 +218,33 @@ def remove_half_written(folder: Path) -> None:
         _remove(path)
 
 
-def _hidden(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # not a process id: several hosts may share a disk
+def _hidden_path(path: Path) -> Path:
+    """A new hidden path in the same folder. No process id, because several hosts may share a disk."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
 
 
-def _put(new: Path, path: Path, *, keep: bool) -> None:
-    """Rename `new` to `path`, even if another process does the same."""
+def _rename(source: Path, target: Path, *, keep: bool) -> None:
+    """Rename `source` to `target`, as others may do at once. A folder at `target` is replaced, or stays with `keep`."""
     while True:
         try:
-            return os.replace(new, path)
+            return os.replace(source, target)
         except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # a folder cannot replace one with files
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # `target` is a folder with files
                 raise
         if keep:
             return
-        old = _hidden(path)
-        with contextlib.suppress(FileNotFoundError):  # the other process was faster
-            os.replace(path, old)
-        _remove(old)
+        previous = _hidden_path(target)
+        with contextlib.suppress(FileNotFoundError):  # another process has just moved the folder
+            os.replace(target, previous)
+        _remove(previous)
 
 
 def _remove(path: Path) -> None:
+    """Remove a file or folder, if it exists. Errors are ignored."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
-        with contextlib.suppress(OSError):  # after success it does not exist; its parent may not be a folder
+        with contextlib.suppress(OSError):
             path.unlink()
 
 
@@ -236,7 +252,7 @@ MOST_BYTES = 120
 """Maximum length of a file name from `file_name`, in bytes. Suffixes of temporary files need the rest of the usual
 255."""
 MOST_SHOWN = 100
-"""Maximum number of printed characters of a name."""
+"""Maximum number of characters of a name in messages."""
 _UNSAFE = re.compile(r"[/\\\x00-\x1f\x7f]")
 
 
@@ -247,21 +263,21 @@ def file_name(name: str) -> str:
     replaced and a hash is appended.
     """
     try:
-        size = len(os.fsencode(name))
-    except UnicodeEncodeError:  # half of a surrogate pair, as JSON may contain
-        size = 0
-    if 0 < size <= MOST_BYTES and name not in (".", "..") and not _UNSAFE.search(name):
+        name_bytes = len(os.fsencode(name))
+    except UnicodeEncodeError:  # half of a surrogate pair, as JSON may contain, is no safe name
+        name_bytes = 0
+    if 0 < name_bytes <= MOST_BYTES and name not in (".", "..") and not _UNSAFE.search(name):
         return name
     readable = re.sub(r"[^\w.-]", "_", name, flags=re.ASCII)[: MOST_BYTES // 2].strip(".")
     return f"{readable}-{hashlib.sha256(name.encode(errors='surrogatepass')).hexdigest()[:16]}"
 
 
 def path_inside(root: Path, listed: Any, *, source: Path) -> Path:
-    """Return the path of a file that a table lists relative to the folder of its dataset.
+    """Return the path of a file from its path `listed` in a table, relative to the folder `root` of the dataset.
 
     Raises ValueError, which names the table `source`, if `listed` is not a relative path or leads out of `root`.
     """
-    path = Path(listed) if isinstance(listed, str) and "\0" not in listed else Path("..")
+    path = Path(listed) if isinstance(listed, str) and "\0" not in listed else Path("..")  # ".." is rejected below
     if path.anchor or ".." in path.parts or path == Path():
         raise ValueError(f"{source}: expected paths of files inside {root}, found {listed!r:.80}")
     return root / path

@@ -1,7 +1,7 @@
-"""Append-only file of records, from which a run that was killed resumes.
+"""Append-only log of records, from which a run that was killed resumes.
 
-Each record has a number, its length and a checksum. A damaged record is skipped, and the gap in the numbers shows it.
-The end of an unfinished record is removed when the file is read.
+Each record has a number, its length and a checksum. A damaged record is skipped, so that its number is missing. An
+unfinished record at the end is removed when the file is read.
 """
 
 import json
@@ -13,35 +13,37 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.data.warning import warn
-from sglpr_jax.files import parse_json, writing
+from sglpr_jax.files import parse_json, warn, writing
 
 HEAD = struct.Struct("<4sIII")
-"""Bytes before a record: `MARK`, number, length, and CRC-32 of the record that begins with the CRC of its number."""
+"""Bytes before a record: `MARK`, number of the record, its length, and the CRC-32 of number and record."""
 MARK = b"\x93FR1"
-"""Beginning of each record. The next record after a damaged one is found by it."""
+"""First bytes of each record, for finding the next record after a damaged one."""
 
 
 class FrameLog:
-    """Records of a file, with ascending numbers.
+    """Append-only file of numbered records.
 
     Example:
       log = FrameLog(path)
-      for number, record in log.records(): ...   # those of an earlier process
+      for number, record in log.records(): ...   # records of an earlier process
       log.append(number, record)
     """
 
     def __init__(self, path: Path):
         """Open a log, or begin a new one in an existing folder. Raises WriteError if the file cannot be written."""
         self.path = path
-        self.cut = 0
+        self.removed_bytes = 0
         """Number of bytes that `records` removed from the end."""
         with writing(path, path):
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
         self._size = os.fstat(self._file).st_size
 
     def records(self) -> Iterator[tuple[int, bytes]]:
-        """Yield number and content of each whole record. Raises ValueError if the file is no log."""
+        """Yield number and content of each whole record, then remove the bytes after the last one.
+
+        Raises ValueError if the file is no log.
+        """
         if not self._size:
             return
         position = end = 0
@@ -56,21 +58,21 @@ class FrameLog:
                 position = end = position + HEAD.size + len(record[1])
         if not is_log and not end:
             raise ValueError(f"{self.path}: expected a log of frames, found another file")
-        self.cut = self._size - end
+        self.removed_bytes = self._size - end
         self.truncate(end)
 
     def append(self, number: int, record: bytes) -> None:
-        """Add a record. It survives a kill of the process, and with `sync` a loss of power.
+        """Add a record. The record survives a kill of the process, and after `sync` also a power failure.
 
-        Raises WriteError if it cannot be written, for instance on a full disk. The file then stays as it was.
+        Raises WriteError if the record cannot be written, for instance on a full disk. The file then stays as it was.
         """
         content = memoryview(HEAD.pack(MARK, number, len(record), _checksum(number, record)) + record)
         with writing(self.path):
             os.lseek(self._file, self._size, os.SEEK_SET)
             try:
-                done = 0
-                while done < len(content):
-                    done += os.write(self._file, content[done:])
+                written = 0
+                while written < len(content):
+                    written += os.write(self._file, content[written:])
             except OSError:
                 self.truncate(self._size)
                 raise
@@ -96,19 +98,21 @@ class FrameLog:
 
 
 class RunLog:
-    """Log of a run. A run that was killed resumes after its last whole step, if its settings are the same.
+    """Log with one record per step of a run. A run that was killed resumes after its last complete step.
+
+    Record 0 of the file contains the settings of the run as JSON, and record n + 1 contains step n.
 
     Example:
       with RunLog(path, settings) as log:
-          steps = log.records            # of an earlier process
+          steps = log.records            # steps of an earlier process
           log.append(len(steps), record)
     """
 
     def __init__(self, path: Path | None, settings: Mapping[str, Any]):
-        """Open or create a log with the JSON values that determine the steps. With other settings, warn and delete it.
+        """Open or create a log. `settings` are the JSON values that determine the steps. `path` None stores nothing.
 
-        `path` None stores nothing. Raises ValueError if the file is no log of a run, WriteError if it cannot be
-        written.
+        Records of other settings are deleted, with a `DataWarning`. Raises ValueError if the file is no log, WriteError
+        if it cannot be written.
         """
         self.records: list[bytes] = []
         """Steps of an earlier process."""
@@ -117,11 +121,12 @@ class RunLog:
             return
         with writing(path, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
-        self._log, records = FrameLog(path), list[bytes]()
+        self._log = FrameLog(path)
+        records: list[bytes] = []
         for number, record in self._log.records():
-            if number <= len(records):  # later records follow a damaged one
-                records[number:] = [record]
-        settings = json.loads(json.dumps(settings))
+            if number <= len(records):  # a larger number follows a damaged record
+                records[number:] = [record]  # a repeated step replaces that step and all after it
+        settings = json.loads(json.dumps(settings))  # as parsed: tuples are lists
         stored = parse_json(records[0], source=path) if records else {}
         if stored == settings:
             self.records = records[1:]
@@ -140,16 +145,16 @@ class RunLog:
             self._log.close()
 
     def append(self, step: int, record: bytes) -> None:
-        """Add a step, counted from 0. It replaces that step of an earlier process and all after it.
+        """Add the record of a step, counted from 0. It replaces this step of an earlier process and all after it.
 
-        Raises WriteError if it cannot be written.
+        Raises WriteError if the record cannot be written.
         """
         if self._log is not None:
             self._log.append(step + 1, record)
 
 
 def _record(content: mmap.mmap, position: int) -> tuple[int, bytes] | None:
-    """Number and content of the record at a position, or None if it is cut or damaged."""
+    """Number and content of the record that begins at a byte of a file, or None if it is unfinished or damaged."""
     if len(content) - position < HEAD.size:
         return None
     _, number, length, checksum = HEAD.unpack_from(content, position)
@@ -159,4 +164,5 @@ def _record(content: mmap.mmap, position: int) -> tuple[int, bytes] | None:
 
 
 def _checksum(number: int, record: bytes) -> int:
+    """CRC-32 of the number as 4 bytes (little-endian) and the record."""
     return zlib.crc32(record, zlib.crc32(number.to_bytes(4, "little")))

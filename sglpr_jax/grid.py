@@ -13,7 +13,7 @@ DENSITY_MAX_COUNT = 10
 """Maximum count of a cell of a density image. It is stored as grey value 255."""
 DENSITY_SIZE = 151
 """Number of rows and of columns of a density image. The outer 13 on each side are empty, because points beyond 25 m are
-cropped."""
+dropped."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Grid:
 
 
 def check_density_grid(grid: Grid) -> None:
-    """Raise ValueError if a grid has other cells than density images, or more of them."""
+    """Raise ValueError if a grid cannot be cropped from a density image: other cells, or more than 151 on a side."""
     if grid.resolution_m != DENSITY_RESOLUTION_M or max(grid.height, grid.width) > DENSITY_SIZE:
         size = f"{DENSITY_SIZE} x {DENSITY_SIZE} cells of {DENSITY_RESOLUTION_M} m"
         raise ValueError(

@@ -11,7 +11,7 @@ class GrowingArray:
     """Rows of one shape and type. The capacity doubles when it is reached, so that appending stays cheap."""
 
     def __init__(self, rows: Shaped[np.ndarray, "n ..."]):
-        """Start with some rows or, to state shape and type, with none. They are not copied."""
+        """Start with `rows`, which are not copied. An empty array states the shape and type of the rows."""
         self._storage, self._count = rows, len(rows)
 
     def __len__(self) -> int:
@@ -24,7 +24,7 @@ class GrowingArray:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes, with the spare capacity."""
+        """Number of bytes of the whole capacity."""
         return self._storage.nbytes
 
     def append(self, row: object) -> None:
@@ -41,12 +41,13 @@ class GrowingArray:
         self._count = end
 
     def keep(self, flags: Bool[np.ndarray, " n"]) -> None:
-        """Remove the rows without a flag. The others stay in order."""
+        """Remove the rows whose flag is False. The others stay in order."""
         remaining = self.rows[flags]
         self._storage[: len(remaining)] = remaining
         self._count = len(remaining)
 
     def _reserve(self, count: int) -> None:
+        """Increase the capacity to at least `count` rows."""
         capacity = max(len(self._storage), FIRST_CAPACITY)
         while capacity < count:
             capacity *= 2

@@ -14,15 +14,15 @@ UNLABELLED = 0
 
 @dataclass(frozen=True, eq=False)
 class Taxonomy:
-    """Assignment of raw ids to classes 0 to k - 1. Class 0 is `UNLABELLED`."""
+    """Assignment of raw SemanticKITTI ids to classes 0 to k - 1. Class 0 is `UNLABELLED`."""
 
     names: tuple[str, ...]
     colors: UInt8[np.ndarray, "k 3"]
     """Red, green and blue of each class in pictures."""
     class_of: Int32[np.ndarray, " 260"]
-    """Class of each raw id, or -1 for ids that do not exist."""
+    """Class of each raw id from 0 to 259, or -1 for ids that do not exist."""
     raw_of: Int32[np.ndarray, " k"]
-    """Raw id that represents each class: the first id of the class."""
+    """First raw id of each class, which represents the class."""
 
 
 @functools.cache
@@ -35,7 +35,8 @@ def taxonomy(categories: int = 20) -> Taxonomy:
     for class_id, raw_ids in enumerate(classes.values()):
         class_of[list(raw_ids)] = class_id
     raw_of = np.array([raw_ids[0] for raw_ids in classes.values()], dtype=np.int32)
-    return Taxonomy(tuple(classes), np.array([RAW_COLORS[raw] for raw in raw_of], np.uint8), class_of, raw_of)
+    colors = np.array([RAW_COLORS[raw] for raw in raw_of], np.uint8)
+    return Taxonomy(names=tuple(classes), colors=colors, class_of=class_of, raw_of=raw_of)
 
 
 CATEGORIES = taxonomy(20).names
@@ -45,12 +46,13 @@ CATEGORIES = taxonomy(20).names
 def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
     """Return the class of each raw SemanticKITTI id. Raises ValueError with the ids that do not exist."""
     class_of = taxonomy(categories).class_of
-    classes = np.where((raw >= 0) & (raw < len(class_of)), class_of[np.clip(raw, 0, len(class_of) - 1)], -1)
+    in_range = (raw >= 0) & (raw < len(class_of))
+    classes = np.where(in_range, class_of[np.clip(raw, 0, len(class_of) - 1)], -1)
     if np.any(classes < 0):
         raise ValueError(f"expected raw SemanticKITTI ids, found {np.unique(raw[classes < 0])[:5].tolist()}")
     return classes
 
 
 def to_raw(classes: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
-    """Return a raw SemanticKITTI id of each class. `to_classes` with the same categories is the inverse."""
+    """Return the first raw SemanticKITTI id of each class. `to_classes` with the same categories is the inverse."""
     return taxonomy(categories).raw_of[classes]

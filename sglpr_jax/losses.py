@@ -11,6 +11,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 DICE_EPSILON = 1e-5
+"""Term added to numerator and denominator of the Dice coefficient, against division by zero."""
 
 
 def descriptor_distance(
@@ -34,7 +35,7 @@ def lazy_triplet(
     temperature: float = 0.0,
     where: Bool[Array, "*t n"] | None = None,
 ) -> Float[Array, "*t"]:
-    """Lazy triplet loss (equation 5) of each tuple.
+    """Lazy triplet loss (equation 5) of each tuple of an anchor with its positives and negatives.
 
     Arguments:
       positive: Distances of each anchor to its k_p positives.
@@ -46,8 +47,8 @@ def lazy_triplet(
         descriptors into one point, where its gradient vanishes.
       where: Mask of the negatives. A tuple without negatives has loss 0.
     """
-    pull = positive.min(-1) if closest_positive else positive.max(-1)
-    violation = margin + pull[..., None] - negative
+    positive_distance = positive.min(-1) if closest_positive else positive.max(-1)
+    violation = margin + positive_distance[..., None] - negative
     if where is not None:
         violation = jnp.where(where, violation, -jnp.inf)
     if temperature > 0:
@@ -57,20 +58,16 @@ def lazy_triplet(
 
 
 def one_threshold(
-    positive: Float[Array, "t p"],
-    negative: Float[Array, "t n"],
-    *,
-    where: Bool[Array, "t n"],
-    **options: Any,
+    positive: Float[Array, "t p"], negative: Float[Array, "t n"], *, where: Bool[Array, "t n"], **options: Any
 ) -> Float[Array, "t"]:
     """Lazy triplet loss, with the options of `lazy_triplet`, in which every anchor has the negatives of all anchors.
 
     Equation 5 compares the distances of one anchor, but loops are accepted below one distance for all places. Here the
     distance to a positive must be below the distance of any two different places.
     """
-    to_all_anchors = functools.partial(jnp.broadcast_to, shape=(len(positive), negative.size))
-    negative, where = to_all_anchors(negative.reshape(1, -1)), to_all_anchors(where.reshape(1, -1))
-    return lazy_triplet(positive, negative, where=where, **options)
+    shape = (len(positive), negative.size)
+    all_negatives = jnp.broadcast_to(negative.reshape(1, -1), shape)
+    return lazy_triplet(positive, all_negatives, where=jnp.broadcast_to(where.reshape(1, -1), shape), **options)
 
 
 def cross_entropy(
@@ -92,29 +89,34 @@ def cross_entropy(
     entropy = optax.softmax_cross_entropy_with_integer_labels(logits, labels)
     weight = jnp.ones_like(entropy) if where is None else where.astype(entropy.dtype)
     if balance:
-        classes = jax.nn.one_hot(labels, logits.shape[-1], dtype=entropy.dtype)
-        pixels = jnp.einsum("...hw,...hwk->...k", weight, classes)
-        weight = weight * jnp.einsum("...k,...hwk->...hw", jnp.maximum(pixels, 1) ** -balance, classes)
+        one_hot = jax.nn.one_hot(labels, logits.shape[-1], dtype=entropy.dtype)
+        pixels_of_class = jnp.einsum("...hw,...hwk->...k", weight, one_hot)
+        weight = weight * jnp.einsum("...k,...hwk->...hw", jnp.maximum(pixels_of_class, 1) ** -balance, one_hot)
     return (weight * entropy).sum((-2, -1)) / jnp.maximum(weight.sum((-2, -1)), 1e-6)
 
 
 def dice_sums(
     logits: Float[Array, "b h w k"], labels: Int[Array, "b h w"], where: Bool[Array, "b h w"] | None = None
 ) -> Float[Array, "3 k"]:
-    """Sums of equation 7 over the pixels (of `where`), per class: p t, p^2 and t^2. Sums of chunks can be added."""
+    """Sums of equation 7 over images and pixels, per class: p t, p^2 and t^2, for probability p and one-hot label t.
+
+    `where` is a mask of the pixels that count. The sums of parts of a batch can be added.
+    """
     probability = jax.nn.softmax(logits)
     truth = jax.nn.one_hot(labels, logits.shape[-1], dtype=logits.dtype)
     if where is not None:
         probability, truth = (jnp.where(where[..., None], x, 0.0) for x in (probability, truth))
-    return jnp.stack([(x * y).sum((0, 1, 2)) for x, y in ((probability, truth), (probability,) * 2, (truth,) * 2)])
+    products = probability * truth, probability * probability, truth * truth
+    return jnp.stack([product.sum((0, 1, 2)) for product in products])
 
 
 def dice_from_sums(sums: Float[Array, "3 k"]) -> Float[Array, ""]:
-    """Equation 7 from the sums of the whole batch: the mean over the classes of one minus Dice."""
-    product, probability, truth = sums
-    return (1 - (2 * product + DICE_EPSILON) / (probability + truth + DICE_EPSILON)).mean()
+    """Dice loss (equation 7) from the `dice_sums` of a whole batch: the mean over the classes of one minus Dice."""
+    intersection, probability_squares, truth_squares = sums
+    dice = (2 * intersection + DICE_EPSILON) / (probability_squares + truth_squares + DICE_EPSILON)
+    return (1 - dice).mean()
 
 
 def joint(terms: Mapping[str, Float[Array, ""]], weights: Mapping[str, float]) -> Float[Array, ""]:
-    """Equation 8: the weighted sum of the terms (triplet 1, cross-entropy 0.4, Dice 0.6 in the paper)."""
+    """Joint loss (equation 8): the weighted sum of loss terms (triplet 1, cross-entropy 0.4, Dice 0.6 in the paper)."""
     return functools.reduce(operator.add, (weights[name] * term for name, term in terms.items()))

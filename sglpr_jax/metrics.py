@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecallCurve:
-    """Precision and recall at every threshold. A threshold accepts the scores that are not below it."""
+    """Precision and recall at every threshold. A threshold accepts the scores at or above it."""
 
     thresholds: Float[np.ndarray, " k"]
     """Increasing thresholds, by default the distinct scores."""
@@ -27,13 +27,13 @@ class PrecisionRecallCurve:
 
     @property
     def best(self) -> int:
-        """Index of the highest F1. If several are equal, the one with the highest threshold."""
+        """Index of the threshold with the highest F1. Of equal ones, the last."""
         return len(self.thresholds) - 1 - int(np.argmax(self.f1[::-1]))
 
     def at_precision(self, precision: float) -> int | None:
-        """Index of the highest recall, above 0, with at least this precision, and of them the highest threshold.
+        """Index of the threshold with the highest recall at this precision or more. Of equal ones, the last.
 
-        None if no threshold has both.
+        None if no threshold has this precision and a recall above 0.
         """
         recall = np.where(self.precision >= precision, self.recall, 0.0)
         return len(recall) - 1 - int(np.argmax(recall[::-1])) if recall.any() else None
@@ -52,16 +52,15 @@ def decision_curve(
     missed_if_rejected: Bool[np.ndarray, " n"],
     thresholds: Float[np.ndarray, " k"] | None = None,
 ) -> PrecisionRecallCurve:
-    """Return the curve of n >= 1 decisions to accept or reject. Equal scores are accepted together.
+    """Return precision and recall of n >= 1 decisions to accept or reject an item, at every threshold of the score.
 
-    An accepted item is a true positive or a false positive. An item flagged as neither has no effect. A rejected item
-    is a false negative or a true negative. A score of -inf is rejected at every threshold. If no item can be missed,
-    recall is 1, as in scikit-learn; otherwise 0 / 0 is 0.
+    An item with a score of -inf is rejected at every threshold. If no item is a false negative when rejected, recall is
+    1, as in scikit-learn. Otherwise 0 / 0 is 0.
 
     Arguments:
       scores: Score of each item.
       true_if_accepted: Whether accepting the item is a true positive.
-      false_if_accepted: Whether accepting the item is a false positive.
+      false_if_accepted: Whether accepting the item is a false positive. An item may be neither.
       missed_if_rejected: Whether rejecting the item is a false negative.
       thresholds: Increasing thresholds that replace the distinct scores.
 
@@ -71,15 +70,16 @@ def decision_curve(
     if not finite.any() or not np.all(finite | np.isneginf(scores)):
         raise ValueError(f"expected finite scores, found {np.sum(~finite)} of {len(scores)} that are not finite")
     thresholds = np.unique(scores[finite]) if thresholds is None else thresholds
-    accepted_up_to = np.searchsorted(thresholds, scores, side="right")
+    accepting_thresholds = np.searchsorted(thresholds, scores, side="right")  # number of thresholds, for each item
 
-    def accepted(flags):
-        counts = np.bincount(accepted_up_to[flags], minlength=len(thresholds) + 1)[1:]
+    def count_accepted(flags):
+        """Number of accepted items with a flag at each threshold."""
+        counts = np.bincount(accepting_thresholds[flags], minlength=len(thresholds) + 1)[1:]
         return np.cumsum(counts[::-1], dtype=np.float64)[::-1]
 
-    true_positives = accepted(true_if_accepted)
-    false_negatives = np.sum(missed_if_rejected) - accepted(missed_if_rejected)
-    precision = _ratio(true_positives, true_positives + accepted(false_if_accepted))
+    true_positives = count_accepted(true_if_accepted)
+    false_negatives = np.sum(missed_if_rejected) - count_accepted(missed_if_rejected)
+    precision = _ratio(true_positives, true_positives + count_accepted(false_if_accepted))
     recall = _ratio(true_positives, true_positives + false_negatives)
     return PrecisionRecallCurve(thresholds, precision, recall if np.any(missed_if_rejected) else np.ones_like(recall))
 

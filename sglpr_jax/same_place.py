@@ -5,9 +5,9 @@ POSITIVE_M = 3.0
 NEGATIVE_M = 20.0
 """Distance beyond which two scans show different places, in metres. Between the two limits a pair is neither."""
 EXCLUDED_S = 30.0
-"""Minimum age of a match, in seconds. Later frames are neighbours of the query, not revisits."""
+"""Minimum time between a query and its match, in seconds. Closer frames are neighbours, not revisits."""
 EXCLUDED_FRAMES = 290
 """Replaces EXCLUDED_S for sequences without times: 30 s at KITTI's 9.6 scans per second."""
 SAME_PASS_FRAMES = 50
-"""Maximum difference of the frame numbers within one pass, in training. It is smaller than
-EXCLUDED_FRAMES, because a pass that returns after 5 s also gives training pairs."""
+"""Maximum difference of the frame numbers of two scans of one pass, in training. It is smaller than EXCLUDED_FRAMES,
+because a vehicle that returns after 5 s also gives training pairs."""

@@ -24,9 +24,9 @@ class Column(NamedTuple):
 
 
 def check_about(about: Any, fields: Mapping[str, Any], *, format: str) -> None:
-    """Raise ValueError if the parsed JSON `about` is no object of a `format`, or if a field is missing or invalid.
+    """Raise ValueError if the parsed JSON `about` is no object with this "format", or if a field is missing or invalid.
 
-    `fields` has the annotation of each required value, as in a configuration (`fields.check_value`).
+    `fields` has the annotation of each required field, as in a configuration (`fields.check_value`).
     """
     found = about.get("format") if isinstance(about, dict) else about
     if found != format:
@@ -38,11 +38,11 @@ def check_about(about: Any, fields: Mapping[str, Any], *, format: str) -> None:
 
 
 def check_columns(arrays: Mapping[str, np.ndarray], columns: Mapping[str, Column], **sizes: int) -> None:
-    """Check the arrays of a file by name. Other arrays than `columns` are ignored.
+    """Check the arrays of a file by name. Arrays without a column are ignored.
 
-    `sizes` are known lengths of named axes. The first array with an axis defines the others.
+    `sizes` are the known lengths of named axes. The first array with any other named axis defines its length.
 
-    Raises ValueError, with the name of the array, if one is missing, has another type or shape, or is not finite.
+    Raises ValueError, with the name of the array, if an array is missing, has another type or shape, or is not finite.
     """
     missing = [name for name, column in columns.items() if not column.optional and name not in arrays]
     if missing:
@@ -53,7 +53,7 @@ def check_columns(arrays: Mapping[str, np.ndarray], columns: Mapping[str, Column
 
 
 def _check_column(name: str, array: np.ndarray, column: Column, sizes: dict[str, int]) -> None:
-    """Check an array, and add the lengths of its named axes to `sizes`."""
+    """Raise ValueError if an array does not fit its column. Adds unknown lengths of its named axes to `sizes`."""
     if array.ndim == len(column.shape):
         for axis, length in zip(column.shape, array.shape, strict=True):
             if isinstance(axis, str):
@@ -63,8 +63,8 @@ def _check_column(name: str, array: np.ndarray, column: Column, sizes: dict[str,
         shape = ", ".join(map(str, expected))
         raise ValueError(f"expected {name} as {column.dtype} ({shape}), found {array.dtype} {array.shape}")
     if column.finite and array.dtype.kind == "f":
-        broken = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
-        if broken.size:
+        rows = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+        if rows.size:
             raise ValueError(
-                f"expected finite {name}, found NaN or infinity in {broken.size} rows, first in row {broken[0]}"
+                f"expected finite {name}, found NaN or infinity in {rows.size} rows, first in row {rows[0]}"
             )

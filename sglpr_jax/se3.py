@@ -1,4 +1,4 @@
-"""Rigid transforms as 4 x 4 matrices, `a_from_b @ b_from_c == a_from_c`."""
+"""Rigid transforms as 4 x 4 matrices, which compose as `a_from_b @ b_from_c == a_from_c`, and planar poses."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -6,11 +6,11 @@ from jaxtyping import Bool, Float
 PlanarPose = Float[np.ndarray, "... 3"]
 """Poses in the x-y plane: x and y in metres, yaw in radians counter-clockwise."""
 ROTATION_TOLERANCE = 0.01
-"""Tolerance for rotations in files with few digits."""
+"""Maximum deviation of an entry of R R^T from the identity, for rotations R in files with few digits."""
 
 
 def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
-    """Transform in the plane, from x and y in metres and yaw in radians counter-clockwise."""
+    """Transform in the x-y plane, from x and y in metres and yaw in radians counter-clockwise."""
     a_from_b = np.eye(4)
     a_from_b[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     a_from_b[:2, 3] = x, y
@@ -18,7 +18,7 @@ def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
 
 
 def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
-    """Inverse b_from_a of rigid transforms."""
+    """Return the inverses b_from_a of rigid transforms."""
     rotation = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     b_from_a = np.zeros_like(a_from_b)
     b_from_a[..., :3, :3] = rotation
@@ -33,21 +33,22 @@ def yaw_of(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n"]:
 
 
 def planar_pose(a_from_b: Float[np.ndarray, "*n 4 4"]) -> PlanarPose:
-    """Projection of poses to the x-y plane of frame a."""
+    """Project poses to the x-y plane of frame a."""
     return np.concatenate([a_from_b[..., :2, 3], yaw_of(a_from_b)[..., None]], axis=-1)
 
 
 def compose_planar(a_from_b: PlanarPose, b_from_c: PlanarPose) -> PlanarPose:
-    """Planar pose a_from_c."""
+    """Compose planar poses to a_from_c."""
     a_from_b, b_from_c = np.broadcast_arrays(a_from_b, b_from_c)
     x, y, yaw = np.moveaxis(b_from_c, -1, 0)
     cos, sin = np.cos(a_from_b[..., 2]), np.sin(a_from_b[..., 2])
-    moved = a_from_b[..., 0] + cos * x - sin * y, a_from_b[..., 1] + sin * x + cos * y
-    return np.stack([*moved, wrap_angle(a_from_b[..., 2] + yaw)], axis=-1)
+    x_in_a = a_from_b[..., 0] + cos * x - sin * y
+    y_in_a = a_from_b[..., 1] + sin * x + cos * y
+    return np.stack([x_in_a, y_in_a, wrap_angle(a_from_b[..., 2] + yaw)], axis=-1)
 
 
 def inverse_planar(a_from_b: PlanarPose) -> PlanarPose:
-    """Planar pose b_from_a."""
+    """Return the inverse planar poses b_from_a."""
     x, y, yaw = np.moveaxis(a_from_b, -1, 0)
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack([-cos * x - sin * y, sin * x - cos * y, -yaw], axis=-1)
@@ -64,10 +65,10 @@ def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n
 
 
 def adjoint(a_from_b: Float[np.ndarray, "*m 4 4"]) -> Float[np.ndarray, "*m 6 6"]:
-    """Matrix that transforms a small motion of a body (metres, then radians) from its frame b to its frame a."""
+    """Matrix that transforms a small motion of a rigid body (metres, then radians) from its frame b to its frame a."""
     x, y, z = np.moveaxis(a_from_b[..., :3, 3], -1, 0)
     rotation = a_from_b[..., :3, :3]
-    cross = np.zeros(rotation.shape)
+    cross = np.zeros(rotation.shape)  # cross @ v is the cross product of the translation and v
     cross[..., 0, 1], cross[..., 0, 2] = -z, y
     cross[..., 1, 0], cross[..., 1, 2] = z, -x
     cross[..., 2, 0], cross[..., 2, 1] = -y, x
@@ -78,13 +79,13 @@ def adjoint(a_from_b: Float[np.ndarray, "*m 4 4"]) -> Float[np.ndarray, "*m 6 6"
 
 
 def transform_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "*m 4 4"]) -> np.ndarray:
-    """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
+    """Transform the covariance of a small motion of a rigid body (metres, then radians) from frame b to frame a."""
     matrix = adjoint(a_from_b)
     return matrix @ covariance @ np.swapaxes(matrix, -1, -2)
 
 
 def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
-    """Rotations as quaternions x, y, z, w with non-negative w."""
+    """Return the rotations of poses as quaternions x, y, z, w with non-negative w."""
     from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     return Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
@@ -93,7 +94,7 @@ def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
 def from_quaternions(
     translations: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Poses from translations and quaternions (x, y, z, w)."""
+    """Return the poses with these translations and with rotations from quaternions (x, y, z, w)."""
     from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     poses = np.tile(np.eye(4), (len(translations), 1, 1))
@@ -103,7 +104,7 @@ def from_quaternions(
 
 
 def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
-    """Travelled distance at each pose, in metres."""
+    """Travelled distance from the first pose to each pose, in metres."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 

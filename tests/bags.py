@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sglpr_jax.live.ros_messages import LIVOX, LIVOX_POINT
+from sglpr_jax.live.ros_encoding import LIVOX_CUSTOM_MSG, LIVOX_POINT
 
 LIVOX_DRIVERS = ("livox_ros_driver", "livox_ros_driver2")
 CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7, "f8": 8}
@@ -29,7 +29,7 @@ def typestore(kind: str) -> Any:
     types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     for package in LIVOX_DRIVERS:
         types.register(get_types_from_msg(LIVOX_POINT, f"{package}/msg/CustomPoint"))
-        types.register(get_types_from_msg(LIVOX, f"{package}/msg/CustomMsg"))
+        types.register(get_types_from_msg(LIVOX_CUSTOM_MSG, f"{package}/msg/CustomMsg"))
     if kind == "ros1":
         types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TRANSFORMS))
     return types

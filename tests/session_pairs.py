@@ -11,7 +11,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, align_frames
 from sglpr_jax.loops.result import LoopSearchResult, Session
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import inverse, transform, travelled
 
 MATCH_FROM_QUERY = transform(40.0, -25.0, 2.0)

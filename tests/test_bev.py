@@ -17,7 +17,7 @@ from sglpr_jax.bev import (
     rotate_image,
     rotate_labels,
     rotate_points,
-    uncropped,
+    uncrop_labels,
 )
 from sglpr_jax.grid import Grid
 
@@ -149,7 +149,7 @@ angles = st.floats(-10, 10, width=32)
 
 @hypothesis.settings(deadline=None, max_examples=25)
 @hypothesis.given(hnp.arrays(np.float32, (2, 5, 3), elements=st.floats(-100, 100, width=32)), st.tuples(angles, angles))
-def test_points_turn_as_numpy_turns_them(points, turns):
+def test_points_rotate_as_in_numpy(points, turns):
     turns = np.float32(turns)
     found = rotate_points(points, turns)
     cos, sin = np.cos(turns.astype(np.float64)), np.sin(turns.astype(np.float64))
@@ -169,7 +169,7 @@ def bump(centre, size, resolution_m):
 
 @hypothesis.settings(deadline=None, max_examples=25)
 @hypothesis.given(angles, st.floats(-6, 6), st.floats(-6, 6))
-def test_images_turn_as_their_points_do(angle, x, y):
+def test_images_rotate_as_their_points(angle, x, y):
     turned_centre = np.asarray(rotate_points(np.float32([[x, y, 0]]), np.float32(angle)))[0]
     found = rotate_image(bump((x, y), 64, 0.4), np.float32(angle))
     np.testing.assert_allclose(found, bump(turned_centre, 64, 0.4), atol=0.01)
@@ -207,7 +207,7 @@ def nearest_labels(labels, angle):
 
 @hypothesis.settings(deadline=None, max_examples=25)
 @hypothesis.given(hnp.arrays(np.int32, (2, 7, 10), elements=st.integers(0, 34)), st.tuples(angles, angles))
-def test_labels_turn_to_the_nearest_cell(labels, turns):
+def test_rotated_labels_are_those_of_the_nearest_cell(labels, turns):
     turns = np.float32(turns)
     found = np.asarray(rotate_labels(labels, turns))
     assert found.dtype == np.int32
@@ -218,14 +218,14 @@ def test_labels_turn_to_the_nearest_cell(labels, turns):
 
 
 @pytest.mark.parametrize("shape, kept", [((4, 6), 16), ((5, 6), 12), ((5, 9), 9)])
-def test_what_was_cropped_lies_where_it_was(shape, kept):
+def test_uncrop_labels_inverts_the_crop(shape, kept):
     labels = np.random.default_rng(0).integers(1, 20, shape).astype(np.int32)
     crop = np.array(centre_crop(even_cells(jnp.asarray(labels)), height=4, width=4))
-    whole = uncropped(crop, shape=shape)
+    whole = uncrop_labels(crop, shape=shape)
     assert whole.shape == shape and (whole > 0).sum() == kept
     np.testing.assert_array_equal(whole, np.where(whole > 0, labels, 0))
     crop[1], crop[2] = 0, 7
-    assert (uncropped(crop, shape=shape)[shape[0] // 2] == 7).sum() == (shape[1] % 2 == 0) + 3
+    assert (uncrop_labels(crop, shape=shape)[shape[0] // 2] == 7).sum() == (shape[1] % 2 == 0) + 3
 
 
 def test_the_centre_is_cropped():

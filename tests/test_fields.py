@@ -32,7 +32,7 @@ class Example:
 @pytest.mark.parametrize(
     "values", [{}, {"share": 1}, {"name": "b"}, {"sizes": (1, 2)}, {"pair": (1, 2.5)}, {"clip": 2.0}]
 )
-def test_what_an_annotation_allows_is_allowed(values):
+def test_valid_values_are_accepted(values):
     assert dataclasses.asdict(Example(**values)) == dataclasses.asdict(Example()) | values
 
 
@@ -50,7 +50,7 @@ def test_what_an_annotation_allows_is_allowed(values):
         ({"name": "a" * 100}, f"Example.name: expected one of 'a', 'b', found '{'a' * 56}..."),
     ],
 )
-def test_anything_else_is_one_error_with_field_expected_and_found(values, message):
+def test_an_invalid_value_is_an_error_with_field_expected_and_found(values, message):
     with pytest.raises(ValueError) as error:
         Example(**values)
     assert str(error.value) == message

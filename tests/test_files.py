@@ -46,7 +46,7 @@ def test_a_file_is_replaced_at_the_end_of_the_block(tmp_path):
 
 
 @pytest.mark.parametrize("folder", [False, True])
-def test_an_error_leaves_what_was_there(tmp_path, folder):
+def test_after_an_error_the_previous_content_stays(tmp_path, folder):
     path = tmp_path / "a"
     write_json(path / "in.json" if folder else path, 1)
     with pytest.raises(KeyboardInterrupt), replacing(path) as temporary:
@@ -57,7 +57,7 @@ def test_an_error_leaves_what_was_there(tmp_path, folder):
 
 
 @pytest.mark.parametrize(("keep", "left"), [(False, "new"), (True, "old")])
-def test_a_folder_takes_the_place_of_another_unless_that_is_kept(tmp_path, keep, left):
+def test_a_folder_replaces_another_unless_keep_is_set(tmp_path, keep, left):
     path = tmp_path / "weights"
     (path / "old").mkdir(parents=True)
     with replacing(path, keep=keep) as temporary:
@@ -65,7 +65,7 @@ def test_a_folder_takes_the_place_of_another_unless_that_is_kept(tmp_path, keep,
     assert names(path) == [left] and names(tmp_path) == ["weights"]
 
 
-def test_several_that_replace_one_folder_at_once_all_end_well(tmp_path, monkeypatch):
+def test_all_who_replace_one_folder_at_once_succeed(tmp_path, monkeypatch):
     path, rename = tmp_path / "weights", os.replace
 
     def rename_and_rest(*names: Path) -> None:
@@ -86,7 +86,7 @@ def test_several_that_replace_one_folder_at_once_all_end_well(tmp_path, monkeypa
     assert (path / "a").read_text() == (path / "b").read_text()
 
 
-def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path):
+def test_a_locked_folder_is_refused_until_it_is_unlocked(tmp_path):
     folder = tmp_path / "new" / "folder"
     with (
         exclusive_lock(folder),
@@ -107,7 +107,7 @@ def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files)
     assert names(tmp_path) == []
 
 
-def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
+def test_unfinished_files_of_a_killed_process_are_removed(tmp_path):
     (tmp_path / "run" / ".weights.1.tmp" / "in").mkdir(parents=True)
     (tmp_path / "run" / "test").mkdir()
     for name in (".config.json.2.tmp", "test/.a.png.3.tmp", "test/a.png"):
@@ -117,7 +117,7 @@ def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
     assert names(tmp_path / "run") == ["test"] and names(tmp_path / "run" / "test") == ["a.png"]
 
 
-def test_whether_a_file_can_be_written_is_known_before(tmp_path):
+def test_an_unwritable_path_is_an_error_before_work(tmp_path):
     check_writable(tmp_path / "new" / "folder" / "a.npz")
     assert names(tmp_path) == []
     (tmp_path / "file").write_text("")
@@ -160,7 +160,7 @@ def test_a_safe_name_is_its_file_name_and_any_other_becomes_one(tmp_path, name):
 
 
 @pytest.mark.parametrize("listed", ["/etc/passwd", "samples/../../x", "", "a\0b", None])
-def test_another_path_is_refused_and_the_table_is_named(listed):
+def test_a_path_outside_the_dataset_is_refused(listed):
     with pytest.raises(ValueError, match=r"t\.json: expected paths of files inside d, found "):
         path_inside(Path("d"), listed, source=Path("t.json"))
 

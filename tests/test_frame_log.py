@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.files import WriteError
+from sglpr_jax.files import DataWarning, WriteError
 from sglpr_jax.frame_log import HEAD, FrameLog, RunLog
 
 RECORDS = [(0, b"first"), (1, b"second" * 9), (2, b"\0third")]
@@ -25,22 +24,22 @@ def read(path) -> tuple[list[tuple[int, bytes]], int]:
     log = FrameLog(path)
     found = list(log.records())
     log.close()
-    return found, log.cut
+    return found, log.removed_bytes
 
 
-def test_wherever_it_was_cut_whole_records_stay_and_more_can_follow(path):
+def test_a_log_cut_at_any_byte_keeps_whole_records_and_continues(path):
     content = path.read_bytes()
     for size in range(4, len(content) + 1):
         path.write_bytes(content[:size])
         whole = [record for record, end in zip(RECORDS, ENDS, strict=True) if end <= size]
         assert read(path) == (whole, size - ([0, *ENDS][len(whole)]))
         log = FrameLog(path)
-        assert list(log.records()) == whole and log.cut == 0
+        assert list(log.records()) == whole and log.removed_bytes == 0
         log.append(7, b"more")
         assert read(path) == ([*whole, (7, b"more")], 0)
 
 
-def test_wherever_a_byte_is_damaged_the_other_records_stay(path):
+def test_a_damaged_byte_loses_one_record_only(path):
     content = path.read_bytes()
     for at in range(len(content)):
         path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
@@ -48,14 +47,14 @@ def test_wherever_a_byte_is_damaged_the_other_records_stay(path):
         assert read(path)[0] == [record for record in RECORDS if record[0] != damaged]
 
 
-def test_another_file_is_refused_and_stays(path):
+def test_a_file_that_is_no_log_is_refused_and_unchanged(path):
     path.write_bytes(b"something else")
     with pytest.raises(ValueError, match=r"frames\.log: expected a log of frames, found another file"):
         read(path)
     assert path.read_bytes() == b"something else"
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_an_unwritable_log_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(WriteError, match="file"):
         FrameLog(tmp_path / "file" / "frames.log")

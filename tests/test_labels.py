@@ -29,7 +29,7 @@ def test_the_raw_id_of_a_class_becomes_that_class(categories):
     np.testing.assert_array_equal(to_classes(raw, categories=categories), classes)
 
 
-def test_dynamic_things_are_sorted_as_the_paper_says():
+def test_moving_objects_have_the_classes_of_the_paper():
     moving, movable = np.arange(252, 260), np.array([10, 11, 13, 15, 16, 18, 20, 30, 31, 32])
     twins = np.array([10, 31, 30, 32, 16, 13, 18, 20])
     np.testing.assert_array_equal(to_classes(moving), to_classes(twins))

@@ -38,7 +38,7 @@ def test_no_frames_have_no_database():
 
 
 @pytest.mark.parametrize("times", [[0.0, 2.0, 1.0], [0.0, np.nan, 1.0]])
-def test_times_must_run_forwards(times):
+def test_decreasing_times_are_refused(times):
     with pytest.raises(ValueError, match="never decrease"):
         database_end(3, times=np.array(times))
 

@@ -46,7 +46,7 @@ def test_quaternions_go_there_and_back():
     np.testing.assert_allclose(from_quaternions(poses()[:, :3, 3], found), poses(), atol=1e-12)
 
 
-def test_the_way_is_the_sum_of_steps():
+def test_travelled_distance_is_the_sum_of_steps():
     line = np.tile(np.eye(4), (3, 1, 1))
     line[:, 0, 3] = [0, 3, 3]
     line[:, 1, 3] = [0, 4, 5]
@@ -55,7 +55,7 @@ def test_the_way_is_the_sum_of_steps():
 
 @hypothesis.settings(deadline=None, max_examples=25)
 @hypothesis.given(st.floats(-4, 4), st.sampled_from([0.0, 0.02, 1e300, np.inf, np.nan]))
-def test_rotations_are_told_from_what_is_none(angle, error):
+def test_rotations_are_distinguished_from_other_matrices(angle, error):
     turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     mirror, damaged = turned * [1, 1, -1], turned + np.full((3, 3), error)
     np.testing.assert_array_equal(are_rotations(np.stack([turned, mirror, damaged])), [True, False, error == 0])

@@ -113,7 +113,7 @@ def index(
     with tempfile.TemporaryDirectory() as folder:
         fleet = FleetIndex(folder, weights_hash="drawn")
         _fill(fleet, drawn, places)
-        size = sum(path.stat().st_size for path in Path(fleet.place).rglob("*") if path.is_file())
+        size = sum(path.stat().st_size for path in Path(fleet.address).rglob("*") if path.is_file())
         print(f"{size / 1e9:.2f} GB, {size / places:.0f} bytes a place", flush=True)
         for asked, *how in itertools.product(_exact(drawn, places, queries), probes, refine):
             _report(fleet, asked, *how)

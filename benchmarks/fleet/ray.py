@@ -22,7 +22,7 @@ import tyro
 import sglpr_jax
 from sglpr_jax.files import replacing
 from sglpr_jax.methods.registry import network
-from sglpr_jax.pose_graph.folder import write_found
+from sglpr_jax.pose_graph.folder import write_loop_folder
 from sglpr_jax.retrieval.fleet_index import FleetIndex
 from sglpr_jax.retrieval.parquet import embed_to_store, read_places, stored_places
 
@@ -170,5 +170,5 @@ class PairSearch:
             recordings = [sglpr_jax.open_recording(path) for path in (first, second)]
             found = sglpr_jax.find_loops(recordings, self.params)
             with replacing(Path(self.out) / row["pair"]) as folder:
-                write_found(found, folder)
+                write_loop_folder(found, folder)
         return row | {"said": str(found).splitlines()[-1]}

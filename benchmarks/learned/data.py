@@ -14,7 +14,7 @@ import tyro
 from jaxtyping import Int
 
 import sglpr_jax
-from sglpr_jax.bev import uncropped
+from sglpr_jax.bev import uncrop_labels
 from sglpr_jax.data.density_image import values_of_points
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
@@ -152,6 +152,6 @@ def _unlabelled(scan: Scan) -> Int[np.ndarray, " n"]:
 
 def _predicted(params: sglpr_jax.Params, scan: Scan) -> Int[np.ndarray, " n"]:
     """Return the raw label of each point's cell, 0 outside the map."""
-    cells = uncropped(semantic_map(params, scan).predicted, shape=(DENSITY_SIZE, DENSITY_SIZE))
+    cells = uncrop_labels(semantic_map(params, scan).predicted, shape=(DENSITY_SIZE, DENSITY_SIZE))
     classes = values_of_points(np.rot90(cells), scan.upright_points)  # density_image is rotated by 90 degrees
     return to_raw(classes, categories=params.config.categories)

@@ -29,7 +29,7 @@ from sglpr_jax.loops.calibration import calibration_error, reliability
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.consistency import are_consistent
-from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
+from sglpr_jax.loops.probability import DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.sequence import neighbour_weights
 from sglpr_jax.models.params import Params
 from sglpr_jax.se3 import transform
@@ -99,7 +99,7 @@ def fit_model(
         table.add(f"{world}, alone", *_cells(of_world.alone, of_world.is_loop))
     everything = _joined(judged)
     table.add("all", *_cells(everything.probability, everything.is_loop))
-    for name in (*ALL, "support") if without_each else ():
+    for name in (*Evidence._fields, "support") if without_each else ():
         reduced = _joined(held_out(pairs, without=name))
         table.add(f"without {name}", *_cells(reduced.probability, reduced.is_loop))
     for one in reliability(everything.probability, everything.is_loop):
@@ -117,7 +117,7 @@ def _pairs(drive: DescribedDrive, odometry: Odometry, params: Params, *, breaks:
     candidates = [one for one in candidates if one.evidence.deviation <= search.present_drift.max_deviation]
     fits = [transform(*(float(value) for value in one.alignment[:3])) for one in candidates]
     errors = pose_errors([(one.query, one.match) for one in candidates], np.array(fits), drive.world_from_lidar)
-    evidence = np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(ALL))
+    evidence = np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(Evidence._fields))
     loops = [planar_loop(one.query, one.match, one.alignment, probability=0.5) for one in candidates]
     way_m = np.maximum.accumulate([float(search.motion.travelled[one.query]) for one in candidates])
     agreeing = are_consistent(loops, search.motion.path, drift=search.present_drift)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from sglpr_jax.cli.runtime import cache_folder
 from sglpr_jax.data import training_recordings
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan_stream import readable
+from sglpr_jax.data.scan_stream import only_readable
 from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def without_bad_scans(
         readable_recordings, scans_before = [], 0
         for recording in recordings:
             show_total = functools.partial(lambda before, scans: show(before + scans), scans_before)
-            readable_recordings.append(readable(recording, on_bad_scan=on_bad_scan, on_progress=show_total))
+            readable_recordings.append(only_readable(recording, on_bad_scan=on_bad_scan, on_progress=show_total))
             scans_before += len(recording)
     return readable_recordings
 

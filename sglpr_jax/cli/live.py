@@ -17,9 +17,9 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
-    from sglpr_jax.live.endpoints import Sink, Source
     from sglpr_jax.live.live_map import LiveMap
-    from sglpr_jax.live.messages import Report
+    from sglpr_jax.live.node_messages import Report
+    from sglpr_jax.live.sources_and_sinks import Sink, Source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,8 +56,8 @@ class LiveCommand(LiveOptions, DetectorFlags):
 
 def live(command: LiveCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.live.endpoints import open_sink, open_source
-    from sglpr_jax.live.messages import Reports
+    from sglpr_jax.live.node_messages import Reports
+    from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 
     _check_endpoints(command)
     report = Reports()
@@ -91,12 +91,12 @@ def run_node(
     cannot be written.
     """
     from sglpr_jax.live.node import Node
-    from sglpr_jax.live.results import write_results
+    from sglpr_jax.live.result_files import write_results
 
     with exclusive_lock(command.out), contextlib.ExitStack() as exit_stack:
         live_map = _open_map(command, report)
         exit_stack.callback(live_map.close)
-        unpublished = live_map.recall()
+        unpublished = live_map.restore()
         sinks = []
         for sink in open_sinks():
             exit_stack.callback(_close_sink, sink, report)
@@ -115,13 +115,13 @@ def run_node(
 
 
 def _check_endpoints(command: LiveCommand) -> None:
-    """Raise ValueError before any work if --poses would be overwritten. `check_name` raises it for unknown names."""
-    from sglpr_jax.live.endpoints import SINKS, SOURCES, check_name
-    from sglpr_jax.live.results import CORRECTED, TRAJECTORY
+    """Raise ValueError before any work if --poses would be overwritten. `split_known_name` for unknown names."""
+    from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
+    from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, split_known_name
 
-    check_name(command.source, SOURCES, kind="sources")
+    split_known_name(command.source, SOURCES, kind="sources")
     for sink in command.sinks:
-        check_name(sink, SINKS, kind="sinks")
+        split_known_name(sink, SINKS, kind="sinks")
     output_files = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
     if command.poses is not None and command.poses.resolve() in output_files:
         raise ValueError(

@@ -141,15 +141,16 @@ def _search_and_write(command: LoopsCommand) -> int:
     """Find the loops, write all files of the command and print a summary. Returns the exit status."""
     from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
-    from sglpr_jax.loops.checkpoint import remove
+    from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.loops.closure import why_rejected
     from sglpr_jax.loops.result import diagnose_no_loops
     from sglpr_jax.loops.search import can_register, find_loops
     from sglpr_jax.models.weights_file import load
-    from sglpr_jax.pose_graph.folder import write_found
+    from sglpr_jax.pose_graph.folder import write_loop_folder
     from sglpr_jax.pose_graph.optimize import optimize_trajectory
 
     params, out, checkpoint = load(command.weights), command.out, command.out / UNFINISHED
+    detector = command.detector  # raises an error for invalid settings before the recordings are opened
     odometry_checkpoints = [out / f"unfinished-{number}.odometry.log" for number in range(len(command.recordings))]
     effective, recordings, odometry = open_with_odometry(
         command,
@@ -171,7 +172,7 @@ def _search_and_write(command: LoopsCommand) -> int:
             recordings,
             params,
             odometry=odometry or None,
-            config=command.detector,
+            config=detector,
             registered=command.register and unregistrable is None,
             scale=effective.scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
@@ -182,7 +183,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     if command.degenerate == "drop":
         result = result.without_degenerate()
     optimized = optimize_trajectory(result) if command.optimize else None
-    paths = write_found(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
+    paths = write_loop_folder(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
     paths.append(record_command(effective, out))
     if command.rerun is not None:
         write_rerun(result, command.rerun, optimized=optimized)
@@ -195,8 +196,8 @@ def _search_and_write(command: LoopsCommand) -> int:
         return stop.exit_status
     if len(recordings) > 1:
         for number in range(len(recordings)):
-            remove(checkpoint / f"{number}")
-    remove(checkpoint)
+            delete_checkpoint(checkpoint / f"{number}")
+    delete_checkpoint(checkpoint)
     for path in odometry_checkpoints:
         path.unlink(missing_ok=True)
     return 0

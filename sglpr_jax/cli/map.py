@@ -91,7 +91,7 @@ def write_map(command: MapCommand) -> int:
 
 def _build_and_write(command: MapCommand, params: "Params") -> int:
     """Build the map and write it, unless a stopped run would replace a larger map. Returns the exit status."""
-    from sglpr_jax.loops.checkpoint import remove
+    from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
     from sglpr_jax.models.weights import weights_hash
@@ -148,7 +148,7 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     if is_stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
-    remove(unfinished)
+    delete_checkpoint(unfinished)
     odometry_checkpoint.unlink(missing_ok=True)
     return 0
 

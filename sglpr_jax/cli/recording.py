@@ -17,7 +17,8 @@ from sglpr_jax.data.choices import (
 )
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorConfig
-from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_PERCENT, DriftModel, OdometryFormat
+from sglpr_jax.odometry.config import OdometryFormat
+from sglpr_jax.odometry.drift_model import DRIFT_DEG_PER_100M, DRIFT_PERCENT, DriftModel
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.stop_request import stop_on_signal
@@ -179,15 +180,15 @@ def open_with_poses(
     cloud map, the scans are those that its LiDAR would measure at the poses.
     """
     from sglpr_jax.data.formats.scan_files import is_cloud_file
-    from sglpr_jax.pose_graph.odometry_files import at_scans, is_own, own_odometry, read_stamped
+    from sglpr_jax.pose_graph.odometry_files import is_bag_of_recording, match_to_scans, read_stamped, take_bag_odometry
 
     if is_cloud_file(root):
-        return own_odometry(source.open(root, poses=path, pose_format=format), root)
-    if is_own(path, root):
-        return own_odometry(source.open(root), root)
+        return take_bag_odometry(source.open(root, poses=path, pose_format=format), root)
+    if is_bag_of_recording(path, root):
+        return take_bag_odometry(source.open(root), root)
     odometry = read_stamped(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly
     whole_recording = source.open(root)
-    recording, poses = at_scans(whole_recording, *odometry, path)
+    recording, poses = match_to_scans(whole_recording, *odometry, path)
     if recording is not whole_recording:  # its last message says how many scans were removed
         print(recording.found[-1], file=sys.stderr)
     return recording, poses
@@ -257,10 +258,10 @@ def open_with_odometry(
 
 def _odometry_of(recording: "Recording", command: Any, checkpoint: Path) -> "Float[np.ndarray, 'n 4 4']":
     """Compute the odometry of a recording, with progress on stderr. Exits if a signal stops it before the end."""
-    from sglpr_jax.odometry.kiss_icp import about, scan_odometry
+    from sglpr_jax.odometry.kiss_icp import describe_odometry, scan_odometry
 
     if not recording.has_images:
-        print(about(recording, command.scan_odometry, scale=command.scale), file=sys.stderr)
+        print(describe_odometry(recording, command.scan_odometry, scale=command.scale), file=sys.stderr)
     with stop_on_signal() as stop, progress_bar(f"odometry {recording.name}", len(recording)) as show:
         poses = scan_odometry(
             recording,

@@ -21,9 +21,8 @@ import tyro
 from rich.console import Console
 
 from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, split_settings
-from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.fields import check_value, field_types, has_bounds
-from sglpr_jax.files import in_short, printable
+from sglpr_jax.files import DataWarning, in_short, printable
 
 _TABLE_WIDTH = 140
 INSTALLED_AS = "sglpr-"

@@ -3,21 +3,9 @@ readers."""
 
 from typing import Literal
 
-RecordFormat = Literal[
-    "kitti",
-    "nuscenes",
-    "nclt",
-    "float32x3",
-    "float32x4",
-    "float32x5",
-    "float32x6",
-    "float32x7",
-    "float32x8",
-    "float64x3",
-    "float64x4",
-    "float64x5",
-    "float64x6",
-]
+_Float32 = Literal["float32x3", "float32x4", "float32x5", "float32x6", "float32x7", "float32x8"]
+_Float64 = Literal["float64x3", "float64x4", "float64x5", "float64x6"]
+RecordFormat = Literal["kitti", "nuscenes", "nclt", _Float32, _Float64]
 """Format of a point in a .bin file. `kitti` is `float32x4`. `nuscenes` is `float32x5` with other axes and the laser
 number in the last column."""
 ScanFormat = Literal["auto", "pcd", "ply", "npy", "npz", "las", RecordFormat]
@@ -30,11 +18,11 @@ SensorHeight = float | Literal["auto", "estimate"]
 estimates them only if the layout does not define the sensor mounting."""
 Gravity = Literal["auto", "recording", "scan"]
 """Mounting of the sensor: one for the recording, or height and tilt of each scan. "auto" estimates each scan if the
-layout does not define the mounting and the sensor tilts, as in a hand."""
+layout does not define the mounting and the sensor tilts, as a handheld one does."""
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 """Unit of times in text files and from Python. "auto" expects seconds and rejects times whose steps contradict this. It
 ignores row numbers (0, 1, 2, ...)."""
 Scale = Literal[1, 2, 4]
-"""Factor for all lengths of a recording before images are computed. Rooms need more than 1 to fill an image."""
+"""Factor for all lengths of a recording before images are computed. Rooms fill an image only with a factor above 1."""
 ScaleChoice = Literal["auto", 1, 2, 4]
 """Scale, or "auto", which chooses it from the ranges of the scans."""

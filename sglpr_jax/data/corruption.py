@@ -13,62 +13,63 @@ from jaxtyping import Bool, Float, Float32, Int, Int32
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import naming
+from sglpr_jax.se3 import wrap_angle
 
 GAP_DEG = 0.1
-"""Elevation separates the rings if no ring is wider than this angle, in degrees, and all gaps between rings are
-wider."""
+"""Maximum width of a ring and minimum gap between rings, in degrees of elevation, if elevation separates the rings."""
 IN_ORDER = 0.9
-"""Minimum correlation of revolution and elevation for points that are stored ring after ring."""
+"""Minimum correlation between the number of the revolution and the elevation, if points are stored ring after ring."""
 
 
 def ring_numbers(
     points: Float[np.ndarray, "n 3"], *, lasers: Int[np.ndarray, " n"] | None = None
 ) -> Int32[np.ndarray, " n"]:
-    """Return the ring of every finite point, counted from 0 at the lowest elevation.
+    """Return the ring of each of some finite points (x, y, z in metres), counted from 0 at the lowest elevation.
 
     The first of these sources that separates the rings is used:
 
     - `lasers`: laser numbers in any order, unless all are equal as in simulated NCLT files.
     - Elevation, if it separates all rings, as in simulated scans and for sensors with few lasers.
     - The order of the points, if they are stored ring after ring, each counter-clockwise from straight ahead, as in
-      KITTI's files. There the elevation varies within a ring by more than the distance between two rings.
+      KITTI's files, where the rings overlap in elevation.
 
     Raises ValueError if no source separates the rings.
     """
     if len(points) == 0:
         return np.zeros(0, np.int32)
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
-    known = lasers is not None and lasers.min() < lasers.max()
-    groups = lasers if known else _by_elevation(elevation)
+    has_lasers = lasers is not None and lasers.min() < lasers.max()
+    groups = lasers if has_lasers else _groups_by_elevation(elevation)
     if groups is None:
         azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
-        groups = np.cumsum(np.diff(azimuth, prepend=0) < -np.pi)  # revolutions
+        groups = np.cumsum(np.diff(azimuth, prepend=0) < -np.pi)  # a new revolution starts where the azimuth drops
         if groups[-1] == 0 or abs(np.corrcoef(groups, elevation)[0, 1]) < IN_ORDER:
             raise ValueError(
                 "expected a scan with rings (laser numbers in its file, separate elevations, or points ring after ring "
                 f"from straight ahead), found {len(points)} points without rings"
             )
-    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
-    mean = np.bincount(group, weights=elevation) / count
-    return np.argsort(np.argsort(mean)).astype(np.int32)[group]
+    _, group, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    mean_elevation = np.bincount(group, weights=elevation) / counts
+    rank_of_group = np.argsort(np.argsort(mean_elevation)).astype(np.int32)
+    return rank_of_group[group]
 
 
-def keep_rings(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
-    """Whether each point remains if the sensor has only `beams` lasers: every 2nd of 64 for 32, every 4th for 16.
+def is_on_kept_ring(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
+    """Whether each point remains if only `beams` lasers are kept: every 2nd of 64 for 32 lasers, every 4th for 16.
 
     The number of rings is rounded up to a power of two, because some lasers may have no returns.
     """
-    sensor = 2 ** math.ceil(math.log2(int(rings.max(initial=0)) + 1))
-    return rings % max(sensor // beams, 1) == 0
+    lasers = 2 ** math.ceil(math.log2(int(rings.max(initial=0)) + 1))
+    return rings % max(lasers // beams, 1) == 0
 
 
-def _by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | None:
+def _groups_by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | None:
     """Group of each point between gaps of elevation, in degrees, or None if a group is wider than `GAP_DEG`."""
     order = np.argsort(elevation)
-    rising = elevation[order]
-    starts = np.flatnonzero(np.diff(rising, prepend=-np.inf) > GAP_DEG)
-    ends = np.append(starts[1:], len(rising)) - 1
-    if (rising[ends] - rising[starts]).max() > GAP_DEG:
+    sorted_elevation = elevation[order]
+    starts = np.flatnonzero(np.diff(sorted_elevation, prepend=-np.inf) > GAP_DEG)
+    ends = np.append(starts[1:], len(sorted_elevation)) - 1
+    if (sorted_elevation[ends] - sorted_elevation[starts]).max() > GAP_DEG:
         return None
     groups = np.empty(len(order), np.int64)
     groups[order] = np.repeat(np.arange(len(starts)), ends - starts + 1)
@@ -76,9 +77,10 @@ def _by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] |
 
 
 Cloud = Float32[np.ndarray, "n 3"]
-Corrupt = Callable[[Cloud, float, np.random.Generator, Int[np.ndarray, " n"] | None], Cloud | Bool[np.ndarray, " n"]]
-"""Function of finite points, strength, random generator and lasers if known. Returns a mask of the remaining points, or
-all points at new positions."""
+Lasers = Int[np.ndarray, " n"] | None
+Corrupt = Callable[[Cloud, float, np.random.Generator, Lasers], Cloud | Bool[np.ndarray, " n"]]
+"""Function of finite points (n, 3), strength, random generator and laser numbers, if known. It returns either a mask of
+the points that remain, or all points at new positions."""
 
 
 class Kind(NamedTuple):
@@ -86,58 +88,56 @@ class Kind(NamedTuple):
 
     corrupt: Corrupt
     strengths: tuple[float, ...]
-    """Usual strengths, from weak to strong. Only 0 for a kind without a strength."""
+    """Usual strengths, from weak to strong. Only 0, or none, for a kind without a strength."""
     limits: tuple[float, float] = (0.0, np.inf)
     """Minimum and maximum strength."""
 
 
 def occlude(points: Cloud, degrees: float, rng: np.random.Generator, lasers: object) -> Bool[np.ndarray, " n"]:
-    """Remove the points in a sector of the given width, in degrees, about a random heading."""
-    heading, width = rng.uniform(-np.pi, np.pi), np.radians(degrees)
+    """Return a mask of the points outside a sector `degrees` wide about a random heading."""
+    heading = rng.uniform(-np.pi, np.pi)
     azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
-    return np.abs((azimuth - heading + np.pi) % (2 * np.pi) - np.pi) >= width / 2
+    return np.abs(wrap_angle(azimuth - heading)) >= np.radians(degrees) / 2
 
 
-def remove_beams(
-    points: Cloud, beams: float, rng: np.random.Generator, lasers: Int[np.ndarray, " n"] | None
-) -> Bool[np.ndarray, " n"]:
-    """Keep the points of a number of lasers."""
-    return keep_rings(ring_numbers(points, lasers=lasers), int(beams))
+def remove_beams(points: Cloud, beams: float, rng: np.random.Generator, lasers: Lasers) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the points of evenly spaced lasers, `beams` in number."""
+    return is_on_kept_ring(ring_numbers(points, lasers=lasers), int(beams))
 
 
 def add_noise(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
-    """Add Gaussian noise along each ray, with the given standard deviation in metres. A point at the sensor stays."""
-    distance = np.linalg.norm(points.astype(np.float64), axis=1)
-    steps = metres * rng.standard_normal(len(points))
-    fractions = np.divide(steps, distance, out=np.zeros_like(distance), where=distance > 0)
-    return (points * (1 + fractions[:, None])).astype(np.float32)
+    """Add Gaussian noise of standard deviation `metres` to the range of each point. A point at the sensor stays."""
+    ranges = np.linalg.norm(points.astype(np.float64), axis=1)
+    errors_m = metres * rng.standard_normal(len(points))
+    relative_errors = np.divide(errors_m, ranges, out=np.zeros_like(ranges), where=ranges > 0)
+    return (points * (1 + relative_errors[:, None])).astype(np.float32)
 
 
 def drop_points(points: Cloud, probability: float, rng: np.random.Generator, lasers: object) -> Bool[np.ndarray, " n"]:
-    """Remove each point with this probability."""
+    """Return a mask that removes each point with this probability."""
     return rng.random(len(points)) >= probability
 
 
-def offset(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
-    """Move the sensor to the left or to the right at random, by some metres. Occlusions stay as they are."""
+def move_sensor(points: Cloud, metres: float, rng: np.random.Generator, lasers: object) -> Cloud:
+    """Move the sensor by `metres` to the left or right, at random. No point appears or disappears behind another."""
     return points - np.array([0, rng.choice((-1, 1)) * metres, 0], np.float32)
 
 
-def rotate_input(*_: object) -> Cloud:
-    """Raise ValueError. Embedding rotates the scans, because it can rotate images, too."""
+def reject_rotation(*_: object) -> Cloud:
+    """Raise ValueError: `embed` applies the corruption "rotation" itself, because it can rotate images, too."""
     raise ValueError("expected a corruption other than rotation; for rotation use the rotation_seed of embed")
 
 
 KINDS: dict[str, Kind] = {
     "clean": Kind(lambda points, *_: points, strengths=()),
-    "rotation": Kind(rotate_input, strengths=(0.0,)),
+    "rotation": Kind(reject_rotation, strengths=(0.0,)),
     "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), limits=(0.0, 360.0)),
     "beams": Kind(remove_beams, strengths=(32.0, 16.0), limits=(1.0, np.inf)),
     "noise": Kind(add_noise, strengths=(0.05, 0.1, 0.2)),
     "dropout": Kind(drop_points, strengths=(0.5, 0.9), limits=(0.0, 1.0)),
-    "offset": Kind(offset, strengths=(0.5, 1.0, 2.0)),
+    "offset": Kind(move_sensor, strengths=(0.5, 1.0, 2.0)),
 }
-"""All kinds by name."""
+"""All kinds by name. Strengths are degrees (occlusion), lasers (beams), metres (noise, offset), or a probability."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,9 +167,12 @@ CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() f
 
 
 def corruption_named(name: str) -> Corruption:
-    """Return the corruption of this name: a kind and, except for rotation, any strength, such as "occlusion-60"."""
+    """Return the corruption of a name: a kind of `KINDS` and, if the kind has one, a strength, as in "occlusion-60".
+
+    Raises ValueError, with the most similar name, if the kind or the strength is invalid.
+    """
     kind, _, strength = name.partition("-")
-    if kind not in KINDS or bool(strength) != any(KINDS[kind].strengths):
+    if kind not in KINDS or bool(strength) != any(KINDS[kind].strengths):  # "clean" and "rotation" have no strength
         known = [corruption.name for corruption in CORRUPTIONS]
         nearest = difflib.get_close_matches(name, known, n=1, cutoff=0)[0]
         raise ValueError(f"expected a corruption such as {', '.join(known)}, found {name!r}; did you mean {nearest!r}?")
@@ -180,26 +183,22 @@ def corruption_named(name: str) -> Corruption:
 
 
 def corrupt(
-    points: Cloud,
-    corruption: Corruption,
-    *,
-    rng: np.random.Generator,
-    lasers: Int[np.ndarray, " n"] | None = None,
+    points: Cloud, corruption: Corruption, *, rng: np.random.Generator, lasers: Lasers = None
 ) -> tuple[Float32[np.ndarray, "m 3"], Bool[np.ndarray, " n"]]:
-    """Corrupt the finite points of a scan, in metres in the LiDAR frame. `lasers` are their lasers, if known.
+    """Corrupt the finite points of a scan, in metres in the LiDAR frame. `lasers` are their laser numbers, if known.
 
-    Returns the remaining points, and a mask of them among the given points.
+    Returns the corrupted points that remain, and a mask of their rows in `points`.
 
     Raises ValueError for a rotation (see `rotation_seed` of `embed`), or if the beams cannot be separated.
     """
-    result = KINDS[corruption.kind].corrupt(points, corruption.strength, rng, lasers)
-    if result.dtype == bool:
-        return points[result], result
-    return result, np.ones(len(points), bool)
+    mask_or_moved = KINDS[corruption.kind].corrupt(points, corruption.strength, rng, lasers)
+    if mask_or_moved.dtype == bool:
+        return points[mask_or_moved], mask_or_moved
+    return mask_or_moved, np.ones(len(points), bool)
 
 
 def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:
-    """Return the recording with every scan corrupted on reading, as a function of `seed` and its row.
+    """Return the recording with every scan corrupted when it is read. Equal seeds and rows give equal scans.
 
     Labels and lasers stay with their points. Points that are not finite and the times of points are removed. Raises
     ValueError for a recording of images.
@@ -218,4 +217,4 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
             points, remaining = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
             return dataclasses.replace(finite.only(remaining), points=points)
 
-    return recording.derived(read)
+    return recording.with_reader(read)

@@ -2,7 +2,7 @@
 
 A scan is reduced to one centroid per voxel. A pixel thus measures how much of its column is occupied, regardless of
 its distance to the sensor. The rows of the image point against x (forward), and its columns against y (left).
-`density_bev` returns the image in the orientation of eq. 1, on the scale of counts.
+`density_bev` returns the image in the orientation of equation 1, on the scale of counts.
 """
 
 import numpy as np
@@ -20,16 +20,16 @@ within 32 bits."""
 MAX_VOXELS = 6000
 """Maximum number of voxels of a scan."""
 MOST_SPREAD = 2**25
-"""Maximum range of voxel numbers to be counted in an array. Larger ranges are sorted. A usual range is 2**24; a point
+"""Maximum range of voxel numbers for counting them in an array instead of sorting them. A usual range is 2**24. A point
 30 m above the sensor increases it to 10**8."""
-SOME_POINTS, SOME_VOXELS = 18_000, 2**16
-"""The quick voxel count samples at least `SOME_POINTS` points and takes voxel numbers modulo `SOME_VOXELS`."""
+SAMPLE_POINTS, SAMPLE_VOXELS = 18_000, 2**16
+"""Number of points in the sample for a lower bound of the number of voxels, and the modulus of its voxel numbers."""
 FIRST_EDGE_M, EDGE_STEP_M = 0.10, 0.05
 """Smallest voxel edge and its increment, in metres."""
 
 
 def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 151"]:
-    """Compute the density image of a scan in the orientation of eq. 1, as counts from 0 to 10 in cells of 0.4 m.
+    """Compute the density image of a scan in the orientation of equation 1, as counts from 0 to 10 in cells of 0.4 m.
 
     The result equals writing `density_image` to a PNG and reading it as a ready-made image.
     """
@@ -44,7 +44,7 @@ def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
 def density_label_bev(
     points: Float32[np.ndarray, "n 3"], classes: Int[np.ndarray, " n"]
 ) -> Int32[np.ndarray, "151 151"]:
-    """Compute the map of classes aligned with `density_bev`. See `density_label_image`."""
+    """Compute the map of classes aligned with `density_bev`: `density_label_image` in the orientation of equation 1."""
     return np.ascontiguousarray(np.rot90(density_label_image(points, classes), -1))
 
 
@@ -54,8 +54,9 @@ def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 
     The edge of the voxels is the smallest of 0.10, 0.15, 0.20, ... m that gives at most 6000 voxels. Points that are
     not finite are dropped. The result equals KITTI's ready-made images pixel for pixel.
     """
-    centroids = _voxel_centroids(points.T.take(np.flatnonzero(_in_crop(points)), axis=1))
-    counts = np.bincount(_cell_of_point(centroids), minlength=DENSITY_SIZE**2).clip(max=DENSITY_MAX_COUNT)
+    cropped = points.T.take(np.flatnonzero(_is_in_crop(points)), axis=1)
+    cells = _cell_of_point(_voxel_centroids(cropped))
+    counts = np.bincount(cells, minlength=DENSITY_SIZE**2).clip(max=DENSITY_MAX_COUNT)
     return np.round(counts * (255 / max(counts.max(), 1))).astype(np.uint8).reshape(DENSITY_SIZE, DENSITY_SIZE)
 
 
@@ -67,74 +68,75 @@ def density_label_image(
     A label belongs to the cell of its point, but a count belongs to the cell of the voxel's centroid. At the edges of
     objects, a cell may therefore have one without the other.
     """
-    counted = _in_crop(points)
+    in_crop = _is_in_crop(points)
     labels = np.zeros(DENSITY_SIZE**2, np.int32)
-    labels[_cell_of_point(points[counted].T)] = classes[counted]  # NumPy keeps the last of repeated assignments.
+    labels[_cell_of_point(points[in_crop].T)] = classes[in_crop]  # NumPy keeps the last of repeated assignments.
     return labels.reshape(DENSITY_SIZE, DENSITY_SIZE)
 
 
 def values_of_points(image: Int[np.ndarray, "151 151"], points: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Return the value of each point's cell in an image aligned with `density_image`, and 0 outside the crop."""
-    counted = _in_crop(points)
+    in_crop = _is_in_crop(points)
     values = np.zeros(len(points), image.dtype)
-    values[counted] = image.reshape(-1)[_cell_of_point(points[counted].T)]
+    values[in_crop] = image.reshape(-1)[_cell_of_point(points[in_crop].T)]
     return values
 
 
-def _in_crop(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+def _is_in_crop(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether each point counts in a density image: it is finite, within 25 m in x and y, and above the road."""
     x, y, z = points.T
     return (np.abs(x) < REACH_M) & (np.abs(y) < REACH_M) & (z > FLOOR_M) & (z < CEILING_M)
 
 
 def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
-    """Return the flat cell index of each point. Truncation makes the central row and column two cells wide."""
+    """Return the flat cell index of each point (column). Truncation makes the middle row and column two cells wide."""
     row, column = DENSITY_SIZE // 2 - np.trunc(points[:2] / DENSITY_RESOLUTION_M).astype(np.int64)
     return row * DENSITY_SIZE + column
 
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
     """Return x and y of the mean point of each voxel, in metres, for the smallest edge with at most `MAX_VOXELS`."""
-    voxels = _fewest_voxels(points)
+    voxels = _voxels_at_smallest_edge(points)
     if not len(voxels):
         return np.zeros((2, 0))
-    occupied = _occupied(voxels)
-    if occupied is None:
+    is_occupied = _occupancy(voxels)
+    if is_occupied is None:
         voxel = np.unique(voxels, return_inverse=True)[1]
     else:
-        voxel = (np.cumsum(occupied) - 1)[voxels - voxels.min()]  # numbers without gaps, in the same order
+        voxel = (np.cumsum(is_occupied) - 1)[voxels - voxels.min()]  # numbers without gaps, in the same order
     return np.stack([np.bincount(voxel, weights=axis) for axis in points[:2]]) / np.bincount(voxel)
 
 
-def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"]:
-    """Return the voxel number of each point, for the smallest edge with at most `MAX_VOXELS` voxels.
-
-    The quick count rules out most edges. It never exceeds the true number of voxels.
-    """
-    sample = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SOME_POINTS)])
+def _voxels_at_smallest_edge(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"]:
+    """Return the voxel number of each point, for the smallest edge with at most `MAX_VOXELS` voxels."""
+    sample = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SAMPLE_POINTS)])
     edge_m = FIRST_EDGE_M
-    while _too_many(_voxel_of_point(sample, edge_m) & (SOME_VOXELS - 1)) or _too_many(
-        voxels := _voxel_of_point(points, edge_m)
-    ):
+    while True:
+        # The count of a sample, with numbers modulo 2**16, is quick and never above the count of all points.
+        if not _are_too_many(_voxel_of_point(sample, edge_m) & (SAMPLE_VOXELS - 1)):
+            voxels = _voxel_of_point(points, edge_m)
+            if not _are_too_many(voxels):
+                return voxels
         edge_m += EDGE_STEP_M
-    return voxels
 
 
-def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
-    occupied = _occupied(voxels)
-    return int(len(np.unique(voxels)) if occupied is None else np.count_nonzero(occupied)) > MAX_VOXELS
+def _are_too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
+    """Whether more than `MAX_VOXELS` different voxel numbers occur."""
+    is_occupied = _occupancy(voxels)
+    return int(len(np.unique(voxels)) if is_occupied is None else np.count_nonzero(is_occupied)) > MAX_VOXELS
 
 
-def _occupied(voxels: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
-    """Flags of the voxel numbers that occur, from the smallest. None beyond a range of `MOST_SPREAD`."""
+def _occupancy(voxels: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
+    """Whether each number from the smallest to the largest voxel occurs, or None beyond `MOST_SPREAD` numbers."""
     if not len(voxels):
         return np.zeros(0, bool)
     least = int(voxels.min())
     spread = int(voxels.max()) - least + 1
     if spread > MOST_SPREAD:
         return None
-    occupied = np.zeros(spread, bool)
-    occupied[voxels - least] = True
-    return occupied
+    is_occupied = np.zeros(spread, bool)
+    is_occupied[voxels - least] = True
+    return is_occupied
 
 
 def _voxel_of_point(points: Float32[np.ndarray, "3 n"], edge_m: float) -> Int32[np.ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""Packs of recordings: the arrays of all scans one after another in files that are mapped into memory."""
+"""Packs of recordings: the arrays of all scans, concatenated in files that are mapped into memory."""
 
 import contextlib
 import hashlib
@@ -25,32 +25,23 @@ LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)
 
 
 class Stacked:
-    """Arrays in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`.
-
-    Indexing returns a read-only view. It raises ValueError if the checksum of the array is wrong.
-    """
+    """Arrays in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`."""
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        dtype: str,
-        row: Sequence[int],
-        offsets: Sequence[int],
-        checksums: Sequence[int] | None = None,
+        self, path: Path, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int] | None = None
     ):
-        """Map a file of `_write_arrays` with the layout that it returned. Packs of older versions have no checksums.
+        """Map a file and its layout as returned by `_write_arrays`. Packs of older versions have no checksums.
 
-        Raises ValueError if the layout contradicts the file. Access beyond its end would kill the process.
+        Raises ValueError if the layout contradicts the file. Access beyond the end of the file would kill the process.
         """
         if any(type(n) is not int for n in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
             raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
         if checksums is not None and [type(checksum) for checksum in checksums] != [int] * (len(offsets) - 1):
             raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {checksums!s:.60}")
         shape = (offsets[-1], *row)
-        expected, found = np.dtype(dtype).itemsize * math.prod(shape), path.stat().st_size
-        if expected != found:
-            raise ValueError(f"{path.name}: expected {expected} bytes, found {found}")
+        expected_bytes = np.dtype(dtype).itemsize * math.prod(shape)
+        if (found_bytes := path.stat().st_size) != expected_bytes:
+            raise ValueError(f"{path.name}: expected {expected_bytes} bytes, found {found_bytes}")
         self._path, self._offsets, self._checksums = path, offsets, checksums
         with path.open("rb") as stream:
             self._file = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
@@ -60,11 +51,12 @@ class Stacked:
         return len(self._offsets) - 1
 
     def __getitem__(self, i: int) -> np.ndarray:
+        """Return array `i` as a read-only view. Raises ValueError if its checksum is wrong."""
         array = self._rows[slice(*self._offsets[i : i + 2])]
-        if len(array):  # request the bytes at once: by default, the system reads 128 KiB at each first access
+        if len(array):  # request all bytes at once: by default, the system reads 128 KiB at each first access
             start = self._offsets[i] * self._rows.strides[0]
-            page = start - start % mmap.PAGESIZE
-            self._file.madvise(mmap.MADV_WILLNEED, page, start + array.nbytes - page)
+            page_start = start - start % mmap.PAGESIZE
+            self._file.madvise(mmap.MADV_WILLNEED, page_start, start + array.nbytes - page_start)
         if self._checksums is not None and self._checksums[i] != (found := _checksum(array)):
             raise ValueError(
                 f"{self._path}: expected array {i} with the checksum {self._checksums[i]} of pack.json, found {found};"
@@ -82,12 +74,9 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     """Return the same recording, read from its pack in `folder`. If there is no pack, it is created first.
 
     Points, labels and images are bitwise equal to those of the files, and read-only. Lasers, and the labels of images,
-    still come from the files. Raises ValueError if the pack is damaged or `recording` is not read from its own files.
+    still come from the files. `on_progress` is called with the number of packed scans.
 
-    Arguments:
-      recording: Recording as opened by a reader.
-      folder: Folder of the packs.
-      on_progress: Called with the number of packed scans.
+    Raises ValueError if the pack is damaged, or if `recording` does not return the content of its files (`on_disk`).
     """
     if not recording.on_disk:
         raise ValueError(
@@ -98,26 +87,26 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     identity = hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
     target = folder / f"{file_name(recording.name)}-{identity}"
     if not target.is_dir():
-        with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
+        with replacing(target, keep=True) as temporary:  # If another process is faster, its pack stays.
             temporary.mkdir()
-            about = _write_arrays(temporary, recording, on_progress)
+            layouts = _write_arrays(temporary, recording, on_progress)
             with (temporary / ABOUT_FILE).open("w") as stream:
-                json.dump({**source, "arrays": about}, stream)
+                json.dump({**source, "arrays": layouts}, stream)
                 _sync(stream)
     arrays = open_pack(target, scans=len(recording))
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
+    def read_row(row: int, label_path: Path | None, lasers: bool) -> Scan:
         if "images" in arrays:
-            return image_scan(recording.paths[row], label_path, read=lambda _: arrays["images"][row])
+            return image_scan(recording.paths[row], label_path, read=lambda path: arrays["images"][row])
         labels = arrays["labels"][row].astype(np.int32) if label_path is not None and "labels" in arrays else None
-        numbers = recording.read_row(row, None, True).lasers if lasers else None
-        return Scan(points=arrays["points"][row], labels=labels, lasers=numbers)
+        laser_numbers = recording.read_row(row, None, True).lasers if lasers else None
+        return Scan(points=arrays["points"][row], labels=labels, lasers=laser_numbers)
 
-    return recording.derived(read)
+    return recording.with_reader(read_row)
 
 
 def _source(recording: Recording) -> dict[str, Any]:
-    """Identify the pack of a recording by its files and their read options, which include hashes of other files."""
+    """Values whose hash identifies the pack of a recording: its files, with size and time, and its read options."""
     paths = recording.paths if recording.has_images else (*recording.paths, *recording.label_paths)
     files = [(str(path.absolute()), path.stat()) for path in paths if path is not None]
     return {
@@ -128,18 +117,22 @@ def _source(recording: Recording) -> dict[str, Any]:
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
-    """Write the arrays of all scans or images one after another, and return their layout, as for `Stacked`."""
+    """Concatenate the arrays of all scans or images in a file `NAME.bin` for each name, such as `points.bin`.
+
+    Returns the layout of each file by name: the arguments of `Stacked` other than the path.
+    """
     streams: dict[str, IO] = {}
     layouts: dict[str, Any] = {}
     with contextlib.ExitStack() as opened:
         for i in range(len(recording)):
             for name, array in _arrays(recording, i).items():
-                path, rows = folder / f"{name}.bin", {"dtype": array.dtype.str, "row": array.shape[1:]}
-                layout = layouts.setdefault(name, {**rows, "offsets": [0], "checksums": []})
-                if any(layout[part] != value for part, value in rows.items()):
+                path, row_shape = folder / f"{name}.bin", array.shape[1:]
+                layout = {"dtype": array.dtype.str, "row": row_shape, "offsets": [0], "checksums": []}
+                layout = layouts.setdefault(name, layout)
+                if (layout["dtype"], layout["row"]) != (array.dtype.str, row_shape):
                     raise ValueError(
                         f"scan {recording.ids[i]} of sequence {recording.name}: expected {layout['dtype']} with rows "
-                        f"of shape {layout['row']}, like the first array of the pack, found {array.dtype} {rows['row']}"
+                        f"of shape {layout['row']}, like the first array of the pack, found {array.dtype} {row_shape}"
                     )
                 array = np.ascontiguousarray(array)
                 with writing(path):
@@ -157,18 +150,19 @@ def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int
 
 
 def _close(stream: IO) -> None:
-    with contextlib.suppress(OSError):  # An earlier write error is already being raised.
+    """Close a file. An error is ignored, because an earlier error of the same file is already raised."""
+    with contextlib.suppress(OSError):
         stream.close()
 
 
 def _sync(stream: IO) -> None:
-    """Flush a file to disk. If the file were renamed before, a power failure could leave it incomplete."""
+    """Flush a file to disk. If its folder were renamed before, a power failure could leave an incomplete pack."""
     stream.flush()
     os.fsync(stream.fileno())
 
 
 def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
-    """Arrays of one scan or image by their name in the pack."""
+    """Arrays of scan or image `i` by their name in a pack. A scan without labels has an empty array of labels."""
     if recording.has_images:
         return {"images": recording.image(i)}
     scan = recording.scan(i)
@@ -179,7 +173,7 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
 
 
 def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
-    """Return the arrays of a pack by name. Raises ValueError, with the folder, if the pack is damaged."""
+    """Return the arrays of a pack by name. Raises ValueError if the pack is damaged or has not this number of scans."""
     try:
         layouts = read_json(folder / ABOUT_FILE)["arrays"]
         for name, layout in layouts.items():

@@ -9,22 +9,22 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import usual_step
 from sglpr_jax.se3 import are_rotations
 
-WIDEST_S = (1.0, 2.0)
-"""Least and greatest value of the maximum time between two poses for interpolation (`widest_gap_s`), in seconds."""
-JITTER = 1.5
+GAP_RANGE_S = (1.0, 2.0)
+"""Range of the maximum time between two poses for interpolation (`widest_gap_s`), in seconds."""
+GAP_STEPS = 1.5
 """Maximum time between two poses for interpolation, as a multiple of the median time between them."""
 BEYOND_S = 0.1
 """Maximum time of a scan before the first pose or after the last one, in seconds."""
 SAME_S = 0.001
 """Maximum difference of equal times, in seconds. Programs round times differently."""
 LEAST_SHARE = 0.5
-"""Minimum fraction of scans with a pose. Below it, the poses belong to another drive, another clock or a goal."""
+"""Minimum fraction of scans with a pose. Below it, the poses are of another drive or clock, or no trajectory."""
 
 
 def poses_of(
     positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None = None
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Combine positions and rotations to poses. The default is identity rotations."""
+    """Combine positions and rotations to poses. By default the rotations are the identity."""
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
     poses[:, :3, 3] = positions
     if rotations is not None:
@@ -32,12 +32,12 @@ def poses_of(
     return poses
 
 
-def poses_of_scans(
+def checked_scan_poses(
     recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"], *, use: str
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses that a caller gives for the scans of a recording, as float64. `use` names their use in messages.
+    """Return poses given by the user, one for each scan of a recording, as float64. `use` is their use, for messages.
 
-    Raises ValueError for ready-made images, another number of poses, or poses without rotations.
+    Raises ValueError for ready-made images, another number of poses, or invalid poses (`checked_poses`).
     """
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans for {use}, found ready-made images")
@@ -47,39 +47,42 @@ def poses_of_scans(
             f"sequence {recording.name}: expected a pose (4, 4) for each of {len(recording)} scans, found an array of "
             f"shape {poses.shape}"
         )
-    return turned_poses(poses, use=use)
+    return checked_poses(poses, use=use)
 
 
-def turned_poses(poses: Float[np.ndarray, "n 4 4"], *, use: str) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses. Raises ValueError if one of them is not finite or has no rotation."""
-    wrong = ~(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[:, :3, :3]))
-    if wrong.any():
-        row = int(wrong.argmax())
+def checked_poses(poses: Float[np.ndarray, "n 4 4"], *, use: str) -> Float[np.ndarray, "n 4 4"]:
+    """Return the poses. Raises ValueError if a pose is not finite or its 3 x 3 part is no rotation."""
+    is_invalid = ~(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[:, :3, :3]))
+    if is_invalid.any():
+        row = int(is_invalid.argmax())
         raise ValueError(f"{use}: expected poses with rotations, found {poses[row].tolist()} at scan {row}")
     return poses
 
 
 def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
-    """Maximum time between two poses for interpolation, in seconds: 1.5 s at 1 Hz, from 1 s to 2 s at other rates."""
-    return float(np.clip(JITTER * usual_step(stamps), *WIDEST_S))
+    """Maximum time between two poses for interpolation, in seconds: 1.5 times their median step, from 1 s to 2 s."""
+    return float(np.clip(GAP_STEPS * usual_step(stamps), *GAP_RANGE_S))
 
 
 def have_poses(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
-    """Whether each of `times` is between two poses that are near enough in time. `stamps` may have any order."""
+    """Whether a pose can be interpolated at each of `times`: the poses around it are at most `widest_gap_s` apart.
+
+    `stamps` are the times of the poses in seconds, in any order. A time may be up to `BEYOND_S` before or after them.
+    """
     stamps = np.unique(stamps)
     if len(stamps) < 2:
         return np.zeros(len(times), bool)
-    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    near = stamps[later] - stamps[later - 1] <= widest_gap_s(stamps)
-    return near & (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
+    next_pose = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
+    has_small_gap = stamps[next_pose] - stamps[next_pose - 1] <= widest_gap_s(stamps)
+    return has_small_gap & (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
 
 
 def interpolate_poses(
     stamps: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " q"]
 ) -> Float[np.ndarray, "q 4 4"]:
-    """Interpolate positions linearly and rotations with constant angular velocity. Valid where `have_poses` is true.
+    """Interpolate positions linearly and rotations with constant angular velocity, at `times` in seconds.
 
-    `stamps` and `times` are in seconds and in any order.
+    `stamps` are the times of the poses, in any order. The result is meaningful where `have_poses` is true.
     """
     from scipy.spatial.transform import Rotation, Slerp  # imported here because the import is slow
 
@@ -94,19 +97,19 @@ def interpolate_poses(
 def pose_at(
     stamps: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"], time: float
 ) -> Float[np.ndarray, "4 4"] | None:
-    """Interpolate poses at one time, in seconds. Returns None if no poses are near enough in time (`have_poses`)."""
+    """Interpolate poses with times `stamps` at one time, in seconds, or return None if `have_poses` is false."""
     times = np.array([time])
     return interpolate_poses(stamps, poses, times)[0] if have_poses(stamps, times).all() else None
 
 
 class ScanPoses(NamedTuple):
-    """Poses of the scans."""
+    """Poses of the scans of a recording."""
 
-    kept: Bool[np.ndarray, " n"]
-    """True for scans with a pose."""
+    has_pose: Bool[np.ndarray, " n"]
+    """Whether each scan has a pose."""
     poses: Float[np.ndarray, "k 4 4"]
-    """Poses of the scans with a pose."""
-    said: str
+    """Poses of the scans that have one."""
+    note: str
     """Description of how poses and scans were matched. Empty if their times are equal or unknown."""
 
 
@@ -117,9 +120,9 @@ def poses_at_scans(
     times: Float[np.ndarray, " n"] | None,
     *,
     scans: int,
-    of: str,
+    item: str,
 ) -> ScanPoses:
-    """Assign poses to scans: pose i to scan i, or interpolated at the scans with poses near in time (`have_poses`).
+    """Assign poses to scans: pose i to scan i, or poses interpolated at the times of the scans (`have_poses`).
 
     Pose i belongs to scan i if there are as many poses as scans and their times are equal, unknown, or have the same
     intervals from another origin.
@@ -130,44 +133,44 @@ def poses_at_scans(
       stamps: Times of the poses in seconds, or None.
       times: Times of the scans in seconds, or None.
       scans: Number of scans.
-      of: What a row belongs to, for messages: "scan of 08".
+      item: Name of what each pose belongs to, for messages: "scan of 08".
 
     Raises ValueError if fewer than half of the scans have a pose, or if interpolation is needed and times are missing.
     """
-    if len(poses) == scans and (note := _row_by_row(stamps, times)) is not None:
+    if len(poses) == scans and (note := _row_by_row_note(stamps, times)) is not None:
         return ScanPoses(np.ones(scans, bool), poses, note)
-    expected, found = f"expected {scans} poses, one for each {of}", f"found {len(poses)}"
+    expected, found = f"expected {scans} poses, one for each {item}", f"found {len(poses)}"
     if stamps is None or times is None:
         why = "the file has no times" if stamps is None else "the scans have no times"
         raise ValueError(
             f"{source}: {expected}, {found}, and {why} to interpolate at (row numbers 0, 1, 2, ... are not times)"
         )
-    with_pose = have_poses(stamps, times)
-    if with_pose.mean() < LEAST_SHARE:
-        by_row = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
+    has_pose = have_poses(stamps, times)
+    if has_pose.mean() < LEAST_SHARE:
+        advice = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
         raise ValueError(
             f"{source}: {expected}, at its time, or poses at most {widest_gap_s(stamps):.2g} s apart that cover the "
             f"scans, {times[0]:.1f} to {times[-1]:.1f} s, {found} from {stamps[0]:.1f} to {stamps[-1]:.1f} s"
-            f"{by_row if len(stamps) == len(times) else ''}"
+            f"{advice if len(stamps) == len(times) else ''}"
         )
-    note = f"interpolated at the times of the scans{left_out(with_pose)}"
-    return ScanPoses(with_pose, interpolate_poses(stamps, poses, times)[with_pose], note)
+    note = f"interpolated at the times of the scans{missing_poses_note(has_pose)}"
+    return ScanPoses(has_pose, interpolate_poses(stamps, poses, times)[has_pose], note)
 
 
-def left_out(with_pose: Bool[np.ndarray, " n"]) -> str:
+def missing_poses_note(has_pose: Bool[np.ndarray, " n"]) -> str:
     """Describe how many scans have no pose. The description is empty if all have one."""
-    missing = len(with_pose) - int(with_pose.sum())
-    return f"; {missing} of {len(with_pose)} scans left out, which have no pose" if missing else ""
+    missing = len(has_pose) - int(has_pose.sum())
+    return f"; {missing} of {len(has_pose)} scans left out, which have no pose" if missing else ""
 
 
-def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
-    """Description of a match row by row, or None if the times contradict it."""
+def _row_by_row_note(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
+    """Describe how pose i fits scan i by their times, or return None if it does not. "" for equal or unknown times."""
     if stamps is None or times is None:
         return ""
     offsets = times - stamps
     if np.abs(offsets).max() <= SAME_S:
         return ""
-    other_clock = stamps[-1] < times[0] or times[-1] < stamps[0]
-    if other_clock and np.ptp(offsets) <= SAME_S:
+    is_other_clock = stamps[-1] < times[0] or times[-1] < stamps[0]
+    if is_other_clock and np.ptp(offsets) <= SAME_S:
         return f"row by row: the scans have the same intervals and start {offsets.mean():.1f} s later"
     return None

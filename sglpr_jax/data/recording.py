@@ -1,4 +1,4 @@
-"""Recordings: what a reader of a dataset returns."""
+"""`Recording`: the scans of one drive as a reader of a dataset returns them."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -16,7 +16,8 @@ from sglpr_jax.data.scan import Scan
 ReadRecord = Callable[[Path, Path | None, bool], Scan]
 """Reads a scan from the file of its points or image, its label file (None: no labels), and whether to read lasers."""
 ReadUps = Callable[[], tuple[Float[np.ndarray, "n 3"], str] | None]
-"""Reads up in the LiDAR frame at each scan, NaN where unknown, and its source in words; None if there is no gravity."""
+"""Returns the direction of up in the LiDAR frame at each scan (NaN where unknown) and a description of its source, or
+None if the IMU does not measure gravity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +81,12 @@ class Recording:
 
     @property
     def numbers(self) -> Int[np.ndarray, " n"]:
-        """Number of each scan in the whole recording, from 0. Scans that are left out have numbers, too."""
+        """Number of each scan in the whole recording, from 0. Scans that were left out (`rows`) are counted."""
         return np.arange(len(self)) if self.rows is None else self.rows
 
     @property
     def description(self) -> tuple[str, ...]:
-        """Number of scans, their format, times, poses and extent, one line each. A large height is a wrong frame."""
+        """Lines for the user: number of scans, notes of the reader, and times, poses and extent of the trajectory."""
         times = "none" if self.times is None else f"over {np.ptp(self.times):.1f} s"
         poses = self.pose_source or "none"
         if self.positions is not None and len(self):
@@ -120,7 +121,7 @@ class Recording:
         return self.read_row(i, self.label_paths[i] if labels and self.label_paths else None, lasers)
 
     def read_row(self, i: int, label_path: Path | None, lasers: bool) -> Scan:
-        """Read scan or image `i` with the labels of a file, or without labels."""
+        """Read scan or image `i` with the labels of a file, or without labels, and add what is known of it."""
         scan = self.read(self.paths[i], label_path, lasers)
         return dataclasses.replace(
             scan,
@@ -130,13 +131,13 @@ class Recording:
             mounting=self.mounting_of(i),
         )
 
-    def noting(self, note: str, **fields: Any) -> "Recording":
-        """Return the recording with a further note in `found` and other `fields`."""
+    def with_note(self, note: str, **fields: Any) -> "Recording":
+        """Return the recording with one more note in `found`, and with other values of some `fields`."""
         return dataclasses.replace(self, found=(*self.found, note), **fields)
 
-    def derived(
+    def with_reader(
         self,
-        read: Callable[[int, Path | None, bool], Scan],
+        read_row: Callable[[int, Path | None, bool], Scan],
         *,
         options: Mapping[str, str] | None = None,
         **fields: Any,
@@ -144,17 +145,17 @@ class Recording:
         """Return a recording whose scans are computed from those of this recording, such as corrupted or scaled ones.
 
         Arguments:
-          read: Function of the row, the label file and whether to read lasers, as `read_row`.
+          read_row: Function of the row, the label file and whether to read lasers, as `Recording.read_row`.
           options: Read options that identify the change, in addition to those of this recording.
           fields: Other fields that change.
         """
         row_of = {path: row for row, path in enumerate(self.paths)}
 
-        def read_path(path: Path, label_path: Path | None, lasers: bool, **options: str) -> Scan:
-            return read(row_of[path], label_path, lasers)
+        def read(path: Path, label_path: Path | None, lasers: bool, **options: str) -> Scan:
+            return read_row(row_of[path], label_path, lasers)
 
-        read_options = {**self.read_options, **(options or {})}
-        return dataclasses.replace(self, read=partial(read_path, **read_options), on_disk=False, **fields)
+        read_options = {**self.read_options, **(options or {})}  # the keywords of the partial, unused by `read`
+        return dataclasses.replace(self, read=partial(read, **read_options), on_disk=False, **fields)
 
     def mounting_of(self, i: int) -> Mounting | None:
         """Mounting of the sensor at scan `i`."""
@@ -162,7 +163,7 @@ class Recording:
 
     @property
     def uprights(self) -> Float[np.ndarray, "n 4 4"]:
-        """Transform from the LiDAR frame to the gravity-aligned frame at each scan."""
+        """Transform from the LiDAR frame to the gravity-aligned frame (`upright_from_lidar`) at each scan."""
         mountings = [self.mounting] if self.mountings is None else self.mountings
         return np.broadcast_to([upright_from_lidar(mounting) for mounting in mountings], (len(self), 4, 4))
 

@@ -1,7 +1,7 @@
-"""Scale of a recording: its scans are multiplied by a factor, so that the places of a small sensor fill an image.
+"""Scale of a recording: a factor of its lengths, so that scans of rooms or of a short-range sensor fill an image.
 
 An image shows 25 m in each direction, in cells of 0.4 m. With a factor of 4, it shows 6.25 m in cells of 0.1 m. The
-weights, the descriptors and the model of the probabilities stay as they are.
+same weights are used.
 """
 
 import dataclasses
@@ -21,10 +21,10 @@ SCALE = "scale"
 SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0
-"""Minimum range of scans that are not scaled, in metres. Simulated corridors and rooms have 5 to 6 m, warehouses 9 to
-13 m, and garages and streets 12 m or more (`benchmarks/quality/sensors.py`)."""
+"""Minimum range of a sensor whose scans are not scaled, in metres. Simulated corridors and rooms have 5 to 6 m,
+warehouses 9 to 13 m, and garages and streets 12 m or more (`benchmarks/quality/sensors.py`)."""
 NEAR_SCALE: Scale = 4
-"""Scale of recordings with shorter ranges."""
+"""Scale of recordings with a range below `FAR_M`."""
 
 
 def scaled(recording: Recording, scale: Scale) -> Recording:
@@ -38,7 +38,7 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans to scale by {scale}, found ready-made images")
     mountings = recording.mountings
-    return recording.derived(
+    return recording.with_reader(
         lambda row, label_path, lasers: scaled_scan(recording.read_row(row, label_path, lasers), scale),
         options={SCALE: str(scale)},
         mounting=_scaled_mounting(recording.mounting, scale),
@@ -47,27 +47,30 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
 
 
 def chosen_scale(recording: Recording) -> Scale:
-    """Choose the scale of a recording: `NEAR_SCALE` if the sensor sees less than `FAR_M`, otherwise 1.
+    """Choose the scale of a recording: `NEAR_SCALE` if the range of the sensor is below `FAR_M`, otherwise 1.
 
-    The range of a scan is the 90 % quantile of its horizontal distances, that of the sensor the median of some scans.
-    Recordings of images and unreadable recordings have scale 1.
+    The range is the median over some scans of the 90 % quantile of the horizontal distances of their points. Recordings
+    of images and unreadable recordings have scale 1.
     """
     if recording.has_images or not len(recording):
         return 1
     ranges_m = []
     for points in sampled_points(recording, SCANS):
-        if points is not None and len(points := points[np.isfinite(points).all(axis=1)]):
-            ranges_m.append(np.quantile(np.hypot(*points[:, :2].T), 0.9))
+        if points is None:
+            continue
+        finite = points[np.isfinite(points).all(axis=1)]
+        if len(finite):
+            ranges_m.append(np.quantile(np.hypot(*finite[:, :2].T), 0.9))
     return NEAR_SCALE if ranges_m and np.median(ranges_m) < FAR_M else 1
 
 
 def scale_of(recording: Recording) -> int:
-    """Scale of the scans of a recording."""
+    """Scale of a recording that `scaled` returned. 1 for any other recording."""
     return int(recording.read_options.get(SCALE, "1"))
 
 
 def scaled_scan(scan: Scan, scale: Scale) -> Scan:
-    """Return a scan with its points and the height of its sensor multiplied by `scale`."""
+    """Return a scan with its points and sensor height multiplied by `scale`. Raises ValueError for an image."""
     if scale == 1:
         return scan
     if scan.points is None:
@@ -84,4 +87,5 @@ def scaled_poses(poses: Float[np.ndarray, "*n 4 4"], factor: float) -> Float[np.
 
 
 def _scaled_mounting(mounting: Mounting | None, scale: Scale) -> Mounting:
+    """Scale a mounting. An unknown mounting is 1.73 m above the ground before scaling, as models assume."""
     return (mounting or Mounting(MODEL_HEIGHT_M)).scaled(scale)

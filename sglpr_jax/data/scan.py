@@ -1,4 +1,4 @@
-"""A scan or ready-made image, the times of its points, and the check of its points.
+"""`Scan`: a scan or ready-made image, with the times of its points and the check of its points.
 
 Drivers write times of points in several units, relative to the scan or to an epoch, without stating the unit. A scan
 takes 2 ms to 1 s, so only one unit fits the span of its times.
@@ -21,9 +21,9 @@ FARTHEST_M = 300.0
 TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "stamps", "offset_time", "ts", "gps_time")
 """Names of the field that drivers use for the time of a point."""
 UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
-"""Possible units, in seconds."""
+"""Possible units of the times of points, in seconds."""
 SHORTEST_S, LONGEST_S = 0.002, 1.0
-"""Range of the duration of a scan, in seconds. It is narrower than the ratio of two units."""
+"""Range of the duration of a scan, in seconds. Their ratio is below 1000, so that only one unit fits."""
 ABSOLUTE_S = 10.0
 """Minimum time of a point since an epoch, in seconds. Smaller times are relative to the scan."""
 SAME_CLOCK_S = 1.0
@@ -31,18 +31,19 @@ SAME_CLOCK_S = 1.0
 
 
 def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
-    """Raise ValueError, which begins with `name`, if a point cloud shows no place.
+    """Raise ValueError, which begins with `name`, if a point cloud is unusable.
 
-    It must be (n, 3), with a finite point that is not at the sensor, and at least half within `FARTHEST_M`.
+    The shape must be (n, 3), a finite point must differ from (0, 0, 0), and half of the finite points must be within
+    `FARTHEST_M` in each axis.
     """
     source = f"{name}: " if name else ""
     if points.shape[1] != 3:
         raise ValueError(f"{source}expected points (n, 3) with x, y and z only, found shape {points.shape}")
     x, y, z = np.abs(points.T)  # Column by column: a reduction over the last axis takes ten times as long.
     largest = np.maximum(np.maximum(x, y), z)  # Not finite if any coordinate is not finite.
-    near = largest <= FARTHEST_M
-    if 2 * np.count_nonzero(near) > len(points) and (near & (largest > 0)).any():
-        return  # Nearly all scans end here.
+    is_near = largest <= FARTHEST_M
+    if 2 * np.count_nonzero(is_near) > len(points) and (is_near & (largest > 0)).any():
+        return  # Nearly all scans are valid and need no further test.
     largest = largest[np.isfinite(largest)]
     if not len(largest):
         raise ValueError(f"{source}expected finite points, found none among {len(points)}")
@@ -57,7 +58,7 @@ def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
 
 
 def time_field_of(names: Collection[str]) -> str | None:
-    """Return the name of the field of times among the names of the fields of a point, or None."""
+    """Return the first of `TIME_FIELDS` among the names of the fields of a point, or None."""
     return next((name for name in TIME_FIELDS if name in names), None)
 
 
@@ -67,15 +68,15 @@ class TimeField(NamedTuple):
     name: str
     """Name of the field."""
     values: Shaped[np.ndarray, " n"]
-    """Numbers of the field, one per point, in an unknown unit."""
+    """Values of the field, one per point, in an unknown unit."""
 
     def seconds(self, *, valid: Bool[np.ndarray, " n"], scan_time: float | None) -> Float32[np.ndarray, " n"]:
         """Return the time of each point relative to the time of its scan, in seconds.
 
-        Times since an epoch are compared with the scan's time. If that has another clock or is unknown, the first point
-        has the time of the scan. Points that are not `valid` may have any time, and get 0.
+        Times since an epoch are relative to `scan_time`, also since an epoch. If the scan has another clock or no time,
+        they are relative to the first point. Points that are not `valid` may have any value, and get the time 0.
 
-        Raises ValueError if the span of the times is not that of a scan in any unit.
+        Raises ValueError if no value is finite, or if the span of the values is not that of a scan in any unit.
         """
         values = np.where(valid & np.isfinite(self.values), self.values, np.nan).astype(np.float64)
         if np.isnan(values).all():
@@ -102,7 +103,7 @@ class Scan:
     points: Float32[np.ndarray, "n 3"] | None = None
     """Points in the LiDAR frame, in metres: x forward, y left, z up. Some may not be finite."""
     image: Float32[np.ndarray, "h w"] | None = None
-    """Image in the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
+    """Image in the orientation of equation 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
     labels: Int32[np.ndarray, "..."] | None = None
     """Raw SemanticKITTI ids, one per point or pixel. 0 means an unknown class."""
     labels_file: Path | None = None
@@ -112,21 +113,21 @@ class Scan:
     name: str = ""
     """Name for error messages: "scan 000052 of sequence 08"."""
     time_field: TimeField | None = None
-    """Times of the points as the file states them, if it does."""
+    """Times of the points as the file states them, or None if it has none."""
     time: float | None = None
-    """Time in seconds."""
+    """Time of the scan in seconds, or None if unknown."""
     mounting: Mounting | None = None
     """Mounting of the sensor. None means gravity-aligned, 1.73 m above the ground."""
 
     @property
     def cloud(self) -> Float32[np.ndarray, "n 3"]:
-        """Points of a scan."""
+        """Points of a scan, for type checkers: never None. Ready-made images have no points."""
         assert self.points is not None
         return self.points
 
     @property
     def upright_points(self) -> Float32[np.ndarray, "n 3"]:
-        """Points as seen by a gravity-aligned sensor 1.73 m above the ground. Models use these points."""
+        """Points in the frame of a gravity-aligned sensor 1.73 m above the ground. Models use these points."""
         return self.cloud if self.mounting is None else self.mounting.level(self.cloud)
 
     @property
@@ -139,13 +140,16 @@ class Scan:
             return self.time_field.seconds(valid=valid, scan_time=self.time)
 
     def only(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Scan":
-        """Return the scan with some of its points, their labels and laser numbers, but without times of the points."""
+        """Return the scan with only some points (rows or a mask), their labels and lasers, without times of points."""
         labels = None if self.labels is None else self.labels[rows]
         lasers = None if self.lasers is None else self.lasers[rows]
         return replace(self, points=self.cloud[rows], labels=labels, lasers=lasers, time_field=None)
 
     def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
-        """Return the class (docs/reference/labels.md) of every point or pixel, or None without labels."""
+        """Return the class of every point or pixel in a setting with this many categories, or None without labels.
+
+        Raises ValueError, with the file of the labels, if a label is no SemanticKITTI id.
+        """
         if self.labels is None:
             return None
         with naming(self.labels_file or self.name):

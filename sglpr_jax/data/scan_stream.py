@@ -1,4 +1,4 @@
-"""Reads the scans of a recording in order, and skips or reports bad ones."""
+"""Reading of the scans of a recording in order. Bad scans are skipped and reported, or raise their error."""
 
 import contextlib
 import dataclasses
@@ -8,7 +8,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from jaxtyping import Float32
@@ -19,13 +19,13 @@ from sglpr_jax.data.scan import Scan, check_cloud
 OnBadScan = Callable[[str, Exception], None]
 """Receives the id and the error of a bad scan."""
 T = TypeVar("T")
-Look = Callable[[int, Scan], T]
+Compute = Callable[[int, Scan], T]
 """Computes a result from the row of a scan and the scan."""
 
 
 def scan_stream(
     recording: Recording,
-    look: Look[T],
+    compute: Compute[T],
     *,
     rows: Iterable[int] | None = None,
     labels: bool = False,
@@ -34,13 +34,13 @@ def scan_stream(
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Iterator[tuple[int, T | None]]:
-    """Yield the row of every scan or image, in order, and the result of `look`, or None for a bad scan.
+    """Yield the row of every scan or image, in order, and the result of `compute`, or None for a bad scan.
 
-    A scan is bad if it cannot be read, if it shows no place (`check_cloud`), or if `look` raises ValueError or OSError.
+    A scan is bad if reading it, `check_cloud` or `compute` raises ValueError or OSError.
 
     Arguments:
       recording: Scans or images to read.
-      look: Function of the row and the scan. With `ahead` it must be pure, because it runs in other threads.
+      compute: Function of the row and the scan. With `ahead` it must be pure, because it runs in other threads.
       rows: Rows to read, by default all. Without `ahead`, a row is taken after the previous scan was processed.
       labels: Whether to read the labels, too.
       ahead: Number of scans that are read ahead.
@@ -48,11 +48,12 @@ def scan_stream(
       should_stop: Asked before a scan is read. If it returns True, no further scan is read.
       on_progress: Called with the number of rows up to a scan, after the caller has processed the scan.
     """
-    rows = itertools.takewhile(lambda row: not should_stop(), range(len(recording)) if rows is None else rows)
-    for row, compute in _results(recording, look, rows, labels=labels, ahead=ahead):
+    rows = range(len(recording)) if rows is None else rows
+    rows = itertools.takewhile(lambda row: not should_stop(), rows)
+    for row, get_result in _pending_results(recording, compute, rows, labels=labels, ahead=ahead):
         result = None
         try:
-            result = compute()
+            result = get_result()
         except (ValueError, OSError) as error:
             if on_bad_scan is None:
                 raise
@@ -68,9 +69,9 @@ def check_readable(recording: Recording, readable: int) -> None:
 
 
 def require_content(method: str, takes: str, recording: Recording, *, every_label: bool = False) -> None:
-    """Raise ValueError, in one line, if a recording lacks the points or labels that a method takes (`Method.takes`).
+    """Raise ValueError if a recording lacks the points or labels that a method needs: `takes`, e.g. "labelled points".
 
-    With `every_label` every scan must have labels. Otherwise one label file suffices.
+    With `every_label`, every scan must have labels. Otherwise one label file suffices.
     """
     if takes.endswith("points") and recording.has_images:
         raise ValueError(f"{method} needs points, found only images in sequence {recording.name}; use polar-fft")
@@ -86,37 +87,37 @@ def require_content(method: str, takes: str, recording: Recording, *, every_labe
         )
 
 
-def _results(
-    recording: Recording, look: Look[T], rows: Iterable[int], *, labels: bool, ahead: int
+def _pending_results(
+    recording: Recording, compute: Compute[T], rows: Iterable[int], *, labels: bool, ahead: int
 ) -> Iterator[tuple[int, Callable[[], T]]]:
-    """Yield each row and a function that returns the result for it or raises its error.
+    """Yield each row and a function that returns the result of `compute` for the row, or raises the error.
 
-    This thread reads the files, because not every file can be read in parallel. Other threads call `look`.
+    This thread reads the files, because not every file can be read in parallel. With `ahead`, other threads compute.
     """
 
-    def checked(row: int, scan: Scan) -> T:
+    def check_and_compute(row: int, scan: Scan) -> T:
         if scan.points is not None:
             check_cloud(scan.points, name=scan.name)
-        return look(row, scan)
+        return compute(row, scan)
 
     def fail(error: Exception) -> NoReturn:
         raise error
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        waiting: deque[tuple[int, Callable[[], T]]] = deque()
+        pending: deque[tuple[int, Callable[[], T]]] = deque()
         for row in rows:
             try:
-                compute = functools.partial(checked, row, recording.scan(row, labels=labels))
-                waiting.append((row, threads.submit(compute).result if ahead else compute))
+                job = functools.partial(check_and_compute, row, recording.scan(row, labels=labels))
+                pending.append((row, threads.submit(job).result if ahead else job))
             except (ValueError, OSError) as error:
-                waiting.append((row, functools.partial(fail, error)))
-            if len(waiting) > ahead:
-                yield waiting.popleft()
-        yield from waiting
+                pending.append((row, functools.partial(fail, error)))
+            if len(pending) > ahead:
+                yield pending.popleft()
+        yield from pending
 
 
 def sampled_points(recording: Recording, scans: int) -> Iterator[Float32[np.ndarray, "n 3"] | None]:
-    """Yield the points of some scans, spread over the recording, or None for unreadable ones."""
+    """Yield the points of at most `scans` scans, spread over the recording, or None for unreadable scans."""
     for row in np.unique(np.linspace(0, len(recording) - 1, scans).astype(int)).tolist():
         points = None
         with contextlib.suppress(ValueError, OSError):
@@ -124,27 +125,26 @@ def sampled_points(recording: Recording, scans: int) -> Iterator[Float32[np.ndar
         yield points
 
 
-def readable(
+def only_readable(
     recording: Recording, *, on_bad_scan: OnBadScan, on_progress: Callable[[int], None] = lambda done: None
 ) -> Recording:
-    """Read every scan or image with its labels, and return the recording without invalid scans (`scan_stream`).
+    """Read every scan or image with its labels, and return the recording without bad scans (`scan_stream`).
 
-    Raises ValueError if all scans are invalid.
+    Raises ValueError if all scans are bad.
     """
     options = {"labels": True, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
-    rows = [row for row, is_valid in scan_stream(recording, lambda row, scan: True, **options) if is_valid]
+    rows = [row for row, is_good in scan_stream(recording, lambda row, scan: True, **options) if is_good]
     check_readable(recording, len(rows))
     return recording if len(rows) == len(recording) else only(recording, rows)
 
 
 def only(recording: Recording, rows: Sequence[int]) -> Recording:
-    """Return the recording with only the given scans or images. They keep their ids and numbers."""
-    arrays = {name: getattr(recording, name) for name in ("positions", "times", "world_from_lidar")}
-    tuples = {name: getattr(recording, name) for name in ("ids", "paths", "label_paths", "mountings")}
-    return dataclasses.replace(
-        recording,
-        **{name: None if values is None else values[list(rows)] for name, values in arrays.items()},
-        **{name: tuple(values[row] for row in rows) if values else values for name, values in tuples.items()},
-        rows=recording.numbers[list(rows)],
-        read_ups=None,
-    )
+    """Return the recording with only the scans or images at `rows`. Their ids and numbers stay the same."""
+    fields: dict[str, Any] = {}
+    for name in ("positions", "times", "world_from_lidar"):
+        array = getattr(recording, name)
+        fields[name] = None if array is None else array[list(rows)]
+    for name in ("ids", "paths", "label_paths", "mountings"):
+        values = getattr(recording, name)
+        fields[name] = tuple(values[row] for row in rows) if values else values
+    return dataclasses.replace(recording, **fields, rows=recording.numbers[list(rows)], read_ups=None)

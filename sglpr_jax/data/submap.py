@@ -1,7 +1,7 @@
 """Submaps: the scans of the last metres of a drive, merged in the frame of the newest scan.
 
-A narrow sensor sees more of a place in several scans than in one. A submap holds the nearest point of each direction,
-as a scan does, because the weights are trained on scans (docs/decisions.md).
+A sensor with a narrow field of view sees more in several scans than in one. A submap holds the nearest point of each
+direction, as a scan does, because the weights are trained on scans (docs/decisions.md).
 """
 
 import dataclasses
@@ -15,27 +15,29 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt64
 
-from sglpr_jax.data.poses import poses_of_scans, turned_poses
+from sglpr_jax.data.poses import checked_poses, checked_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, check_cloud
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 
 LENGTH_M, KEYFRAME_M = 10.0, 1.0
 """Default travelled distance that a submap covers, and default distance between its scans, in metres."""
 KEYFRAME_DEG = 20.0
-"""Rotation after which a scan is a keyframe, in degrees, at any distance."""
-TURN = 18
-"""Number of further keyframes of a sensor that turns in place: a full turn."""
+"""Rotation since the last keyframe after which a scan is a keyframe, in degrees, at any distance."""
+KEYFRAMES_PER_TURN = 18
+"""Number of keyframes of a sensor that turns once in place."""
 VOXEL_M = 0.1
 """Edge of the voxels of a stored scan, in metres. Each voxel holds one point."""
 DIRECTION_DEG = 0.4
-"""Edge of a direction of a submap, in degrees of azimuth and elevation. Each direction holds its nearest point."""
+"""Edge of the cells of azimuth and elevation of a submap, in degrees. Each cell holds its nearest point."""
 AZIMUTHS = round(360 / DIRECTION_DEG)
-"""Number of directions in a revolution."""
-INDEX_BITS = 22
-"""Bits of the number of a point in a sorted key. A submap has at most 4 million points before it is thinned."""
-HALF = 2**13
-"""Offset of voxel numbers, which makes them positive. Points more than `HALF` voxels from the sensor are dropped."""
+"""Number of cells in a revolution."""
+ROW_BITS = 22
+"""Number of bits for the row of a point in a sorted key. A submap has at most 4 million points before it is thinned."""
+VOXEL_OFFSET = 2**13
+"""Number added to voxel numbers to make them positive. Points farther away than this number of voxels are dropped."""
+DISTANCE_BITS = 20
+"""Number of bits for a distance in steps of 2 mm, up to 2 km."""
 SUBMAPS = "submaps"
 """Name of the read option that describes the submaps of a recording."""
 
@@ -43,7 +45,7 @@ SUBMAPS = "submaps"
 class SubmapBuilder:
     """Builds the submap of each scan of a stream, from keyframes at least `keyframe_m` or 20 degrees apart.
 
-    Its memory is bounded by `length_m / keyframe_m` + 19 scans of one point per voxel.
+    A builder stores at most `length_m / keyframe_m` + 19 scans, with one point per voxel.
 
     Example:
       builder = sglpr_jax.SubmapBuilder(length_m=10.0)
@@ -52,8 +54,8 @@ class SubmapBuilder:
     """
 
     def __init__(self, *, length_m: float = LENGTH_M, keyframe_m: float = KEYFRAME_M):
-        """Create a builder of submaps of `length_m` metres of path, of scans at least `keyframe_m` metres apart."""
-        self._window = _Window(length_m, keyframe_m)
+        """Create a builder of submaps of `length_m` metres of path. Raises ValueError if a length is not positive."""
+        self._window = _KeyframeWindow(length_m, keyframe_m)
         self._scans: dict[int, tuple[Scan, Float[np.ndarray, "4 4"]]] = {}
 
     def add(
@@ -65,13 +67,15 @@ class SubmapBuilder:
           points: Points of the scan in the LiDAR frame, in metres.
           world_from_lidar: Pose of the LiDAR in a fixed frame. It may drift.
 
-        Raises ValueError if the scan shows no place (`check_cloud`), or if the pose has no rotation.
+        Raises ValueError if `check_cloud` rejects the points, or if the pose has no rotation.
         """
         check_cloud(points)
-        pose = turned_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
+        pose = checked_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
         newest, *older = self._window.add(pose)
-        self._scans = {newest: (_thinned(Scan(points=points)), pose), **{row: self._scans[row] for row in older}}
-        return _merged(*zip(*self._scans.values(), strict=True)).cloud
+        older_scans = {frame: self._scans[frame] for frame in older}
+        self._scans = {newest: (_one_point_per_voxel(Scan(points=points)), pose), **older_scans}
+        scans, poses = zip(*self._scans.values(), strict=True)
+        return _merged(scans, poses).cloud
 
 
 def submaps(
@@ -87,7 +91,7 @@ def submaps(
 
     Arguments:
       recording: Recording of scans.
-      world_from_lidar: Pose of the LiDAR at each scan, from odometry or a map. Drift within `length_m` blurs it.
+      world_from_lidar: Pose of the LiDAR at each scan, from odometry or a map. Drift within `length_m` blurs submaps.
       length_m: Travelled distance that a submap covers, in metres. 0 returns the recording unchanged.
       keyframe_m: Minimum distance between the scans of a submap, in metres.
 
@@ -98,25 +102,24 @@ def submaps(
     """
     if length_m == 0:
         return recording
-    window = _Window(length_m, keyframe_m)
-    poses = poses_of_scans(recording, world_from_lidar, use=SUBMAPS)
-    members = [window.add(pose) for pose in poses]
+    window = _KeyframeWindow(length_m, keyframe_m)
+    poses = checked_scan_poses(recording, world_from_lidar, use=SUBMAPS)
+    rows_of_submap = [window.add(pose) for pose in poses]
 
-    @lru_cache(maxsize=max(map(len, members), default=1))
-    def thinned(row: int, labelled: bool) -> Scan:
-        scan = recording.scan(row, labels=labelled)
+    @lru_cache(maxsize=max(map(len, rows_of_submap), default=1))  # the scans of one submap
+    def read_thinned(row: int, labels: bool) -> Scan:
+        scan = recording.scan(row, labels=labels)
         check_cloud(scan.cloud, name=scan.name)
-        if labelled and scan.labels is None:
+        if labels and scan.labels is None:
             scan = dataclasses.replace(scan, labels=np.zeros(len(scan.cloud), np.int32))
-        return _thinned(scan)
+        return _one_point_per_voxel(scan)
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
-        """Read a submap. Submaps have no laser numbers."""
-        newest, *older = members[row]
-        scans = {newest: thinned(newest, label_path is not None)}
+    def read_submap(row: int, label_path: Path | None, lasers: bool) -> Scan:
+        newest, *older = rows_of_submap[row]
+        scans = {newest: read_thinned(newest, label_path is not None)}
         for keyframe in older:
             try:
-                scans[keyframe] = thinned(keyframe, label_path is not None)
+                scans[keyframe] = read_thinned(keyframe, label_path is not None)
             except (ValueError, OSError) as error:
                 warn(f"{recording.ids[keyframe]}: left out of the submaps of later scans: {error}")
         submap = _merged(list(scans.values()), [poses[keyframe] for keyframe in scans])
@@ -124,74 +127,81 @@ def submaps(
 
     digest = hashlib.sha256(poses.tobytes()).hexdigest()[:16]
     note = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
-    return recording.derived(read, options={SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}).noting(note)
+    options = {SUBMAPS: f"{length_m:g} {keyframe_m:g} {digest}"}
+    return recording.with_reader(read_submap, options=options).with_note(note)
 
 
-class _Window:
-    """Keyframes within the last `length_m` metres of a drive."""
+class _KeyframeWindow:
+    """Selects the frames of each submap: keyframes within the last `length_m` metres of a drive."""
 
     def __init__(self, length_m: float, keyframe_m: float):
         for name, value in (("length_m", length_m), ("keyframe_m", keyframe_m)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"submaps: expected {name} in metres, more than 0, found {value}")
         self._length_m, self._keyframe_m = length_m, keyframe_m
-        self._frames, self._path_m = 0, 0.0
-        most = math.ceil(length_m / keyframe_m) + TURN
-        self._keyframes: deque[tuple[int, float]] = deque(maxlen=most)
-        self._last: Float[np.ndarray, "4 4"] | None = None
+        self._frames = 0
+        most = math.ceil(length_m / keyframe_m) + KEYFRAMES_PER_TURN
+        self._keyframes: deque[tuple[int, float, Float[np.ndarray, "4 4"]]] = deque(maxlen=most)
+        """Frame number, travelled distance in metres and pose of each keyframe."""
 
     def add(self, pose: Float[np.ndarray, "4 4"]) -> tuple[int, ...]:
-        """Add the next frame. Returns its number and those of the keyframes before it, the newest first."""
-        frame, self._frames = self._frames, self._frames + 1
-        step_m, turn_deg = (math.inf, 0.0) if self._last is None else _motion(self._last, pose)
-        path_m = self._path_m + step_m if self._keyframes else 0.0
-        rows = (frame, *(row for row, at_m in reversed(self._keyframes) if path_m - at_m <= self._length_m))
+        """Add the next frame. Returns its number, then those of the keyframes in the window, the newest first."""
+        frame = self._frames
+        self._frames += 1
+        step_m, turn_deg, path_m = math.inf, 0.0, 0.0  # the first frame is a keyframe
+        if self._keyframes:
+            _, last_path_m, last_pose = self._keyframes[-1]
+            step_m, turn_deg = _distance_and_angle(last_pose, pose)
+            path_m = last_path_m + step_m
+        in_window = [row for row, row_path_m, _ in reversed(self._keyframes) if path_m - row_path_m <= self._length_m]
         if step_m >= self._keyframe_m or turn_deg >= KEYFRAME_DEG:
-            self._keyframes.append((frame, path_m))
-            self._path_m, self._last = path_m, pose
-        return rows
+            self._keyframes.append((frame, path_m, pose))
+        return (frame, *in_window)
 
 
-def _motion(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-    """Distance in metres and rotation in degrees between two poses."""
-    cosine = (np.sum(before[:3, :3] * after[:3, :3]) - 1) / 2
-    return float(np.linalg.norm(after[:3, 3] - before[:3, 3])), math.degrees(math.acos(np.clip(cosine, -1, 1)))
+def _distance_and_angle(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+    """Distance in metres and angle of rotation in degrees between two poses."""
+    cosine = (np.sum(a[:3, :3] * b[:3, :3]) - 1) / 2
+    return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), math.degrees(math.acos(np.clip(cosine, -1, 1)))
 
 
 def _merged(scans: Sequence[Scan], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Scan:
-    """One scan in the frame of the first one, with the nearest point of each direction."""
+    """Merge scans in the frame of the first one. Of each cell of azimuth and elevation, the nearest point is kept."""
     rotation, position = poses[0][:3, :3], poses[0][:3, 3]
-    moved = [
+    others = [
         (scan.cloud @ (rotation.T @ pose[:3, :3]).T + rotation.T @ (pose[:3, 3] - position)).astype(np.float32)
         for scan, pose in zip(scans[1:], poses[1:], strict=True)
     ]
     labels = [scan.labels for scan in scans if scan.labels is not None]
-    points = np.concatenate([scans[0].cloud, *moved])
+    points = np.concatenate([scans[0].cloud, *others])
     x, y, z = points.T
     distance = np.sqrt(x * x + y * y + z * z)
-    scale = np.float32(AZIMUTHS / (2 * np.pi))
-    azimuth = np.floor(np.arctan2(y, x) * scale).astype(np.int64) + AZIMUTHS
-    elevation = np.floor(np.arctan2(z, np.hypot(x, y)) * scale).astype(np.int64) + AZIMUTHS
-    direction = (elevation * 2 * AZIMUTHS + azimuth).astype(np.uint64)
-    keys = direction << np.uint64(20) | (distance * 500).clip(max=2**20 - 1).astype(np.uint64)
+    cells_per_radian = np.float32(AZIMUTHS / (2 * np.pi))
+    azimuth = np.floor(np.arctan2(y, x) * cells_per_radian).astype(np.int64) + AZIMUTHS
+    elevation = np.floor(np.arctan2(z, np.hypot(x, y)) * cells_per_radian).astype(np.int64) + AZIMUTHS
+    cell = (elevation * 2 * AZIMUTHS + azimuth).astype(np.uint64)
+    steps_of_2_mm = (distance * 500).clip(max=2**DISTANCE_BITS - 1).astype(np.uint64)
     merged = Scan(points=points, labels=np.concatenate(labels) if labels else None)
-    return merged.only(_first_of(keys, shift=20))
+    return merged.only(_rows_of_smallest(cell << np.uint64(DISTANCE_BITS) | steps_of_2_mm, ignored_bits=DISTANCE_BITS))
 
 
-def _thinned(scan: Scan) -> Scan:
-    """The first point of each voxel. Points that are not finite are dropped."""
+def _one_point_per_voxel(scan: Scan) -> Scan:
+    """The first point of each voxel. Points that are not finite or more than 819 m away are dropped."""
     with np.errstate(over="ignore", invalid="ignore"):
-        inside = np.flatnonzero((np.abs(scan.cloud) < (HALF - 1) * VOXEL_M).all(axis=1))  # false for NaN
-    x, y, z = (np.floor(scan.cloud[inside].T / np.float32(VOXEL_M)) + HALF).astype(np.uint64)
-    return scan.only(inside[_first_of((z * np.uint64(2 * HALF) + y) * np.uint64(2 * HALF) + x, shift=0)])
+        is_near = (np.abs(scan.cloud) < (VOXEL_OFFSET - 1) * VOXEL_M).all(axis=1)  # False for NaN
+    rows = np.flatnonzero(is_near)
+    x, y, z = (np.floor(scan.cloud[rows].T / np.float32(VOXEL_M)) + VOXEL_OFFSET).astype(np.uint64)
+    voxels_per_axis = np.uint64(2 * VOXEL_OFFSET)
+    return scan.only(rows[_rows_of_smallest((z * voxels_per_axis + y) * voxels_per_axis + x, ignored_bits=0)])
 
 
-def _first_of(keys: UInt64[np.ndarray, " n"], *, shift: int) -> Int[np.ndarray, " m"]:
-    """Row of the smallest of the keys that are equal but for their last `shift` bits, in the order of the rows.
+def _rows_of_smallest(keys: UInt64[np.ndarray, " n"], *, ignored_bits: int) -> Int[np.ndarray, " m"]:
+    """Row of the smallest key in each group of keys that are equal without their last bits, in ascending order.
 
     Sorting keys that contain the row is ten times as fast as np.unique. Keys have at most 42 bits.
     """
-    keys = keys[: 2**INDEX_BITS]  # the newest scans come first
-    order = np.sort(keys << np.uint64(INDEX_BITS) | np.arange(len(keys), dtype=np.uint64))
-    first = np.diff(order >> np.uint64(INDEX_BITS + shift), prepend=np.uint64(2**64 - 1)) != 0
-    return np.sort(order[first] & np.uint64(2**INDEX_BITS - 1)).astype(np.int64)
+    keys = keys[: 2**ROW_BITS]  # drops the oldest scans of a submap, which come last
+    keys_with_rows = np.sort(keys << np.uint64(ROW_BITS) | np.arange(len(keys), dtype=np.uint64))
+    groups = keys_with_rows >> np.uint64(ROW_BITS + ignored_bits)
+    is_smallest = np.diff(groups, prepend=np.uint64(2**64 - 1)) != 0  # the first of its group
+    return np.sort(keys_with_rows[is_smallest] & np.uint64(2**ROW_BITS - 1)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Times of scans and poses: their unit and order, and row numbers in place of times."""
+"""Times of scans and poses: checks of their unit and order, and of row numbers in place of times."""
 
 from pathlib import Path
 
@@ -6,23 +6,23 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from sglpr_jax.data.choices import TimeUnit
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 
 PER_SECOND = {"auto": 1.0, "s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """Ticks of each unit in a second. "auto" expects seconds."""
 NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 LATEST_S = 1e11
 """Maximum time in seconds, after the year 5000. Larger numbers are milli-, micro- or nanoseconds."""
-SLOWEST_S = 10.0
+LONGEST_STEP_S = 10.0
 """Maximum median step of scans and poses, in seconds: keyframes at 0.1 Hz."""
 FACTORS = (1e3, 1e6, 1e9)
 """Ratios of two units."""
 SAME_FACTOR = 3.0
-"""Maximum ratio between the growth of times at a change of the unit and one of `FACTORS`."""
+"""Maximum ratio between one of `FACTORS` and the factor by which times or steps grow, if the unit changes."""
 MIN_TIMES = 5
-"""The unit is judged from more times than this."""
+"""Number of times above which the unit is checked."""
 EPOCH = 1e8
-"""Whole numbers below this one may number frames. Whole seconds since 1970 are larger since 1973."""
+"""Number below which whole numbers may be frame numbers. Seconds since 1970 are above it since 1973."""
 PAUSE_S = 3600.0
 """Minimum step that is reported as a jump of the times, in seconds."""
 ADVICE = "state the unit with --time-unit s, ms, us or ns (Python: time_unit)"
@@ -31,9 +31,9 @@ ADVICE = "state the unit with --time-unit s, ms, us or ns (Python: time_unit)"
 def times_of(
     values: Float[np.ndarray, " n"], *, source: Path | str, unit: TimeUnit = "auto"
 ) -> Float[np.ndarray, " n"] | None:
-    """Convert times of a file `source` to seconds. "auto" expects seconds and returns None for row numbers.
+    """Convert times of a file `source` to seconds. The unit "auto" expects seconds and returns None for row numbers.
 
-    Raises ValueError if times decrease or their steps contradict the unit.
+    Raises ValueError if `check_order` rejects the times, or if their steps cannot be seconds and the unit is "auto".
     """
     seconds = values / PER_SECOND[unit]
     check_order(seconds, source=source)
@@ -47,12 +47,13 @@ def times_of(
 
 
 def time_unit_problem(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
-    """Describe why times cannot be seconds of scans or poses. Empty if they can, or are too few to judge.
+    """Describe why times cannot be seconds of scans or poses. Empty if they can, or if there are too few to decide.
 
-    With `numbers`, whole numbers count as numbers of frames.
+    With `numbers`, whole numbers with steps of 1 or more are taken for frame numbers, which are not seconds.
     """
     if change := unit_change(times):
-        return change[1]
+        _, description = change
+        return description
     if len(times) and abs(times[-1]) > LATEST_S:
         return f"{times[-1]:g}, after the year 5000"
     if len(times) <= MIN_TIMES:
@@ -60,8 +61,8 @@ def time_unit_problem(times: Float[np.ndarray, " n"], *, numbers: bool = True) -
     if counts_rows(times):
         return f"row numbers ({times[0]:g}, {times[1]:g}, {times[2]:g}, ...)"
     step = usual_step(times)
-    if step > SLOWEST_S:
-        unit = next((unit for unit in NAMES if step <= SLOWEST_S * PER_SECOND[unit]), "ns")
+    if step > LONGEST_STEP_S:
+        unit = next((unit for unit in NAMES if step <= LONGEST_STEP_S * PER_SECOND[unit]), "ns")
         return f"steps of {step:g}, which fit {NAMES[unit]}"
     if numbers and step >= 1 and times[0] < EPOCH and (times == np.round(times)).all():
         return f"whole numbers from {times[0]:g} to {times[-1]:g}, as of frames"
@@ -77,17 +78,18 @@ def usual_step(times: Float[np.ndarray, " n"]) -> float:
 def unit_change(times: Float[np.ndarray, " n"]) -> tuple[int, str] | None:
     """Return the row from which times and steps are about 1e3, 1e6 or 1e9 times as large, with a description, or None.
 
-    A pause or another rate alone is no change of the unit. Two steps on either side are required.
+    If only the times or only the steps grow, as after a pause, None is returned, and so it is with fewer than two steps
+    before or after the row.
     """
-    before = np.where(times[:-1] > 0, times[:-1], np.inf)
-    if not len(before):
+    previous = np.where(times[:-1] > 0, times[:-1], np.inf)
+    if not len(previous):
         return None
-    row = int(np.argmax(times[1:] / before)) + 1
-    if any(np.count_nonzero(np.diff(part) > 0) < 2 for part in (times[:row], times[row:])):
+    row = int(np.argmax(times[1:] / previous)) + 1
+    if min(np.count_nonzero(np.diff(times[:row]) > 0), np.count_nonzero(np.diff(times[row:]) > 0)) < 2:
         return None
-    ratios = np.array([times[row] / before[row - 1], usual_step(times[row:]) / usual_step(times[:row])])
+    growth = np.array([times[row] / previous[row - 1], usual_step(times[row:]) / usual_step(times[:row])])
     for factor in FACTORS:
-        if (ratios > factor / SAME_FACTOR).all() and (ratios < factor * SAME_FACTOR).all():
+        if (growth > factor / SAME_FACTOR).all() and (growth < factor * SAME_FACTOR).all():
             return row, f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large"
     return None
 
@@ -106,10 +108,10 @@ def check_order(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
             f"{source}, row {late[0] + 1}: expected seconds, found {times[late[0]]:g}; is it in a smaller unit? "
             f"{ADVICE[0].upper()}{ADVICE[1:]}"
         )
-    backwards = np.flatnonzero(np.diff(times) < 0)
-    if backwards.size:
-        row = int(backwards[0]) + 2
-        raise ValueError(f"{source}, row {row}: expected a time >= {times[row - 2]}, found {times[row - 1]}")
+    drops = np.flatnonzero(np.diff(times) < 0)
+    if drops.size:
+        row = int(drops[0]) + 1
+        raise ValueError(f"{source}, row {row + 1}: expected a time >= {times[row - 1]}, found {times[row]}")
 
 
 def check_unit(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
@@ -119,7 +121,7 @@ def check_unit(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
 
 
 def check_jumps(times: Float[np.ndarray, " n"], *, source: str) -> None:
-    """Warn if two consecutive times of a recording are more than an hour apart, as after a change of the clock."""
+    """Issue a `DataWarning` if two consecutive times of a recording are over an hour apart, as with a changed clock."""
     steps = np.diff(times)
     jumps = np.flatnonzero(steps > PAUSE_S)
     if jumps.size:

@@ -1,4 +1,4 @@
-"""Converts a scan to the input of a model: its image and, if requested, its map of classes.
+"""Conversion of a scan to the input of a model: its image and, if requested, its map of classes.
 
 `view` converts one scan. Training divides the work: the host computes `picture` or the points of each scan, and the
 compiled step applies `image_view` or `cloud_view` to a whole batch.
@@ -26,7 +26,7 @@ from sglpr_jax.grid import DENSITY_MAX_COUNT, Grid, ImageKind, check_density_gri
 BEYOND_COUNTS = 2.0
 """Tolerance for counts below 0 or above 10, which smooth resizing of an image produces."""
 _POINTS_STEP = 16384
-"""Clouds are padded to a multiple of this number of points, so that few sizes are compiled."""
+"""Number of points to whose multiples clouds are padded, so that few sizes are compiled."""
 
 
 class View(NamedTuple):
@@ -52,9 +52,9 @@ def view(
       grid: Grid of the image. Ready-made images are cropped to it, or kept whole with None.
       image: Kind of image to compute from the points of a scan.
       categories: Number of classes of the map; 0 for no map.
-      angle: Angle by which the place is rotated first, in radians, counter-clockwise.
+      angle: Angle by which the scan is rotated first, in radians, counter-clockwise.
 
-    Raises ValueError if a scan shows no place (`check_cloud`), or if the grid, the kind or the labels do not fit.
+    Raises ValueError if `check_cloud` rejects the points, or if the grid, the kind of image or the labels do not fit.
     """
     classes = classes_of(scan, categories) if categories else None
     if scan.points is None:
@@ -68,17 +68,17 @@ def view(
         points = scan.upright_points if angle is None else rotated(scan.upright_points, float(angle))
         return image_view(*picture(Scan(points=points), classes), grid)
     padding = -len(scan.points) % _POINTS_STEP
-    points = jnp.asarray(np.pad(scan.upright_points, ((0, padding), (0, 0))))
-    padded = None if classes is None else jnp.asarray(np.pad(classes, (0, padding)))
-    return cloud_view(points, padded, jnp.int32(len(scan.points)), grid, angle)
+    padded_points = jnp.asarray(np.pad(scan.upright_points, ((0, padding), (0, 0))))
+    padded_classes = None if classes is None else jnp.asarray(np.pad(classes, (0, padding)))
+    return cloud_view(padded_points, padded_classes, jnp.int32(len(scan.points)), grid, angle)
 
 
 def check_ready_made(scan: Scan, image: ImageKind) -> None:
-    """Raise ValueError if the ready-made image of a scan should be a density image, but has grey values or counts."""
+    """Raise ValueError if a ready-made image should be a density image, but has floats outside 0 to 10."""
     if image != "density" or scan.image is None or not np.issubdtype(scan.image.dtype, np.floating):
         return
     least, most = scan.image.min(initial=0), scan.image.max(initial=0)
-    if not (least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS):  # True for NaN
+    if not (least >= -BEYOND_COUNTS and most <= DENSITY_MAX_COUNT + BEYOND_COUNTS):  # also for NaN
         raise ValueError(
             f"{scan.name}: expected a density image, floats from 0 to {DENSITY_MAX_COUNT}, found floats from "
             f"{least:g} to {most:g}; does the image contain grey values (255 instead of "
@@ -87,7 +87,7 @@ def check_ready_made(scan: Scan, image: ImageKind) -> None:
 
 
 def classes_of(scan: Scan, categories: int) -> Int32[np.ndarray, "..."]:
-    """Return the class of every point or pixel. Raises ValueError if the scan has no labels."""
+    """Return the class of every point or pixel (`Scan.classes`). Raises ValueError if the scan has no labels."""
     classes = scan.classes(categories)
     if classes is None:
         raise ValueError(f"{scan.name}: expected labels, found none")
@@ -97,7 +97,7 @@ def classes_of(scan: Scan, categories: int) -> Int32[np.ndarray, "..."]:
 def picture(
     scan: Scan, classes: Int32[np.ndarray, "..."] | None
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"] | None]:
-    """Return the whole ready-made image, or the whole density image of a scan, and its map of `classes`."""
+    """Return the uncropped ready-made image, or density image of a scan, with its map of `classes`, if not None."""
     if scan.points is None:
         assert scan.image is not None
         return scan.image, classes
@@ -111,18 +111,20 @@ def image_view(
     grid: Grid | None,
     angle: Float[Array | np.ndarray, "*b"] | None = None,
 ) -> View:
-    """Return the view of whole images and maps, rotated by `angle` and cropped to `grid`.
+    """Return the view of uncropped images and maps, rotated by `angle` in radians and cropped to `grid`.
 
     With a grid, the wide central row and column of density images are split first (`even_cells`). With `grid=None`,
-    images stay whole.
+    images are not cropped.
     """
 
-    def transformed(whole: Any, rotate: Any) -> Array | np.ndarray:
-        whole = whole if grid is None else even_cells(whole)
-        whole = whole if angle is None else rotate(jnp.asarray(whole), angle)
-        return whole if grid is None else centre_crop(whole, height=grid.height, width=grid.width)
+    def rotate_and_crop(uncropped: Any, rotate: Any) -> Array | np.ndarray:
+        if grid is not None:
+            uncropped = even_cells(uncropped)
+        rotated = uncropped if angle is None else rotate(jnp.asarray(uncropped), angle)
+        return rotated if grid is None else centre_crop(rotated, height=grid.height, width=grid.width)
 
-    return View(transformed(image, rotate_image), None if classes is None else transformed(classes, rotate_labels))
+    classes = None if classes is None else rotate_and_crop(classes, rotate_labels)
+    return View(rotate_and_crop(image, rotate_image), classes)
 
 
 def cloud_view(
@@ -132,7 +134,7 @@ def cloud_view(
     grid: Grid,
     angle: Float[Array | np.ndarray, "*b"] | None = None,
 ) -> View:
-    """Return the view of padded clouds: a rotation by `angle` in radians, then rasterisation by eq. 1.
+    """Return the view of padded clouds: rotated by `angle` in radians, then rasterised by equation 1.
 
     `count` is the number of points of each cloud without padding.
     """

@@ -156,9 +156,9 @@ def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> De
             raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
         return file
     positions, times = trajectory.positions, trajectory.times
-    recorded = file.recorded
-    if len(positions) == len(recorded) != len(file):
-        positions, times = positions[recorded], None if times is None else times[recorded]
+    is_described = file.is_described
+    if len(positions) == len(is_described) != len(file):
+        positions, times = positions[is_described], None if times is None else times[is_described]
     with naming(path):
         scan_poses = poses_at_scans(
             trajectory.source,
@@ -166,15 +166,15 @@ def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> De
             None if trajectory.by_row else times,
             file.times,
             scans=len(file),
-            of=f"frame of {path.name}",
+            item=f"frame of {path.name}",
         )
-        with_pose = file if scan_poses.kept.all() else file.only(scan_poses.kept)
+        with_pose = file if scan_poses.has_pose.all() else file.only(scan_poses.has_pose)
         keeps_times = times is None or (file.times is not None and not trajectory.by_row)
         return replace(
             with_pose,
             positions=scan_poses.poses[:, :3, 3],
             times=with_pose.times if keeps_times else times,
-            pose_source=", ".join(filter(None, (trajectory.source, scan_poses.said))),
+            pose_source=", ".join(filter(None, (trajectory.source, scan_poses.note))),
         )
 
 

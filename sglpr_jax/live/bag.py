@@ -1,4 +1,4 @@
-"""A ROS bag, replayed at its own pace by the project's reader of bags."""
+"""Source of scans from a ROS bag, replayed at the times of its scans or as fast as possible."""
 
 import dataclasses
 import threading
@@ -8,18 +8,19 @@ from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.live.endpoints import Taken
-from sglpr_jax.live.messages import WAIT_S, LatestScan, LiveFrame, Report
+from sglpr_jax.live.node_messages import WAIT_S, LatestScan, LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.sources_and_sinks import Taken
 
 
 class BagSource:
-    """Scans of a recording at the times of their headers. With `rate=0`, as fast as they are taken."""
+    """Scans of a bag at the times of their headers, `rate` times as fast. With `rate=0`, as fast as they are taken."""
 
     def __init__(self, root: Path, recording: Recording, options: LiveOptions, report: Report, taken: Taken):
+        """Begin after the last scan for which `taken` is true."""
         self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
         self._poses = None if options.odometry_topic is None else recording.world_from_lidar
-        last_taken = max((row for row in range(len(recording)) if taken(self._name(row))), default=-1)
+        last_taken = max((row for row in range(len(recording)) if taken(self._scan_name(row))), default=-1)
         self._rows = range(last_taken + 1, len(recording))
         self._latest: LatestScan[LiveFrame] = LatestScan()
         self._stopped, self._ended = threading.Event(), threading.Event()
@@ -29,45 +30,46 @@ class BagSource:
         return self._latest.dropped
 
     def frames(self) -> Iterator[LiveFrame | None]:
-        """Yield the scans. Ends after the last one."""
+        """Yield the scans, and None while none arrives. Ends after the last one."""
         if not self._rate:
             for row in self._rows:
-                yield self._frame(row)
+                yield self._read_frame(row)
             return
         thread = threading.Thread(target=self._replay, daemon=True)
         thread.start()
         while (frame := self._latest.take(WAIT_S)) is not None or not self._ended.is_set():
             yield frame
-        yield self._latest.take(0.0)
+        yield self._latest.take(0.0)  # one may have come between the two conditions
 
     def close(self) -> None:
         self._stopped.set()
 
     def _replay(self) -> None:
-        """Put each scan at its time."""
+        """Put each scan into `_latest` at its time. Runs in its own thread."""
         times, begin = self._recording.times, time.monotonic()
         try:
             for row in self._rows:
-                frame = self._frame(row)
-                due = 0.0 if times is None else (times[row] - times[self._rows[0]]) / self._rate
-                if self._stopped.wait(max(0.0, begin + due - time.monotonic())):
+                frame = self._read_frame(row)
+                due_s = 0.0 if times is None else (times[row] - times[self._rows[0]]) / self._rate
+                if self._stopped.wait(max(0.0, begin + due_s - time.monotonic())):
                     return
                 if frame is not None:
                     self._latest.put(frame._replace(received=time.monotonic()))
         finally:
             self._ended.set()
 
-    def _frame(self, row: int) -> LiveFrame | None:
-        """Read a scan, or report that it cannot be read."""
+    def _read_frame(self, row: int) -> LiveFrame | None:
+        """Read a scan. If it cannot be read, report the error and return None."""
         try:
             scan = self._recording.scan(row, labels=False)
         except (ValueError, OSError) as error:
             return self._report("scan", f"a scan is left out: {error}")
         pose = None if self._poses is None else self._poses[row]
         stamp = 0.0 if self._recording.times is None else float(self._recording.times[row])
-        return LiveFrame(dataclasses.replace(scan, name=self._name(row)), stamp, pose, time.monotonic())
+        scan = dataclasses.replace(scan, name=self._scan_name(row))
+        return LiveFrame(scan, time=stamp, odometry=pose, received=time.monotonic())
 
-    def _name(self, row: int) -> str:
+    def _scan_name(self, row: int) -> str:
         return f"{self._root}, scan {self._recording.ids[row]}"
 
 
@@ -82,7 +84,8 @@ def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) 
     root = Path(where)
     names = recording_names(root)
     name = None if options.topic is None else options.topic.strip("/").replace("/", "_")
-    name = None if len(names) == 1 and name not in names else name
+    if len(names) == 1 and name not in names:  # a single recording is not named by its topic
+        name = None
     recording = open_recording(
         root, name, pose_topic=options.odometry_topic, sensor_height=options.sensor_height, gravity="recording"
     )

@@ -1,8 +1,8 @@
 """Connection to ROS 2 by DDS, without an installation of ROS (cyclonedds, extra `live`).
 
-A topic `/points` is `rt/points` on the wire, and types have names such as `sensor_msgs::msg::dds_::PointCloud2_`, as
-rmw_cyclonedds and rmw_fastrtps write them. Types are described with the fields of ROS 2 and are final, so that they fit
-the type information that newer releases of rmw_cyclonedds send. Messages stay CDR (XCDR1) here.
+Names are those of rmw_cyclonedds and rmw_fastrtps: a topic `/points` is `rt/points` on the wire, and a type has a name
+such as `sensor_msgs::msg::dds_::PointCloud2_`. Types are declared with the fields of ROS 2 and as final, like the type
+information of newer releases of rmw_cyclonedds. Messages stay encoded (CDR, XCDR1).
 """
 
 import functools
@@ -22,29 +22,29 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.messages import Report
+from sglpr_jax.live.node_messages import Report
 from sglpr_jax.live.ros import Receive, domain_of, ros_type, wire_type
-from sglpr_jax.live.ros_messages import Received, typestore
+from sglpr_jax.live.ros_encoding import Received, typestore
 
-PREFIX = "rt"
+TOPIC_PREFIX = "rt"
 """Beginning of the names of ROS 2 topics on the wire. Services have others."""
-LOOK_S = 1.0
-"""Time between two looks at subscriptions and publishers with other settings, in seconds."""
-BUFFER = '<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max="16MB"/></Internal></Domain></CycloneDDS>'
+QOS_CHECK_S = 1.0
+"""Time between two checks for publishers and subscribers whose QoS does not fit, in seconds."""
+RECEIVE_BUFFER = '<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max="16MB"/></Internal></Domain></CycloneDDS>'
 """Setting of cyclonedds. A scan of 2 MB arrives as a burst of packets, and the usual buffer of 1 MB loses many of them.
 The system may set a lower limit (`net.core.rmem_max`)."""
 POLICIES = {2: "durability", 4: "deadline", 8: "liveliness", 10: "partition", 11: "reliability", 23: "representation"}
 """Names of QoS policies, by their numbers in the standard."""
-TYPE = 24
-"""Number of the policy on types. It does not fit between the types of one topic, which the source reports itself."""
-_NUMBERS = {"bool": bool, "byte": types.uint8, "octet": types.uint8, "char": types.uint8, "string": str} | {
+TYPE_POLICY = 24
+"""Number of the policy on types. Mismatches of types are not reported here, because `RosSource` reports them."""
+_BASE_TYPES = {"bool": bool, "byte": types.uint8, "octet": types.uint8, "char": types.uint8, "string": str} | {
     name: getattr(types, name)
     for name in ("float32", "float64", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 }
 
 
 class _Reader(NamedTuple):
-    """A reader of one type, and what to do with its messages."""
+    """A subscription to one type of a topic. `receive` takes its messages, and at most `depth` of them wait."""
 
     kind: str
     reader: DataReader
@@ -57,10 +57,8 @@ class DdsTransport:
     """Participant of a DDS domain. A thread takes the messages. See `ros.Transport`."""
 
     def __init__(self, domain: int, report: Report):
-        """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2.
-
-        Raises ValueError if cyclonedds cannot use the network or this configuration.
-        """
+        """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2. Raises ValueError if
+        cyclonedds cannot use the network or this configuration."""
         self._report = report
         _configure(domain)
         try:
@@ -75,7 +73,8 @@ class DdsTransport:
         self._topics: dict[tuple[str, str], Topic] = {}
         self._readers: list[_Reader] = []
         self._writers: dict[str, DataWriter] = {}
-        self._watched: list[tuple[str, Callable[[], Any]]] = []
+        self._qos_statuses: list[tuple[str, Callable[[], Any]]] = []
+        """Report of each topic, and function that returns the status of its QoS mismatches."""
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="dds", daemon=True)
         self._thread.start()
@@ -84,19 +83,20 @@ class DdsTransport:
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
         qos = _qos(depth, reliable=reliable, latched=latched)
-        asked = f"{topic}: expected a publisher with the QoS {_described(reliable, latched)}, found one without"
+        mismatch = f"{topic}: expected a publisher with the QoS {_qos_text(reliable, latched)}, found one without"
         for kind in kinds:
             reader = DataReader(self._participant, self._topic(topic, kind), qos=qos)
             condition = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
             self._readers.append(_Reader(kind, reader, condition, receive, depth))
             self._waiting.attach(condition)
-        self._watched.append((asked, self._readers[-1].reader.get_requested_incompatible_qos_status))
+        self._qos_statuses.append((mismatch, self._readers[-1].reader.get_requested_incompatible_qos_status))
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
         qos = _qos(depth, reliable=True, latched=latched)
         writer = DataWriter(self._participant, self._topic(topic, kind), qos=qos)
-        offered = f"{topic}: expected subscribers that accept the QoS {_described(True, latched)}, found one that asks"
-        self._watched.append((f"{offered} for more", writer.get_offered_incompatible_qos_status))
+        expected = f"{topic}: expected subscribers that accept the QoS {_qos_text(True, latched)}"
+        mismatch = f"{expected}, found one that asks for more"
+        self._qos_statuses.append((mismatch, writer.get_offered_incompatible_qos_status))
         self._writers[topic] = writer
         del writer  # held by the dictionary alone, so that `close` deletes it
 
@@ -113,65 +113,68 @@ class DdsTransport:
         for publication in self._publications.read(N=10_000):
             name, kind = publication.topic_name, publication.type_name
             alive = publication.sample_info.instance_state == InstanceState.Alive
-            if alive and name is not None and kind is not None and name.startswith(f"{PREFIX}/"):
-                topics.setdefault(name.removeprefix(PREFIX), set()).add(ros_type(kind))
+            if alive and name is not None and kind is not None and name.startswith(f"{TOPIC_PREFIX}/"):
+                topics.setdefault(name.removeprefix(TOPIC_PREFIX), set()).add(ros_type(kind))
         return topics
 
     def close(self) -> None:
         self._closed.set()
         self._thread.join()
-        for entities in (self._watched, self._readers, self._writers, self._topics):
+        for entities in (self._qos_statuses, self._readers, self._writers, self._topics):
             entities.clear()
         del self._waiting, self._publications, self._participant
 
     def _topic(self, topic: str, kind: str) -> Topic:
         if (topic, kind) not in self._topics:
-            self._topics[topic, kind] = Topic(self._participant, f"{PREFIX}{topic}", _raw_type(kind))
+            self._topics[topic, kind] = Topic(self._participant, f"{TOPIC_PREFIX}{topic}", _raw_type(kind))
         return self._topics[topic, kind]
 
     def _run(self) -> None:
-        looked = time.monotonic()
+        """Deliver messages, and check the QoS regularly, until the transport is closed. Runs in its own thread."""
+        checked_at = time.monotonic()
         while not self._closed.is_set():
             if self._readers:
                 self._waiting.wait(duration(milliseconds=100))
-            else:  # the wait of cyclonedds returns at once if nothing is attached, and this loop would use a core
+            else:  # without readers, the wait of cyclonedds returns at once, and this loop would use a core
                 self._closed.wait(0.1)
             for reader in tuple(self._readers):
-                self._take(reader)
-            if time.monotonic() - looked > LOOK_S:
-                looked = time.monotonic()
-                self._look()
+                self._deliver(reader)
+            if time.monotonic() - checked_at > QOS_CHECK_S:
+                checked_at = time.monotonic()
+                self._report_qos_mismatches()
 
-    def _take(self, source: _Reader) -> None:
-        """Hand on the new messages of a reader."""
+    def _deliver(self, source: _Reader) -> None:
+        """Pass the new messages of a reader to its `receive`. An error is reported, and the message is lost."""
         kind = source.kind
         try:
             for sample in source.reader.take(N=source.depth, condition=source.condition):
                 if sample.sample_info.valid_data:
                     publisher = sample.sample_info.publication_handle
                     source.receive(Received(kind, sample.cdr, publisher, time.monotonic()))
-        except Exception as error:  # the thread serves the other topics, too
+        except Exception as error:  # must not end the thread, which serves the other topics, too
             self._report(f"message {kind}", f"{kind}: expected a valid message, found {in_short(error)}")
 
-    def _look(self) -> None:
-        """Report publishers and subscribers whose QoS does not fit, each once. The readers of all types count them."""
-        for text, status in tuple(self._watched):
-            mismatch = status()
-            if mismatch.total_count_change > 0 and mismatch.last_policy_id != TYPE:
+    def _report_qos_mismatches(self) -> None:
+        """Report each new publisher or subscriber whose QoS does not fit."""
+        for text, qos_status in tuple(self._qos_statuses):
+            mismatch = qos_status()
+            if mismatch.total_count_change > 0 and mismatch.last_policy_id != TYPE_POLICY:
                 policy = POLICIES.get(mismatch.last_policy_id, f"policy {mismatch.last_policy_id}")
                 self._report(f"qos {text}", f"{text} ({policy}); they do not exchange messages")
 
 
 @functools.cache
 def _configure(domain: int) -> Domain | None:
-    """Configure a domain for this process, once. The settings of the environment come after ours and override them."""
+    """Configure a domain, once in a process, with `RECEIVE_BUFFER`. CYCLONEDDS_URI overrides it. Returns None if
+    another part of the process uses the domain already."""
     try:
-        return Domain(domain, ",".join(filter(None, (BUFFER, os.environ.get("CYCLONEDDS_URI")))))
-    except DDSException:  # another part of the process uses the domain
+        return Domain(domain, ",".join(filter(None, (RECEIVE_BUFFER, os.environ.get("CYCLONEDDS_URI")))))
+    except DDSException:
         return None
 
 
 def _qos(depth: int, *, reliable: bool, latched: bool) -> Qos:
+    """Return the QoS of a reader or writer. See `ros.Transport.subscribe` for the arguments."""
     return Qos(
         Policy.Reliability.Reliable(duration(milliseconds=100)) if reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
@@ -181,37 +184,47 @@ def _qos(depth: int, *, reliable: bool, latched: bool) -> Qos:
     )
 
 
-def _described(reliable: bool, latched: bool) -> str:
+def _qos_text(reliable: bool, latched: bool) -> str:
+    """Return reliability and durability as ROS 2 names them."""
     return f"{'reliable' if reliable else 'best effort'}, {'transient local' if latched else 'volatile'}"
 
 
 @functools.cache
 def _raw_type(kind: str) -> Any:
-    """Type of messages that stay encoded, as the attribute `cdr`. Others see the fields of ROS 2."""
+    """Return the type of a ROS 2 message for cyclonedds, whose objects hold only the encoded message, as `cdr`. Other
+    participants see the type with its fields. cyclonedds calls the four methods that are replaced here."""
 
-    def begin(self: Any, cdr: bytes) -> None:
+    def init(self: Any, cdr: bytes) -> None:
         self.cdr = cdr
 
-    def read(cls: Any, cdr: bytes) -> Any:
+    def serialize(self: Any, **_: Any) -> bytes:
+        return self.cdr
+
+    def deserialize(cls: Any, cdr: bytes) -> Any:
         return cls(cdr)
 
-    raw = _struct.__wrapped__(kind)
-    raw.__init__, raw.serialize = begin, lambda self, **_: self.cdr
-    raw.deserialize = raw.deserialize_key = classmethod(read)  # a key: a publisher has ended
-    return raw
+    raw_type = _ros_struct.__wrapped__(kind)  # not the cached type, because it is changed
+    raw_type.__init__ = init
+    raw_type.serialize = serialize
+    raw_type.deserialize = classmethod(deserialize)
+    raw_type.deserialize_key = classmethod(deserialize)  # for the message that a publisher has ended
+    return raw_type
 
 
 @functools.cache
-def _struct(kind: str) -> Any:
-    """Type with the fields of ROS 2, from their definitions by rosbags."""
+def _ros_struct(kind: str) -> Any:
+    """Return the type of a ROS 2 message for cyclonedds, with the fields that rosbags defines."""
 
     def field_type(node: Any, definition: Any) -> Any:
+        """Return the type of a field: a base type, the type of a message, or an array or sequence of a type."""
         if node.name == "BASE":
-            return _NUMBERS[definition[0]]
+            return _BASE_TYPES[definition[0]]
         if node.name == "NAME":
-            return _struct(definition)
-        inner, count = definition
-        return types.array[field_type(*inner), count] if node.name == "ARRAY" else types.sequence[field_type(*inner)]
+            return _ros_struct(definition)
+        element, count = definition
+        if node.name == "ARRAY":
+            return types.array[field_type(*element), count]
+        return types.sequence[field_type(*element)]
 
     name = wire_type(kind).replace("::", ".")
     fields = {field: field_type(*definition) for field, definition in typestore().fielddefs[kind][1]}
@@ -219,5 +232,5 @@ def _struct(kind: str) -> Any:
 
 
 def open_transport(where: str, report: Report) -> DdsTransport:
-    """Connect to the domain `where`, by default that of ROS. Raises ValueError if it is not a domain."""
+    """Connect to the domain `where`, by default ROS_DOMAIN_ID or 0. Raises ValueError if it is not from 0 to 232."""
     return DdsTransport(domain_of(where, source="dds"), report)

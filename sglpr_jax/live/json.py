@@ -1,4 +1,4 @@
-"""Results as JSON, one object a line, whose `type` is `frame` (`FrameStatus`) or `loop` (`LoopEdge`)."""
+"""Sink that writes results as JSON lines, whose `type` is `frame` (`FrameStatus`) or `loop` (`LoopEdge`)."""
 
 import json
 import sys
@@ -8,7 +8,7 @@ from typing import IO, Any
 import numpy as np
 
 from sglpr_jax.files import writing
-from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.node_messages import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 
@@ -36,7 +36,7 @@ class JsonLines:
 
 
 def _json_value(value: Any) -> Any:
-    """Arrays as lists, and numbers with six decimals, but times since 1970 with all digits."""
+    """Return an array as lists, and a float with six decimals or, from 1e6 (times since 1970), with all digits."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     return round(value, 6) if isinstance(value, float) and abs(value) < 1e6 else value

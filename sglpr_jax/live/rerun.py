@@ -1,4 +1,4 @@
-"""Loops and status for the rerun viewer (extra `view`): `rerun`, `rerun:HOST:PORT` or `rerun:FILE.rrd`."""
+"""Sink that shows loops and status in the rerun viewer (extra `view`): `rerun`, `rerun:HOST:PORT`, `rerun:FILE.rrd`."""
 
 import os
 import socket
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import check_writable, writing
-from sglpr_jax.live.messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.node_messages import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 os.environ.setdefault("RUST_LOG", "off")  # read by the import; the node has its own line for a lost viewer
@@ -18,24 +18,21 @@ import rerun.blueprint as views
 
 VIEWER = "127.0.0.1:9876"
 """Address at which the viewer listens if it is started without options."""
-WAIT_S = 2.0
+CONNECT_S = 2.0
 """Maximum time to reach the viewer at the start, in seconds."""
-CHECK_S, CHECK_WAIT_S = 1.0, 0.02
+CHECK_S, MAX_CHECK_S = 1.0, 0.02
 """Time between two checks of the connection, and the maximum time that a check takes, in seconds."""
-LINE = (60, 180, 75)
+LOOP_COLOUR = (60, 180, 75)
 """Colour of a loop, red, green, blue."""
 
 
 class RerunSink:
-    """Draws loops and plots the status. See `endpoints.Sink`.
-
-    A loop with odometry of both scans is a line between their positions. Every loop is a line of text with its
-    probability. The time lines are `frame` and, if scans have times, `time`.
-    """
+    """Shows each loop as text and, if both scans have odometry, as a line on the map. Plots the status of each scan.
+    The viewer's time lines are `frame` and, if scans have times, `time`."""
 
     def __init__(self, stream: Any):
         """Take a `rerun.RecordingStream`. `close` disconnects it."""
-        self._stream, self._checked = stream, time.monotonic()
+        self._stream, self._checked_at = stream, time.monotonic()
         self._stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def frame(self, status: FrameStatus) -> None:
@@ -45,28 +42,30 @@ class RerunSink:
         self._plot("milliseconds/latency", 1e3 * status.latency_s)
         self._plot("scans/dropped", status.dropped)
         self._plot("scans/places", status.places)
-        if time.monotonic() - self._checked > CHECK_S:
-            self._checked = time.monotonic()
+        if time.monotonic() - self._checked_at > CHECK_S:
+            self._checked_at = time.monotonic()
             try:
-                self._stream.flush(timeout_sec=CHECK_WAIT_S)
+                self._stream.flush(timeout_sec=MAX_CHECK_S)
             except RuntimeError as error:
                 if "timed out" not in str(error):  # a slow viewer is not a lost one
                     raise
 
     def loop(self, edge: LoopEdge) -> None:
+        """Write a loop as text, and draw a line between the positions of its scans."""
         self._set_time(edge.query, edge.query_time)
         text = f"query {edge.query}, match {edge.match}: probability {edge.probability:.4f}"
         self._stream.log("loops", rerun.TextLog(text))
         self._plot("probability/loop", edge.probability)
         if edge.world_from_query is not None and edge.world_from_match is not None:
             ends = np.stack([edge.world_from_match[:3, 3], edge.world_from_query[:3, 3]])
-            self._stream.log(f"map/loops/{edge.query}", rerun.LineStrips3D([ends], colors=[LINE], labels=[text]))
+            self._stream.log(f"map/loops/{edge.query}", rerun.LineStrips3D([ends], colors=[LOOP_COLOUR], labels=[text]))
 
     def close(self) -> None:
         """Disconnect from the viewer, or finish the file."""
         self._stream.disconnect()
 
     def _set_time(self, frame: int, seconds: float) -> None:
+        """Set the frame and, if it is known, the time of what is logged next."""
         self._stream.reset_time()
         self._stream.set_time("frame", sequence=frame)
         if np.isfinite(seconds) and seconds > 0:
@@ -77,9 +76,9 @@ class RerunSink:
 
 
 def open_sink(where: str, options: LiveOptions, report: Report) -> RerunSink:
-    """Connect to a viewer, or begin the file `where`. An existing file is replaced.
+    """Connect to a viewer at the address `where`, or begin the file `where` (.rrd). An existing file is replaced.
 
-    Without a viewer, a line says so and nothing is drawn. The node starts all the same.
+    If no viewer listens, a report says so, and the returned sink draws nothing.
 
     Raises:
       ValueError: If `where` is neither an address nor a file that ends with .rrd.
@@ -97,7 +96,7 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> RerunSink:
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ValueError(f"rerun:{where}: expected rerun, rerun:HOST:PORT or rerun:FILE.rrd, found {where}")
     try:
-        socket.create_connection((host, int(port)), timeout=WAIT_S).close()
+        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
     except OSError as error:
         expected = f"rerun: expected a viewer at {host}:{port}"
         report("rerun", f"{expected}, found none ({error}); start `rerun` before bin/live")
@@ -108,8 +107,8 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> RerunSink:
 
 
 def _layout() -> Any:
-    """The map, the loops as text, and three plots."""
+    """Return the layout of the viewer: the map, three plots, and the loops as text."""
     names = "milliseconds", "scans", "probability"
     plots = [views.TimeSeriesView(origin=name, name=name.capitalize()) for name in names]
-    beside = views.Vertical(*plots, views.TextLogView(origin="loops", name="Loops"))
-    return views.Blueprint(views.Horizontal(views.Spatial3DView(origin="map", name="Map"), beside))
+    plots_and_loops = views.Vertical(*plots, views.TextLogView(origin="loops", name="Loops"))
+    return views.Blueprint(views.Horizontal(views.Spatial3DView(origin="map", name="Map"), plots_and_loops))

@@ -1,4 +1,4 @@
-"""ROS topics as source of scans and odometry and as sink of loops, for every transport (DDS, zenoh, rclpy)."""
+"""ROS topics as source of scans and odometry and as sink of loops, over any connection to ROS (DDS, zenoh, rclpy)."""
 
 import dataclasses
 import os
@@ -10,10 +10,10 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sglpr_jax.live.messages import WAIT_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.node_messages import WAIT_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros_messages import (
-    CLOUDS,
+from sglpr_jax.live.ros_encoding import (
+    CLOUD_TYPES,
     EDGE,
     MARKERS,
     TRANSFORMS,
@@ -23,22 +23,22 @@ from sglpr_jax.live.ros_messages import (
     marker_message,
     transform_message,
 )
-from sglpr_jax.live.ros_odometry import KINDS, LiveOdometry
+from sglpr_jax.live.ros_odometry import ODOMETRY_TYPES, LiveOdometry
 
-CLOUD_TOPIC = "/points"
+DEFAULT_CLOUD_TOPIC = "/points"
 STATIC_TOPIC = "/tf_static"
 MISSING_S = 5.0
 """Time without scans after which the existing topics are reported, in seconds. It is also the time between reports."""
-TAKEN_OVER_S = 2.0
-"""Time after which another publisher may take the place of one that is silent, in seconds."""
-POSES_KEPT = 100
-"""Number of messages with poses that wait for the thread of the connection."""
-EDGES_KEPT = 1000
-"""Number of edges that a subscriber receives that begins late."""
-LINES = 500
-"""Number of the last loops that are drawn."""
+TAKEOVER_S = 2.0
+"""Time without scans of a publisher after which those of another one are used, in seconds."""
+POSE_QUEUE = 100
+"""Maximum number of messages with poses that wait for the thread of the connection."""
+EDGE_HISTORY = 1000
+"""Maximum number of past edges that a late subscriber receives."""
+MAX_DRAWN_LOOPS = 500
+"""Maximum number of loops that are drawn, the latest ones."""
 Receive = Callable[[Received], None]
-"""Function that takes a message, in a thread of the connection. It must return at once."""
+"""Function that is called with each message, in a thread of the connection. It must return at once."""
 
 
 @runtime_checkable
@@ -48,44 +48,39 @@ class Transport(Protocol):
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """Receive the messages of a topic that have one of these types. At most `depth` messages wait for `receive`.
-
-        `reliable` requests lost messages again, and `latched` the messages of before the subscription.
-        """
-        ...
+        """Call `receive` with each message of a topic that has one of the types `kinds`. At most `depth` messages wait.
+        `reliable` requests lost messages again, `latched` requests earlier messages."""
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
-        """Return a function that publishes messages of one type, given as CDR. With `latched`, later subscribers
+        """Return a function that publishes encoded messages (CDR) of one type. With `latched`, later subscribers
         receive the last `depth` messages."""
-        ...
 
     def published(self) -> dict[str, set[str]]:
-        """Topics with a publisher, and their types."""
-        ...
+        """Return the types of each topic that has a publisher."""
 
     def close(self) -> None: ...
 
 
 class RosSource:
-    """Source of the scans of a topic."""
+    """Source of the scans of a topic, with poses from a topic of odometry if `options` name one."""
 
     def __init__(self, transport: Transport, options: LiveOptions, report: Report):
         """Subscribe to the topics. After `MISSING_S` seconds without scans, the existing topics are reported."""
-        self.topic = full_name(options.topic or CLOUD_TOPIC)
+        self.topic = absolute_topic(options.topic or DEFAULT_CLOUD_TOPIC)
         self._transport, self._report = transport, report
         self._latest: LatestScan[Received] = LatestScan()
-        self._publisher = None
+        self._publisher = None  # of the last scan
         self._received = self._reported = time.monotonic()
         self._closed = threading.Event()
-        transport.subscribe(self.topic, CLOUDS, self._receive, depth=1, reliable=options.reliable, latched=False)
+        transport.subscribe(self.topic, CLOUD_TYPES, self._receive, depth=1, reliable=options.reliable, latched=False)
         self._odometry = None
         if options.odometry_topic is not None:
-            odometry = self._odometry = LiveOdometry(full_name(options.odometry_topic), report)
+            odometry = self._odometry = LiveOdometry(absolute_topic(options.odometry_topic), report)
             transport.subscribe(
-                odometry.topic, KINDS, odometry.receive, depth=POSES_KEPT, reliable=False, latched=False
+                odometry.topic, ODOMETRY_TYPES, odometry.receive, depth=POSE_QUEUE, reliable=False, latched=False
             )
             static = odometry.receive_static
-            transport.subscribe(STATIC_TOPIC, (TRANSFORMS,), static, depth=POSES_KEPT, reliable=True, latched=True)
+            transport.subscribe(STATIC_TOPIC, (TRANSFORMS,), static, depth=POSE_QUEUE, reliable=True, latched=True)
 
     def frames(self) -> Iterator[LiveFrame | None]:
         while not self._closed.is_set():
@@ -103,9 +98,9 @@ class RosSource:
         return self._latest.dropped
 
     def _receive(self, message: Received) -> None:
-        """Keep the scan, if it is of the publisher in use."""
+        """Keep a scan for `frames`, unless another publisher than the one in use sent it."""
         if message.publisher != self._publisher:
-            if self._publisher is not None and message.at - self._received < TAKEN_OVER_S:
+            if self._publisher is not None and message.at - self._received < TAKEOVER_S:
                 expected = f"{self.topic}: expected one publisher"
                 return self._report("publishers", f"{expected}, found several; the scans of the first are used")
             self._publisher = message.publisher
@@ -124,15 +119,15 @@ class RosSource:
         return LiveFrame(dataclasses.replace(scan, time=header.time), header.time, pose, message.at)
 
     def _report_silence(self) -> None:
-        """Report which topics exist if no scans arrive."""
+        """Report existing topics and types if no scan arrived, and nothing was reported, for `MISSING_S` seconds."""
         now = time.monotonic()
         if now - max(self._received, self._reported) < MISSING_S:
             return
         self._reported = now
         topics = {topic: sorted(kinds) for topic, kinds in sorted(self._transport.published().items())}
         kinds = topics.get(self.topic, [])
-        expected = f"{self.topic}: expected {' or '.join(CLOUDS)}"
-        if not set(CLOUDS).isdisjoint(kinds):
+        expected = f"{self.topic}: expected {' or '.join(CLOUD_TYPES)}"
+        if not set(CLOUD_TYPES).isdisjoint(kinds):
             silence = f"found a publisher but no message for {now - self._received:.0f} s"
             self._report("silent", f"{expected}, {silence}; waiting")
         elif kinds:
@@ -149,11 +144,11 @@ class RosSink:
     def __init__(self, transport: Transport, options: LiveOptions):
         """Advertise the topics. `close` closes the connection."""
         self._transport, self._options = transport, options
-        prefix = full_name(options.topic_prefix)
-        self._publish_edge = transport.advertise(f"{prefix}/loops", EDGE, depth=EDGES_KEPT, latched=True)
+        prefix = absolute_topic(options.topic_prefix)
+        self._publish_edge = transport.advertise(f"{prefix}/loops", EDGE, depth=EDGE_HISTORY, latched=True)
         self._publish_markers = transport.advertise(f"{prefix}/loop_markers", MARKERS, depth=1, latched=True)
         self._publish_transform = transport.advertise("/tf", TRANSFORMS, depth=100, latched=False)
-        self._lines: deque[np.ndarray] = deque(maxlen=LINES)
+        self._loop_ends: deque[np.ndarray] = deque(maxlen=MAX_DRAWN_LOOPS)
         """Positions (2, 3) of match and query of the last loops, in metres in the frame of the odometry."""
 
     def frame(self, status: FrameStatus) -> None:
@@ -165,28 +160,26 @@ class RosSink:
         self._publish_transform(transform_message(status.map_from_world, time=stamp, **frames))
 
     def loop(self, edge: LoopEdge) -> None:
-        """Publish an edge. With odometry of both scans, draw it."""
+        """Publish an edge. If both scans have odometry, publish the lines of the latest loops, too."""
         self._publish_edge(edge_message(edge))
-        query, match = edge.world_from_query, edge.world_from_match
-        if query is not None and match is not None:
-            self._lines.append(np.stack([match[:3, 3], query[:3, 3]]))
+        query_pose, match_pose = edge.world_from_query, edge.world_from_match
+        if query_pose is not None and match_pose is not None:
+            self._loop_ends.append(np.stack([match_pose[:3, 3], query_pose[:3, 3]]))
             frame = self._options.odometry_frame
-            self._publish_markers(marker_message(list(self._lines), time=edge.query_time, frame=frame))
+            self._publish_markers(marker_message(list(self._loop_ends), time=edge.query_time, frame=frame))
 
     def close(self) -> None:
         self._transport.close()
 
 
-def full_name(topic: str) -> str:
-    """Name of a topic with a slash at its beginning."""
+def absolute_topic(topic: str) -> str:
+    """Return the name of a topic with a slash at its beginning."""
     return f"/{topic.strip('/')}"
 
 
 def domain_of(where: str, *, source: str) -> int:
-    """Number of a ROS 2 domain: `where`, or else the environment variable ROS_DOMAIN_ID, or else 0.
-
-    Raises ValueError if it is not from 0 to 232.
-    """
+    """Return the number of a ROS 2 domain: `where`, or else the environment variable ROS_DOMAIN_ID, or else 0. Raises
+    ValueError, naming the `source`, if it is not from 0 to 232."""
     text = where or os.environ.get("ROS_DOMAIN_ID") or "0"
     if not (text.isdecimal() and int(text) <= 232):
         raise ValueError(f"{source}: expected a ROS 2 domain from 0 to 232, found {text}")
@@ -194,11 +187,11 @@ def domain_of(where: str, *, source: str) -> int:
 
 
 def wire_type(kind: str) -> str:
-    """Name of a type on the wire: `sensor_msgs::msg::dds_::PointCloud2_` of `sensor_msgs/msg/PointCloud2`."""
+    """Return the DDS name of a ROS type: `sensor_msgs::msg::dds_::PointCloud2_` for `sensor_msgs/msg/PointCloud2`."""
     package, folder, name = kind.split("/")
     return f"{package}::{folder}::dds_::{name}_"
 
 
 def ros_type(name: str) -> str:
-    """Name of a type in ROS 2, from its name on the wire."""
+    """Return the ROS name of a type from its DDS name, the inverse of `wire_type`."""
     return name.removesuffix("_").replace("::dds_::", "::").replace("::", "/")

@@ -3,10 +3,10 @@
 Keys, attachments and liveliness tokens follow rmw_zenoh from its release for Jazzy 0.2.4:
 
 * A message of `/points` in domain 0 has the key `0/points/sensor_msgs::msg::dds_::PointCloud2_/RIHS01_...`. The last
-  part is a hash of the type (REP 2011). rosbags computes it. Subscriptions accept any hash, publishers need the
-  subscriber's. Humble has the text `TypeHashNotSupported` there, so its nodes do not receive our messages.
+  part is a hash of the type (REP 2011). rosbags computes it. Our subscriptions accept any hash. A publisher reaches
+  only subscribers with the same hash: not nodes of Humble, whose keys have the text `TypeHashNotSupported` instead.
 * The attachment is sequence number and time in nanoseconds (int64), and 16 bytes that identify the publisher.
-* A token `@ros2_lv/DOMAIN/SESSION/NODE/ID/MP/...` exists while a publisher lives.
+* A token `@ros2_lv/DOMAIN/SESSION/NODE_NAME/ID/MP/...` exists while a publisher lives.
 
 The hashes of PointCloud2 and TFMessage were compared with published ones.
 """
@@ -29,13 +29,13 @@ from zenoh.ext import (
 )
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.messages import Report
+from sglpr_jax.live.node_messages import Report
 from sglpr_jax.live.ros import Receive, domain_of, ros_type, wire_type
-from sglpr_jax.live.ros_messages import Received, typestore
+from sglpr_jax.live.ros_encoding import Received, typestore
 
-ROUTER = "tcp/localhost:7447"
+DEFAULT_ROUTER = "tcp/localhost:7447"
 """Endpoint of rmw_zenoh's router."""
-NODE = "sglpr"
+NODE_NAME = "sglpr"
 """Name of this node in ROS 2."""
 GID_BYTES = 16
 """Length of the identifier of a publisher, at the end of an attachment."""
@@ -44,36 +44,35 @@ ANSWER_S = 1.0
 
 
 class ZenohTransport:
-    """Session of zenoh. See `ros.Transport`."""
+    """Connection by a zenoh session. See `ros.Transport` for the methods."""
 
     def __init__(self, endpoint: str, domain: int, report: Report):
-        """Open a session. Raises ValueError if the endpoint or the configuration is invalid.
-
-        `endpoint` is that of a router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that
-        ZENOH_SESSION_CONFIG_URI names configures the session, or else it uses rmw_zenoh's router on this computer.
-        """
+        """Open a session. Raises ValueError if the endpoint or the configuration is invalid. `endpoint` is that of a
+        router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that ZENOH_SESSION_CONFIG_URI names
+        configures the session, or else it uses rmw_zenoh's router on this computer."""
         self._domain, self._report = domain, report
         try:
-            self._session = zenoh.open(_config(endpoint))
+            self._session = zenoh.open(_session_config(endpoint))
         except (zenoh.ZError, OSError) as error:
-            where = endpoint or os.environ.get("ZENOH_SESSION_CONFIG_URI") or ROUTER
+            where = endpoint or os.environ.get("ZENOH_SESSION_CONFIG_URI") or DEFAULT_ROUTER
             raise ValueError(
                 f"zenoh: expected a valid endpoint or configuration, found {where} ({in_short(error)})"
             ) from error
-        self._declared: list[Any] = [self._token("NN", 0)]
+        self._declared: list[Any] = [self._declare_token("NN", 0)]
 
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """Receive the messages of a topic that have one of these types. zenoh has no settings that do not fit."""
+        """See `ros.Transport`. `reliable` has no effect, because zenoh has no such setting of a subscriber."""
 
         def take(sample: zenoh.Sample) -> None:
+            """Pass a message to `receive`. The type is the last but one part of its key."""
             try:
                 kind = ros_type(str(sample.key_expr).split("/")[-2])
                 if kind in kinds and sample.kind == zenoh.SampleKind.PUT:
                     publisher = b"" if sample.attachment is None else sample.attachment.to_bytes()[-GID_BYTES:]
                     receive(Received(kind, sample.payload.to_bytes(), publisher, time.monotonic()))
-            except Exception as error:  # zenoh would print it and go on
+            except Exception as error:  # zenoh would only print it
                 self._report(f"message {topic}", f"{topic}: expected a valid message, found {in_short(error)}")
 
         key = f"{self._domain}{topic}/*/*"
@@ -84,6 +83,7 @@ class ZenohTransport:
             self._declared.append(self._session.declare_subscriber(key, take))
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
+        """See `ros.Transport`."""
         type_hash = typestore().hash_rihs01(kind)
         key = f"{self._domain}{topic}/{wire_type(kind)}/{type_hash}"
         drop = zenoh.CongestionControl.DROP
@@ -94,20 +94,22 @@ class ZenohTransport:
         else:
             publisher = self._session.declare_publisher(key, congestion_control=drop)
         name = topic.replace("/", "%")
+        # QoS of rmw_zenoh: reliability, durability (1: transient local), history and depth, ... Empty is the default.
         qos = f":{1 if latched else ''}:,{depth}:,:,:,,"
-        token = self._token("MP", len(self._declared), f"/{name}/{wire_type(kind)}/{type_hash}/{qos}")
+        token = self._declare_token("MP", len(self._declared), f"/{name}/{wire_type(kind)}/{type_hash}/{qos}")
         self._declared += [publisher, token]
-        gid, sent = secrets.token_bytes(GID_BYTES), 0
+        publisher_id, messages_sent = secrets.token_bytes(GID_BYTES), 0
 
         def publish(cdr: bytes) -> None:
-            nonlocal sent
-            sent += 1
-            publisher.put(cdr, attachment=z_serialize((Int64(sent), Int64(time.time_ns()), gid)))
+            """Publish a message with the attachment of rmw_zenoh: number, time and publisher."""
+            nonlocal messages_sent
+            messages_sent += 1
+            publisher.put(cdr, attachment=z_serialize((Int64(messages_sent), Int64(time.time_ns()), publisher_id)))
 
         return publish
 
     def published(self) -> dict[str, set[str]]:
-        """Topics with a publisher, and their types, by the tokens of rmw_zenoh."""
+        """See `ros.Transport`. Asks for the tokens of publishers, whose keys end with topic, type, hash and QoS."""
         topics: dict[str, set[str]] = {}
         for reply in self._session.liveliness().get(f"@ros2_lv/{self._domain}/*/*/*/MP/**", timeout=ANSWER_S):
             if reply.ok is not None:
@@ -120,21 +122,22 @@ class ZenohTransport:
             entity.undeclare()
         self._session.close()
 
-    def _token(self, entity: str, number: int, topic: str = "") -> Any:
+    def _declare_token(self, entity: str, number: int, topic: str = "") -> Any:
         """Declare a liveliness token of the node (NN) or of a publisher (MP)."""
-        key = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{number}/{entity}/%/%/{NODE}{topic}"
+        key = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{number}/{entity}/%/%/{NODE_NAME}{topic}"
         return self._session.liveliness().declare_token(key)
 
 
-def _config(endpoint: str) -> zenoh.Config:
-    """Configuration of a peer that finds others by a router, as rmw_zenoh's."""
+def _session_config(endpoint: str) -> zenoh.Config:
+    """Return the configuration of a session. It is the file that ZENOH_SESSION_CONFIG_URI names. With an endpoint, or
+    without a file, it is that of a peer that finds others by a router, as rmw_zenoh's."""
     file = "" if endpoint else os.environ.get("ZENOH_SESSION_CONFIG_URI")
     config = zenoh.Config.from_file(file) if file else zenoh.Config()
     settings: dict[str, Any] = {"timestamping/enabled": True}  # publishers with a cache need timestamps
     if not file:
         settings |= {
             "mode": "peer",
-            "connect/endpoints": [endpoint or ROUTER],
+            "connect/endpoints": [endpoint or DEFAULT_ROUTER],
             "listen/endpoints": ["tcp/localhost:0"],
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": True,
@@ -145,5 +148,5 @@ def _config(endpoint: str) -> zenoh.Config:
 
 
 def open_transport(where: str, report: Report) -> ZenohTransport:
-    """Connect by the endpoint `where`. Raises ValueError if it is not an endpoint."""
+    """Connect to the endpoint `where`, such as tcp/localhost:7447. Raises the errors of `ZenohTransport`."""
     return ZenohTransport(where, domain_of("", source="zenoh"), report)

@@ -16,37 +16,37 @@ MOST_COLUMNS = 8
 
 
 def check_is(value: Any, kind: type, *, by: str) -> None:
-    """Raise TypeError if `value` is not of type `kind`. The message names `by`, the function that returns one."""
+    """Raise TypeError if `value` is not of type `kind`. `by` is the function of `sglpr_jax` that returns this type."""
     if not isinstance(value, kind):
         raise TypeError(f"expected a {kind.__name__}, found {_value_or_type(value)}; sglpr_jax.{by} returns one")
 
 
 def as_scan(scan: Any) -> Scan:
-    """Convert points (n, 3) or an image (h, w) to a `Scan`. Accepts a `Scan`, too."""
+    """Convert points (n, 3) or an image (h, w) to a `Scan`. A `Scan` is returned unchanged."""
     if isinstance(scan, Scan):
         return scan
     expected = "points (n, 3) or an image (h, w)"
-    values = _numbers(scan, np.float32, expected, by="read_scan")
-    if values.ndim != 2:
-        raise ValueError(f"expected {expected}, found an array of shape {values.shape}")
-    if 3 < values.shape[1] <= MOST_COLUMNS:
-        raise ValueError(f"expected points (n, 3) of x, y and z only, found an array of shape {values.shape}")
-    return Scan(points=values) if values.shape[1] == 3 else Scan(image=values)
+    array = _as_array(scan, np.float32, expected, by="read_scan")
+    if array.ndim != 2:
+        raise ValueError(f"expected {expected}, found an array of shape {array.shape}")
+    if 3 < array.shape[1] <= MOST_COLUMNS:
+        raise ValueError(f"expected points (n, 3) of x, y and z only, found an array of shape {array.shape}")
+    return Scan(points=array) if array.shape[1] == 3 else Scan(image=array)
 
 
 def as_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
     """Convert a pose to a 4 x 4 array. Returns None for None."""
-    return None if odometry is None else _poses(odometry, "odometry (4, 4)", 2)
+    return None if odometry is None else _checked_poses(odometry, "odometry (4, 4)", 2)
 
 
 def as_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
     """Convert an array or a list of 4 x 4 arrays to poses. Errors name them by `of`, for instance "odometry"."""
-    return _poses(poses, f"{of} (n, 4, 4)", 3)
+    return _checked_poses(poses, f"{of} (n, 4, 4)", 3)
 
 
-def _poses(values: Any, expected: str, ndim: int) -> Float[np.ndarray, "*n 4 4"]:
-    """Convert to finite matrices that contain a rotation and have the last row 0 0 0 1."""
-    poses = _numbers(values, np.float64, expected, by="read_odometry")
+def _checked_poses(values: Any, expected: str, ndim: int) -> Float[np.ndarray, "*n 4 4"]:
+    """Convert to an array of poses of `ndim` axes: finite matrices with a rotation and the last row 0 0 0 1."""
+    poses = _as_array(values, np.float64, expected, by="read_odometry")
     if poses.ndim != ndim or poses.shape[-2:] != (4, 4):
         raise ValueError(f"expected {expected}, found an array of shape {poses.shape}")
     matrices = poses.reshape(-1, 4, 4)
@@ -59,7 +59,7 @@ def _poses(values: Any, expected: str, ndim: int) -> Float[np.ndarray, "*n 4 4"]
 
 
 def as_seconds(time: Any) -> float | None:
-    """Convert a time to a number, and a date to seconds. Returns None for None."""
+    """Convert a date or a duration to seconds, and any other time to a number. Returns None for None."""
     if time is None:
         return None
     if isinstance(time, datetime.datetime):
@@ -77,8 +77,8 @@ def as_seconds(time: Any) -> float | None:
     return seconds
 
 
-def _numbers(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
-    """Convert to an array of numbers, or raise TypeError. For a path, the message names the reader `by`."""
+def _as_array(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
+    """Convert to an array of numbers, or raise TypeError. For a path, the message names its reader, `by`."""
     if isinstance(values, str | os.PathLike):
         raise TypeError(f"expected {expected}, found the path {values}; read it with sglpr_jax.{by}")
     try:

@@ -17,11 +17,11 @@ from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan, imag
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, BevOdometry
-from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
+from sglpr_jax.odometry.drift_model import MOTION_DRIFT, DriftModel
 from sglpr_jax.registration.background import Background
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
-from sglpr_jax.registration.bev_search import CorrelationPeak, search_near
+from sglpr_jax.registration.bev_search import NO_PRIOR, CorrelationPeak, search_near
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, transform, yaw_of
@@ -29,8 +29,7 @@ from sglpr_jax.se3 import inverse, transform, yaw_of
 FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
 AGREE_M, AGREE_DEG = 0.8, 6.0
-"""Maximum distance and angle between two poses of a scan in one frame that agree, in metres and degrees."""
-NO_PRIOR = np.full(3, np.nan)
+"""Maximum distance and angle between two estimates of a pose that agree, in metres and degrees."""
 
 
 class Reference(NamedTuple):
@@ -42,13 +41,14 @@ class Reference(NamedTuple):
 
 
 class CandidateSearch:
-    """Finds candidates in a stream of scans. Stores descriptor and compressed image of each scan that is not empty.
+    """Finds candidates in a stream of scans, and stores descriptor and compressed image of the scans.
 
-    Each frame takes a constant number of image comparisons, and a matrix product for the nearest descriptors.
+    Almost empty scans, and scans close to the last stored one, are not stored. Each frame takes a constant number of
+    image comparisons, and a matrix product for the nearest descriptors.
     """
 
     def __init__(self, params: Params, config: DetectorConfig = DetectorConfig()):
-        """Start without frames."""
+        """Start without frames. Raises TypeError or ValueError if the model is not one that describes images alone."""
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
@@ -57,12 +57,13 @@ class CandidateSearch:
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         limits = {"keyframe_m": config.keyframe_m, "max_places": config.max_places}
         self.stored = StoredScans(index, verification=config.verification, **limits)
-        """Descriptors, and centres of the images without the background, for comparison."""
+        """Descriptors, and central parts of the images without the background, of the stored scans."""
         self.fits = NO_FITS
         """Comparisons of the last frame."""
         self.has_odometry = False
         """Whether the frames have poses from odometry. If so, `motion` holds them."""
         self.motion = BevOdometry()
+        """Motion of the sensor over all frames."""
         self.mountings: list[Mounting | None] = []
         """Mounting of the sensor at each frame."""
         self.missing: list[int] = []
@@ -75,10 +76,11 @@ class CandidateSearch:
         self._time: float | None = None
         """Time of the last frame, in seconds. None if the frames have no times."""
         self._last: Reference | None = None
+        """The last frame. None if it is almost empty."""
         self._keyframe: Reference | None = None
+        """The keyframe of the motion. None if it is almost empty."""
         self._checked: Reference | None = None
-        """The last frame, the keyframe of the motion, and the last frame with which the odometry was checked. None for
-        empty images."""
+        """The last frame that was used to check the odometry."""
 
     def __len__(self) -> int:
         """Number of added frames."""
@@ -91,7 +93,7 @@ class CandidateSearch:
 
     @property
     def empty(self) -> Bool[np.ndarray, " n"]:
-        """Whether each frame is almost empty: it has fewer than `MIN_CELLS` occupied cells."""
+        """Whether each frame is almost empty: its image has fewer than `MIN_CELLS` occupied cells."""
         return self._empty.rows
 
     @property
@@ -106,11 +108,11 @@ class CandidateSearch:
 
     @property
     def knows_height(self) -> bool:
-        """Whether the odometry measures height. Wheels do not."""
+        """Whether there is odometry that measures height. That of wheels does not."""
         return self.has_odometry and float(np.ptp(self.motion.path.poses[:, 2, 3])) > FLAT_M
 
     def keyframe(self, scan: Scan) -> Keyframe:
-        """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
+        """Compute descriptor and 8-bit density image of a scan or image (`describe_scan`). Nothing is stored."""
         return describe_scan(self.params, scan)
 
     def to_upright(self, loop: LoopClosure) -> LoopClosure:
@@ -122,7 +124,7 @@ class CandidateSearch:
         return to_lidar(loop, query=self.mountings[loop.query], match=self.mountings[loop.match])
 
     def close_loop(self, query: int, match: int) -> None:
-        """Note an accepted loop between two frames."""
+        """Store an accepted loop between two frames."""
         self.loops.append((query, match))
         self.stored.close_loop(query, match)
 
@@ -135,7 +137,7 @@ class CandidateSearch:
         fits: Fits | None = None,
         continues: bool = True,
     ) -> list[Candidate]:
-        """Add a described scan or image, and return its candidates, mostly one or none.
+        """Add the next frame, and return its candidates: at most two, mostly one or none.
 
         Arguments:
           keyframe: Descriptor and image, or None for a scan that cannot be read.
@@ -147,7 +149,7 @@ class CandidateSearch:
         Raises:
           ValueError: If only some frames have a time or a pose, or if times decrease.
         """
-        self._check(time, odometry)
+        self._check_order(time, odometry)
         frame = len(self)
         if keyframe is None:
             self.missing.append(frame)
@@ -159,13 +161,14 @@ class CandidateSearch:
             self.stored.check(frame, image)
         foreground = self.background.without(image)
         query = None if is_empty else Query(frame, keyframe.descriptor, foreground, self.verification)
-        motion_keyframe = self.motion.keyframe
+        previous_motion_keyframe = self.motion.keyframe
         link = self._add_motion(query, keyframe.mounting, time, odometry, fits, continues=continues)
         comparer = KeyframeComparison(self.motion, self.present_drift, self.config, self.verification, self.loops.rows)
         if fits is None:
             fits = (NO_FITS if query is None else comparer.compare(query, self.stored))._replace(link=link)
         candidates = [] if query is None else comparer.candidates(query, fits, self.stored)
-        if image.size and (self.motion.keyframe != motion_keyframe or not frame):
+        has_moved = self.motion.keyframe != previous_motion_keyframe or not frame
+        if image.size and has_moved:
             self.background.add(image)
         self._last = None if is_empty else Reference(frame, foreground)
         if self.motion.keyframe == frame:
@@ -176,8 +179,8 @@ class CandidateSearch:
         self._time, self.fits = time, fits
         return candidates
 
-    def _check(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
-        """Raise ValueError if time or odometry of the next frame do not follow those of the others."""
+    def _check_order(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
+        """Raise ValueError if some frames have a time or odometry and others have none, or if times decrease."""
         if not len(self):
             return
         for name, is_given, is_expected in (
@@ -199,22 +202,23 @@ class CandidateSearch:
         *,
         continues: bool,
     ) -> BevRegistration | None:
-        """Add the motion up to the next frame. Returns its registration, for the comparisons of the frame.
+        """Add the motion up to the next frame. Returns the registration that shows it, or None.
 
-        The frame is registered with the keyframe or, with odometry, with the last frame that was checked.
+        With odometry, the frame is registered with the last frame that was used to check the odometry, otherwise with
+        the keyframe of the motion. Comparisons of an earlier run (`fits`) contain the registration.
         """
         link = None if fits is None else fits.link
         to_upright = upright_from_lidar(mounting)
         pose = None if odometry is None else np.asarray(odometry, np.float64) @ inverse(to_upright)
-        clock = float(len(self)) if time is None else time
+        time = float(len(self)) if time is None else time
         self.has_odometry = pose is not None
         if not continues:
             self.odometry_check.restart()
         if pose is not None:
             link = self._check_odometry(query, pose, link, is_known=fits is not None)
         elif fits is None and continues:
-            link = self._link(query, clock)
-        self.motion.add(clock, pose=pose, link=link, continues=continues)
+            link = self._register_with_keyframe(query, time)
+        self.motion.add(time, pose=pose, link=link, continues=continues)
         self.motion.path.tilted |= is_tilted(to_upright)
         self.mountings.append(mounting)
         return link
@@ -222,7 +226,10 @@ class CandidateSearch:
     def _check_odometry(
         self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: BevRegistration | None, *, is_known: bool
     ) -> BevRegistration | None:
-        """Compare the odometry with the images, if this is due. Returns the pose in the frame of the last such scan."""
+        """Compare the odometry with the images, if this is due. Returns the registration with the last compared scan.
+
+        The registration `link` of an earlier run (`is_known`) is not repeated.
+        """
         if query is None or not self.odometry_check.is_due(pose):
             self.odometry_check.skip()
             return None
@@ -232,11 +239,11 @@ class CandidateSearch:
         self._checked = Reference(query.frame, query.image)
         return link
 
-    def _link(self, query: Query | None, clock: float) -> BevRegistration | None:
+    def _register_with_keyframe(self, query: Query | None, time: float) -> BevRegistration | None:
         """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
 
-        The image is compared with that of the keyframe and, if this is ambiguous, with that of the last frame. Two
-        ambiguous poses that agree are trusted, too. If the images show only the position across a direction, the sensor
+        The image is registered with that of the keyframe and, if this is ambiguous, with that of the last frame. Two
+        ambiguous poses that agree are trusted, too. If the images show the position in one direction only, the sensor
         is assumed to move on as before.
         """
         if query is None:
@@ -244,7 +251,7 @@ class CandidateSearch:
         links, along_ridge = list[BevRegistration](), None
         references = {each.frame: each for each in (self._keyframe, self._last) if each is not None}
         for reference in references.values():
-            prior = self.motion.prior(clock, reference.frame)
+            prior = self.motion.prior(time, reference.frame)
             best, expected = self._register(query, reference, prior)
             if self.motion.is_trusted(best, prior):
                 return self._from_keyframe(best, reference.frame)
@@ -263,20 +270,23 @@ class CandidateSearch:
     def _register(
         self, query: Query, reference: Reference, prior: Float[np.ndarray, " 3"]
     ) -> tuple[BevRegistration, BevRegistration]:
-        """Best pose of a query in the frame of a reference, and best pose near the expected x, y and yaw."""
+        """Best pose of a query in the frame of a reference, and best pose near `prior`. Equal with `NO_PRIOR`."""
         spectrum = image_spectrum(reference.image, self.verification)
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
         best = self._refine(query, reference, peaks.at(0))
-        is_same = np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1]
-        return best, best if is_same else self._refine(query, reference, peaks.at(1))
+        if np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1]:
+            return best, best
+        return best, self._refine(query, reference, peaks.at(1))
 
     def _refine(self, query: Query, reference: Reference, peak: CorrelationPeak) -> BevRegistration:
+        """Register the image of a query with that of a reference, near a peak of the search."""
         return jax.device_get(refine(query.image, reference.image, peak, config=self.verification))
 
     def _from_keyframe(self, link: BevRegistration, frame: int) -> BevRegistration:
-        """Convert a pose in the frame of a scan to one in the frame of the motion's keyframe."""
-        key, poses = self.motion.keyframe, self.motion.poses
-        if frame == key:
+        """Convert a registration with an earlier frame to one with the motion's keyframe."""
+        keyframe, poses = self.motion.keyframe, self.motion.poses
+        if frame == keyframe:
             return link
-        moved = inverse(poses[key]) @ poses[frame] @ transform(float(link.x), float(link.y), float(link.yaw))
-        return link._replace(x=moved[0, 3], y=moved[1, 3], yaw=yaw_of(moved))
+        frame_from_query = transform(float(link.x), float(link.y), float(link.yaw))
+        keyframe_from_query = inverse(poses[keyframe]) @ poses[frame] @ frame_from_query
+        return link._replace(x=keyframe_from_query[0, 3], y=keyframe_from_query[1, 3], yaw=yaw_of(keyframe_from_query))

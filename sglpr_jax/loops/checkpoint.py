@@ -1,6 +1,6 @@
-"""Frames with their comparisons as bytes, and the log of them from which a killed search or map resumes.
+"""Checkpoints of loop searches and maps: a log of described frames, from which a killed run resumes.
 
-Everything that takes time is stored: descriptors, images and the comparisons of candidates.
+All results that take time are stored: descriptors, images, and comparisons with other frames.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from sglpr_jax.frame_log import RunLog
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.keyframes import Keyframe
-from sglpr_jax.odometry.config import MOTION_DRIFT
+from sglpr_jax.odometry.drift_model import MOTION_DRIFT
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.retrieval.descriptor_cache import fingerprint
@@ -36,6 +36,7 @@ OLD = "settings.json"
 """File of checkpoints of earlier versions, which are not read."""
 FRAME_FORMAT = "sglpr-jax live 4"
 LINK = ("x", "y", "yaw", "correlation", "second", "along_m")
+"""Stored fields of the registration that shows the motion (`Fits.link`)."""
 COLUMNS = {
     "descriptor": Column("float32", ("d",), optional=True),
     "image": Column("uint8", ("h", "h"), optional=True),
@@ -44,13 +45,13 @@ COLUMNS = {
     "fits": Column("float64", ("fits", len(CorrelationPeak._fields))),
     "links": Column("float64", (1, len(LINK)), finite=False),
 }
-"""Arrays of a frame. A scan that cannot be read has no descriptor and image. NaN in the links is a missing link."""
+"""Arrays of a frame. A scan that cannot be read has no descriptor and image. A missing link is stored as NaN."""
 
 
 def frame_bytes(
-    keyframe: Keyframe | None, fits: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **about: Any
+    keyframe: Keyframe | None, fits: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **values: Any
 ) -> bytes:
-    """Return the compressed bytes of a frame, with further JSON values."""
+    """Serialise a frame for `read_frame`: description, comparisons, pose by odometry, and further JSON values."""
     arrays = {
         "fitted": np.asarray(fits.frames, np.int64),
         "fits": np.stack(fits.peaks, axis=1).astype(np.float64),
@@ -58,49 +59,49 @@ def frame_bytes(
     }
     if keyframe is not None:
         arrays |= {"descriptor": keyframe.descriptor, "image": keyframe.image}
-        about["mounting"] = None if keyframe.mounting is None else keyframe.mounting.fields
+        values["mounting"] = None if keyframe.mounting is None else keyframe.mounting.fields
     if pose is not None:
         arrays["pose"] = np.asarray(pose, np.float64)
-    contiguous = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-    text = json.dumps({"format": FRAME_FORMAT, **about})
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    text = json.dumps({"format": FRAME_FORMAT, **values})
     return zlib.compress(tensors_as_bytes(contiguous, {"scan": text}), 1)
 
 
 def read_frame(
-    content: bytes, frame: int, about: Mapping[str, Any], *, source: Path | None
+    content: bytes, frame: int, annotations: Mapping[str, Any], *, source: Path | None
 ) -> tuple[Keyframe | None, Fits, Float[np.ndarray, "4 4"] | None, dict[str, Any]]:
     """Return the keyframe, the comparisons, the pose and the JSON values of `frame_bytes`.
 
-    `about` has the annotation of each JSON value (`schema.check_about`). Raises ValueError, which names the file
-    `source`, if the content is invalid.
+    `annotations` has the type of each expected JSON value, as in a dataclass. Raises ValueError, which names the file
+    `source` and the number `frame`, if the content is invalid.
     """
     try:
         plain = zlib.decompress(content)
         arrays = safetensors.numpy.load(plain)
         size = int.from_bytes(plain[:8], "little")
         values = json.loads(json.loads(plain[8 : 8 + size])["__metadata__"]["scan"])
-        check_about(values, about, format=FRAME_FORMAT)
+        check_about(values, annotations, format=FRAME_FORMAT)
         check_columns(arrays, COLUMNS)
         frames, (link,) = arrays["fitted"], arrays["links"]
         if ((frames < 0) | (frames >= frame)).any():
-            raise ValueError(f"expected comparisons of frame {frame}, found others")
+            raise ValueError(f"expected comparisons with frames before {frame}, found {frames.tolist()}")
         keyframe, mounting = None, values.get("mounting")
         if "image" in arrays:
-            mounting = None if mounting is None else Mounting(**{**mounting, "up": tuple(mounting["up"])})
+            mounting = None if mounting is None else Mounting(**{**mounting, "up": tuple(mounting["up"])})  # JSON: list
             keyframe = Keyframe(arrays["descriptor"], arrays["image"], mounting)
     except Exception as error:  # another program may have written it
         raise ValueError(f"{source}: expected frame {frame}, found another content ({in_short(error)})") from error
     x, y, yaw, correlation, second, along_m = link
-    covariance = np.diag([along_m, along_m, 0.0]) ** 2
+    covariance = np.diag([along_m, along_m, 0.0]) ** 2  # of the stored one, only `along_m` is used
     registration = None if np.isnan(link).all() else BevRegistration(x, y, yaw, covariance, correlation, second)
     fits = Fits(frames, CorrelationPeak(*arrays["fits"].T), registration)
-    return keyframe, fits, arrays.get("pose"), {name: values[name] for name in about}
+    return keyframe, fits, arrays.get("pose"), {name: values[name] for name in annotations}
 
 
 def settings(
     recording: Recording, finder: CandidateSearch, **arguments: np.ndarray | int | float | str | None
 ) -> dict[str, Any]:
-    """Settings that determine the frames, as JSON values. `arguments` are those of the run, arrays by their hash."""
+    """Settings and `arguments` of a run that determine its frames, as JSON values, with hashes for arrays."""
     hashed = {
         name: hashlib.sha256(value.tobytes()).hexdigest()[:16] if isinstance(value, np.ndarray) else value
         for name, value in arguments.items()
@@ -116,7 +117,7 @@ def settings(
     }
 
 
-def remove(folder: Path) -> None:
+def delete_checkpoint(folder: Path) -> None:
     """Delete the checkpoint in a folder, and the folder if it is then empty."""
     (folder / LOG).unlink(missing_ok=True)
     if folder.is_dir() and not any(folder.iterdir()):
@@ -135,20 +136,23 @@ def add_scans(
     on_progress: Callable[[int], None],
     **arguments: np.ndarray | int | float | str | None,
 ) -> None:
-    """Add the frames of a checkpoint directory, then read, describe and add further scans.
+    """Add the frames of a checkpoint, then read, describe and add further scans, and append them to the checkpoint.
 
     Arguments:
       recording: The scans.
       finder: Candidate search without frames.
       add: Function that adds the next frame to the finder. It receives the keyframe, or None for a bad scan, and the
-        comparisons of a frame of the checkpoint.
+        comparisons of a frame of the checkpoint, or None for a new frame.
       rows: Rows of the scans that the checkpoint lacks, by default all further rows. A row is taken after the previous
         scan was added.
       kept_in: Checkpoint directory, or None.
-      on_bad_scan: See `scan_stream`, also for the next two. Without it, the checkpoint ends at the first bad scan.
+      on_bad_scan: Called with id and error of a bad scan. Without it, the error is raised, and frames of the checkpoint
+        after a bad scan are ignored.
+      should_stop: If it returns True, no further scan is read.
+      on_progress: Called with the number of added frames.
       arguments: Further arguments that determine the frames (`settings`).
 
-    Raises the errors of `RunLog` and `scan_stream`.
+    Raises ValueError for a checkpoint of an earlier version, and the errors of `RunLog` and `scan_stream`.
     """
     path = None if kept_in is None else Path(kept_in) / LOG
     if path is not None and path.with_name(OLD).exists():
@@ -163,9 +167,9 @@ def add_scans(
             add(keyframe, fits)
         if len(finder):
             on_progress(len(finder))
-        further = range(len(finder), len(recording)) if rows is None else rows
+        rows = range(len(finder), len(recording)) if rows is None else rows
         options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-        for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), rows=further, **options):
+        for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), rows=rows, **options):
             add(keyframe, None)
             if path is not None:
                 log.append(len(finder) - 1, frame_bytes(keyframe, finder.fits))

@@ -24,11 +24,11 @@ Reason = Literal[
     "little overlap",
     "degenerate",
 ]
-"""Why a pair that looked like a loop closure was rejected."""
+"""Why a compared pair is not a loop closure."""
 HEIGHT_M, HEIGHT_PER_M = 0.03, 0.018
 TILT_DEG, TILT_DEG_PER_M = 1.2, 0.07
 """Standard deviations of height, and of pitch and roll, which images do not show: for two scans at one position, and
-the increase per metre between them. They hold for vehicles, in simulated towns and outskirts and on KITTI."""
+their increase per metre between the scans. They hold for vehicles, in simulated towns and outskirts and on KITTI."""
 GROUND_HEIGHT_PER_M, GROUND_TILT_DEG_PER_M = 0.008, 0.03
 """Increase of these standard deviations per metre between two scans whose mountings were estimated from the scans."""
 UNKNOWN_HEIGHT_M = 10.0
@@ -48,11 +48,11 @@ class FrameId(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LoopClosure:
-    """Two frames of one place, with the pose between them."""
+    """Two frames of one place, with the relative pose of their scans."""
 
     query: int
     match: int
-    """Frames, counted from 0 in each session. Of one session, the match is the earlier frame."""
+    """Frames, counted from 0 in each session. If both are of one session, the match is the earlier frame."""
     match_from_query: Float[np.ndarray, "4 4"]
     """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. The points of the scans are in these
     frames, which are tilted if the sensor is tilted."""
@@ -69,7 +69,7 @@ class LoopClosure:
 
     @property
     def nodes(self) -> tuple[FrameId, FrameId]:
-        """The match and the query."""
+        """The match and the query, as nodes of a pose graph."""
         return FrameId(self.match_session, self.match), FrameId(self.query_session, self.query)
 
     @property
@@ -89,53 +89,56 @@ class LoopClosure:
 
 
 def to_upright(loop: LoopClosure, *, query: Mounting | None, match: Mounting | None) -> LoopClosure:
-    """Convert a loop between LiDAR frames to one between gravity-aligned frames of the sensors."""
+    """Convert a loop between LiDAR frames to one between gravity-aligned frames, by the mountings of both sensors."""
     return _between_frames(loop, upright_from_lidar(query), upright_from_lidar(match))
 
 
 def to_lidar(loop: LoopClosure, *, query: Mounting | None, match: Mounting | None) -> LoopClosure:
-    """Convert a loop between gravity-aligned frames of the sensors to one between LiDAR frames."""
+    """Convert a loop between gravity-aligned frames to one between LiDAR frames, by the mountings of both sensors."""
     return _between_frames(loop, inverse(upright_from_lidar(query)), inverse(upright_from_lidar(match)))
 
 
-def _between_frames(loop: LoopClosure, query: Float[np.ndarray, "4 4"], match: Float[np.ndarray, "4 4"]) -> LoopClosure:
-    """Express a loop between other frames of its scans. `query` and `match` are poses of old frames in new ones."""
-    pose = match @ loop.match_from_query @ inverse(query)
-    return dataclasses.replace(loop, match_from_query=pose, covariance=transform_covariance(loop.covariance, query))
+def _between_frames(
+    loop: LoopClosure, new_from_query: Float[np.ndarray, "4 4"], new_from_match: Float[np.ndarray, "4 4"]
+) -> LoopClosure:
+    """Express a loop between other frames of its scans, given the poses of the old frames in the new ones."""
+    pose = new_from_match @ loop.match_from_query @ inverse(new_from_query)
+    covariance = transform_covariance(loop.covariance, new_from_query)
+    return dataclasses.replace(loop, match_from_query=pose, covariance=covariance)
 
 
 def vertical_covariance(
     match_from_query: Float[np.ndarray, "4 4"], query: Mounting | None = None, match: Mounting | None = None
 ) -> Float[np.ndarray, "6 6"]:
-    """Covariance of height, roll and pitch of a query in its own frame, between two gravity-aligned scans.
+    """Covariance of height, roll and pitch of a query in its own frame, relative to a match. Both are gravity-aligned.
 
     Suspension, bumps and slopes change height and tilt, the more the farther the scans are apart. If a mounting was
-    estimated from its scan, its standard deviations count instead. A wrong tilt of the match lifts the query.
+    estimated from its scan, its standard deviations count instead. A tilted match lifts the query.
     """
     apart_m = float(np.hypot(*match_from_query[:2, 3]))
     if not any(sensor is not None and sensor.tilt_deviation_deg is not None for sensor in (query, match)):
-        return _height_and_tilt(
-            np.hypot(HEIGHT_M, HEIGHT_PER_M * apart_m), np.hypot(TILT_DEG, TILT_DEG_PER_M * apart_m)
-        )
+        height_m, tilt_deg = np.hypot(HEIGHT_M, HEIGHT_PER_M * apart_m), np.hypot(TILT_DEG, TILT_DEG_PER_M * apart_m)
+        return _height_and_tilt(height_m, tilt_deg)
     covariances = []
     for sensor in (query, match):
         if sensor is None or sensor.height_deviation_m is None or sensor.tilt_deviation_deg is None:
-            covariances.append(_height_and_tilt(HEIGHT_M / 2**0.5, TILT_DEG / 2**0.5))
+            covariances.append(_height_and_tilt(HEIGHT_M / 2**0.5, TILT_DEG / 2**0.5))  # half of the variance of a pair
         else:
             covariances.append(_height_and_tilt(sensor.height_deviation_m, sensor.tilt_deviation_deg))
-    of_match = transform_covariance(covariances[1], inverse(match_from_query))
-    return covariances[0] + of_match + _height_and_tilt(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)
+    match_in_query_frame = transform_covariance(covariances[1], inverse(match_from_query))
+    ground = _height_and_tilt(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)
+    return covariances[0] + match_in_query_frame + ground
 
 
 def _height_and_tilt(height_m: float, tilt_deg: float) -> Float[np.ndarray, "6 6"]:
-    """Covariance with these standard deviations of height, and of roll and pitch."""
+    """Covariance of a pose with these standard deviations of height, and of roll and pitch, and 0 for the rest."""
     tilt = np.radians(tilt_deg)
     return np.diag([0.0, 0.0, height_m, tilt, tilt, 0.0]) ** 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RejectedClosure:
-    """A pair that looked like a loop closure, and the reason why it was rejected."""
+    """A compared pair that is not accepted as a loop closure, and the reason."""
 
     loop: LoopClosure
     reason: Reason
@@ -152,16 +155,16 @@ def planar_loop(
 ) -> LoopClosure:
     """Loop closure of two registered images, between gravity-aligned frames.
 
-    If the odometry does not measure height (`knows_height`), the storey is unknown. `sensors` are the mountings at
-    query and match (`vertical_covariance`).
+    If the odometry does not measure height (`knows_height`), the storey is unknown. `sensors` are the mountings of
+    query and match.
     """
     pose = transform(float(registration.x), float(registration.y), float(registration.yaw))
     covariance = vertical_covariance(pose, *sensors)
     covariance[2, 2] += 0.0 if knows_height else UNKNOWN_HEIGHT_M**2
-    query_from_match = np.eye(3)
+    query_from_match = np.eye(3)  # rotation of (x, y, yaw)
     query_from_match[:2, :2] = pose[:2, :2].T
-    in_match = np.asarray(registration.covariance, np.float64)
-    covariance[PLANAR[:, None], PLANAR] = query_from_match @ in_match @ query_from_match.T
+    match_covariance = np.asarray(registration.covariance, np.float64)
+    covariance[PLANAR[:, None], PLANAR] = query_from_match @ match_covariance @ query_from_match.T
     return LoopClosure(query, match, pose, covariance, float(probability))
 
 
@@ -184,20 +187,20 @@ def frames_of(loops: Sequence[LoopClosure]) -> tuple[Int[np.ndarray, " n"], Int[
 
 
 def in_metres(loop: LoopClosure, scale: Scale) -> LoopClosure:
-    """Loop of scans before all their lengths were multiplied by `scale`."""
+    """Convert a loop of scans whose lengths were multiplied by `scale` to metres."""
     pose = scaled_poses(loop.match_from_query, 1 / scale)
     return dataclasses.replace(loop, match_from_query=pose, covariance=covariance_in_metres(loop.covariance, scale))
 
 
 def covariance_in_metres(covariance: Float[np.ndarray, "6 6"], scale: Scale) -> Float[np.ndarray, "6 6"]:
-    """Covariance of a pose (x, y, z, rotations) before all lengths were multiplied by `scale`."""
-    units = np.repeat([1 / scale, 1.0], 3)
-    return covariance * np.outer(units, units)
+    """Convert the covariance of a pose (x, y, z, rotations) with lengths multiplied by `scale` to metres."""
+    factors = np.repeat([1 / scale, 1.0], 3)
+    return covariance * np.outer(factors, factors)
 
 
-def renumbered(loop: LoopClosure, numbers: Sequence[Int[np.ndarray, " _"]]) -> LoopClosure:
-    """Replace the frames of a loop by their numbers. `numbers` has one array for each session."""
-    query, match = numbers[loop.query_session][loop.query], numbers[loop.match_session][loop.match]
+def renumbered(loop: LoopClosure, new_frames: Sequence[Int[np.ndarray, " _"]]) -> LoopClosure:
+    """Replace the frame numbers of a loop. `new_frames` has for each session the new number of each frame."""
+    query, match = new_frames[loop.query_session][loop.query], new_frames[loop.match_session][loop.match]
     return dataclasses.replace(loop, query=int(query), match=int(match))
 
 
@@ -211,13 +214,13 @@ MEANING: dict[Reason, str] = {
     "little overlap": "The two scans, registered in 6 degrees of freedom, overlap too little.",
     "degenerate": f"The position is uncertain by more than {DEGENERATE_M:g} m along one direction, as between walls.",
 }
-"""Meaning of each reason, one sentence each."""
+"""Explanation of each reason for the user, one sentence each."""
 
 
 def convert_rejected(
     rejected: Sequence[RejectedClosure], convert: Callable[[LoopClosure], LoopClosure]
 ) -> list[RejectedClosure]:
-    """Apply a function to the loop of each rejected pair."""
+    """Apply a function to the loop of each rejected pair, and keep the reason."""
     return [RejectedClosure(convert(closure.loop), closure.reason) for closure in rejected]
 
 

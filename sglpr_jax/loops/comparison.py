@@ -1,7 +1,7 @@
 """Comparison of a scan with stored scans: the best match, and the evidence that it shows the same place.
 
-The query is also compared with scans of other places according to the motion. If one of these distractors fits about as
-well as the match, the fit proves little. Neither frame rate nor speed matters: distances are travelled distances.
+The query is also compared with distractors: scans that show other places, according to the motion. If a distractor fits
+about as well as the match, the fit proves little. Only travelled distances count, not frame rate or speed.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from sglpr_jax.loops.drift import planar_covariance, planar_deviations
 from sglpr_jax.loops.keyframes import EVERY, Keyframes
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, search
 from sglpr_jax.registration.bev_spectra import query_spectra
@@ -26,13 +26,14 @@ from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar
 
 BATCH, COARSE_BATCH = 8, 32
-"""Number of matches of a batch, of the exact and of the coarse comparison."""
+"""Batches of the exact and of the coarse comparison are padded to a multiple of these numbers of matches."""
 DISTRACTOR_M = 10.0
 """Minimum travelled distance of a distractor from query and match, in metres."""
 EXACT_COHORT, EXACT_NEAR_COHORT = 6, 3
-"""Numbers of distractors of the two cohorts, the best by the coarse comparison, whose images are compared exactly."""
+"""Numbers of distractors that are compared exactly, the best by the coarse comparison: elsewhere, and near."""
 SURROUNDINGS_M, SYMMETRIES = 300.0, 4
-"""Side of the square in which a lookalike may stand, in metres, and number of rotations at which it may fit."""
+"""Side of the square in which a lookalike of a place may be, in metres, and number of rotations at which it may fit:
+walls stand at right angles."""
 
 
 class Candidate(NamedTuple):
@@ -63,9 +64,9 @@ class Fits(NamedTuple):
 
     @classmethod
     def joined(cls, *parts: "Fits") -> "Fits":
-        """Comparisons of one query, one part after the other, without links."""
-        frames, peaks, _ = zip(*parts, strict=True)
-        return cls(np.concatenate(frames), CorrelationPeak(*map(np.concatenate, zip(*peaks, strict=True))))
+        """Concatenate comparisons of one query, without their links."""
+        fields = zip(*(fits.peaks for fits in parts), strict=True)
+        return cls(np.concatenate([fits.frames for fits in parts]), CorrelationPeak(*map(np.concatenate, fields)))
 
 
 NO_FITS = Fits(np.zeros(0, np.int64), NO_PEAKS)
@@ -79,6 +80,7 @@ class Query:
     """Frame number in the motion."""
     descriptor: Float32[np.ndarray, " d"]
     image: UInt8[np.ndarray, "m m"]
+    """Density image, of which only the part `within_reach` is compared."""
     verification: VerificationConfig = VerificationConfig()
 
     @functools.cached_property
@@ -103,13 +105,13 @@ class KeyframeComparison:
     def compare(
         self, query: Query, searched: Keyframes, *others: Keyframes, possible: Bool[np.ndarray, " n"] | None = None
     ) -> Fits:
-        """Compare a query with the scans most like it: possible matches, and scans that show other places.
+        """Compare a query with the scans most like it: first possible matches, then distractors of the best match.
 
         Arguments:
           query: The scan. Its frame is part of the motion.
           searched: Scans among which the match is sought.
-          others: Further scans that show other places, such as those of the query's own recording.
-          possible: Whether each searched scan may be the match. By default the motion decides.
+          others: Further scans for distractors, such as those of the query's own recording.
+          possible: Whether each searched scan may be the match. By default, the motion decides.
         """
         config, frames = self.config, searched.frames
         if possible is None:
@@ -119,7 +121,7 @@ class KeyframeComparison:
         rows = rows[coarse >= config.min_coarse_correlation]
         first, second = np.split(rows[: 2 * config.candidates], [config.candidates])
         fits = self._compare_exactly(query, searched, first)
-        best = self._best_allowed(query.frame, fits, EVERY)
+        best = self._best_consistent_with_motion(query.frame, fits, EVERY)
         if best is None or fits.peaks.correlation[best] < config.good_correlation:
             fits = Fits.joined(fits, self._compare_exactly(query, searched, second))
             best = self._best(query.frame, fits, EVERY) if best is None else best
@@ -129,32 +131,34 @@ class KeyframeComparison:
     def candidates(
         self, query: Query, fits: Fits, searched: Keyframes, *, possible: Bool[np.ndarray, "*k"] = EVERY
     ) -> list[Candidate]:
-        """Choose the match of a query among the `searched` scans, and collect the evidence, if any scan fits.
+        """Candidates of a query: the best match that the motion allows and, if it differs, the best match of all.
 
-        If another scan fits better, but contradicts the motion, it is a second candidate. It can show that the motion
-        is wrong. Only `possible` fits outside of the query's own pass count.
+        The latter can show that the motion is wrong. Only `possible` fits outside of the query's own pass count, of at
+        least `min_correlation`. Their scans are `searched`.
         """
-        rows = self._best_allowed(query.frame, fits, possible), self._best(query.frame, fits, possible)
+        rows = self._best_consistent_with_motion(query.frame, fits, possible), self._best(query.frame, fits, possible)
         return [
-            self.verify(query, fits, row, searched)
-            for row in dict.fromkeys(rows)
+            self.candidate_of_fit(query, fits, row, searched)
+            for row in dict.fromkeys(rows)  # without duplicates
             if row is not None and fits.peaks.correlation[row] >= self.config.min_correlation
         ]
 
-    def verify(self, query: Query, fits: Fits, row: int, searched: Keyframes) -> Candidate:
-        """Register the images of a query and of the scan of one fit, and collect the evidence.
+    def candidate_of_fit(self, query: Query, fits: Fits, row: int, searched: Keyframes) -> Candidate:
+        """Register the images of a query and of the scan of one fit (`row`), and collect the evidence.
 
-        The fits of scans that the motion excludes count against the match. So do second-best poses, those of the match
-        and of scans whose best poses the motion allows.
+        The ambiguity ratio is the highest correlation that speaks against the match, divided by that of the match. For
+        distractors, whose fits exclude the match according to the motion, it is that of the best pose. For the match
+        and all other scans, it is that of the second-best pose.
         """
         match, peak, poses = int(fits.frames[row]), fits.peaks.at(row), fits.poses
         deviations, limit = self.deviations(query.frame, fits.frames, poses), self.drift.max_deviation
-        # The motion between the match and another scan may exclude that the query fits both.
-        from_match = self.deviations(match, fits.frames, compose_planar(poses, inverse_planar(poses[row])))
-        distracts = (from_match > limit) | ((deviations > limit) & (deviations[row] <= limit))
-        distracts &= ~self.are_joined(match, fits.frames) & (fits.frames != match)
-        distractors = np.where(distracts, fits.peaks.correlation, fits.peaks.second)
-        ambiguity_ratio = float(distractors.max()) / max(float(peak.correlation), 1e-6)
+        # Pose of the match in the frame of each scan, if the query fits both. The motion between them may exclude it.
+        scans_from_match = compose_planar(poses, inverse_planar(poses[row]))
+        excludes_match = self.deviations(match, fits.frames, scans_from_match) > limit
+        excludes_match |= (deviations > limit) & (deviations[row] <= limit)
+        excludes_match &= ~self.are_joined(match, fits.frames) & (fits.frames != match)
+        opposing = np.where(excludes_match, fits.peaks.correlation, fits.peaks.second)
+        ambiguity_ratio = float(opposing.max()) / max(float(peak.correlation), 1e-6)
         image = searched.image(int(np.searchsorted(searched.frames, match)))
         registration = jax.device_get(refine(query.image, image, peak, config=self.verification))
         surprise = self.surprise(query.frame, match)
@@ -162,23 +166,23 @@ class KeyframeComparison:
         return Candidate(query.frame, match, registration, evidence)
 
     def surprise(self, query: int, match: int) -> float:
-        """Logarithm of all poses that a sensor may have over those within the uncertainty of the motion.
+        """Logarithm of the number of poses of a lookalike over the number of poses that the motion allows the query.
 
-        A lookalike stands anywhere in the surroundings, at one of `SYMMETRIES` rotations, because walls stand at right
-        angles. The result is negative if the motion allows more positions than the surroundings have.
+        A lookalike may be anywhere in a square of `SURROUNDINGS_M`, at `SYMMETRIES` rotations. The result is negative
+        if the motion allows more positions than the square has.
         """
         covariance = planar_covariance(self.motion.path, np.array([query]), np.array([match]), drift=self.drift)[0]
-        area = 2 * np.pi * np.sqrt(np.linalg.det(covariance[:2, :2]))
-        rotation = max(2 * self.drift.max_deviation * np.sqrt(covariance[2, 2]), 2 * np.pi / SYMMETRIES)
-        return float(np.log(SURROUNDINGS_M**2 / area) + max(np.log(2 * np.pi / rotation), 0))
+        area_m2 = 2 * np.pi * np.sqrt(np.linalg.det(covariance[:2, :2]))
+        yaw_range = max(2 * self.drift.max_deviation * np.sqrt(covariance[2, 2]), 2 * np.pi / SYMMETRIES)
+        return float(np.log(SURROUNDINGS_M**2 / area_m2) + max(np.log(2 * np.pi / yaw_range), 0))
 
     def _best(self, query: int, fits: Fits, allowed: Bool[np.ndarray, "*k"]) -> int | None:
-        """Row of the allowed fit with the highest correlation, outside of the query's own pass. None without a fit."""
+        """Row of the allowed fit of another pass (`recent_m`) with the highest correlation, or None."""
         allowed = allowed & (self.travelled_between(fits.frames, query) >= self.config.recent_m)
         return int(np.argmax(np.where(allowed, fits.peaks.correlation, -1.0))) if allowed.any() else None
 
-    def _best_allowed(self, query: int, fits: Fits, allowed: Bool[np.ndarray, "*k"]) -> int | None:
-        """The same among the fits whose poses the motion allows."""
+    def _best_consistent_with_motion(self, query: int, fits: Fits, allowed: Bool[np.ndarray, "*k"]) -> int | None:
+        """Result of `_best` among the allowed fits whose poses deviate from the motion by at most `max_deviation`."""
         deviations = self.deviations(query, fits.frames, fits.poses)
         return self._best(query, fits, (deviations <= self.drift.max_deviation) & allowed)
 
@@ -191,30 +195,32 @@ class KeyframeComparison:
         path = self.motion.path
         apart_m = np.linalg.norm(path.poses[frames, :3, 3] - path.poses[frame, :3, 3], axis=1)
         drift_m = path.position_deviations(frames, frame, drift=self.drift)
-        place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
-        return apart_m > place_m + self.drift.max_deviation * drift_m
+        max_shift_m = np.sqrt(2) * self.verification.max_shift_m  # along x and y at once
+        return apart_m > max_shift_m + self.drift.max_deviation * drift_m
 
     def _compare_distractors(self, query: Query, match: int, scans: Keyframes) -> Fits:
-        """Compare a query with the scans most like it that show another place than the query or the match, and with
-        those near enough to contradict the motion by their fit."""
+        """Compare a query with the distractors most like it, of two kinds.
+
+        One kind shows another place than the query or the match. The other is less than two `recent_m` of travel from
+        one of them: its fit may contradict the motion.
+        """
         config, frames = self.config, scans.frames
         travelled_m = np.stack([self.travelled_between(frames, frame) for frame in (query.frame, match)])
+        distracts = (travelled_m >= DISTRACTOR_M).all(axis=0)
         elsewhere = self.are_elsewhere(frames, query.frame) | self.are_elsewhere(frames, match)
         near = (travelled_m < 2 * config.recent_m).any(axis=0) & ~elsewhere
-        distracts = (travelled_m >= DISTRACTOR_M).all(axis=0)
-        rows = [
-            self._most_similar(query, scans, count, flags & distracts)[0][:exact]
-            for count, exact, flags in (
-                (config.cohort, EXACT_COHORT, elsewhere),
-                (config.near_cohort, EXACT_NEAR_COHORT, near),
-            )
-        ]
-        return Fits.joined(*(self._compare_exactly(query, scans, cohort) for cohort in rows))
+        far_rows, _ = self._most_similar(query, scans, config.cohort, elsewhere & distracts)
+        near_rows, _ = self._most_similar(query, scans, config.near_cohort, near & distracts)
+        far_fits = self._compare_exactly(query, scans, far_rows[:EXACT_COHORT])
+        return Fits.joined(far_fits, self._compare_exactly(query, scans, near_rows[:EXACT_NEAR_COHORT]))
 
     def _most_similar(
         self, query: Query, scans: Keyframes, count: int, among: Bool[np.ndarray, " n"]
     ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Rows of the scans with the nearest descriptors, and their coarse correlations, the highest first."""
+        """Rows of the `count` scans with the nearest descriptors, and their coarse correlations, the highest first.
+
+        Only scans with a flag in `among` count.
+        """
         rows = scans.nearest(query.descriptor, count, among)
         if not len(rows):
             return rows, np.zeros(0)
@@ -235,22 +241,24 @@ class KeyframeComparison:
     def deviations(
         self, query: int, matches: Int[np.ndarray, " k"], match_from_query: PlanarPose
     ) -> Float[np.ndarray, " k"]:
-        """Deviation of poses of a frame in the frames of others from the motion, in standard deviations."""
+        """Deviation from the motion, in standard deviations, of the pose of a frame in the frame of each match."""
         queries = np.full(len(matches), query)
         return planar_deviations(self.motion.path, queries, matches, match_from_query, drift=self.drift)
 
     def are_joined(self, match: int, frames: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
-        """Whether an accepted loop joins the surroundings of each frame with those of a match."""
+        """Whether an accepted loop shows that a frame and a match are of one place, up to `recent_m` of travel."""
         joined = np.zeros(len(frames), bool)
-        for near_ends, far_ends in (self.loops.T, self.loops.T[::-1]):
-            at_match = self.travelled_between(near_ends, match) < self.config.recent_m
-            for far_end in far_ends[at_match].tolist():
-                joined |= self.travelled_between(frames, far_end) < self.config.recent_m
+        query, earlier = self.loops.T
+        for ends, other_ends in ((query, earlier), (earlier, query)):
+            is_near_match = self.travelled_between(ends, match) < self.config.recent_m
+            for frame in other_ends[is_near_match].tolist():
+                joined |= self.travelled_between(frames, frame) < self.config.recent_m
         return joined
 
 
 def _batched(spectra: Sequence[Complex64[np.ndarray, "s f"]], multiple: int) -> Complex64[np.ndarray, "k s f"]:
-    """Stack spectra, and pad them to a multiple of a number, because each size compiles its own program."""
-    batch = np.zeros((-(-len(spectra) // multiple) * multiple, *spectra[0].shape), np.complex64)
+    """Stack spectra, and pad the stack with zeros to a multiple of `multiple`, because each size compiles a program."""
+    padded_length = -(-len(spectra) // multiple) * multiple
+    batch = np.zeros((padded_length, *spectra[0].shape), np.complex64)
     batch[: len(spectra)] = spectra
     return batch

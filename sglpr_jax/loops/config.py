@@ -4,11 +4,11 @@ import dataclasses
 from typing import Annotated, Literal
 
 from sglpr_jax.fields import Bounds, Count, NotNegative, Positive, Share, check_fields
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.config import VerificationConfig
 
 Degenerate = Literal["keep", "drop"]
-"""Whether degenerate loops are kept or rejected. The position of a degenerate loop is uncertain by more than 1 m in one
+"""Whether degenerate loops are kept or rejected. Their position has a standard deviation of more than 1 m in one
 horizontal direction, for example between plain walls."""
 MIN_PROBABILITY = 0.99
 """Minimum probability of a returned loop."""
@@ -16,11 +16,11 @@ SPACING_M = 1.0
 """Minimum distance of consecutive places of a drive in a map, in metres."""
 PlaceCount = Annotated[int, Bounds(1, 1000)]
 PlaceCountOrNone = Annotated[int, Bounds(0, 1000)]
-"""Number of places whose images are compared with a query. Each takes milliseconds."""
+"""Number of places whose images are compared with a query. A comparison takes milliseconds. `OrNone` accepts 0."""
 INDEPENDENT_M = 25.0
-"""Travelled distance after which two frames are nearly independent, in metres: the reach of an image."""
+"""Travelled distance after which two frames are nearly independent, in metres: the radius of the compared images."""
 MIN_CELLS = 20
-"""Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
+"""Minimum number of occupied cells of an image. Images with fewer come from a blocked or failed sensor."""
 CANDIDATES = 5
 """Number of nearest places of a map that a query is compared with."""
 
@@ -30,19 +30,20 @@ class CandidateConfig:
     """Selection of the scans that a query is compared with: possible matches, and scans that show other places."""
 
     further: PlaceCount = 32
-    """Number of nearest descriptors among the possible matches whose images are compared on coarse cells."""
+    """Number of possible matches, those with the nearest descriptors, whose images are compared coarsely."""
     candidates: PlaceCount = 4
-    """Number of these, the best by the coarse comparison, whose images are compared exactly."""
+    """Number of possible matches, the best by the coarse comparison, whose images are compared exactly."""
     good_correlation: float = 0.6
-    """If no compared image has this correlation, as many further ones are compared exactly."""
+    """If no compared image has this correlation, the next `candidates` are compared exactly, too."""
     min_coarse_correlation: float = 0.3
     """Minimum correlation by the coarse comparison (`registration.bev_search`) of a match that is compared exactly."""
     min_correlation: float = 0.25
     """Minimum correlation of a candidate. Pairs below it are not loops."""
     cohort: PlaceCountOrNone = 24
-    """Number of nearest descriptors among the scans that show another place than the query or the match."""
+    """Number of scans of other places than query and match, those with the nearest descriptors, that are compared."""
     near_cohort: PlaceCountOrNone = 8
-    """Number of nearest descriptors among other scans of the same passes, whose fits may contradict the motion."""
+    """Number of scans of the same passes, those with the nearest descriptors, that are compared. Their fits may
+    contradict the motion."""
     recent_m: Positive = 30.0
     """Minimum travelled distance between a match and its query, in metres. Nearer scans belong to the same pass."""
 
@@ -73,5 +74,5 @@ class DetectorConfig:
         check_fields(self)
 
     def at_scale(self, scale: float) -> "DetectorConfig":
-        """The settings for scans with all lengths multiplied by `scale`. Those of the images stay as they are."""
+        """The settings for scans with all lengths multiplied by `scale`. Settings of the images do not change."""
         return dataclasses.replace(self, keyframe_m=self.keyframe_m * scale, drift=self.drift.at_scale(scale))

@@ -19,15 +19,15 @@ from sglpr_jax.loops.sequence import WINDOW_M, Pair, pair_of, probable_loops, re
 from sglpr_jax.models.params import Params
 
 MAX_WAITING = 240
-"""Maximum number of pairs that wait for their neighbours. It limits the time of a frame of a slow sensor."""
+"""Maximum number of pairs that wait for their neighbours. It limits the computation per frame if the sensor is slow."""
 
 
 class LoopDetector:
     """Finds loop closures in a stream of scans or images, with or without times and odometry.
 
-    The sequential test (`loops.sequence`) adds the evidence of neighbouring frames to that of each pair. Pairs that
-    contradict the odometry or, without it, the motion estimated from the images, are rejected. The first loops of a
-    revisit may be returned some frames late, together with others.
+    The sequential test (`loops.sequence`) adds the evidence of neighbouring frames to that of each pair, so the first
+    loops of a revisit may be returned some frames late. Pairs that contradict the odometry or, without it, the motion
+    estimated from the images, are rejected.
 
     Example:
       detector = LoopDetector(sglpr_jax.load("sglpr"))
@@ -37,7 +37,7 @@ class LoopDetector:
     """
 
     def __init__(self, params: Params, *, model: LoopModel | None = None, config: DetectorConfig = DetectorConfig()):
-        """Create a detector without frames. The default `model` of the probabilities is the one shipped."""
+        """Create a detector without frames. By default, `model` is the shipped model of the probabilities."""
         self.finder = CandidateSearch(params, config)
         self.model = default_model() if model is None else model
         self.config = config
@@ -46,12 +46,13 @@ class LoopDetector:
         self.loops: list[LoopClosure] = []
         """All returned loops."""
         self.rejected: list[RejectedClosure] = []
-        """All other pairs of frames that are old enough, each with the reason for its rejection."""
+        """All other compared pairs, except those whose later neighbours may still be added, with reasons."""
         self._waiting: list[Pair] = []
         """Pairs whose later neighbours may still be added."""
         self._returned: set[int] = set()
+        """Queries of the returned loops."""
         self._contradicting: set[int] = set()
-        """Queries of the returned loops, and queries of the loops that contradict the motion."""
+        """Queries of the probable loops that contradict the motion."""
 
     def __len__(self) -> int:
         """Number of added frames."""
@@ -59,9 +60,9 @@ class LoopDetector:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of all frames, without results and the spectra of the last compared scans (13 MB at most).
+        """Number of bytes of all frames, without results and without the kept spectra (13 MB at most).
 
-        With `max_places`, only poses still grow: 297 bytes a frame, and up to as much in spare capacity.
+        With `max_places`, only the motion grows: by 297 bytes a frame, and up to as much in spare capacity.
         """
         return self.finder.nbytes
 
@@ -99,14 +100,15 @@ class LoopDetector:
         fits: Fits | None = None,
         continues: bool = True,
     ) -> list[LoopClosure]:
-        """Add a described frame (`CandidateSearch.add_keyframe`), and return loops as `add` does."""
+        """Add a described frame, with the arguments of `CandidateSearch.add_keyframe`. Returns loops as `add` does."""
         finder = self.finder
         candidates = finder.add_keyframe(keyframe, time=time, odometry=odometry, fits=fits, continues=continues)
         self.candidates += candidates
         if self.config.max_places is not None:
             del self.candidates[: -self.config.max_places]
-        about = self.model, finder.motion, finder.mountings
-        self._waiting += [pair_of(candidate, *about, knows_height=finder.knows_height) for candidate in candidates]
+        for candidate in candidates:
+            pair = pair_of(candidate, self.model, finder.motion, finder.mountings, knows_height=finder.knows_height)
+            self._waiting.append(pair)
         oldest_m = finder.motion.travelled[len(self) - 1] - WINDOW_M
         decided = sum(pair.travelled_m < oldest_m for pair in self._waiting)
         decided = max(decided, len(self._waiting) - MAX_WAITING)
@@ -117,24 +119,24 @@ class LoopDetector:
         allowed = [pair for pair in self._waiting if self._is_allowed(pair)]
         excluded = [pair for pair in self._waiting if not self._is_allowed(pair)]
         reason: Reason = "contradicts the odometry" if finder.has_odometry else "contradicts the motion"
-        self.rejected += [RejectedClosure(loop, reason) for loop in self._probable(excluded, self._contradicting)]
-        loops = self._probable(allowed, self._returned)
+        self.rejected += [RejectedClosure(loop, reason) for loop in self._new_loops(excluded, self._contradicting)]
+        loops = self._new_loops(allowed, self._returned)
         self.loops += loops
         for loop in loops:
             finder.close_loop(loop.query, loop.match)
         return loops
 
     def undecided(self) -> list[RejectedClosure]:
-        """Rejections of the pairs of the last frames, if no further frame follows."""
+        """Rejections of the pairs that still wait for their neighbours, for the end of a stream."""
         return self._reject(self._waiting)
 
-    def _probable(self, pairs: Sequence[Pair], known_queries: set[int]) -> list[LoopClosure]:
-        """Loops that are probable given their neighbours, without `known_queries`. Adds their queries to that set."""
+    def _new_loops(self, pairs: Sequence[Pair], known_queries: set[int]) -> list[LoopClosure]:
+        """Probable loops, given their neighbours, whose queries are new. Adds their queries to `known_queries`."""
         finder = self.finder
         loops = probable_loops(pairs, self.model, finder.motion.path, drift=finder.present_drift, config=self.config)
-        new = [self.finder.to_lidar(loop) for loop in loops if loop is not None and loop.query not in known_queries]
-        known_queries |= {loop.query for loop in new}
-        return new
+        new_loops = [finder.to_lidar(loop) for loop in loops if loop is not None and loop.query not in known_queries]
+        known_queries |= {loop.query for loop in new_loops}
+        return new_loops
 
     def _is_allowed(self, pair: Pair) -> bool:
         """Whether the motion allows the pose of a pair."""
@@ -142,9 +144,9 @@ class LoopDetector:
 
     def _reject(self, pairs: Sequence[Pair]) -> list[RejectedClosure]:
         """Rejections, with reasons, of the pairs that were not returned although the motion allows them."""
-        least = self.config.min_probability
+        min_probability = self.config.min_probability
         return [
-            RejectedClosure(self.finder.to_lidar(pair.loop), rejection_reason(pair, self.model, least))
+            RejectedClosure(self.finder.to_lidar(pair.loop), rejection_reason(pair, self.model, min_probability))
             for pair in pairs
             if pair.loop.query not in self._returned and self._is_allowed(pair)
         ]

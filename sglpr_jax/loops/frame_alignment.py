@@ -11,7 +11,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.loops.closure import LoopClosure, covariance_in_metres, frames_of
 from sglpr_jax.loops.config import INDEPENDENT_M
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import adjoint, inverse, transform_covariance, yaw_of
 
 ROUNDS = 20
@@ -21,7 +21,7 @@ SMALL = 1e-9
 
 
 class TrajectorySegment(NamedTuple):
-    """Consecutive scans of a session whose poses are known in one frame: all scans if there is odometry."""
+    """Consecutive scans of a session whose poses are known in one frame. With odometry, these are all scans."""
 
     session: int
     first: int
@@ -44,7 +44,7 @@ class SegmentAlignment(NamedTuple):
     """Number of loops from which the transform was estimated."""
 
     def in_metres(self, scale: Scale) -> "SegmentAlignment":
-        """The transform before all lengths were multiplied by `scale`."""
+        """Convert a transform with lengths multiplied by `scale` to metres."""
         pose = scaled_poses(self.match_from_query, 1 / scale)
         return self._replace(match_from_query=pose, covariance=covariance_in_metres(self.covariance, scale))
 
@@ -68,10 +68,11 @@ def align_frames(
     query_travelled_m: Float[np.ndarray, " m"],
     drift: DriftModel,
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
-    """Estimate the transform between two frames by iteratively reweighted least squares, with Cauchy's cost.
+    """Estimate the transform between the frames of two recordings from the loops between them.
 
-    The weight of a loop follows from its covariance and from the drift between it and the middle of all loops. Loops
-    closer than `INDEPENDENT_M` see the same walls, so their weights are reduced in proportion to their distance.
+    The method is iteratively reweighted least squares with Cauchy's cost. The weight of a loop follows from its
+    covariance and from the drift between it and the median loop. Loops closer than `INDEPENDENT_M` see the same walls,
+    so their weights are reduced in proportion to their distance.
 
     Arguments:
       loops: At least one loop closure between the two recordings.
@@ -86,13 +87,13 @@ def align_frames(
       the path between the loops, which does not average out.
     """
     query, match = frames_of(loops)
-    measured = match_poses[match] @ np.stack([loop.match_from_query for loop in loops])
+    measured = match_poses[match] @ np.stack([loop.match_from_query for loop in loops])  # queries in the match frame
     queries = query_poses[query]
     drift_covariances = _drift_covariances(match_travelled_m[match], query_travelled_m[query], drift)
     covariances = np.stack([loop.covariance for loop in loops]) + drift_covariances
     independent = _independent_shares(query_travelled_m[query])
     jacobians = np.stack([adjoint(inverse(pose)) for pose in queries])
-    # Start with the transform of the loop whose median distance to the measurements of the others is least.
+    # Start with the transform of the loop that predicts the positions of the queries of all loops best, in the median.
     transforms = measured @ inverse(queries)
     predicted = transforms[:, None] @ queries[None]
     apart_m = np.linalg.norm(predicted[..., :3, 3] - measured[None, :, :3, 3], axis=2)
@@ -106,37 +107,44 @@ def align_frames(
         hessian = np.einsum("n,nij,nik->jk", weights, jacobians, solved[..., 1:])
         step = -np.linalg.solve(hessian, gradient)
         motion = np.eye(4)
-        motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(step[3:]).as_matrix(), step[:3]
+        motion[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
+        motion[:3, 3] = step[:3]
         estimate = estimate @ motion
         if np.abs(step).max() < SMALL:
             break
-    middle = np.eye(4)
-    middle[:3, 3] = np.median(queries[:, :3, 3], axis=0)
-    return estimate, np.linalg.inv(hessian) + transform_covariance(drift_covariances.mean(axis=0), middle)
+    median_query = np.eye(4)  # the drift counts from there
+    median_query[:3, 3] = np.median(queries[:, :3, 3], axis=0)
+    return estimate, np.linalg.inv(hessian) + transform_covariance(drift_covariances.mean(axis=0), median_query)
 
 
 def _drift_covariances(
     match_travelled_m: Float[np.ndarray, " k"], query_travelled_m: Float[np.ndarray, " k"], drift: DriftModel
 ) -> Float[np.ndarray, "k 6 6"]:
-    """Covariance of the drift of both recordings between each loop and the middle of the loops."""
-    middles = np.median(match_travelled_m), np.median(query_travelled_m)
-    length = np.hypot(match_travelled_m - middles[0], query_travelled_m - middles[1])
-    position, yaw = drift.metres_per_metre * length, np.radians(drift.degrees_per_metre * length)
-    vertical = np.zeros_like(length)  # loops measure height, roll and pitch less precisely than they drift
-    sigmas = np.stack([position, position, vertical, vertical, vertical, yaw], axis=1)
+    """Covariance of the drift of both recordings between each loop and the median loop.
+
+    The arguments are travelled distances at the matches and queries of the loops, in metres.
+    """
+    match_lengths_m = match_travelled_m - np.median(match_travelled_m)
+    query_lengths_m = query_travelled_m - np.median(query_travelled_m)
+    length_m = np.hypot(match_lengths_m, query_lengths_m)
+    position, yaw = drift.metres_per_metre * length_m, np.radians(drift.degrees_per_metre * length_m)
+    zero = np.zeros_like(length_m)  # of height, roll and pitch, whose drift is less than the errors of loops
+    sigmas = np.stack([position, position, zero, zero, zero, yaw], axis=1)
     return sigmas[:, None] ** 2 * np.eye(6)
 
 
 def _independent_shares(travelled_m: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Weight of each loop: its share of the travelled distance, in units of `INDEPENDENT_M`, at most 1."""
+    """Weight of each loop: mean distance to the loops before and after it, divided by `INDEPENDENT_M`, at most 1."""
+    if len(travelled_m) == 1:
+        return np.ones(1)
     order = np.argsort(travelled_m)
-    gaps = np.diff(travelled_m[order])
-    mean_gaps = (np.append(gaps, gaps[-1:]) + np.append(gaps[:1], gaps)) / 2 if len(gaps) else np.array([np.inf])
+    gaps_m = np.diff(travelled_m[order])
+    gaps_before_m, gaps_after_m = np.append(gaps_m[:1], gaps_m), np.append(gaps_m, gaps_m[-1:])
     weights = np.empty(len(travelled_m))
-    weights[order] = np.clip(mean_gaps / INDEPENDENT_M, 1e-3, 1)
+    weights[order] = np.clip((gaps_after_m + gaps_before_m) / 2 / INDEPENDENT_M, 1e-3, 1)
     return weights
 
 
 def logarithm(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6"]:
-    """Translation (metres) and rotation vector (radians) of small motions."""
+    """Translation (metres) and rotation vector (radians) of small motions, given as poses."""
     return np.concatenate([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()], axis=1)

@@ -1,4 +1,4 @@
-"""Description of a scan for the loop search: its descriptor and its density image."""
+"""Scans of the loop search: description of a scan by descriptor and density image, and storage of described scans."""
 
 import abc
 import copy
@@ -29,58 +29,60 @@ class Keyframe(NamedTuple):
 
     descriptor: Float32[np.ndarray, " d"]
     image: UInt8[np.ndarray, "n n"]
-    """Density image."""
+    """Central square of the density image or of the ready-made image."""
     mounting: Mounting | None
     """Mounting of the sensor. Descriptor and image are gravity-aligned."""
 
 
 def describe_scan(params: Params, scan: Scan) -> Keyframe:
-    """Descriptor and 8-bit density image of a scan or ready-made image."""
+    """Compute the descriptor of a scan and its 8-bit density image. The descriptor may be that of another image kind.
+
+    A ready-made image replaces both images. Raises the ValueError of `check_ready_made`.
+    """
     model = params.config
     check_ready_made(scan, model.image)
-    whole, _ = picture(scan, None)
+    density_image, _ = picture(scan, None)
     if scan.points is None or model.image == "density":
-        bev = image_view(whole, None, model.grid).image
+        model_image = image_view(density_image, None, model.grid).image
     else:
-        bev = view(scan, model.grid, image=model.image).image
-    return Keyframe(np.asarray(describe(params, bev)), _square_8_bit(whole), scan.mounting)
+        model_image = view(scan, model.grid, image=model.image).image
+    return Keyframe(np.asarray(describe(params, model_image)), _square_8_bit(density_image), scan.mounting)
 
 
 def square_image(scan: Scan) -> UInt8[np.ndarray, "n n"]:
-    """Image for the comparison of scans: the density image or the ready-made image, as 8 bits."""
+    """Image for the comparison of scans: the central square of the density image or ready-made image, as 8 bits."""
     return _square_8_bit(picture(scan, None)[0])
 
 
 def _square_8_bit(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
-    """Central square of an image, with an even number of cells, as 8 bits."""
-    even = even_cells(jnp.asarray(image, jnp.float32))
-    size = min(even.shape)
-    grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / DENSITY_MAX_COUNT)
+    """Central square of an image, with an even number of cells per side. 255 means `DENSITY_MAX_COUNT` or more."""
+    even_image = even_cells(jnp.asarray(image, jnp.float32))
+    size = min(even_image.shape)
+    grey = np.asarray(centre_crop(even_image, height=size, width=size)) * (255 / DENSITY_MAX_COUNT)
     return np.round(grey).clip(0, 255).astype(np.uint8)
 
 
 LEVEL = 1
-"""Level of zlib, the fastest one. Most cells of an image are empty, so higher levels save little."""
+"""Compression level of zlib, the fastest one. Most cells of an image are empty, so higher levels save little."""
 KEYFRAME_DEG = 20.0
-"""Rotation from the last stored scan from which a scan is stored, whatever the distance, in degrees."""
+"""Minimum rotation from the last stored scan at which a scan is stored at any distance, in degrees."""
 SPECTRA = 512
 """Number of spectra that are kept for the next queries. Consecutive queries are compared with the same scans."""
 PARTS = 16
-"""The stored scans are forgotten in this many parts, because each removal moves all rows that follow."""
-
+"""With `max_places`, 1 / `PARTS` of the scans are removed at once, because each removal moves all rows that follow."""
 EVERY = np.array(True)
-"""Flag of all scans."""
+"""Flag that broadcasts to all scans."""
 
 
 class Keyframes(abc.ABC):
-    """Described scans with which queries are compared: those of a session, or the places of a map."""
+    """Described scans with which queries are compared, one row each: those of a session, or the places of a map."""
 
     index: Index
     """Descriptor of each scan."""
     verification = VerificationConfig()
     """Settings of the spectra."""
     searchable: Bool[np.ndarray, "*n"] = EVERY
-    """Whether each scan may be one of the nearest, or one value for all."""
+    """Whether `nearest` may return each scan, or one value for all."""
 
     @property
     @abc.abstractmethod
@@ -94,9 +96,11 @@ class Keyframes(abc.ABC):
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Rows of up to k (0 or more) scans in `among` with the nearest descriptors, the nearest first."""
-        rows = self.index.query(descriptor, k, exclude=~(among & self.searchable)).rows if k else np.zeros(0, np.int64)
-        return rows[rows >= 0]
+        """Rows of up to k searchable scans with a flag in `among` whose descriptors are nearest, the nearest first."""
+        if not k:
+            return np.zeros(0, np.int64)
+        rows = self.index.query(descriptor, k, exclude=~(among & self.searchable)).rows
+        return rows[rows >= 0]  # the index pads with -1
 
     def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
         """Spectrum of the image of each row (`match_spectra`)."""
@@ -130,13 +134,13 @@ class StoredScans(Keyframes):
 
     @property
     def frames(self) -> Int[np.ndarray, " n"]:
-        """See `Keyframes`. They increase."""
+        """Frame of each scan, in increasing order."""
         return self._frames.rows + self._first_frame
 
     def view(self, *, first_frame: int = 0, searchable: Bool[np.ndarray, "*n"] = EVERY) -> "StoredScans":
-        """The same scans, in shared memory.
+        """Return the same scans, in shared memory, with other frame numbers or other `searchable` flags.
 
-        Frame numbers begin at `first_frame`. With `searchable`, `nearest` returns only scans that it flags.
+        `first_frame` is added to the frame numbers.
         """
         scans = copy.copy(self)
         scans._first_frame, scans.searchable = first_frame, searchable
@@ -144,7 +148,7 @@ class StoredScans(Keyframes):
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of descriptors and compressed images, without the spectra (`SPECTRA`)."""
+        """Number of bytes of descriptors and compressed images, without the kept spectra."""
         arrays = self.index.nbytes + self._frames.nbytes + self._superseded.nbytes
         return arrays + sum(map(len, self._compressed))
 
@@ -152,18 +156,18 @@ class StoredScans(Keyframes):
         """Whether a frame is far enough from the last stored scan, or its motion from there is unknown."""
         if not self.keyframe_m or not len(self):
             return True
-        last = self.frames[-1:]
-        moved_m, rotation = motion.moved(int(last[0]), motion.poses[frame])
+        last_frame = int(self.frames[-1])
+        moved_m, rotation = motion.moved(last_frame, motion.poses[frame])
         is_near = moved_m < self.keyframe_m and rotation < np.radians(KEYFRAME_DEG)
-        return not (is_near and motion.same(frame, last).all())
+        return not (is_near and motion.segments[frame] == motion.segments[last_frame])
 
     def check(self, frame: int, image: UInt8[np.ndarray, "m m"]) -> None:
-        """Raises ValueError if an image has another shape than the stored ones."""
+        """Raise ValueError if the image of a frame has another shape than the stored images."""
         if len(self) and image.shape != self._shape:
             raise ValueError(f"frame {frame}: expected an image of {self._shape} cells, found {image.shape}")
 
     def add(self, frame: int, descriptor: Float32[np.ndarray, " d"], image: UInt8[np.ndarray, "m m"]) -> None:
-        """Add the scan of a frame, after forgetting others if there are `max_places`. Raises the error of `check`."""
+        """Store the scan of a frame. With `max_places` scans, others are removed first. Raises the error of `check`."""
         self.check(frame, image)
         if self.max_places is not None and len(self) >= self.max_places:
             self.forget(max(self.max_places // PARTS, 1))
@@ -174,7 +178,7 @@ class StoredScans(Keyframes):
         self._shape = image.shape
 
     def close_loop(self, query: int, match: int) -> None:
-        """Note a loop between two frames. If both are stored, the query represents the place from now on."""
+        """Note a loop between two frames. If both are stored, the match is now superseded by the query."""
         if query in self.frames and match in self.frames:
             self._superseded.rows[np.searchsorted(self.frames, match)] = True
 
@@ -188,16 +192,16 @@ class StoredScans(Keyframes):
         self._compressed = [self._compressed[row] for row in np.flatnonzero(remains)]
 
     def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
-        """See `Keyframes`."""
+        """Image of a scan, decompressed."""
         return np.frombuffer(zlib.decompress(self._compressed[row]), np.uint8).reshape(self._shape)
 
     def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        """See `Keyframes`. The last used ones stay in memory."""
+        """Spectrum of the image of each row (`match_spectra`). The `SPECTRA` last used ones stay in memory."""
         spectra = []
         for row, frame in zip(rows.tolist(), self._frames.rows[rows].tolist(), strict=True):
             if frame not in self._spectra:
                 self._spectra[frame] = image_spectrum(self.image(row), self.verification)
-            self._spectra.move_to_end(frame)
+            self._spectra.move_to_end(frame)  # the order of last use
             spectra.append(self._spectra[frame])
         while len(self._spectra) > SPECTRA:
             self._spectra.popitem(last=False)

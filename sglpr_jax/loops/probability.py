@@ -1,7 +1,8 @@
 """Probability that two scans show one place: a monotone additive model of the evidence.
 
-The log odds are a sum of bounded, monotone, piecewise linear functions, one for each field of `Evidence`, so that a
-perfect fit of the images cannot outweigh other places that fit as well. Three more add what neighbouring pairs say.
+The log odds are a sum of bounded, monotone, piecewise linear functions, one for each field of `Evidence`. Since they
+are bounded, a perfect fit of the images cannot outweigh other places that fit as well. A second model of the same kind
+adds the evidence of neighbouring pairs.
 """
 
 import dataclasses
@@ -26,26 +27,27 @@ KNOTS: Mapping[str, tuple[float, ...]] = {
     "alone": (-10.0, -6.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0),
     "support": (-12.0, -6.0, -3.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 13.0, 18.0),
 }
-"""Knots of the piecewise linear functions. Outside the knots they are constant."""
+"""Knots of the piecewise linear functions, by argument. Outside the knots they are constant."""
 RISING = ("surprise", "alone", "support")
-"""Fields whose functions rise. The other functions fall."""
+"""Arguments whose functions rise. The other functions fall."""
 MAX_STRENGTH = 4.0
-"""Maximum log odds with which a pair counts as neighbour."""
+"""Maximum log odds with which a pair supports its neighbours."""
 RIDGE = 0.02
 """Weight of the penalty on squared steps between knots. It keeps the functions finite and smooth."""
 
 
 class Evidence(NamedTuple):
-    """Evidence that pairs of scans show one place, one number of each kind for each pair (`KeyframeComparison`)."""
+    """Evidence that pairs of scans show one place: one number in each field for each pair (`KeyframeComparison`)."""
 
     ambiguity_ratio: Float[np.ndarray, "*n"]
-    """Correlation with the best other place, or at the best other pose, divided by the correlation with the match."""
+    """Highest correlation with other places, or at other poses, divided by the correlation with the match."""
     along_m: Float[np.ndarray, "*n"]
     """Standard deviation of the position along its least certain direction, in metres. It is large between walls."""
     deviation: Float[np.ndarray, "*n"]
     """Deviation of the pose from the motion, in standard deviations."""
     surprise: Float[np.ndarray, "*n"]
-    """Logarithm of all poses over those that the motion allows. It is negative if the motion is unknown."""
+    """Logarithm of the number of poses of a lookalike over the number of poses that the motion allows. It is negative
+    if the motion is unknown."""
 
     @classmethod
     def of(cls, *values: Any) -> "Evidence":
@@ -58,7 +60,6 @@ class Evidence(NamedTuple):
         return cls(*np.array(pairs, np.float64).reshape(len(pairs), len(cls._fields)).T)
 
 
-ALL = Evidence._fields
 TESTED = ("alone", "support", "surprise")
 """Arguments of the model with neighbours: log odds of a pair alone, support by its neighbours, and surprise."""
 
@@ -72,7 +73,7 @@ class Curve(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class AdditiveModel:
-    """Log odds: bias + sum of curves."""
+    """Model of log odds: the bias plus the sum of the curves, each at the value of its argument."""
 
     curves: Mapping[str, Curve]
     """Curves by the name of their argument. Arguments without a curve are not used."""
@@ -89,15 +90,15 @@ class AdditiveModel:
 
     @classmethod
     def from_json(cls, value: Any, names: Sequence[str]) -> "AdditiveModel":
-        """Build a model of arguments with these names from the output of `to_json`. Raises ValueError if invalid."""
+        """Build a model from the output of `to_json`. Arguments must be in `names`. Raises ValueError if invalid."""
         try:
             curves = {
                 name: Curve(tuple(curve["knots"]), tuple(curve["values"])) for name, curve in value["curves"].items()
             }
             is_valid = set(curves) <= set(names) and math.isfinite(value["bias"])
-            for knots, values in curves.values():
-                is_valid &= len(knots) == len(values) > 0 and all(map(math.isfinite, (*knots, *values)))
-                is_valid &= bool((np.diff(knots) > 0).all())
+            for knots, heights in curves.values():
+                is_valid &= len(knots) == len(heights) > 0 and all(map(math.isfinite, (*knots, *heights)))
+                is_valid &= bool((np.diff(knots) > 0).all())  # knots ascend
         except (TypeError, KeyError, AttributeError, OverflowError):
             is_valid = False
         if not is_valid:
@@ -106,8 +107,8 @@ class AdditiveModel:
 
 
 _IDENTITY = Curve((-50.0, 50.0), (-50.0, 50.0))
-ADDED = AdditiveModel({"alone": _IDENTITY, "support": _IDENTITY}, 0.0)
-"""Model with neighbours that adds their support to the log odds of a pair alone."""
+SUM_OF_SUPPORT = AdditiveModel({"alone": _IDENTITY, "support": _IDENTITY}, 0.0)
+"""Model with neighbours that is not fitted: the log odds of a pair alone plus the support by its neighbours."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,18 +116,18 @@ class LoopModel:
     """Model of the probability of loops."""
 
     alone: AdditiveModel
-    """Log odds of a pair by its `Evidence`."""
+    """Log odds of a pair by its `Evidence`, without neighbours."""
     made_with: str
     """Description of the pairs that the model was fitted to."""
-    tested: AdditiveModel = ADDED
-    """Log odds of a pair given its neighbours, by the terms of `TESTED`."""
+    tested: AdditiveModel = SUM_OF_SUPPORT
+    """Log odds of a pair given its neighbours, by the arguments `TESTED`."""
 
     def probability(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Probability that each pair alone is a loop."""
+        """Probability that each pair is a loop, without neighbours."""
         return np.asarray(expit(self.log_odds(evidence)))
 
     def log_odds(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Log odds of each pair alone: the logarithm of probability / (1 - probability)."""
+        """Log odds of each pair without neighbours: the logarithm of probability / (1 - probability)."""
         return self.alone(evidence._asdict())
 
     def tested_log_odds(self, evidence: Evidence, support: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -134,9 +135,10 @@ class LoopModel:
         return self.tested({"alone": self.log_odds(evidence), "support": support, "surprise": evidence.surprise})
 
     def strength(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Strength with which a pair supports its neighbours: log odds by the images alone, from 0 to `MAX_STRENGTH`.
+        """Strength with which each pair supports its neighbours, from 0 to `MAX_STRENGTH`.
 
-        The motion between the two passes is common to neighbours, so it does not count again.
+        It is the log odds by the images, without the motion: that is nearly the same for all neighbours, so it would
+        count several times.
         """
         without_motion = evidence._replace(
             deviation=np.zeros_like(evidence.deviation), surprise=np.zeros_like(evidence.surprise)
@@ -152,7 +154,11 @@ class LoopModel:
         """Build a model from the output of `to_json`. Raises ValueError, which names its file `source`, if invalid."""
         try:
             alone, tested = value["alone"], value["tested"]
-            return cls(AdditiveModel.from_json(alone, ALL), value["made_with"], AdditiveModel.from_json(tested, TESTED))
+            return cls(
+                AdditiveModel.from_json(alone, Evidence._fields),
+                value["made_with"],
+                AdditiveModel.from_json(tested, TESTED),
+            )
         except (TypeError, KeyError) as error:
             raise ValueError(f"{source}: expected a loop model, found another value") from error
         except ValueError as error:
@@ -173,17 +179,21 @@ def fit(
     if is_loop.all() or not is_loop.any():
         raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
     weights = np.ones(len(is_loop)) if weights is None else weights
+    # Log odds are a product of `columns` (pairs by intervals between knots, and the bias) and steps. A column is the
+    # share of its interval, from 0 to 1, that lies on the worse side of the value. A step is the rise of the curve over
+    # the interval, so curves are monotone if steps are not negative.
     columns = []
-    for name, numbers in values.items():  # for each interval of knots, the way from its worse end, from 0 to 1
+    for name, argument in values.items():
         knots = np.array(KNOTS[name])
-        rises = np.clip((np.asarray(numbers)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
-        columns.append(rises if name in RISING else 1 - rises)
+        shares = np.clip((np.asarray(argument)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
+        columns.append(shares if name in RISING else 1 - shares)
     columns = np.concatenate([*columns, np.ones((len(is_loop), 1))], axis=1)
     sign = np.where(is_loop, 1.0, -1.0)
 
     def cost(steps: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
+        """Negative log likelihood with penalty, and its gradient."""
         margin = sign * (columns @ steps)
-        penalty = RIDGE * np.append(steps[:-1], 0.0)
+        penalty = RIDGE * np.append(steps[:-1], 0.0)  # not on the bias
         gradient = columns.T @ (-weights * sign * expit(-margin)) + penalty
         return float(weights @ np.logaddexp(0, -margin) + penalty @ steps / 2), gradient
 
@@ -200,15 +210,19 @@ def fit(
 
 
 def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, made_with: str) -> LoopModel:
-    """Scale and shift the log odds of a model for another sensor by maximum likelihood, from labelled pairs."""
+    """Scale and shift the log odds of pairs without neighbours for another sensor, from labelled pairs.
+
+    Gain and shift have maximum likelihood, with a penalty on gains other than 1. `made_with` describes the result.
+    """
     log_odds, sign = model.log_odds(evidence), np.where(is_loop, 1.0, -1.0)
 
-    def cost(line: Float[np.ndarray, " 2"]) -> float:
-        return float(np.logaddexp(0, -sign * (line[0] * log_odds + line[1])).sum() + (line[0] - 1) ** 2)
+    def cost(gain_and_shift: Float[np.ndarray, " 2"]) -> float:
+        gain, shift = gain_and_shift
+        return float(np.logaddexp(0, -sign * (gain * log_odds + shift)).sum() + (gain - 1) ** 2)
 
     gain, shift = minimize(cost, np.array([1.0, 0.0]), method="L-BFGS-B", bounds=[(0.0, None), (None, None)]).x
     curves = {
-        name: Curve(curve.knots, tuple(float(gain) * value for value in curve.values))
+        name: Curve(curve.knots, tuple(float(gain) * height for height in curve.values))
         for name, curve in model.alone.curves.items()
     }
     alone = AdditiveModel(curves, float(gain) * model.alone.bias + float(shift))
@@ -216,7 +230,7 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
 
 
 def default_model(path: Path = DEFAULT) -> LoopModel:
-    """Read the shipped model, or that of another file. Raises FileNotFoundError, or ValueError if it is invalid."""
+    """Read the shipped model, or that of another file. Raises FileNotFoundError or, if it is invalid, ValueError."""
     try:
         value = json.loads(path.read_text())
     except ValueError as error:

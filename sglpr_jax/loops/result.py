@@ -14,7 +14,7 @@ from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.frame_alignment import SegmentAlignment
 from sglpr_jax.loops.probability import LoopModel
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Session:
     unregistered: int = 0
     """Number of loops within the session that were not registered because the search was stopped."""
     candidates: tuple[Candidate, ...] = ()
-    """All compared pairs or, with `max_places`, that many of the last ones. Their lengths have the search's scale."""
+    """All compared pairs or, with `max_places`, that many of the last ones. Lengths are multiplied by the scale."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,8 +48,8 @@ class LoopSearchResult:
     rejected: tuple[RejectedClosure, ...] = ()
     """All other compared pairs, each with the reason for its rejection."""
     transforms: tuple[SegmentAlignment, ...] = ()
-    """Transforms between the frames of sessions. For each pair, the one with most loops is first; none if no common
-    place was found. With odometry there is at most one."""
+    """Transforms between the frames of sessions: for each pair, one for each accepted pair of segments, that with most
+    loops first. With odometry there is at most one."""
     model: LoopModel | None = None
     """Model of the probabilities."""
     config: DetectorConfig = DetectorConfig()
@@ -61,9 +61,9 @@ class LoopSearchResult:
 
     @property
     def whole(self) -> bool:
-        """Whether the search was completed."""
-        ended = (session.frames == len(session.recording) and not session.unregistered for session in self.sessions)
-        return not self.stopped and all(ended)
+        """Whether the search was completed, with the registration of all loops."""
+        is_whole = (session.frames == len(session.recording) and not session.unregistered for session in self.sessions)
+        return not self.stopped and all(is_whole)
 
     def split(self, poses: Float[np.ndarray, "n 4 4"]) -> list[Float[np.ndarray, "_ 4 4"]]:
         """Divide the poses of all searched frames by session."""
@@ -71,47 +71,50 @@ class LoopSearchResult:
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Numbers of the two sessions of each pair: first that of the matches, then that of the queries."""
+        """All pairs of sessions, by number: first the session of the matches, then that of the queries."""
         return list(itertools.combinations(range(len(self.sessions)), 2))
 
     def between(self, match: int, query: int) -> "LoopSearchResult":
-        """The results whose queries and matches are in these sessions, which may be the same."""
-        ends = match, query
+        """Results with matches in one session and queries in another one, by number. Both may be the same session."""
+        pair = match, query
         return dataclasses.replace(
             self,
-            loops=tuple(loop for loop in self.loops if _sessions(loop) == ends),
-            rejected=tuple(closure for closure in self.rejected if _sessions(closure.loop) == ends),
+            loops=tuple(loop for loop in self.loops if _sessions_of(loop) == pair),
+            rejected=tuple(closure for closure in self.rejected if _sessions_of(closure.loop) == pair),
             transforms=tuple(
-                transform for transform in self.transforms if (transform.match.session, transform.query.session) == ends
+                transform for transform in self.transforms if (transform.match.session, transform.query.session) == pair
             ),
         )
 
     def within(self, session: int) -> "LoopSearchResult":
-        """The results of one session, as if it had been searched alone."""
+        """Results of one session, as if it had been searched alone: its number becomes 0."""
 
-        def alone(loop: LoopClosure) -> LoopClosure:
+        def in_session_0(loop: LoopClosure) -> LoopClosure:
             return dataclasses.replace(loop, match_session=0, query_session=0)
 
         result = self.between(session, session)
         return dataclasses.replace(
             result,
             sessions=(self.sessions[session],),
-            loops=tuple(map(alone, result.loops)),
-            rejected=tuple(convert_rejected(result.rejected, alone)),
+            loops=tuple(map(in_session_0, result.loops)),
+            rejected=tuple(convert_rejected(result.rejected, in_session_0)),
         )
 
     def without_degenerate(self) -> "LoopSearchResult":
-        """Reject the degenerate loops (`LoopClosure.is_degenerate`). Transforms stay, because they weigh the loops."""
+        """Reject the degenerate loops. Transforms stay, because their estimation weighs loops by their covariance."""
         loops = tuple(loop for loop in self.loops if not loop.is_degenerate)
         degenerate = [RejectedClosure(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
         rejected = ordered_rejections([*self.rejected, *degenerate])
         return dataclasses.replace(self, loops=loops, rejected=tuple(rejected))
 
     def __str__(self) -> str:
-        sessions = (self.within(number)._describe_session() for number in range(len(self.sessions)))
-        return "\n".join([*sessions, *(self.between(*pair)._describe_pair(*pair) for pair in self.pairs)])
+        """One line for each session, then one for each pair of sessions."""
+        lines = [self.within(number)._describe_session() for number in range(len(self.sessions))]
+        lines += [self.between(match, query)._describe_pair(match, query) for match, query in self.pairs]
+        return "\n".join(lines)
 
     def _describe_session(self) -> str:
+        """Describe the loops of a result with one session."""
         session = self.sessions[0]
         degenerate = sum(loop.is_degenerate for loop in self.loops)
         loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
@@ -119,40 +122,44 @@ class LoopSearchResult:
         skipped = f", {len(session.skipped)} scans skipped" if session.skipped else ""
         unregistered = f", {session.unregistered} not registered" if session.unregistered else ""
         scale = f", scale {self.scale}" if self.scale != 1 else ""
-        return f"{text}, {len(self.rejected)} rejected{self._reasons()}{unregistered}{skipped}{scale}"
+        return f"{text}, {len(self.rejected)} rejected{self._reason_counts()}{unregistered}{skipped}{scale}"
 
     def _describe_pair(self, match: int, query: int) -> str:
+        """Describe the loops between two sessions, which must be those of `between`."""
         names = f"{self.sessions[match].recording.name} and {self.sessions[query].recording.name}"
         if not self.transforms:
-            return f"{names}: no common place found{self._reasons()}"
+            return f"{names}: no common place found{self._reason_counts()}"
         transforms = "; ".join(map(str, self.transforms))
-        return f"{names}: {len(self.loops)} loops, {len(self.rejected)} rejected{self._reasons()}; {transforms}"
+        return f"{names}: {len(self.loops)} loops, {len(self.rejected)} rejected{self._reason_counts()}; {transforms}"
 
-    def _reasons(self) -> str:
+    def _reason_counts(self) -> str:
+        """Numbers of rejected pairs by reason, in brackets, or an empty text."""
         counts = (f"{reason}: {count}" for reason, count in count_reasons(self.rejected).items())
         return f" ({', '.join(counts)})" if self.rejected else ""
 
 
-def _sessions(loop: LoopClosure) -> tuple[int, int]:
-    """Sessions of match and query."""
+def _sessions_of(loop: LoopClosure) -> tuple[int, int]:
+    """Numbers of the sessions of match and query."""
     return loop.match_session, loop.query_session
 
 
 def ordered_rejections(rejected: Iterable[RejectedClosure]) -> list[RejectedClosure]:
-    """Pairs within the sessions, then those between them, in the order of their frames."""
+    """Sort rejected pairs: those within the sessions, then those between them, in the order of their frames."""
 
     def order(closure: RejectedClosure) -> tuple[bool, tuple[int, int], int, int]:
-        match, query = _sessions(closure.loop)
+        match, query = _sessions_of(closure.loop)
         return match != query, (match, query), closure.loop.query, closure.loop.match
 
     return sorted(rejected, key=order)
 
 
 def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
-    """Reasons why sessions have no loops of their own, one sentence each. With several, names begin the sentences."""
+    """Explain why sessions have no loops, one sentence for each reason, with the name of its session if several."""
     if len(result.sessions) != 1:
-        names = [session.recording.name for session in result.sessions]
-        return [f"{name}: {line}" for k, name in enumerate(names) for line in diagnose_no_loops(result.within(k))]
+        sentences = []
+        for number, session in enumerate(result.sessions):
+            sentences += [f"{session.recording.name}: {line}" for line in diagnose_no_loops(result.within(number))]
+        return sentences
     if result.loops:
         return []
     session = result.sessions[0]
@@ -169,7 +176,7 @@ def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
     if 2 * len(session.skipped) > session.frames:
         reasons.append(f"{len(session.skipped)} of {session.frames} scans cannot be read.")
     if result.rejected:
-        reason, count = next(iter(count_reasons(result.rejected).items()))
+        reason, count = next(iter(count_reasons(result.rejected).items()))  # the most frequent one
         return [*reasons, f"{len(result.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]
     source = "images" if session.odometry is None else "odometry"
     return [

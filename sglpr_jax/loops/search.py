@@ -1,7 +1,7 @@
 """Search for the loops within and between sessions: a detector over the scans of each one, then joint acceptance.
 
-Loops between two sessions: each stored scan of the later one is compared with the stored scans of the earlier one.
-Comparison, probability and sequential test are the same as within a session. Scans of both sessions are distractors.
+For loops between two sessions, each stored scan of the later session is compared with the stored scans of the earlier
+one. Probability and sequential test are the same as within a session. Scans of both sessions are distractors.
 """
 
 import dataclasses
@@ -20,18 +20,12 @@ from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.loops.acceptance import AXES, accept_loops, check_odometry, register_loops
 from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import (
-    LoopClosure,
-    RejectedClosure,
-    convert_rejected,
-    in_metres,
-    to_lidar,
-)
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, in_metres, to_lidar
 from sglpr_jax.loops.comparison import Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import accept_between
@@ -43,7 +37,7 @@ from sglpr_jax.loops.result import LoopSearchResult, Session, ordered_rejections
 from sglpr_jax.loops.sequence import pair_of, probable_loops, rejection_reason
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.gicp import check_installed, is_installed
 from sglpr_jax.se3 import inverse
 
@@ -79,8 +73,8 @@ def find_loops(
 
     Poses are between LiDAR frames, the frames of the points. A warning says if the odometry contradicts most loops.
     Several recordings need no common frame. Loops between two of them are accepted if at least five, over at least 15 m
-    of both recordings, fit one transform between the frames and no other transform fits half as many. Without odometry,
-    parts whose motion is unknown are aligned one by one.
+    of both recordings, fit one transform between the frames, and if no other transform fits more than half as many.
+    Without odometry, each pair of segments, between which the motion is unknown, is aligned on its own.
 
     Arguments:
       recordings: The scans of one recording, or several recordings.
@@ -89,8 +83,8 @@ def find_loops(
         Candidates and loops beyond the drift are rejected. Of the others the largest consistent set is kept.
       model: Model of the probabilities, by default the one shipped for the weights.
       config: Settings of the detector.
-      registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap
-        are rejected. None registers scans, not images.
+      registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap are rejected.
+        None does so if all recordings have scans, not images, and small-gicp is installed.
       scale: Factor for all lengths during the search, 1, 2 or 4, for places that are small in an image, such as rooms.
         Results, `config.keyframe_m` and `config.drift` are in metres, the other settings those of scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
@@ -111,9 +105,9 @@ def find_loops(
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
-    is_list = isinstance(recordings, list | tuple)
-    all_recordings: Any = recordings if is_list else [recordings]
-    all_odometry: Any = odometry if is_list else [odometry]
+    has_several = isinstance(recordings, list | tuple)
+    all_recordings: Any = recordings if has_several else [recordings]
+    all_odometry: Any = odometry if has_several else [odometry]
     all_odometry = [None] * len(all_recordings) if all_odometry is None else list(all_odometry)
     if not all_recordings or len(all_odometry) != len(all_recordings):
         counts = f"{len(all_recordings)} with odometry of {len(all_odometry)}"
@@ -122,11 +116,11 @@ def find_loops(
         check_is(recording, Recording, by="open_recording")
     registered = all(map(can_register, all_recordings)) if registered is None else registered
     inputs = [_check_input(*pair, registered=registered) for pair in zip(all_recordings, all_odometry, strict=True)]
-    steps, searched = 0, list[SearchedSession]()
+    finished_steps, searched = 0, list[SearchedSession]()
     loops, rejected, transforms = list[LoopClosure](), list[RejectedClosure](), list[SegmentAlignment]()
 
     def report(done: int) -> None:
-        on_progress(steps + done)
+        on_progress(finished_steps + done)
 
     options = {"registered": registered, "should_stop": should_stop, "on_progress": report}
     for number, (recording, poses) in enumerate(inputs):
@@ -146,15 +140,19 @@ def find_loops(
 
         loops += map(in_session, session.loops)
         rejected += convert_rejected(session.rejected, in_session)
-        steps += len(recording)
+        finished_steps += len(recording)
     for match, query in itertools.combinations(range(len(inputs)), 2):
         pair_loops, pair_rejected, pair_transforms = _search_pair(match, query, searched, **options)
         loops += pair_loops
         rejected += pair_rejected
         transforms += pair_transforms
-        steps += len(searched[query].recording)
+        finished_steps += len(searched[query].recording)
+    sessions = (
+        _session_in_metres(recording, poses, session, scale, registered)
+        for (recording, poses), session in zip(inputs, searched, strict=True)
+    )
     return LoopSearchResult(
-        tuple(_result_of(*given, session, scale, registered) for given, session in zip(inputs, searched, strict=True)),
+        tuple(sessions),
         tuple(in_metres(loop, scale) for loop in loops),
         tuple(convert_rejected(rejected, lambda loop: in_metres(loop, scale))),
         tuple(transform.in_metres(scale) for transform in transforms),
@@ -166,14 +164,14 @@ def find_loops(
 
 
 def can_register(recording: Recording) -> bool:
-    """Whether the scans of a recording can be registered: it has scans, not images, and the extra is installed."""
+    """Whether the scans of a recording can be registered: it has scans, not images, and small-gicp is installed."""
     return not recording.has_images and is_installed()
 
 
 def _check_input(
     recording: Recording, odometry: ArrayLike | None, *, registered: bool
 ) -> tuple[Recording, Float[np.ndarray, "n 4 4"] | None]:
-    """Check recording and odometry before any work. The odometry levels the scans of a sensor that tilts."""
+    """Check a recording and its odometry before any work. Returns the recording with its odometry, and the poses."""
     poses = None if odometry is None else as_poses(odometry, of="odometry")
     if poses is not None and len(poses) != len(recording):
         raise ValueError(
@@ -184,18 +182,18 @@ def _check_input(
     if registered:
         check_installed()
     if poses is not None:
-        recording = with_odometry(recording, poses)
+        recording = with_odometry(recording, poses)  # levels the scans of a sensor that tilts
     return recording, poses
 
 
-def _result_of(
+def _session_in_metres(
     recording: Recording,
     odometry: Float[np.ndarray, "n 4 4"] | None,
     searched: SearchedSession,
     scale: Scale,
     registered: bool,
 ) -> Session:
-    """Result of a session, from the recording and odometry in metres and the search at a scale."""
+    """Result of a session, from recording and odometry in metres, and from a search with lengths times `scale`."""
     finder = searched.detector.finder
     return Session(
         recording,
@@ -221,7 +219,10 @@ def _search_session(
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
 ) -> SearchedSession:
-    """Search one session with a detector without frames. The input is already checked and scaled."""
+    """Search one session with a detector without frames. Recording and odometry are already checked and scaled.
+
+    Odometry that the images contradict is ignored: the session is then searched again without odometry.
+    """
     config, finder = detector.config, detector.finder
     stream = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
 
@@ -231,8 +232,10 @@ def _search_session(
         pose = None if odometry is None else odometry[row]
         detector.add_keyframe(keyframe, time=time, odometry=pose, fits=fits)
 
-    # With a limit of places, the loops decide which scans are stored, and so does all that decides about loops.
-    decisive = None if config.max_places is None else repr((config, detector.model)).encode()
+    # With a limit of places, loops decide which scans are stored. A checkpoint then depends on settings and model, too.
+    acceptance = None
+    if config.max_places is not None:
+        acceptance = hashlib.sha256(repr((config, detector.model)).encode()).hexdigest()[:16]
     add_scans(
         recording,
         finder,
@@ -241,7 +244,7 @@ def _search_session(
         odometry=odometry,
         keyframe_m=config.keyframe_m,
         max_places=config.max_places,
-        acceptance=None if decisive is None else hashlib.sha256(decisive).hexdigest()[:16],
+        acceptance=acceptance,
         **stream,
     )
     check_readable(recording, len(recording) - len(finder.missing))
@@ -254,14 +257,15 @@ def _search_session(
             f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored; check "
             f"that the poses belong to these scans and use these axes: {AXES}"
         )
-        again = LoopDetector(finder.params, model=detector.model, config=config)
+        new_detector = LoopDetector(finder.params, model=detector.model, config=config)
         options = {"registered": registered, "scale": scale, "kept_in": None, **stream}
-        return _search_session(recording, None, again, **options)
+        return _search_session(recording, None, new_detector, **options)
     loops, rejected = detector.loops, list[RejectedClosure]()
-    drift, path = config.drift if odometry is None else finder.present_drift, finder.motion.path
+    drift = config.drift if odometry is None else finder.present_drift
+    path = finder.motion.path
     if odometry is not None:
-        upright, contradicting = accept_loops(list(map(finder.to_upright, loops)), path, drift=drift)
-        loops, rejected = list(map(finder.to_lidar, upright)), convert_rejected(contradicting, finder.to_lidar)
+        upright_loops, contradicting = accept_loops(list(map(finder.to_upright, loops)), path, drift=drift)
+        loops, rejected = list(map(finder.to_lidar, upright_loops)), convert_rejected(contradicting, finder.to_lidar)
     if registered:
         options = {"knows_height": finder.knows_height, "should_stop": should_stop}
         loops, without_overlap = register_loops(recording, recording, loops, **options)
@@ -282,14 +286,18 @@ def _search_pair(
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
 ) -> tuple[list[LoopClosure], list[RejectedClosure], list[SegmentAlignment]]:
-    """Loops, rejected pairs and transforms between two of the searched sessions, given by their numbers."""
+    """Loops, rejected pairs and transforms between two of the searched sessions, given by their numbers.
+
+    Frames of the queries are counted from the end of the matches' session, until `between_sessions` converts them.
+    """
     sessions = searched[match], searched[query]
-    finders = sessions[0].detector.finder, sessions[1].detector.finder
-    motion = BevOdometry.joined([finder.motion for finder in finders])
-    mountings = [*finders[0].mountings, *finders[1].mountings]
-    knows_height = all(finder.knows_height for finder in finders)
-    model, config, drift = sessions[0].detector.model, sessions[0].detector.config, finders[1].present_drift
-    candidates = _candidates_between(*finders, motion, should_stop=should_stop, on_progress=on_progress)
+    match_finder, query_finder = (session.detector.finder for session in sessions)
+    motion = BevOdometry.joined([match_finder.motion, query_finder.motion])
+    mountings = [*match_finder.mountings, *query_finder.mountings]
+    knows_height = match_finder.knows_height and query_finder.knows_height
+    model, config, drift = sessions[0].detector.model, sessions[0].detector.config, query_finder.present_drift
+    options = {"should_stop": should_stop, "on_progress": on_progress}
+    candidates = _candidates_between(match_finder, query_finder, motion, **options)
     pairs = [pair_of(candidate, model, motion, mountings, knows_height=knows_height) for candidate in candidates]
     probable = probable_loops(pairs, model, motion.path, drift=drift, config=config)
     improbable = [
@@ -301,18 +309,19 @@ def _search_pair(
     consistent_sets, contradicting = accept_between(likely, motion, drift=drift)
 
     def between_sessions(loop: LoopClosure) -> LoopClosure:
-        """Convert a loop between gravity-aligned frames of the joined motion."""
+        """Convert a loop between gravity-aligned frames of the joined motion to LiDAR frames of the two sessions."""
         loop = to_lidar(loop, query=mountings[loop.query], match=mountings[loop.match])
-        return dataclasses.replace(loop, query=loop.query - len(finders[0]), match_session=match, query_session=query)
+        query_frame = loop.query - len(match_finder)
+        return dataclasses.replace(loop, query=query_frame, match_session=match, query_session=query)
 
     rejected = convert_rejected([*improbable, *contradicting], between_sessions)
     loops, transforms = list[LoopClosure](), list[SegmentAlignment]()
     for consistent in consistent_sets:
         accepted = list(map(between_sessions, consistent))
         if registered:
-            recordings = sessions[1].recording, sessions[0].recording
             options = {"knows_height": knows_height, "should_stop": should_stop}
-            accepted, without_overlap = register_loops(*recordings, accepted, **options)
+            query_scans, match_scans = sessions[1].recording, sessions[0].recording
+            accepted, without_overlap = register_loops(query_scans, match_scans, accepted, **options)
             rejected += without_overlap
         if accepted:
             transforms.append(_align_segments(accepted, sessions, motion, drift))
@@ -328,25 +337,25 @@ def _candidates_between(
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
 ) -> list[Candidate]:
-    """Best match of each stored scan of a session in another one, by their joined motion.
+    """Candidates of each stored scan of the queries' session in the matches' session, by their joined motion.
 
-    Raises ValueError if the images of the two sessions have other sizes.
+    Raises ValueError if the images of the two sessions have different sizes.
     """
-    candidates, offset = list[Candidate](), len(matches)
+    candidates, query_offset = list[Candidate](), len(matches)
     if not len(queries.stored) or not len(matches.stored):
         return candidates
-    query_shape, match_shape = (finder.stored.image(0).shape for finder in (queries, matches))
+    query_shape, match_shape = queries.stored.image(0).shape, matches.stored.image(0).shape
     if query_shape != match_shape:
         raise ValueError(f"expected images of one size in both recordings, found {match_shape} and {query_shape} cells")
-    loops = np.concatenate([matches.loops.rows, queries.loops.rows + offset])
+    loops = np.concatenate([matches.loops.rows, queries.loops.rows + query_offset])
     comparer = KeyframeComparison(motion, queries.present_drift, matches.config, matches.verification, loops)
-    own_scans = queries.stored.view(first_frame=offset)
-    for row, frame in enumerate(own_scans.frames.tolist()):
+    query_scans = queries.stored.view(first_frame=query_offset)
+    for row, frame in enumerate(query_scans.frames.tolist()):
         if should_stop():
             break
-        query = Query(frame, own_scans.index.descriptors[row], own_scans.image(row), matches.verification)
-        fits = comparer.compare(query, matches.stored, own_scans)
-        candidates += comparer.candidates(query, fits, matches.stored, possible=fits.frames < offset)
+        query = Query(frame, query_scans.index.descriptors[row], query_scans.image(row), matches.verification)
+        fits = comparer.compare(query, matches.stored, query_scans)
+        candidates += comparer.candidates(query, fits, matches.stored, possible=fits.frames < query_offset)
         on_progress(row + 1)
     return candidates
 
@@ -354,18 +363,22 @@ def _candidates_between(
 def _align_segments(
     loops: Sequence[LoopClosure], sessions: Sequence[SearchedSession], motion: BevOdometry, drift: DriftModel
 ) -> SegmentAlignment:
-    """Transform between the two trajectory segments that loops connect. `motion` and `drift` are those of both."""
-    ends = (loops[0].match_session, loops[0].match), (loops[0].query_session, loops[0].query)
+    """Estimate the transform between the two trajectory segments that loops connect.
+
+    `sessions` are those of the matches and the queries, `motion` is their joined motion, and `drift` that of both.
+    """
     segments, poses = [], []
-    for (session, frame), searched in zip(ends, sessions, strict=True):
+    for node, searched in zip(loops[0].nodes, sessions, strict=True):
         finder, odometry = searched.detector.finder, searched.odometry
-        rows = np.flatnonzero(finder.motion.segments == finder.motion.segments[frame])
-        segments.append(TrajectorySegment(session, int(rows[0]), int(rows[-1]), odometry is not None))
+        frames = np.flatnonzero(finder.motion.segments == finder.motion.segments[node.frame])
+        segments.append(TrajectorySegment(node.session, int(frames[0]), int(frames[-1]), odometry is not None))
         if odometry is None:
             lidar_poses = finder.motion.poses @ searched.recording.uprights[: len(finder)]
-            poses.append(inverse(lidar_poses[rows[0]]) @ lidar_poses)
+            poses.append(inverse(lidar_poses[frames[0]]) @ lidar_poses)
         else:
             poses.append(odometry[: len(finder)])
-    match_m, query_m = np.split(motion.travelled, [len(poses[0])])
-    transform = align_frames(loops, *poses, match_travelled_m=match_m, query_travelled_m=query_m, drift=drift)
-    return SegmentAlignment(segments[0], segments[1], *transform, len(loops))
+    match_poses, query_poses = poses
+    match_m, query_m = np.split(motion.travelled, [len(match_poses)])
+    distances = {"match_travelled_m": match_m, "query_travelled_m": query_m}
+    transform, covariance = align_frames(loops, match_poses, query_poses, drift=drift, **distances)
+    return SegmentAlignment(segments[0], segments[1], transform, covariance, len(loops))

@@ -1,4 +1,4 @@
-"""Alignment of a new map with an existing map whose world frame differs, or a check that the frames are the same."""
+"""Transform between the world frames of a new and an existing map, and a check that both have the same frame."""
 
 import dataclasses
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from sglpr_jax.loops.consistency import accept_between
 from sglpr_jax.loops.frame_alignment import align_frames
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import travelled, yaw_of
 
-SAMPLE = 300
+MAX_LOCATED = 300
 """Maximum number of places of the new map that are located in the existing map. They are evenly spaced."""
 MIN_PROBABILITY = 0.5
 """Minimum probability of a located place. The located places must also be consistent with each other."""
 MAX_APART_M = 5.0
-"""Maximum median distance between the two positions of common places in one world frame, in metres."""
+"""Maximum median distance between the positions of common places in two maps of the same world frame, in metres."""
 
 
 class MapAlignment(NamedTuple):
@@ -32,7 +32,7 @@ class MapAlignment(NamedTuple):
     places: int
     """Number of common places from which the transform was estimated."""
     apart_m: float
-    """Median distance between the positions of these places in both maps, as if the frames were the same."""
+    """Median distance in metres between the positions that both maps state for these places, without the transform."""
 
     def __str__(self) -> str:
         (x, y, z), yaw = self.old_from_new[:3, 3], np.degrees(yaw_of(self.old_from_new))
@@ -44,19 +44,21 @@ class MapAlignment(NamedTuple):
 
 
 def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
-    """Locate places of a new map in an existing one, and estimate the transform between their world frames, if any.
+    """Locate places of a new map in an existing one, and estimate the transform between their world frames.
 
-    `new` is the map of one drive, with its places in order. Raises ValueError if the maps were made with other weights,
-    or if their images have other sizes.
+    `new` is the map of one drive, in order. Returns None if no places are located consistently. Raises
+    ValueError if weights or image sizes of the maps differ (`PlaceMap.relocate_keyframe`).
     """
     loops = []
-    for row in np.unique(np.linspace(0, len(new) - 1, min(len(new), SAMPLE)).astype(int)).tolist():
+    evenly_spaced_rows = np.unique(np.linspace(0, len(new) - 1, min(len(new), MAX_LOCATED)).astype(int))
+    for row in evenly_spaced_rows.tolist():
         answers = before.relocate_keyframe(new.keyframe(row), weights_hash=new.index.weights_hash)
         if answers and answers[0].probability >= MIN_PROBABILITY:
             loops.append(dataclasses.replace(answers[0].loop, query=row))
     if not loops:
         return None
-    upright_loops = []  # as if the new map followed the existing one
+    # To check the loops for consistency, both maps are one motion: the new places follow the existing ones.
+    upright_loops = []
     for loop in loops:
         upright = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
         upright_loops.append(dataclasses.replace(upright, query=len(before) + loop.query))
@@ -64,20 +66,20 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     groups, _ = accept_between(upright_loops, motion, drift=DriftModel())
     if not groups:
         return None
-    accepted = {loop.query - len(before) for loop in groups[0]}
-    common = [loop for loop in loops if loop.query in accepted]
+    accepted_rows = {loop.query - len(before) for loop in groups[0]}
+    accepted_loops = [loop for loop in loops if loop.query in accepted_rows]
     old_from_new, covariance = align_frames(
-        common,
+        accepted_loops,
         before.world_from_place,
         new.world_from_place,
         match_travelled_m=travelled(before.world_from_place),
         query_travelled_m=travelled(new.world_from_place),
         drift=DriftModel(),
     )
-    located = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])
-    stated = new.world_from_place[[loop.query for loop in common]]
-    apart_m = np.linalg.norm(located[:, :3, 3] - stated[:, :3, 3], axis=1)
-    return MapAlignment(old_from_new, covariance, len(common), float(np.median(apart_m)))
+    located_poses = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in accepted_loops])
+    new_poses = new.world_from_place[[loop.query for loop in accepted_loops]]
+    apart_m = np.linalg.norm(located_poses[:, :3, 3] - new_poses[:, :3, 3], axis=1)
+    return MapAlignment(old_from_new, covariance, len(accepted_loops), float(np.median(apart_m)))
 
 
 def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
@@ -94,4 +96,4 @@ def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
 def without_known_places(before: PlaceMap, new: PlaceMap) -> PlaceMap:
     """The new map without the places whose descriptors the existing map has, so that no scan is added twice."""
     known = {descriptor.tobytes() for descriptor in before.index.descriptors}
-    return new.some([row for row in range(len(new)) if new.index.descriptors[row].tobytes() not in known])
+    return new.subset([row for row in range(len(new)) if new.index.descriptors[row].tobytes() not in known])

@@ -1,4 +1,4 @@
-"""Creation of the map of a recording with known poses. It can skip unreadable scans, stop and resume."""
+"""Creation of a `PlaceMap` from a recording with known poses. A run can skip unreadable scans, stop and resume."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -69,18 +69,20 @@ def map_recording(
     if len(poses) != len(recording) or not len(recording):
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
     recording = with_odometry(recording, poses)
-    finder, keyframes = CandidateSearch(params), list[Keyframe | None]()
-    frame_rows, places, done = list[int](), list[tuple[int, int]](), 0
-    """Row of each frame of the finder, frame and row of each place, and number of processed rows."""
+    finder = CandidateSearch(params)  # describes the scans; each scan that is read becomes one of its frames
+    keyframes: list[Keyframe | None] = []  # keyframe of each frame. None for an unreadable scan.
+    frame_rows: list[int] = []  # row in the recording of each frame
+    places: list[tuple[int, int]] = []  # frame and row of each place
+    done = 0  # number of processed rows of the recording
 
     def rows_to_read() -> Iterator[int]:
-        """Rows far enough from the last place. Each is added to the finder before the next one is taken."""
+        """Yield the rows at least `spacing_m` from the last place. The caller adds each to `finder` before the next."""
         nonlocal done
         for done in range(len(poses)):
             if places and np.linalg.norm(poses[done, :3, 3] - poses[places[-1][1], :3, 3]) < spacing_m:
                 continue
             frame = len(frame_rows)
-            if frame == len(finder):  # not in the checkpoint of an earlier run
+            if frame == len(finder):  # otherwise the frame is in the checkpoint of an earlier run
                 yield done
             if not finder.empty[frame]:
                 places.append((frame, done))
@@ -88,6 +90,7 @@ def map_recording(
         done = len(poses)
 
     def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
+        """Add a frame without comparing it with earlier ones: a map needs no loops."""
         keyframes.append(keyframe)
         finder.add_keyframe(keyframe, fits=NO_FITS)
 
@@ -110,18 +113,19 @@ def map_recording(
         )
     skipped = tuple(recording.ids[frame_rows[frame]] for frame in finder.missing)
     index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
-    described = [keyframe for frame, _ in places if (keyframe := keyframes[frame]) is not None]
-    return MapBuildResult(_places(index, recording, poses, [row for _, row in places], described), done, skipped)
+    place_keyframes = [keyframe for frame, _ in places if (keyframe := keyframes[frame]) is not None]
+    rows = [row for _, row in places]
+    return MapBuildResult(_place_map(index, recording, poses, rows, place_keyframes), done, skipped)
 
 
-def _places(
+def _place_map(
     index: Index,
     recording: Recording,
     poses: Float[np.ndarray, "n 4 4"],
     rows: Sequence[int],
     keyframes: Sequence[Keyframe],
 ) -> PlaceMap:
-    """Map of some scans of a recording, added to an index without places."""
+    """Return the map of the scans in `rows` of a recording, given their keyframes. `index` is empty and is filled."""
     names = place_names(recording)
     descriptors = np.array([keyframe.descriptor for keyframe in keyframes], np.float32).reshape(-1, index.width)
     index.add(descriptors, ids=[names[row] for row in rows], positions=poses[rows, :3, 3])

@@ -1,4 +1,4 @@
-"""Map of places with known poses, in which scans are located."""
+"""Map of places with known poses: merging, relocalisation of scans in it, and its file."""
 
 import dataclasses
 import functools
@@ -28,7 +28,7 @@ from sglpr_jax.loops.keyframes import Keyframe, Keyframes
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.models.params import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import NEGATIVE_M
@@ -53,27 +53,33 @@ class Relocalization(NamedTuple):
 
 
 def with_shared_probability(answers: Sequence[Relocalization], *, apart_m: float = NEGATIVE_M) -> list[Relocalization]:
-    """Sort answers by probability, scaled so that those of answers more than `apart_m` apart add up to at most 1."""
+    """Sort answers by probability, and divide all probabilities by a common factor.
+
+    The factor makes the sum over the distinct positions at most 1. A position is not distinct if it is within
+    `apart_m` metres of a distinct one with a higher probability.
+    """
     answers = sorted(answers, key=lambda answer: -answer.probability)
-    best: list[Relocalization] = []
+    distinct: list[Relocalization] = []
     for answer in answers:
         position = answer.world_from_query[:3, 3]
-        if all(np.linalg.norm(other.world_from_query[:3, 3] - position) > apart_m for other in best):
-            best.append(answer)
-    total = max(1.0, sum(answer.probability for answer in best))
-    loops = [dataclasses.replace(answer.loop, probability=answer.probability / total) for answer in answers]
-    return [answer._replace(loop=loop) for answer, loop in zip(answers, loops, strict=True)]
+        if all(np.linalg.norm(other.world_from_query[:3, 3] - position) > apart_m for other in distinct):
+            distinct.append(answer)
+    total = max(1.0, sum(answer.probability for answer in distinct))
+    return [
+        answer._replace(loop=dataclasses.replace(answer.loop, probability=answer.probability / total))
+        for answer in answers
+    ]
 
 
 NO_DRIFT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=1e-3)
-"""Drift of the poses of a map. It is small, but large over the unknown motion of a query (`motion.UNKNOWN_M`)."""
+"""Assumed drift of the poses of a map, which are known: almost none between places. A query has an unknown pose."""
 ARRAYS = {
     "images": Column("uint8", ("n", "h", "h")),
     "world_from_place": Column("float64", ("n", 4, 4)),
     "mountings": Column("float64", ("n", 4)),
     "mounting_deviations": Column("float64", ("n", 2), finite=False, optional=True),
 }
-"""Arrays of a map's file in addition to the index. Without the optional one, no sensor tilts."""
+"""Arrays of a map's file in addition to those of the index. `mounting_deviations` is missing if no sensor tilts."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,7 +98,7 @@ class PlaceMap(Keyframes):
     world_from_place: Float[np.ndarray, "n 4 4"]
     """Pose of the LiDAR at each place."""
     mountings: Float[np.ndarray, "n 4"]
-    """Mounting of the sensor: height above the ground, in metres, and the up direction in its frame."""
+    """Mounting of the sensor at each place: height above the ground in metres, and the up direction in its frame."""
     mounting_deviations: Float[np.ndarray, "n 2"]
     """Standard deviations of height (metres) and tilt (degrees), NaN for a sensor fixed to a vehicle."""
 
@@ -102,17 +108,22 @@ class PlaceMap(Keyframes):
     def mounting(self, row: int = -1) -> Mounting:
         """Mounting of the sensor at a place, by default the last one."""
         height, *up = self.mountings[row].tolist()
-        deviations = self.mounting_deviations[row]
-        return Mounting(height, tuple(up), *(() if np.isnan(deviations).any() else deviations.tolist()))
+        deviations = self.mounting_deviations[row].tolist()
+        if np.isnan(deviations).any():  # fixed to a vehicle
+            return Mounting(height, tuple(up))
+        return Mounting(height, tuple(up), *deviations)
 
     def query_mounting(self, points: Float[np.ndarray, "n 3"]) -> Mounting:
-        """Mounting of the sensor of a query: that of the last place or, if the sensor of the map tilts, by the ground
-        of the query near the median of all places."""
+        """Return the assumed mounting of a query's sensor: that of the last place.
+
+        If the sensor of the map tilts, the mounting is estimated from the ground in `points`, starting at the median
+        height and up direction of all places.
+        """
         if not self.tilts:
             return self.mounting()
         height, *up = np.median(self.mountings, axis=0)
-        mean = Mounting(float(height), tuple((np.array(up) / np.linalg.norm(up)).tolist()))
-        return GroundFilter(mean).add(points)
+        median_mounting = Mounting(float(height), tuple((np.array(up) / np.linalg.norm(up)).tolist()))
+        return GroundFilter(median_mounting).add(points)
 
     @property
     def scale(self) -> Scale:
@@ -125,11 +136,11 @@ class PlaceMap(Keyframes):
         return bool(np.isfinite(self.mounting_deviations).all(axis=1).any())
 
     def merged(self, other: "PlaceMap", *, drive: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> "PlaceMap":
-        """Merge two maps in one world frame. Places that are in both are stored once.
+        """Return the map with the places of `other`, which has the same world frame. Common places are stored once.
 
-        If ids of `other` are taken by other places, its recordings are renamed with the suffix ~2, ~3 and so on. If
-        `other` is not complete, `drive` has the poses of all scans of its recording (`poses_by_id`), so that the ids
-        are those of the complete map.
+        If an id of `other` belongs to a different place here, the recordings of `other` get a suffix ~2, ~3, and so on.
+        If `other` is a part of a drive, pass the poses of all its scans as `drive` (`poses_by_id`). The suffix is then
+        that of the complete map.
 
         Raises ValueError if the maps were made with other weights or another scale, or have images of another size.
         """
@@ -137,18 +148,19 @@ class PlaceMap(Keyframes):
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
         contents, other_contents = self._contents(), other._contents()
-        known = set(contents)
-        new = [row for row, content in enumerate(other_contents) if content not in known]
+        known_contents = set(contents)
+        new_rows = [row for row, content in enumerate(other_contents) if content not in known_contents]
         drive_contents: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in (drive or {}).items()}
         drive_contents |= zip(other.index.ids, other_contents, strict=True)
-        taken = dict(zip(self.index.ids, contents, strict=True))
-        index = self.some(range(len(self))).index
+        existing = dict(zip(self.index.ids, contents, strict=True))
+        index = self.subset(range(len(self))).index  # a copy, because an index grows in place
         index.add(
-            other.index.descriptors[new],
-            ids=_free_names([other.index.ids[row] for row in new], drive_contents, taken=taken),
-            positions=other.world_from_place[new, :3, 3],
+            other.index.descriptors[new_rows],
+            ids=_unused_ids([other.index.ids[row] for row in new_rows], drive_contents, existing=existing),
+            positions=other.world_from_place[new_rows, :3, 3],
         )
-        return PlaceMap(index, *(np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in ARRAYS))
+        arrays = {name: np.concatenate([getattr(self, name), getattr(other, name)[new_rows]]) for name in ARRAYS}
+        return PlaceMap(index, **arrays)
 
     def relocate(
         self,
@@ -166,7 +178,7 @@ class PlaceMap(Keyframes):
             the map (`query_mounting`). For another mounting pass a `Scan`.
           model: Model of the probabilities, by default the one shipped for the weights.
           candidates: Maximum number of poses, and number of nearest places that the query is compared with. If it fits
-            none of them well, as many others of the nearest 25 are compared, chosen by a coarse comparison.
+            none of them well, as many of the nearest 25 places are compared, too, chosen by a coarse comparison.
 
         Returns:
           One pose for each compared place, the most probable first. Empty if the scan is almost empty.
@@ -195,7 +207,8 @@ class PlaceMap(Keyframes):
         model: LoopModel | None = None,
         candidates: int = CANDIDATES,
     ) -> list[Relocalization]:
-        """Locate a scan, described with the map's scale by weights with this hash. See `relocate`."""
+        """Locate a described scan in the map. Arguments, result and errors are those of `relocate`. `keyframe` must be
+        described at the map's scale by weights with the hash `weights_hash`. None skips the check."""
         self.index.check(weights=weights_hash)
         image = keyframe.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
@@ -207,14 +220,16 @@ class PlaceMap(Keyframes):
         query = Query(len(self), keyframe.descriptor, image)
         comparison = KeyframeComparison(self._motion, NO_DRIFT, config)
         fits = comparison.compare(query, self)
-        order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
-        _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
+        best_first = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
+        _, first = np.unique(fits.frames[best_first], return_index=True)  # a place may be compared twice
         answers = []
-        for row in order[np.sort(first)][:candidates].tolist():
-            candidate = comparison.verify(query, fits, row, self)
+        for row in best_first[np.sort(first)][:candidates].tolist():
+            candidate = comparison.candidate_of_fit(query, fits, row, self)
             place, probability = candidate.match, float(model.probability(candidate.evidence))
             mountings = keyframe.mounting, self.mounting(place).scaled(self.scale)
-            loop = planar_loop(*candidate[:3], probability=probability, sensors=mountings)
+            loop = planar_loop(
+                candidate.query, candidate.match, candidate.alignment, probability=probability, sensors=mountings
+            )
             loop = in_metres(to_lidar(loop, query=mountings[0], match=mountings[1]), self.scale)
             world_from_query = self.world_from_place[place] @ loop.match_from_query
             answers.append(Relocalization(self.index.ids[place], world_from_query, loop))
@@ -231,13 +246,13 @@ class PlaceMap(Keyframes):
 
     @functools.cached_property
     def _motion(self) -> BevOdometry:
-        """Poses of the scaled places, and a last frame of unknown pose for queries. The world is level."""
+        """Poses of the places at the map's scale, then a frame of unknown pose for the query. The world is level."""
         motion = BevOdometry.of(self.upright_poses(self.scale))
         motion.add(0.0, continues=False)
         return motion
 
     def upright_poses(self, scale: Scale = 1) -> Float[np.ndarray, "n 4 4"]:
-        """Pose of the gravity-aligned frame of the sensor at each place. All lengths are multiplied by `scale`."""
+        """Return the pose of the sensor's gravity-aligned frame at each place, with lengths multiplied by `scale`."""
         uprights = [upright_from_lidar(self.mounting(row).scaled(scale)) for row in range(len(self))]
         return scaled_poses(self.world_from_place, float(scale)) @ inverse(np.array(uprights).reshape(-1, 4, 4))
 
@@ -245,17 +260,17 @@ class PlaceMap(Keyframes):
         """Description of the scaled scan at a place."""
         return Keyframe(self.index.descriptors[row], self.images[row], self.mounting(row).scaled(self.scale))
 
-    def some(self, rows: Sequence[int]) -> "PlaceMap":
-        """Return a map of some of the places, by their numbers."""
+    def subset(self, rows: Sequence[int]) -> "PlaceMap":
+        """Return a map of the places in these rows, in this order."""
         rows, index = list(rows), self.index.without_places()
         ids, positions = [self.index.ids[row] for row in rows], self.world_from_place[rows, :3, 3]
         index.add(self.index.descriptors[rows], ids=ids, positions=positions)
-        return PlaceMap(index, *(getattr(self, name)[rows] for name in ARRAYS))
+        return PlaceMap(index, **{name: getattr(self, name)[rows] for name in ARRAYS})
 
     def moved(self, world_from_old: Float[np.ndarray, "4 4"]) -> "PlaceMap":
-        """Return the map in another world frame, given the pose of the old one in it."""
+        """Return the map in another world frame, in which the frame of this map has the pose `world_from_old`."""
         moved = dataclasses.replace(self, world_from_place=world_from_old @ self.world_from_place)
-        return moved.some(range(len(self)))
+        return moved.subset(range(len(self)))  # with the moved positions in its index
 
     def save(self, path: Path | str) -> None:
         """Write the map atomically to one file: an index file with additional arrays (`ARRAYS`)."""
@@ -267,12 +282,12 @@ class PlaceMap(Keyframes):
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
         """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
-        index, arrays = Index.load_with(path, weights_hash=weights_hash)
+        index, arrays = Index.load_with_arrays(path, weights_hash=weights_hash)
         missing = [name for name, column in ARRAYS.items() if name not in arrays and not column.optional]
         if missing:
             raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(missing)}")
         with naming(path):
-            _check(index, arrays)
+            _check_arrays(index, arrays)
         return cls(index, **{name: arrays.get(name, np.full((len(index), 2), np.nan)) for name in ARRAYS})
 
     def _contents(self) -> list[tuple[bytes, bytes]]:
@@ -281,8 +296,8 @@ class PlaceMap(Keyframes):
         return [(descriptor.tobytes(), pose.tobytes()) for descriptor, pose in places]
 
 
-def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raise ValueError if the content of a file is not that of a map."""
+def _check_arrays(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError if the index or the arrays (`ARRAYS`) of a file are not those of a map."""
     if index.distance != "l2":
         raise ValueError(f"expected descriptors compared by l2, found {index.distance}")
     check_columns(arrays, ARRAYS, n=len(index))
@@ -296,40 +311,40 @@ def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 Content = tuple[bytes | None, bytes]
-"""Identity of a place: its descriptor (None if not known yet) and its pose, as bytes."""
+"""Content of a place, by which equal places are found: descriptor (None if not known yet) and pose, as bytes."""
 
 
 def place_names(recording: Recording) -> list[str]:
-    """Name of the place of each scan, whether or not the scan is in a map."""
+    """Return the id that each scan has as a place of a map: RECORDING/SCAN."""
     return [f"{recording.name}/{scan}" for scan in recording.ids]
 
 
 def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Pose of each scan by the id of its place, whether or not the scan is in the map."""
+    """Return the pose of each scan by its id as a place of a map (RECORDING/SCAN), for `PlaceMap.merged`."""
     return dict(zip(place_names(recording), np.asarray(poses, np.float64), strict=True))
 
 
-def _free_names(names: Sequence[str], drive: Mapping[str, Content], *, taken: Mapping[str, Content]) -> list[str]:
-    """Names for new places, with the first suffix of "", ~2, ~3, ... after the recording that makes them free.
-
-    `drive` has all scans of the drive, because the suffix must not depend on how much of it is mapped. `taken` has the
-    places of the map.
-    """
-    recordings = {name.rpartition("/")[0] for name in names}
+def _unused_ids(ids: Sequence[str], drive: Mapping[str, Content], *, existing: Mapping[str, Content]) -> list[str]:
+    """Return the ids of new places (RECORDING/SCAN), with a suffix of the recording if another place has one of them.
+    The suffix is the first of "", ~2, ~3, ... that no scan of the `drive` shares with a different place of the map
+    (`existing`). All scans count, because the suffix must not depend on how much of the drive is mapped."""
+    recordings = {name.rpartition("/")[0] for name in ids}
     drive = {name: content for name, content in drive.items() if name.rpartition("/")[0] in recordings}
 
     def is_free(suffix: str) -> bool:
-        """Whether no scan of the drive has, with the suffix, the name of another place."""
+        """Return False if a scan of the drive, with the suffix, has the id of a place with other content."""
         for name, (descriptor, pose) in drive.items():
-            place = taken.get(_with_suffix(name, suffix))
+            place = existing.get(_with_suffix(name, suffix))
             if place is not None and (place[1] != pose or descriptor not in (None, place[0])):
                 return False
         return True
 
-    suffix = next(filter(is_free, itertools.chain([""], (f"~{number}" for number in itertools.count(2)))))
-    return [_with_suffix(name, suffix) for name in names]
+    suffixes = itertools.chain([""], (f"~{number}" for number in itertools.count(2)))
+    suffix = next(filter(is_free, suffixes))
+    return [_with_suffix(name, suffix) for name in ids]
 
 
 def _with_suffix(name: str, suffix: str) -> str:
+    """Return an id RECORDING/SCAN with a suffix after the recording."""
     recording, slash, scan = name.rpartition("/")
     return f"{recording}{suffix}{slash}{scan}"

@@ -52,10 +52,8 @@ def read_query(
 
 
 def query_of(recording: Recording, frame: int) -> Scan:
-    """Read the scan with this number from a recording, as a query for `PlaceMap.relocate`.
-
-    Raises ValueError if the recording has no such scan, or if it is left out because it has no pose.
-    """
+    """Read the scan with this number from a recording, as a query for `PlaceMap.relocate`. Raises ValueError if the
+    recording has no such scan, or if it is left out because it has no pose."""
     rows = np.flatnonzero(recording.numbers == frame)
     if not rows.size:
         scans = f"{len(recording)} scans from {recording.numbers[0]} to {recording.numbers[-1]}"

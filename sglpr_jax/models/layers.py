@@ -150,7 +150,7 @@ def residual_sums(
     """
     weights = assignment.astype(features.dtype)
     sums = jnp.einsum("bnd,bnk->bdk", features, weights, preferred_element_type=jnp.float32)
-    return l2_normalize(sums - assignment.sum(1)[:, None, :] * centres[None], axis=1)
+    return l2_normalize(sums - assignment.sum(1)[:, None, :] * jnp.asarray(centres)[None], axis=1)
 
 
 def l2_normalize(x: Float[Array, "*dims"], *, axis: int = -1) -> Float[Array, "*dims"]:

@@ -18,7 +18,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.frame_log import RunLog
 from sglpr_jax.odometry.config import OdometryConfig
 from sglpr_jax.retrieval.descriptor_cache import fingerprint
@@ -33,12 +33,14 @@ MIN_OVERLAP = 0.55
 have more, scans of other places mostly less."""
 
 
+RESULT_NUMBERS = 16 + 1
+"""Numbers of a scan in the log: its pose, and the time of its last point relative to the scan, in seconds."""
 Cloud = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"]]
 """Points of a scan in metres, and the time of each point relative to the scan in seconds or an empty array."""
 
 
-class _Registered(NamedTuple):
-    """Pose of a scan, and how well it was registered."""
+class _RegisteredScan(NamedTuple):
+    """Pose of a scan, and the quality of its registration."""
 
     pose: Float[np.ndarray, "4 4"]
     points: int
@@ -57,11 +59,11 @@ def scan_odometry(
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Compute odometry from the scans of a recording, in the frame of the first scan. Fewer poses if stopped.
+    """Compute odometry from the scans of a recording: poses of the LiDAR in the frame of the first scan.
 
     If scans and points have times, the motion within scans is removed, and each pose is that at the time of its scan.
-    Scans that are unreadable or have few points get an extrapolated pose. A warning names them, and scans that do not
-    overlap the previous ones.
+    Scans that are unreadable or have few points get an extrapolated pose. Warnings name the first scan with few points,
+    and the first one that does not overlap the previous ones.
 
     Arguments:
       recording: The scans, about 10 a second.
@@ -69,7 +71,7 @@ def scan_odometry(
       scale: Factor for all lengths, as in `find_loops`. With 4, the default range is 25 m and the voxels .25 m.
       kept_in: Checkpoint file of this recording and these settings, from which a stopped call resumes. It stays.
       on_bad_scan: Called with id and error of an unreadable scan.
-      should_stop: If it returns True, the poses of the scans so far are returned.
+      should_stop: If it returns True, only the poses of the scans so far are returned.
       on_progress: Called with the number of processed scans.
 
     Raises:
@@ -83,49 +85,54 @@ def scan_odometry(
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans for odometry, found ready-made images")
     check_installed()
-    path, known = None if kept_in is None else Path(kept_in), np.zeros((0, 17))
+    path, results = None if kept_in is None else Path(kept_in), np.zeros((0, RESULT_NUMBERS))
     with RunLog(path, {} if path is None else _settings(recording, config, scale)) as log:
         if log.records:
-            known = np.frombuffer(b"".join(log.records)).reshape(-1, 17)
-        if len(known) < len(recording):
+            results = np.frombuffer(b"".join(log.records)).reshape(-1, RESULT_NUMBERS)
+        if len(results) < len(recording):
             options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-            known = _register(recording, log, known, _FrontEnd(config), scale, **options)
-    poses = scaled_poses(known[:, :16].reshape(-1, 4, 4), 1 / scale)
-    return _at_times_of_scans(poses, recording, known[:, 16])
+            results = _register_scans(recording, log, results, _FrontEnd(config), scale, **options)
+    poses = scaled_poses(results[:, :16].reshape(-1, 4, 4), 1 / scale)
+    return _poses_at_scan_times(poses, recording, results[:, 16])
 
 
 def _settings(recording: Recording, config: OdometryConfig, scale: Scale) -> dict[str, Any]:
-    """Settings that determine the poses."""
+    """Settings that determine the poses. A log with other settings is not resumed."""
     scans = [recording.name, fingerprint(recording, contents="some")]
     return {"scans": scans, "kiss-icp": version("kiss-icp"), "scale": scale, **dataclasses.asdict(config)}
 
 
-def _register(
+def _register_scans(
     recording: Recording,
     log: RunLog,
-    known: Float[np.ndarray, "k 17"],
+    logged: Float[np.ndarray, "k 17"],
     front_end: "_FrontEnd",
     scale: Scale,
     **options: Any,
 ) -> Float[np.ndarray, "n 17"]:
-    """Pose of each scan and time of its last point. Adds new ones to the log, and warns of doubtful ones."""
+    """Add all scans to kiss-icp, the first k at their logged poses. Returns `RESULT_NUMBERS` of each scan.
+
+    New results are appended to the log. If no scan is left, doubtful scans are reported. The options are those of
+    `scan_stream`.
+    """
     is_timed = has_point_times(recording)
-    rows, registered = list(known), dict[int, _Registered]()
+    results, registered = list(logged), dict[int, _RegisteredScan]()
     for row, cloud in scan_stream(scaled(recording, scale), lambda _, scan: _cloud(scan, is_timed), **options):
-        result = front_end.add(cloud, known=known[row, :16].reshape(4, 4) if row < len(known) else None)
+        logged_pose = logged[row, :16].reshape(4, 4) if row < len(logged) else None
+        result = front_end.add(cloud, known_pose=logged_pose)
         if cloud is not None:
             registered[row] = result
-        if row >= len(known):
-            rows.append(np.append(result.pose, 0.0 if cloud is None else cloud[1].max(initial=0)))
-            log.append(row, rows[row].tobytes())
-    if len(rows) == len(recording):
+        if logged_pose is None:
+            results.append(np.append(result.pose, 0.0 if cloud is None else cloud[1].max(initial=0)))
+            log.append(row, results[row].tobytes())
+    if len(results) == len(recording):
         check_readable(recording, len(registered))
         _warn_of_doubtful(recording, registered)
-    return np.array(rows).reshape(-1, 17)
+    return np.array(results).reshape(-1, RESULT_NUMBERS)
 
 
 def _cloud(scan: Scan, is_timed: bool) -> Cloud:
-    """Measured points of a scan, with their times if the scans have times."""
+    """Points of a scan that are finite and not all zero, with their times if `is_timed`."""
     points = scan.points
     assert points is not None
     valid = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
@@ -134,19 +141,19 @@ def _cloud(scan: Scan, is_timed: bool) -> Cloud:
 
 
 class _FrontEnd:
-    """kiss-icp, one scan after the other."""
+    """kiss-icp, to which scans are added one after the other."""
 
     def __init__(self, config: OdometryConfig):
-        library, used = _library(), config.effective
-        data = {"max_range": used.max_range_m, "min_range": used.min_range_m, "deskew": True}
-        settings = importlib.import_module("kiss_icp.config").KISSConfig(
-            data=data, mapping={"voxel_size": used.voxel_m}
-        )
-        self._icp, self._voxel_m = library.KissICP(settings), float(used.voxel_m or 0)
-        self._previous: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
+        library, effective = _library(), config.effective
+        data = {"max_range": effective.max_range_m, "min_range": effective.min_range_m, "deskew": True}
+        mapping = {"voxel_size": effective.voxel_m}
+        settings = importlib.import_module("kiss_icp.config").KISSConfig(data=data, mapping=mapping)
+        self._icp, self._voxel_m = library.KissICP(settings), float(effective.voxel_m or 0)
+        self._previous_clouds: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
+        """Points of the previous scans in the frame of the first scan."""
 
-    def add(self, cloud: Cloud | None, *, known: Float[np.ndarray, "4 4"] | None = None) -> _Registered:
-        """Register the next scan, or add it at its known pose. Without a scan, extrapolate the motion.
+    def add(self, cloud: Cloud | None, *, known_pose: Float[np.ndarray, "4 4"] | None = None) -> _RegisteredScan:
+        """Register the next scan, or add it at its known pose. Without a scan or with few points, extrapolate.
 
         These are the steps of kiss-icp's `register_frame`, which takes no known pose.
         """
@@ -156,8 +163,8 @@ class _FrontEnd:
             source, mapped = icp.voxelize(icp.preprocessor.preprocess(*cloud, icp.last_delta))
         if len(source) < MIN_POINTS:
             icp.last_pose = guess
-            return _Registered(guess, len(source), 1.0)
-        pose = known
+            return _RegisteredScan(guess, len(source), 1.0)
+        pose = known_pose
         if pose is None:
             sigma = icp.adaptive_threshold.get_threshold()
             pose = icp.registration.align_points_to_map(
@@ -169,36 +176,43 @@ class _FrontEnd:
             )
         icp.adaptive_threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         icp.local_map.update(mapped, pose)
-        icp.last_delta, icp.last_pose = np.linalg.inv(icp.last_pose) @ pose, pose
-        return _Registered(pose, len(source), self._overlap(source, mapped, pose))
+        icp.last_delta = np.linalg.inv(icp.last_pose) @ pose
+        icp.last_pose = pose
+        return _RegisteredScan(pose, len(source), self._overlap(source, mapped, pose))
 
     def _overlap(self, source: np.ndarray, mapped: np.ndarray, pose: np.ndarray) -> float:
-        """Share of points with a point of the previous scans within a voxel."""
+        """Share of `source` with a point of the previous scans within a voxel. 1 for the first scans.
+
+        Adds `mapped`, the points for the map, to the previous scans. Both are in the LiDAR frame at `pose`.
+        """
         from scipy.spatial import KDTree  # imported here because the import is slow
 
-        previous = list(self._previous)
-        self._previous.append(transformed(pose, mapped))
-        if len(previous) < PREVIOUS:
+        previous_clouds = list(self._previous_clouds)
+        self._previous_clouds.append(transformed(pose, mapped))
+        if len(previous_clouds) < PREVIOUS:
             return 1.0
-        tree = KDTree(np.concatenate(previous), balanced_tree=False)
+        tree = KDTree(np.concatenate(previous_clouds), balanced_tree=False)
         distances, _ = tree.query(transformed(pose, source), distance_upper_bound=self._voxel_m)
         return float(np.isfinite(distances).mean())
 
 
-def _at_times_of_scans(
-    poses: Float[np.ndarray, "n 4 4"], recording: Recording, ends: Float[np.ndarray, " n"]
+def _poses_at_scan_times(
+    poses: Float[np.ndarray, "n 4 4"], recording: Recording, last_point_s: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Poses at the times of the scans. kiss-icp removes motion up to the last point, and its poses are those then."""
-    end = float(np.median(ends[ends != 0])) if ends.any() else 0.0
-    if end == 0 or recording.times is None or len(poses) < 2:
+    """Interpolate poses of kiss-icp, which are those at the last point of each scan, to the times of the scans.
+
+    `last_point_s` is the time of the last point relative to its scan, or 0. Without times, the poses stay.
+    """
+    delay_s = float(np.median(last_point_s[last_point_s != 0])) if last_point_s.any() else 0.0
+    if delay_s == 0 or recording.times is None or len(poses) < 2:
         return poses
     times = recording.times[: len(poses)]
-    earlier = poses_at(times, times + end, poses)
-    return inverse(earlier[0]) @ earlier
+    interpolated = poses_at(times, times + delay_s, poses)
+    return inverse(interpolated[0]) @ interpolated
 
 
-def _warn_of_doubtful(recording: Recording, registered: dict[int, _Registered]) -> None:
-    """Warn of scans with few points and of scans without overlap. Raises ValueError if all scans have few points."""
+def _warn_of_doubtful(recording: Recording, registered: dict[int, _RegisteredScan]) -> None:
+    """Warn of scans with few points or little overlap. Raises ValueError if all scans have few points."""
     few = [row for row, result in registered.items() if result.points < MIN_POINTS]
     if len(few) == len(registered):
         raise ValueError(
@@ -218,23 +232,24 @@ def _warn_of_doubtful(recording: Recording, registered: dict[int, _Registered]) 
         )
 
 
-def about(recording: Recording, config: OdometryConfig, *, scale: Scale) -> str:
-    """Describe how the odometry of a recording is computed, with lengths in its metres."""
-    used = config.effective
-    assert used.voxel_m is not None
+def describe_odometry(recording: Recording, config: OdometryConfig, *, scale: Scale) -> str:
+    """Describe the odometry of a recording to the user: kiss-icp's version, range and voxels in metres, deskewing."""
+    effective = config.effective
+    assert effective.voxel_m is not None
     deskewing = "motion within scans removed" if has_point_times(recording) else "without times of points"
     return (
-        f"odometry: kiss-icp {version('kiss-icp')}, points up to {used.max_range_m / scale:g} m, voxels of "
-        f"{used.voxel_m / scale:g} m, {deskewing}"
+        f"odometry: kiss-icp {version('kiss-icp')}, points up to {effective.max_range_m / scale:g} m, voxels of "
+        f"{effective.voxel_m / scale:g} m, {deskewing}"
     )
 
 
 def check_installed() -> None:
-    """Raises ImportError if kiss-icp is not installed."""
+    """Raise ImportError if kiss-icp is not installed."""
     _library()
 
 
 def _library() -> ModuleType:
+    """Import kiss-icp. Raises ImportError, which says how to install it, if it is missing."""
     try:
         return importlib.import_module("kiss_icp.kiss_icp")
     except ImportError as error:

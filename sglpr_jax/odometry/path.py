@@ -1,4 +1,4 @@
-"""Path of a sensor with sums along it, from which the drift between any two frames follows in constant time."""
+"""Path of a sensor with integrals along it, from which the drift between any two frames follows in constant time."""
 
 from typing import NamedTuple
 
@@ -7,15 +7,15 @@ from jaxtyping import Float, Int
 
 from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import inverse
 
 UPPER = np.triu_indices(3)
-"""Rows and columns of the stored half of a symmetric matrix."""
+"""Rows and columns of the upper half of a symmetric matrix, which is stored."""
 FROM_UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Index of each element of a symmetric matrix in the stored half."""
+"""Index of each element of a symmetric matrix in its upper half."""
 SUMS = 1 + 3 + 6 + 6
-"""Number of integrals of a frame: length, position, and the upper halves of two matrices."""
+"""Number of integrals of a frame (`PathIntegrals`): length, position, and the upper halves of two matrices."""
 
 
 class PathIntegrals(NamedTuple):
@@ -31,13 +31,14 @@ class PathIntegrals(NamedTuple):
     """Integral of the outer product of the position with itself."""
 
     def rotated(self, rotation: Float[np.ndarray, "d 3"]) -> "PathIntegrals":
-        """The integrals in rotated coordinates: all three, or the first d."""
-        products = (rotation @ matrix @ rotation.T for matrix in (self.direction_products, self.position_products))
-        return PathIntegrals(self.length, self.position @ rotation.T, *products)
+        """The integrals in rotated coordinates. With two rows of a rotation, in two coordinates."""
+        directions = rotation @ self.direction_products @ rotation.T
+        positions = rotation @ self.position_products @ rotation.T
+        return PathIntegrals(self.length, self.position @ rotation.T, directions, positions)
 
 
 class DrivenPath:
-    """Gravity-aligned poses of the sensor in one fixed frame. Adding a pose takes constant time."""
+    """Gravity-aligned poses of the sensor in one fixed frame, with integrals. Adding a pose takes constant time."""
 
     def __init__(
         self,
@@ -46,13 +47,16 @@ class DrivenPath:
         *,
         tilted: bool = False,
     ):
-        """Start with these poses, as in `extend`."""
+        """Start with these poses and guesses, as in `extend`."""
         self.tilted = tilted
         """Whether the sensor is tilted. If not, the z axis of the fixed frame counts as up."""
         self._poses = GrowingArray(np.empty((0, 4, 4)))
         self._sums = GrowingArray(np.empty((0, SUMS)))
+        """Integrals from the first frame to each frame, relative to the position of the first one."""
         self._guessed_m = 0.0
-        self._up = np.zeros(3)
+        """Guessed motion up to the last frame, in metres."""
+        self._up_sum = np.zeros(3)
+        """Sum of the z axes of all poses."""
         if poses is not None:
             self.extend(poses, guessed_m)
 
@@ -76,65 +80,68 @@ class DrivenPath:
 
     @property
     def level(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation from the fixed frame to one whose z axis points up.
+        """Rotation from the fixed frame to one whose z axis points up: along the average z axis of all poses.
 
-        Odometry often starts with the identity, so its world is tilted like the sensor. Up is the average over all
-        poses.
+        Odometry often starts with the identity, so its fixed frame is tilted like the sensor.
         """
         if not self.tilted or not len(self):
             return np.eye(3)
-        up = tuple((self._up / np.linalg.norm(self._up)).tolist())
+        up = tuple((self._up_sum / np.linalg.norm(self._up_sum)).tolist())
         return upright_from_lidar(Mounting(0.0, up))[:3, :3]
 
     def extend(self, poses: Float[np.ndarray, "n 4 4"], guessed_m: Float[np.ndarray, " n"] | None = None) -> None:
         """Add the poses of the next frames, and the guessed motion up to each of them (`BevOdometry.guessed_m`).
 
-        Guessed motion drifts like a path of unknown direction.
+        Guessed motion drifts like a path of unknown direction. Without `guessed_m`, nothing is guessed.
         """
         if not len(poses):
             return
         guessed_m = np.full(len(poses), self._guessed_m) if guessed_m is None else guessed_m
-        origin = (self.poses if len(self) else poses)[0, :3, 3]
         if len(self):
-            ends, guesses_m = np.concatenate([self.poses[-1:], poses]), np.append(self._guessed_m, guessed_m)
-            self._sums.extend(self._sums.rows[-1] + _integrals(ends[:, :3, 3] - origin, guesses_m).cumsum(0))
+            origin, last_sums = self.poses[0, :3, 3], self._sums.rows[-1]
+            path, path_guessed_m = np.concatenate([self.poses[-1:], poses]), np.append(self._guessed_m, guessed_m)
+            self._sums.extend(last_sums + _integrals(path[:, :3, 3] - origin, path_guessed_m).cumsum(0))
         else:
-            steps = _integrals(poses[:, :3, 3] - origin, guessed_m)
+            steps = _integrals(poses[:, :3, 3] - poses[0, :3, 3], guessed_m)
             self._sums.extend(np.concatenate([np.zeros((1, SUMS)), steps.cumsum(0)]))
         self._poses.extend(poses)
-        self._up += poses[:, :3, 2].sum(axis=0)
+        self._up_sum += poses[:, :3, 2].sum(axis=0)
         self._guessed_m = float(guessed_m[-1])
 
     def leveled(self, frames: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 4 4"]:
-        """Poses of these frames in a level world, with positions relative to that of the first frame."""
-        poses = self.poses[frames]
+        """Poses of these frames in a level world, with positions relative to the first frame of the path."""
+        poses = self.poses[frames]  # a copy
         if len(self):
             poses[:, :3, 3] -= self.poses[0, :3, 3]
         poses[:, :3] = self.level @ poses[:, :3]
         return poses
 
     def between(self, start: Int[np.ndarray, " k"], end: Int[np.ndarray, " k"]) -> PathIntegrals:
-        """Integrals from frames `start` to frames `end`. Positions count from that of the first frame."""
-        length, first, directions, squares = np.split(self._sums.rows[end] - self._sums.rows[start], [1, 4, 10], axis=1)
-        return PathIntegrals(length[:, 0], first, directions[:, FROM_UPPER], squares[:, FROM_UPPER])
+        """Integrals from frames `start` to frames `end`. Positions are relative to the first frame of the path."""
+        sums = self._sums.rows[end] - self._sums.rows[start]
+        length, position, directions, positions = np.split(sums, [1, 4, 10], axis=1)
+        return PathIntegrals(length[:, 0], position, directions[:, FROM_UPPER], positions[:, FROM_UPPER])
 
     def position_deviations(
         self, rows: Int[np.ndarray, " k"], frame: int, *, drift: DriftModel = DriftModel()
     ) -> Float[np.ndarray, " k"]:
-        """Standard deviation of the position of each row relative to a frame, in metres, over all directions."""
+        """Root of the trace of the position covariance of each of `rows` (frames) relative to a frame, in metres."""
         position = self.poses[frame, :3, 3] - self.poses[0, :3, 3]
         sums = self._sums.rows[rows] - self._sums.rows[frame]
-        weights = np.zeros(SUMS)  # of the integral of |p - position|^2 = |p|^2 - 2 p position + |position|^2
-        weights[0], weights[1:4], weights[10 + FROM_UPPER.diagonal()] = position @ position, -2 * position, 1
-        lever, length_m = np.abs(sums @ weights), np.abs(sums[:, 0])
-        by_length = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length_m
-        return np.sqrt(by_length**2 + np.radians(drift.degrees_per_metre) ** 2 * length_m * lever)
+        # Weights of the integral of |p - position|^2 = |position|^2 - 2 p position + |p|^2 over positions p.
+        weights = np.zeros(SUMS)
+        weights[0] = position @ position
+        weights[1:4] = -2 * position
+        weights[10 + FROM_UPPER.diagonal()] = 1
+        squared_levers, length_m = np.abs(sums @ weights), np.abs(sums[:, 0])
+        by_position_m = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length_m
+        return np.sqrt(by_position_m**2 + np.radians(drift.degrees_per_metre) ** 2 * length_m * squared_levers)
 
 
 def level_odometry(
     odometry: Float[np.ndarray, "n 4 4"], upright_from_lidar: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Convert poses of the LiDAR to gravity-aligned poses of the sensor in a level world."""
+    """Convert poses of the LiDAR to gravity-aligned poses of the sensor in a world whose z axis points up."""
     path = DrivenPath(odometry @ inverse(upright_from_lidar), tilted=is_tilted(upright_from_lidar))
     poses = path.poses.copy()
     poses[:, :3] = path.level @ poses[:, :3]
@@ -142,13 +149,13 @@ def level_odometry(
 
 
 def _integrals(positions: Float[np.ndarray, "n 3"], guessed_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m s"]:
-    """Integrals over each step of a path, one step fewer than positions. s is `SUMS`."""
+    """Integrals over each step of a path, `SUMS` of them. There is one step fewer than positions."""
     steps, middles = np.diff(positions, axis=0), (positions[:-1] + positions[1:]) / 2
-    moved_m, guesses_m = np.linalg.norm(steps, axis=1), np.diff(guessed_m)
-    length_m = moved_m + guesses_m
+    measured_m, guess_m = np.linalg.norm(steps, axis=1), np.diff(guessed_m)
+    length_m = measured_m + guess_m
     products = steps[:, :, None] * steps[:, None]
-    horizontal = guesses_m[:, None, None] * np.diag([1.0, 1.0, 0.0])
-    directions = products / np.maximum(moved_m, 1e-12)[:, None, None] + horizontal
+    guessed_products = guess_m[:, None, None] * np.diag([1.0, 1.0, 0.0])  # in any horizontal direction
+    directions = products / np.maximum(measured_m, 1e-12)[:, None, None] + guessed_products
     squares = length_m[:, None, None] * (middles[:, :, None] * middles[:, None] + products / 12)
-    halves = (matrices[:, *UPPER] for matrices in (directions, squares))
-    return np.concatenate([length_m[:, None], length_m[:, None] * middles, *halves], axis=1)
+    columns = [length_m[:, None], length_m[:, None] * middles, directions[:, *UPPER], squares[:, *UPPER]]
+    return np.concatenate(columns, axis=1)

@@ -20,7 +20,7 @@ def gtsam_library() -> ModuleType:
 
 
 class FactorGraph:
-    """Factors between poses of nodes, and the first estimates of these poses."""
+    """Graph of nodes with unknown poses: factors (measured poses between nodes), and first estimates of the poses."""
 
     def __init__(self):
         self._gtsam = gtsam_library()
@@ -36,7 +36,7 @@ class FactorGraph:
     def add_step(
         self, before: int, after: int, step: Float[np.ndarray, "4 4"], *, metres: float, radians: float
     ) -> None:
-        """Connect two nodes by odometry, with the standard deviations of `step_deviations`."""
+        """Connect two nodes by odometry: pose of the later in the earlier node, and standard deviations by axis."""
         self._connect(before, after, step, self._gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3)))
 
     def add_loop(
@@ -48,8 +48,8 @@ class FactorGraph:
         *,
         cauchy: float | None = None,
     ) -> None:
-        """Connect two nodes by a loop. With `cauchy`, the residual in standard deviations at which it has half its
-        weight, its cost is robust."""
+        """Connect two nodes by a loop. `cauchy` makes its cost robust: at this residual, in standard deviations, a
+        loop has half its weight."""
         noise = self._gtsam.noiseModel.Gaussian.Covariance(rotation_first(covariance))
         if cauchy is not None:
             robust = self._gtsam.noiseModel.mEstimator.Cauchy(cauchy)
@@ -61,6 +61,6 @@ class FactorGraph:
 
 
 def rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance with rotation before translation, as in gtsam."""
+    """Return a covariance of x, y, z and then rotations with rotations first, the order of gtsam."""
     order = np.array([3, 4, 5, 0, 1, 2])
     return covariance[np.ix_(order, order)]

@@ -14,21 +14,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.drift import step_deviations
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import are_rotations, from_quaternions, inverse, quaternions
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
-UPPER = np.triu_indices(6)
-"""Indices of the 21 numbers of an information matrix, row by row, translation before rotation."""
+UPPER_TRIANGLE = np.triu_indices(6)
+"""Indices of the 21 numbers of an information matrix in a g2o file: upper triangle by rows, translation first."""
 Ids = Sequence[str] | Mapping[int, str]
-"""Id of each frame, by its number."""
+"""Id or recording of each frame, by frame number."""
 CSV_COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
-CSV_RECORDINGS = ("query_recording", "match_recording")
-"""Further columns of a table of several recordings."""
+CSV_RECORDING_COLUMNS = ("query_recording", "match_recording")
+"""Further columns of a table of loops between several recordings."""
 
 
 class Graph(NamedTuple):
@@ -36,7 +36,7 @@ class Graph(NamedTuple):
 
     poses: dict[int, Float[np.ndarray, "4 4"]]
     edges: list[tuple[int, int, Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]]
-    """First frame, second frame, pose of the second in the first, and information matrix, translation first."""
+    """First vertex, second vertex, pose of the second in the first, and information matrix, translation first."""
 
 
 def write_g2o(
@@ -59,58 +59,60 @@ def write_g2o(
     Raises WriteError if the file cannot be written.
     """
     lines = [f"# {comment}" for comment in comments]
-    for vertices, odometry in chains:
+    for vertices, odometry in chains:  # of one session each
         lines += [f"{VERTEX} {i} {pose}" for i, pose in zip(vertices, _pose_texts(odometry), strict=True)]
         steps = _pose_texts(inverse(odometry[:-1]) @ odometry[1:])
+        # metres and radians of each step, each three times: x, y, z, then rotations about x, y, z
         variances = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
         for (i, j), step, variance in zip(itertools.pairwise(vertices), steps, variances, strict=True):
-            lines.append(f"{EDGE} {i} {j} {step} {_nine_digits(np.diag(1 / variance)[UPPER])}")
+            lines.append(f"{EDGE} {i} {j} {step} {_rounded_text(np.diag(1 / variance)[UPPER_TRIANGLE])}")
     for loop, pose in zip(loops, _pose_texts([loop.match_from_query for loop in loops]), strict=True):
-        lines.append(f"{EDGE} {loop.match} {loop.query} {pose} {_nine_digits(loop.information[UPPER])}")
+        lines.append(f"{EDGE} {loop.match} {loop.query} {pose} {_rounded_text(loop.information[UPPER_TRIANGLE])}")
     write_text(Path(path), "".join(f"{line}\n" for line in lines))
 
 
 def read_g2o(path: Path | str) -> Graph:
     """Read vertices and edges of a g2o file (`VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`). Other lines are ignored.
 
-    If the edges have no information matrix, they get the unit matrix.
+    Edges without an information matrix, 9 numbers instead of 30, get the unit matrix.
 
     Raises:
       FileNotFoundError: If the file does not exist.
       ValueError: If a line has too few numbers or repeats a vertex. The message names the line.
     """
-    path, graph, columns = Path(path), Graph({}, []), 0
+    path, graph = Path(path), Graph({}, [])
+    edge_columns = 0  # numbers of an edge, set by the first one
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a g2o file, found none")
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         words, where = line.split(), f"{path}, line {number}"
         if words and words[0] == VERTEX:
-            values = numbers_of(words[1:], columns=8, where=where)
-            (frame,) = _frames(values[:1], where)
+            values = parse_numbers(words[1:], columns=8, where=where)
+            (frame,) = _frame_numbers(values[:1], where)
             if frame in graph.poses:
                 raise ValueError(f"{where}: expected each vertex once, found vertex {frame} again")
-            graph.poses[frame] = _pose(values[1:], where)
+            graph.poses[frame] = _pose_of_numbers(values[1:], where)
         elif words and words[0] == EDGE:
-            columns = columns or (9 if len(words) == 10 else 30)  # the same for all: another line is cut
-            values = numbers_of(words[1:], columns=columns, where=where)
+            edge_columns = edge_columns or (9 if len(words) == 10 else 30)  # a later edge with fewer is cut off
+            values = parse_numbers(words[1:], columns=edge_columns, where=where)
             information = np.eye(6)
-            if columns == 30:
-                information[UPPER] = values[9:]
-                information = np.triu(information, 1).T + information
-            first, second = _frames(values[:2], where)
-            graph.edges.append((first, second, _pose(values[2:9], where), information))
+            if edge_columns == 30:
+                information[UPPER_TRIANGLE] = values[9:]
+                information += np.triu(information, 1).T  # make it symmetric
+            first, second = _frame_numbers(values[:2], where)
+            graph.edges.append((first, second, _pose_of_numbers(values[2:9], where), information))
     return graph
 
 
-def _frames(values: Float[np.ndarray, " n"], where: str) -> list[int]:
-    """Frame numbers. Raises ValueError if a value is negative or not an integer."""
+def _frame_numbers(values: Float[np.ndarray, " n"], where: str) -> list[int]:
+    """Return numbers of a g2o line as frame numbers. Raises ValueError if one is negative or not an integer."""
     if (values < 0).any() or (values != np.round(values)).any():
         raise ValueError(f"{where}: expected frames, counted from 0, found {' '.join(map(str, values))}")
     return [int(value) for value in values]
 
 
-def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
-    """Pose of x y z qx qy qz qw."""
+def _pose_of_numbers(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
+    """Return the pose of x y z qx qy qz qw. Raises ValueError if the quaternion is not of length 1 (within 0.01)."""
     with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
         length = np.linalg.norm(values[3:])
     if abs(length - 1) > 0.01:
@@ -127,17 +129,15 @@ def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[
 def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
     """Write a KITTI file: 12 numbers a line, in KITTI's camera axes (x right, y down, z forward)."""
     camera = CAMERA_FROM_LIDAR @ poses @ CAMERA_FROM_LIDAR.T
-    write_text(Path(path), "".join(f"{_all_digits(pose[:3].reshape(-1))}\n" for pose in camera))
+    write_text(Path(path), "".join(f"{_exact_text(pose[:3].reshape(-1))}\n" for pose in camera))
 
 
 def write_loops_csv(path: Path | str, loops: Sequence[LoopClosure], recordings: Ids | None = None) -> None:
-    """Write a csv table with the columns `CSV_COLUMNS`. The overlap is empty if it is unknown.
-
-    If the `recordings` of the frames are given, the table also has the columns `CSV_RECORDINGS`.
-    """
+    """Write a csv table with the columns `CSV_COLUMNS`. The overlap is empty if it is unknown. If the `recordings` of
+    the frames are given, the table also has the columns `CSV_RECORDING_COLUMNS`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(CSV_COLUMNS if recordings is None else (*CSV_COLUMNS, *CSV_RECORDINGS))
+    table.writerow(CSV_COLUMNS if recordings is None else (*CSV_COLUMNS, *CSV_RECORDING_COLUMNS))
     for loop, pose in zip(loops, _pose_texts([loop.match_from_query for loop in loops]), strict=True):
         overlap = "" if loop.overlap is None else f"{loop.overlap:.4f}"
         names = [] if recordings is None else [recordings[loop.query], recordings[loop.match]]
@@ -158,24 +158,28 @@ def write_loops_jsonl(
 def loop_lines(
     loops: Sequence[LoopClosure | RejectedClosure], ids: Ids | None = None, recordings: Ids | None = None
 ) -> str:
-    """Return a line of JSON for each loop or rejected pair, with ids and recordings of its frames if they are given."""
+    """Return a line of JSON for each loop or rejected pair, with ids and recordings of its frames if they are given. A
+    rejected pair has a reason but no covariance."""
     lines = []
     for closure in loops:
         loop = closure.loop if isinstance(closure, RejectedClosure) else closure
-        fields = ("match_from_query", "covariance", "probability", "overlap")
         row: dict[str, Any] = {"query": loop.query, "match": loop.match}
         for suffix, names in (("id", ids), ("recording", recordings)):
             if names is not None:
                 row |= {f"query_{suffix}": names[loop.query], f"match_{suffix}": names[loop.match]}
         if isinstance(closure, RejectedClosure):
-            row["reason"], fields = closure.reason, ("probability", "overlap", "match_from_query")
+            row["reason"] = closure.reason
+            fields = ("probability", "overlap", "match_from_query")
+        else:
+            fields = ("match_from_query", "covariance", "probability", "overlap")
         row |= {name: getattr(loop, name) for name in fields}
         lines.append(json.dumps(row, default=np.ndarray.tolist) + "\n")
     return "".join(lines)
 
 
 def read_loops_jsonl(path: Path | str) -> list[LoopClosure]:
-    """Read the loops of a file of `write_loops_jsonl`. Raises the errors of `read_g2o`."""
+    """Read the loops of a file of `write_loops_jsonl`. Raises FileNotFoundError, or ValueError, which names the line,
+    if a line is not a valid loop."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
@@ -184,7 +188,7 @@ def read_loops_jsonl(path: Path | str) -> list[LoopClosure]:
 
 
 def _loop_of_json(line: bytes, where: str) -> LoopClosure:
-    """Loop of a line. Raises ValueError if it has no valid loop."""
+    """Parse a line of `loop_lines`. Raises ValueError, which names the place `where`, if it is not a valid loop."""
     value = parse_json(line, source=where)
     try:
         query, match = value["query"], value["match"]
@@ -205,18 +209,19 @@ def _loop_of_json(line: bytes, where: str) -> LoopClosure:
 
 
 def _pose_texts(poses: Sequence[np.ndarray] | Float[np.ndarray, "n 4 4"]) -> list[str]:
-    """x y z qx qy qz qw of each pose, with all digits: coordinates in a country's grid have seven before the point."""
+    """Return `x y z qx qy qz qw` of each pose, with all digits: map coordinates may have seven before the point."""
     if not len(poses):
         return []
     poses = np.asarray(poses, np.float64)
-    return [_all_digits(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
+    return [_exact_text(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
 
 
-def _all_digits(values: Float[np.ndarray, " n"]) -> str:
-    """Shortest text that reads back as the same float64 values."""
+def _exact_text(values: Float[np.ndarray, " n"]) -> str:
+    """Return numbers as text: nine digits if these read back as the same float64, otherwise all digits."""
     texts = ((value, f"{value:.9g}") for value in values.tolist())
     return " ".join(text if float(text) == value else repr(value) for value, text in texts)
 
 
-def _nine_digits(values: Float[np.ndarray, " n"]) -> str:
+def _rounded_text(values: Float[np.ndarray, " n"]) -> str:
+    """Return numbers as text with nine digits."""
     return " ".join(f"{value:.9g}" for value in values)

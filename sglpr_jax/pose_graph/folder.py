@@ -10,27 +10,26 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.warning import warn
-from sglpr_jax.files import file_name, text_bytes, write_all, write_json
+from sglpr_jax.files import file_name, text_bytes, warn, write_all, write_json
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, renumbered
 from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.result import LoopSearchResult
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import Ids, write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements
 
-GRAPH, LINES, TABLE = "loops.g2o", "loops.jsonl", "loops.csv"
+LOOPS_G2O, LOOPS_JSONL, LOOPS_CSV = "loops.g2o", "loops.jsonl", "loops.csv"
 REJECTED = "rejected.jsonl"
 FRAMES = "frames.json"
-"""Transforms between the frames of several sessions."""
+"""File of the transforms between the frames of several sessions."""
 TRAJECTORIES = ("trajectory.tum", "trajectory.kitti", "trajectory-optimized.tum", "trajectory-optimized.kitti")
 FIRST_VERTEX = 1_000_000
-"""Number of the first vertex of the second session, at least. The third one begins at twice this number."""
+"""Minimum offset between the vertex numbers of consecutive sessions."""
 Writers = dict[str, Callable[[Path], object]]
-"""Function that writes a file to a path, by file name (`files.write_all`)."""
+"""For each file name, a function that writes the file to a path (argument of `files.write_all`)."""
 
 
-def write_found(
+def write_loop_folder(
     result: LoopSearchResult,
     folder: Path | str,
     *,
@@ -39,13 +38,13 @@ def write_found(
 ) -> list[Path]:
     """Write loops as g2o, JSON lines and csv, rejected pairs as JSON lines, and trajectories if there is odometry.
 
-    Frames have the numbers of the whole recording (`Recording.numbers`), also if scans without a pose were left out.
-    Trajectories are written as TUM and KITTI. Their times are those of the recording or, without times, the frame
-    numbers. Trajectories of earlier runs that this call does not overwrite stay, and a warning names them.
+    Frames keep their numbers in the recording (`Recording.numbers`), also if scans without a pose were removed.
+    Trajectories are written as TUM and KITTI, with the frame numbers as times if the recording has no times. If
+    trajectories of an earlier run remain, a warning names them.
 
-    Several sessions share one graph and one table, whose frames are vertices (`vertices`). Names of recordings are
-    added, and the transforms between their frames are written. Vertices and corrected trajectories of sessions with a
-    common place are in the frame of the first of these sessions.
+    Several sessions share one graph and one table, whose frames are named by `vertex_numbers`. The names of the
+    recordings and the transforms between their frames are written, too. Sessions with a common place are in the frame
+    of the first of them.
 
     Arguments:
       result: Loops within and between sessions.
@@ -58,30 +57,30 @@ def write_found(
 
     Raises WriteError if a file cannot be written. All files of an earlier run then stay as they were.
     """
-    folder, names, numbers, placed = Path(folder), unique_names(result), vertices(result), placements(result)
-    ids, recordings, chains = dict[int, str](), dict[int, str](), []
-    for name, rows, (_, group_from_session), session in zip(names, numbers, placed, result.sessions, strict=True):
-        ids |= zip(rows.tolist(), session.recording.ids, strict=True)
-        recordings |= dict.fromkeys(rows.tolist(), name)
+    folder, names, numbers, placed = Path(folder), unique_names(result), vertex_numbers(result), placements(result)
+    ids, recordings = dict[int, str](), dict[int, str]()  # by vertex number
+    chains = []  # vertex numbers and poses of each session with odometry
+    for name, vertices, (_, group_from_session), session in zip(names, numbers, placed, result.sessions, strict=True):
+        ids |= zip(vertices.tolist(), session.recording.ids, strict=True)
+        recordings |= dict.fromkeys(vertices.tolist(), name)
         if session.odometry is not None:
-            chains.append((rows[: session.frames], group_from_session @ session.odometry[: session.frames]))
+            chains.append((vertices[: session.frames], group_from_session @ session.odometry[: session.frames]))
     named: dict[str, Any] = {"ids": ids, "recordings": recordings if len(names) > 1 else None}
     loops = [renumbered(loop, numbers) for loop in result.loops]
-    rejected = [dataclasses.replace(one, loop=renumbered(one.loop, numbers)) for one in result.rejected]
+    rejected = [dataclasses.replace(pair, loop=renumbered(pair.loop, numbers)) for pair in result.rejected]
     comments = _comments(result, names, numbers) if len(names) > 1 else []
     files = graph_files(loops, rejected, chains, drift=result.sessions[0].drift, comments=comments, **named)
-    files[LINES] = partial(write_loops_jsonl, loops=loops, **named)
+    files[LOOPS_JSONL] = partial(write_loops_jsonl, loops=loops, **named)
     if len(names) > 1:
         files[FRAMES] = partial(write_json, value=_frames_json(result, names, numbers))
-    files |= _trajectories(result, names, optimized)
+    files |= _trajectory_files(result, names, optimized)
     files |= {name: partial(Path.write_bytes, data=text_bytes(text)) for name, text in texts.items()}
     written = write_all(folder, files)
-    older = {path.name for path in folder.glob("trajectory-*.*")} - set(TRAJECTORIES)
-    others = [
-        name for name in (*TRAJECTORIES, *sorted(older), FRAMES) if name not in files and (folder / name).exists()
-    ]
-    if others:
-        warn(f"{folder}: {', '.join(others)} are from an earlier run and do not belong to these loops")
+    session_trajectories = {path.name for path in folder.glob("trajectory-*.*")} - set(TRAJECTORIES)
+    possible = (*TRAJECTORIES, *sorted(session_trajectories), FRAMES)
+    outdated = [name for name in possible if name not in files and (folder / name).exists()]
+    if outdated:
+        warn(f"{folder}: {', '.join(outdated)} are from an earlier run and do not belong to these loops")
     return written
 
 
@@ -95,16 +94,17 @@ def graph_files(
     ids: Ids | None = None,
     recordings: Ids | None = None,
 ) -> Writers:
-    """Writers of the graph, the table and the rejected pairs. See `write_g2o` for the arguments."""
+    """Return writers of the graph (g2o), the table of loops (csv) and the rejected pairs (JSON lines). `chains`,
+    `drift` and `comments` are arguments of `write_g2o`, `ids` and `recordings` of `loop_lines`."""
     return {
-        GRAPH: partial(write_g2o, loops=loops, chains=chains, drift=drift, comments=comments),
-        TABLE: partial(write_loops_csv, loops=loops, recordings=recordings),
+        LOOPS_G2O: partial(write_g2o, loops=loops, chains=chains, drift=drift, comments=comments),
+        LOOPS_CSV: partial(write_loops_csv, loops=loops, recordings=recordings),
         REJECTED: partial(write_loops_jsonl, loops=rejected, ids=ids, recordings=recordings),
     }
 
 
 def unique_names(result: LoopSearchResult) -> list[str]:
-    """Names of the recordings. A repeated name gets the suffix ~2, ~3 and so on."""
+    """Return the name of each session's recording. A repeated name gets the suffix ~2, ~3 and so on."""
     names: list[str] = []
     for session in result.sessions:
         name, number = session.recording.name, 2
@@ -114,62 +114,67 @@ def unique_names(result: LoopSearchResult) -> list[str]:
     return names
 
 
-def vertices(result: LoopSearchResult) -> list[Int[np.ndarray, " _"]]:
-    """Vertex of each scan in the graph: the scan's number plus a multiple of `FIRST_VERTEX`, the same for a session.
+def vertex_numbers(result: LoopSearchResult) -> list[Int[np.ndarray, " _"]]:
+    """Return the number of each scan's vertex in the graph, for each session.
 
-    If a recording has more scans, the multiple is of the next power of ten.
+    It is the scan's number plus an offset: 0, 1, 2, ... times `FIRST_VERTEX`, for the first, second, third session. If
+    a scan number is as large as that, the next power of ten that exceeds it is used instead.
     """
-    numbers = [session.recording.numbers for session in result.sessions]
-    largest, step = max(int(rows.max(initial=0)) for rows in numbers), FIRST_VERTEX
+    scan_numbers = [session.recording.numbers for session in result.sessions]
+    largest = max(int(numbers.max(initial=0)) for numbers in scan_numbers)
+    step = FIRST_VERTEX
     while step <= largest:
         step *= 10
-    return [rows + number * step for number, rows in enumerate(numbers)]
+    return [numbers + session * step for session, numbers in enumerate(scan_numbers)]
 
 
 def _frames_json(
     result: LoopSearchResult, names: Sequence[str], numbers: Sequence[Int[np.ndarray, " _"]]
 ) -> dict[str, Any]:
-    """Recordings with their first vertices, and transforms between their frames, as a JSON value."""
+    """Return the content of `FRAMES`: recordings with their vertex offsets, and transforms between their frames.
+    `numbers` is the result of `vertex_numbers`."""
 
-    def frame(segment: TrajectorySegment) -> dict[str, Any]:
-        """The frame of a segment, and the first and the last scan whose poses are known in it."""
+    def describe_frame(segment: TrajectorySegment) -> dict[str, Any]:
+        """Return the name of a segment's frame, and the first and the last scan with a pose in this frame."""
         scans = result.sessions[segment.session].recording.numbers
         first, last = int(scans[segment.first]), int(scans[segment.last])
         return {"frame": "odometry" if segment.is_odometry else f"LiDAR at scan {first}", "first": first, "last": last}
 
     recordings = [
-        {"name": name, "scans": session.frames, "first_vertex": int(rows[0] - session.recording.numbers[0])}
-        for name, rows, session in zip(names, numbers, result.sessions, strict=True)
+        {"name": name, "scans": session.frames, "first_vertex": int(vertices[0] - session.recording.numbers[0])}
+        for name, vertices, session in zip(names, numbers, result.sessions, strict=True)
     ]
     transforms = [
         {
-            "match_recording": names[aligned.match.session],
-            "query_recording": names[aligned.query.session],
-            "match_frame": frame(aligned.match),
-            "query_frame": frame(aligned.query),
-            "match_from_query": aligned.match_from_query.tolist(),
-            "covariance": aligned.covariance.tolist(),
-            "loops": aligned.loops,
+            "match_recording": names[transform.match.session],
+            "query_recording": names[transform.query.session],
+            "match_frame": describe_frame(transform.match),
+            "query_frame": describe_frame(transform.query),
+            "match_from_query": transform.match_from_query.tolist(),
+            "covariance": transform.covariance.tolist(),
+            "loops": transform.loops,
         }
-        for aligned in result.transforms
+        for transform in result.transforms
     ]
-    apart = [pair for pair in result.pairs if not result.between(*pair).transforms]
-    no_common_place = [[names[match], names[query]] for match, query in apart]
+    no_common_place = [
+        [names[match], names[query]] for match, query in result.pairs if not result.between(match, query).transforms
+    ]
     return {"recordings": recordings, "transforms": transforms, "no_common_place": no_common_place}
 
 
 def _comments(result: LoopSearchResult, names: Sequence[str], numbers: Sequence[Int[np.ndarray, " _"]]) -> list[str]:
-    """Lines that state the vertices and the frame of each session."""
+    """Return comment lines that state the vertex numbers and the frame of each session."""
     lines = []
-    for name, rows, (group, _), session in zip(names, numbers, placements(result), result.sessions, strict=True):
-        offset = int(rows[0] - session.recording.numbers[0])
+    for name, vertices, (group, _), session in zip(names, numbers, placements(result), result.sessions, strict=True):
+        offset = int(vertices[0] - session.recording.numbers[0])
         frame = f"; poses in the frame of {names[group]}" if session.odometry is not None else ""
         lines.append(f"{name}: vertex = {offset} + number of the scan{frame}")
     return lines
 
 
-def _trajectories(result: LoopSearchResult, names: Sequence[str], optimized: OptimizedTrajectory | None) -> Writers:
-    """Writers of the odometry and of the corrected trajectories. Names of several sessions are part of a file name."""
+def _trajectory_files(result: LoopSearchResult, names: Sequence[str], optimized: OptimizedTrajectory | None) -> Writers:
+    """Return writers of the odometry and of the corrected trajectories of all sessions. If there are several sessions,
+    their names are part of the file names."""
     files: Writers = {}
     corrected = [None] * len(names) if optimized is None else result.split(optimized.poses)
     for name, session, optimized_poses in zip(names, result.sessions, corrected, strict=True):

@@ -1,7 +1,6 @@
 """Correction of a trajectory while it is driven: an incremental pose graph, solved by gtsam's iSAM2 (extra `gtsam`).
 
-`optimize` solves a graph of all frames and loops at the end, and removes wrong loops. Here a robust cost (Cauchy)
-limits the influence of a wrong loop.
+A robust cost (Cauchy) limits the influence of a wrong loop. `optimize` solves the whole graph at the end instead.
 """
 
 import bisect
@@ -14,7 +13,7 @@ from jaxtyping import Float
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.drift import step_deviations
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.factor_graph import FactorGraph, gtsam_library, rotation_first
 from sglpr_jax.se3 import inverse
 
@@ -25,7 +24,7 @@ NODE_EVERY_M = 5.0
 LOOP_EVERY_M = 50.0
 """Minimum travelled distance between two loops in the graph that agree with it, in metres. It limits the growth of time
 and memory on routes that are driven again and again."""
-AGREES = 4.0
+AGREEMENT_SIGMAS = 4.0
 """Maximum residual of a loop that agrees with the graph, in standard deviations. Of right loops, 99 % have less."""
 RELINEARIZE = 0.1
 """Change of a pose after which its factors are linearised again, in metres and radians."""
@@ -34,9 +33,9 @@ RELINEARIZE = 0.1
 class IncrementalTrajectory:
     """A trajectory of odometry that loops correct frame by frame.
 
-    The loops should come from a `LoopDetector` with the same odometry, which rejects loops that contradict it. A
-    segment, a part whose motion is known, enters the graph as soon as a loop connects it with a segment in the graph.
-    The graph has a node every few metres. A loop connects the nodes before its query and its match.
+    The loops should come from a `LoopDetector` with the same odometry, which rejects loops that contradict it. The
+    graph has a node every few metres, and a loop connects the nodes before its query and its match. Where the motion is
+    unknown, a new segment begins. It enters the graph when a loop connects it with a segment in the graph.
 
     Example:
       trajectory = IncrementalTrajectory()
@@ -52,18 +51,14 @@ class IncrementalTrajectory:
         settings.setRelinearizeThreshold(RELINEARIZE)
         settings.relinearizeSkip = 1
         self._solver = self._gtsam.ISAM2(settings)
-        self._graph = FactorGraph()
-        """Factors and nodes since the last update of the solver."""
+        self._graph = FactorGraph()  # factors and nodes since the last update of the solver
         self._odometry = GrowingArray(np.empty((0, 4, 4)))
         self._travelled = GrowingArray(np.empty(0))
-        self._nodes: list[int] = []
-        self._segments: list[int] = []
-        """Frame and segment of each node. The keys of the graph are these frames."""
-        self._connected = {0}
-        """Segments in the graph."""
-        self._waiting: list[LoopClosure] = []
-        """Loops between segments that are not in the graph."""
-        self._last_query = 0
+        self._node_frames: list[int] = []  # frame of each node. Nodes are named by their frames, also in the graph.
+        self._node_segments: list[int] = []  # segment of each node, counted from 0
+        self._segments_in_graph = {0}  # segments whose nodes are in the graph
+        self._waiting_loops: list[LoopClosure] = []  # loops between two segments that are not in the graph
+        self._last_query_node = 0  # node of the query of the last loop in the graph
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -71,91 +66,102 @@ class IncrementalTrajectory:
 
     @property
     def map_from_world(self) -> Float[np.ndarray, "4 4"] | None:
-        """Correction of the odometry at the last frame. None if no loop connects its segment with the first one."""
-        return self._correction(self._nodes[-1]) if self._segments[-1] in self._connected else None
+        """Transform from the odometry's frame to the map at the last frame. None if its segment is not in the graph."""
+        if self._node_segments[-1] not in self._segments_in_graph:
+            return None
+        return self._correction_at(self._node_frames[-1])
 
     @property
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
-        """Corrected pose of the LiDAR at each frame. NaN in segments that no loop connects with the first one."""
+        """Corrected pose of the LiDAR at each frame. NaN in segments that loops do not connect with the first."""
         poses = np.full((len(self), 4, 4), np.nan)
-        for node, end, segment in zip(self._nodes, [*self._nodes[1:], len(self)], self._segments, strict=True):
-            if segment in self._connected:
-                poses[node:end] = self._correction(node) @ self._odometry.rows[node:end]
+        ends = [*self._node_frames[1:], len(self)]
+        for node, end, segment in zip(self._node_frames, ends, self._node_segments, strict=True):
+            if segment in self._segments_in_graph:
+                poses[node:end] = self._correction_at(node) @ self._odometry.rows[node:end]
         return poses
 
     def add(
         self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[LoopClosure] = (), *, continues: bool = True
     ) -> None:
-        """Add the pose of the LiDAR by odometry at the next frame, and new loops of this and of earlier frames.
-
-        With `continues=False`, the motion since the last frame is unknown, and the odometry may begin in another frame.
-        """
-        frame, before = len(self), self._odometry.rows[-1:]
+        """Add the pose of the LiDAR by odometry at the next frame, and new loops of this and of earlier frames. With
+        `continues=False`, the motion since the last frame is unknown, and the odometry may begin in another frame."""
+        frame = len(self)
+        travelled_m = 0.0
+        if frame:
+            travelled_m = float(self._travelled.rows[-1])
+            if continues:
+                travelled_m += float(np.linalg.norm(world_from_lidar[:3, 3] - self._odometry.rows[-1, :3, 3]))
         self._odometry.append(world_from_lidar)
-        step = float(np.linalg.norm(world_from_lidar[:3, 3] - before[-1, :3, 3])) if frame and continues else 0.0
-        self._travelled.append(self._travelled.rows[-1] + step if frame else 0.0)
+        self._travelled.append(travelled_m)
         if not frame:
-            self._nodes, self._segments = [0], [0]
+            self._node_frames, self._node_segments = [0], [0]
             self._graph.add_node(0, world_from_lidar, fixed=True)
         else:
-            last, segment = self._nodes[-1], self._segments[-1] + (not continues)
-            if not continues or self._travelled.rows[-1] - self._travelled.rows[last] >= NODE_EVERY_M:
-                self._nodes.append(frame)
-                self._segments.append(segment)
-                if continues and segment in self._connected:
-                    self._graph.add_node(frame, self._correction(last) @ world_from_lidar)
+            last = self._node_frames[-1]
+            segment = self._node_segments[-1] + (not continues)  # one more if the motion is unknown
+            if not continues or travelled_m - self._travelled.rows[last] >= NODE_EVERY_M:
+                self._node_frames.append(frame)
+                self._node_segments.append(segment)
+                if continues and segment in self._segments_in_graph:
+                    self._graph.add_node(frame, self._correction_at(last) @ world_from_lidar)
                     self._add_step(last, frame)
-        self._waiting += loops
-        self._use_loops()
+        self._waiting_loops += loops
+        self._add_waiting_loops()
         if self._graph.estimates.size() or self._graph.factors.size():
             self._solver.update(self._graph.factors, self._graph.estimates)
-            self._graph = FactorGraph()
+            self._graph = FactorGraph()  # the solver has these factors now
 
-    def _use_loops(self) -> None:
-        """Add loops with an end in the graph. Others wait until another loop connects their segments."""
+    def _add_waiting_loops(self) -> None:
+        """Add the waiting loops with an end in the graph. Repeats, because each may connect a segment for others."""
         while True:
-            usable, waiting = [], []
-            for loop in self._waiting:
-                segments = {self._segment(loop.query), self._segment(loop.match)}
-                (waiting if segments.isdisjoint(self._connected) else usable).append(loop)
-            self._waiting = waiting
+            usable, unusable = [], []
+            for loop in self._waiting_loops:
+                segments = {self._segment_of(loop.query), self._segment_of(loop.match)}
+                loops = unusable if segments.isdisjoint(self._segments_in_graph) else usable
+                loops.append(loop)
+            self._waiting_loops = unusable
             if not usable:
                 return
             for loop in usable:
-                self._use(loop)
+                self._add_loop(loop)
 
-    def _use(self, loop: LoopClosure) -> None:
-        """Connect the nodes of a loop. The covariance is that of the loop, because the nodes are near its frames."""
-        query, match = self._node(loop.query), self._node(loop.match)
+    def _add_loop(self, loop: LoopClosure) -> None:
+        """Connect the nodes before query and match of a loop, of which at least one is in the graph. If the other node
+        is not, its segment enters the graph. A loop that adds no information is ignored. The covariance stays that of
+        the loop, because the nodes are near its frames."""
+        query, match = self._node_before(loop.query), self._node_before(loop.match)
         odometry = self._odometry.rows
         query_from_frame = inverse(odometry[query]) @ odometry[loop.query]
         match_from_frame = inverse(odometry[match]) @ odometry[loop.match]
         match_from_query = match_from_frame @ loop.match_from_query @ inverse(query_from_frame)
-        if self._segment(query) not in self._connected:
+        if self._segment_of(query) not in self._segments_in_graph:
             self._add_segment(query, self._pose(match) @ match_from_query)
-        elif self._segment(match) not in self._connected:
+        elif self._segment_of(match) not in self._segments_in_graph:
             self._add_segment(match, self._pose(query) @ inverse(match_from_query))
-        elif query == match or not self._is_useful(loop, query, match, match_from_query):
+        elif query == match or not self._adds_information(loop, query, match, match_from_query):
             return
-        self._last_query = query
+        self._last_query_node = query
         self._graph.add_loop(match, query, match_from_query, loop.covariance, cauchy=CAUCHY)
 
-    def _is_useful(self, loop: LoopClosure, query: int, match: int, match_from_query: Float[np.ndarray, "4 4"]) -> bool:
-        """Whether a loop between two nodes contradicts the graph, or no other loop was used for a while."""
-        if query == self._last_query:
+    def _adds_information(
+        self, loop: LoopClosure, query: int, match: int, match_from_query: Float[np.ndarray, "4 4"]
+    ) -> bool:
+        """Whether a loop contradicts the graph, or the last added loop is at least `LOOP_EVERY_M` of travel away."""
+        if query == self._last_query_node:
             return False
         travelled = self._travelled.rows
-        if abs(travelled[query] - travelled[self._last_query]) >= LOOP_EVERY_M:
+        if abs(travelled[query] - travelled[self._last_query_node]) >= LOOP_EVERY_M:
             return True
         error = inverse(match_from_query) @ inverse(self._pose(match)) @ self._pose(query)
         residual = self._gtsam.Pose3.Logmap(self._gtsam.Pose3(error))
-        return float(residual @ np.linalg.solve(rotation_first(loop.covariance), residual)) > AGREES**2
+        return float(residual @ np.linalg.solve(rotation_first(loop.covariance), residual)) > AGREEMENT_SIGMAS**2
 
     def _add_segment(self, node: int, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add the nodes of a segment to the graph. The pose of one node is known."""
-        segment = self._segment(node)
-        self._connected.add(segment)
-        nodes = [other for other in self._nodes if self._segment(other) == segment]
+        """Add all nodes of the segment of `node` to the graph, placed by the pose of `node` in the map."""
+        segment = self._segment_of(node)
+        self._segments_in_graph.add(segment)
+        nodes = [other for other in self._node_frames if self._segment_of(other) == segment]
         map_from_world = pose @ inverse(self._odometry.rows[node])
         for other in nodes:
             self._graph.add_node(other, map_from_world @ self._odometry.rows[other])
@@ -168,19 +174,20 @@ class IncrementalTrajectory:
         (metres,), (radians,) = step_deviations(poses, self._drift)
         self._graph.add_step(before, after, inverse(poses[0]) @ poses[1], metres=metres, radians=radians)
 
-    def _node(self, frame: int) -> int:
-        """Last node at or before a frame."""
-        return self._nodes[bisect.bisect_right(self._nodes, frame) - 1]
+    def _node_before(self, frame: int) -> int:
+        """Return the last node at or before a frame."""
+        return self._node_frames[bisect.bisect_right(self._node_frames, frame) - 1]
 
-    def _segment(self, frame: int) -> int:
-        return self._segments[bisect.bisect_right(self._nodes, frame) - 1]
+    def _segment_of(self, frame: int) -> int:
+        """Return the segment of a frame."""
+        return self._node_segments[bisect.bisect_right(self._node_frames, frame) - 1]
 
-    def _correction(self, node: int) -> Float[np.ndarray, "4 4"]:
-        """Correction of the odometry at a node in the graph."""
+    def _correction_at(self, node: int) -> Float[np.ndarray, "4 4"]:
+        """Return the transform from the odometry's frame to the map, at a node in the graph."""
         return self._pose(node) @ inverse(self._odometry.rows[node])
 
     def _pose(self, node: int) -> Float[np.ndarray, "4 4"]:
-        """Latest estimate of the pose of a node in the graph."""
+        """Return the latest estimate of a node's pose in the map."""
         if self._graph.estimates.exists(node):
             return self._graph.estimates.atPose3(node).matrix()
         return self._solver.calculateEstimatePose3(node).matrix()

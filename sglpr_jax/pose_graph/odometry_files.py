@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import TimeUnit
-from sglpr_jax.data.formats.pose_files import FORMATS, format_of
+from sglpr_jax.data.formats.pose_files import FORMATS, detect_pose_format
 from sglpr_jax.data.poses import poses_at_scans
 from sglpr_jax.data.readers.ros import ENDINGS
 from sglpr_jax.data.recording import Recording
@@ -38,20 +38,24 @@ def read_odometry(
 def read_stamped(
     path: Path, *, format: OdometryFormat = "auto", time_unit: TimeUnit = "auto"
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
-    """Read the poses of `read_odometry`, and their times in seconds. Only tum files have times."""
+    """Read the poses of an odometry file, and their times in seconds, or None if its format is not tum. Arguments and
+    errors are those of `read_odometry`."""
     check_value(format, OdometryFormat, f"{path}, format")
     check_value(time_unit, TimeUnit, f"{path}, time_unit")
     if path.suffix in ENDINGS:
         raise ValueError(f"{path}: expected a file of odometry, or the bag of the scans, found another bag")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected odometry, found {'a folder' if path.is_dir() else 'no file'}")
-    file_format = format if format != "auto" else "g2o" if path.suffix == ".g2o" else format_of(path)
+    file_format = format
+    if format == "auto":
+        file_format = "g2o" if path.suffix == ".g2o" else detect_pose_format(path)
     if file_format == "csv":
         raise ValueError(f"{path}: expected odometry with rotations, as tum, found csv")
     if file_format != "g2o":
         poses, times = FORMATS[file_format][1](path, time_unit)
     else:
-        vertices, times = read_g2o(path).poses, None
+        times = None
+        vertices = read_g2o(path).poses
         if sorted(vertices) != list(range(len(vertices))):
             raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without gaps, found others")
         poses = np.array([vertices[i] for i in range(len(vertices))])
@@ -60,13 +64,13 @@ def read_stamped(
     return poses, times
 
 
-def at_scans(
+def match_to_scans(
     recording: Recording, odometry: Float[np.ndarray, "n 4 4"], stamps: Float[np.ndarray, " n"] | None, path: Path
 ) -> tuple[Recording, Float[np.ndarray, "q 4 4"]]:
-    """Match odometry to the scans of a recording, row by row or, if its times differ, interpolated (`poses_at_scans`).
+    """Return the odometry at the scans of a recording: row by row or, if its times differ, interpolated.
 
-    Scans without a pose are removed from the recording, and `Recording.found` says so. The other scans keep their
-    numbers (`Recording.numbers`). Scans without times get those of the poses.
+    Scans without a pose are removed from the recording, which `Recording.found` reports. The other scans keep their
+    numbers (`Recording.numbers`). If the scans have no times, the recording gets those of the poses.
 
     Arguments:
       recording: The scans.
@@ -80,29 +84,29 @@ def at_scans(
     Raises ValueError if most scans have no pose, or if the numbers of poses and scans differ and times are missing.
     """
     matched = poses_at_scans(
-        str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
+        str(path), odometry, stamps, recording.times, scans=len(recording), item=f"scan of {recording.name}"
     )
     if recording.times is None and stamps is not None:
         message = f"times: from {path.name}"
         return dataclasses.replace(recording, times=stamps, found=(*recording.found, message)), matched.poses
-    if not matched.said:
+    if not matched.note:
         return recording, matched.poses
-    recording = only(recording, np.flatnonzero(matched.kept).tolist())
-    message = f"odometry: {len(odometry)} poses of {path.name}, {matched.said}"
+    recording = only(recording, np.flatnonzero(matched.has_pose).tolist())
+    message = f"odometry: {len(odometry)} poses of {path.name}, {matched.note}"
     return dataclasses.replace(recording, found=(*recording.found, message)), matched.poses
 
 
-def is_own(path: Path, root: Path) -> bool:
-    """Whether `path` is the bag of the recording at `root`, so that its own poses are the odometry."""
+def is_bag_of_recording(path: Path, root: Path) -> bool:
+    """Whether `path` is the bag of the recording at `root`, so that the bag's poses are the odometry."""
     path, root = path.resolve(), root.resolve()
     return path.exists() and (path == root or (path.suffix in ENDINGS and path.parent == root))
 
 
-def own_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
-    """Poses from the messages of the recording's bag, and the recording without them.
+def take_bag_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
+    """Return the recording of a bag without its poses, and these poses (n, 4, 4) as odometry.
 
-    The poses are removed, because loops found with them cannot be evaluated with them. Raises ValueError if the bag has
-    no poses, or if these have no rotations.
+    The recording loses them, because loops found with these poses must not be evaluated by them. Raises ValueError if
+    the bag has no poses, or poses without rotations.
     """
     if recording.world_from_lidar is None:
         raise ValueError(

@@ -70,17 +70,17 @@ def slam(
       print(result.trajectory.poses.shape, len(result.loops.loops))
     """
     gtsam_library()  # an error before the search
-    opened = recording if isinstance(recording, Recording) else open_recording(Path(recording))
+    scans = recording if isinstance(recording, Recording) else open_recording(Path(recording))
     folder = None if kept_in is None else Path(kept_in)
     poses = kiss_icp.scan_odometry(
-        opened,
+        scans,
         config=odometry,
         scale=scale,
         kept_in=None if folder is None else folder / "odometry.log",
         on_bad_scan=on_bad_scan,
     )
-    found = find_loops(
-        deskewed(opened, poses) if has_point_times(opened) else opened,
+    loops = find_loops(
+        deskewed(scans, poses) if has_point_times(scans) else scans,
         load(params) if isinstance(params, str) else params,
         odometry=poses,
         config=config,
@@ -89,4 +89,4 @@ def slam(
         on_bad_scan=on_bad_scan,
         kept_in=None if folder is None else folder / "loops",
     )
-    return Slam(poses, found, optimize_trajectory(found))
+    return Slam(poses, loops, optimize_trajectory(loops))

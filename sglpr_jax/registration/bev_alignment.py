@@ -1,7 +1,7 @@
-"""Registration of two images, and its covariance from the shape of the peak: small at a corner, long along a wall.
+"""Registration of two images, and its covariance from the shape of the correlation's peak.
 
-The covariance sums least squares at the peak, the extent of the ridge under it, and small fixed errors. The constants
-were fitted on simulated drives (`benchmarks/quality/poses.py`).
+The covariance is a sum: least squares at the peak, the length of the ridge of high correlation (as along a wall), and
+small fixed errors. The constants were fitted on simulated drives (`benchmarks/quality/poses.py`).
 """
 
 import functools
@@ -34,14 +34,14 @@ because each scan sees other sides of objects."""
 FLAT_M = 10.0
 """Standard deviation along a direction without curvature, in metres. The search covers no more."""
 RIDGE_DROP = 0.04
-"""Scale of the likelihood along the weak axis. The likelihood falls by a factor of e where the correlation, divided by
-the area that both images share, falls by this fraction of the peak."""
+"""Scale of the likelihood along the ridge. The likelihood falls by a factor of e where the correlation, divided by the
+area that both images share, falls by this fraction of the peak."""
 RIDGE_STEP_M, RIDGE_START_M = 1.0, 1.5
-"""Spacing of samples along the weak axis, and distance up to which the curvature alone counts, in metres."""
+"""Spacing of samples along the ridge, and distance from the peak below which samples do not count, in metres."""
 RIDGE_BAND = 0.25
 """Highest frequency of these samples, in cycles per cell. Higher frequencies take time and change nothing."""
 RIDGE_ACROSS, RIDGE_YAW = 0.02, 0.003
-"""Standard deviations across the weak axis (metres) and in yaw (radians), per metre along it."""
+"""Standard deviations across the ridge (metres) and in yaw (radians), per metre along it."""
 LEAST_POSITION_M, LEAST_YAW_DEG = 0.01, 0.03
 """Fixed standard deviations from the cell size and the tilt of the vehicle, in metres and degrees."""
 
@@ -56,15 +56,17 @@ def _peak_covariance(
 ) -> Float[Array, "3 3"]:
     """Covariance of (x, y, yaw) at a peak, from the negative Hessian and the height of the correlation there.
 
-    `occupied` is the number of cells of the image that has fewer.
+    `occupied` is the number of occupied cells of the image that has fewer. `apart_m` is the distance of the two scans.
+    `ridge` is the result of `_ridge_covariance`.
     """
     height = jnp.clip(correlation, 0.05, 0.999)
     noise = NOISE * (1 - height) / height * (1 / jnp.maximum(occupied, 1) + 1 / NOISE_CELLS)
     noise = noise * (1 + (apart_m / NOISE_RANGE_M) ** 2)
-    strengths, directions = jnp.linalg.eigh(curvature)
-    spread = noise / (jnp.maximum(strengths, 0) + noise / FLAT_M**2)
-    peak = (directions * spread[None]) @ directions.T
-    across_ridge = jnp.trace(ridge[:2, :2]) * np.array([RIDGE_ACROSS, RIDGE_ACROSS, RIDGE_YAW], np.float32) ** 2
+    curvatures, directions = jnp.linalg.eigh(curvature)
+    variances = noise / (jnp.maximum(curvatures, 0) + noise / FLAT_M**2)
+    peak = (directions * variances[None]) @ directions.T
+    ridge_m2 = jnp.trace(ridge[:2, :2])
+    across_ridge = ridge_m2 * np.array([RIDGE_ACROSS, RIDGE_ACROSS, RIDGE_YAW], np.float32) ** 2
     least = np.array([LEAST_POSITION_M, LEAST_POSITION_M, np.radians(LEAST_YAW_DEG)], np.float32) ** 2
     return peak + ridge + jnp.diag(across_ridge + least)
 
@@ -76,7 +78,7 @@ def _ridge_covariance(
     curvature: Float[Array, "3 3"],
     config: VerificationConfig,
 ) -> Float[Array, "3 3"]:
-    """Covariance of (x, y, yaw) along the weak axis of a peak, as far as the correlation stays high there.
+    """Covariance of (x, y, yaw) along the ridge of a peak: the direction in which the correlation falls least.
 
     Along a wall the correlation falls only because the two images share less area. In a bend the ridge rotates with the
     distance, so the best of several rotations counts. Samples beyond a minimum belong to another peak and count no more
@@ -85,38 +87,42 @@ def _ridge_covariance(
     Arguments:
       products: Fourier transforms (`rfft2`) of the correlation at each rotation of `yaws`.
       pose: x, y (metres) and yaw (radians) of the peak.
-      yaws: Rotations in radians, that of the peak first.
+      yaws: Rotations in radians. The first one is nearest to the peak and counts as its yaw.
       curvature: Negative Hessian of the correlation at the peak.
-      config: Settings of the comparison.
     """
-    steps = int(config.max_shift_m / RIDGE_STEP_M)
-    along_m = np.arange(-steps, steps + 1, dtype=np.float32) * np.float32(RIDGE_STEP_M)
-    turns = jnp.asarray(yaws - pose[2]).at[0].set(0.0)
-    yaw_part = curvature[:2, 2:] * curvature[2:, :2] / jnp.maximum(curvature[2, 2], 1e-4)
-    planar = curvature[:2, :2] - yaw_part  # curvature in x and y at the best yaw of each position
-    weak_axis = jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2 + np.float32(np.pi / 2)
-    heading = weak_axis + turns / 2  # the chord of an arc
-    shifts = along_m[None, :, None] * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)[:, None]
-    points = pose[None, None, :2] + shifts
+    middle = int(config.max_shift_m / RIDGE_STEP_M)  # index of the peak among the samples
+    along_m = np.arange(-middle, middle + 1, dtype=np.float32) * np.float32(RIDGE_STEP_M)
+    yaw_offsets = jnp.asarray(yaws - pose[2]).at[0].set(0.0)
+    # Curvature in x and y if each position has its best yaw. Its weak eigenvector is the direction of the ridge.
+    coupling = curvature[:2, 2:] * curvature[2:, :2] / jnp.maximum(curvature[2, 2], 1e-4)
+    planar = curvature[:2, :2] - coupling
+    ridge_angle = jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2 + np.float32(np.pi / 2)
+    headings = ridge_angle + yaw_offsets / 2  # a bent ridge is an arc, and its chord turns by half of the angle
+    shifts = along_m[None, :, None] * jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=1)[:, None]
+    points = pose[None, None, :2] + shifts  # samples by rotation, distance along the ridge, and axis
     area = _shared_area(jnp.hypot(points[..., 0], points[..., 1]), config.reach_m)
     heights = jax.vmap(functools.partial(_heights, cell_m=DENSITY_RESOLUTION_M))(products, points) / area
-    share = heights.max(0) / jnp.maximum(heights[0, steps], 1e-6)
-    share = jnp.concatenate([jax.lax.cummin(share[steps::-1])[::-1], jax.lax.cummin(share[steps:])[1:]])
+    share = heights.max(0) / jnp.maximum(heights[0, middle], 1e-6)
+    falling_before, falling_after = jax.lax.cummin(share[middle::-1])[::-1], jax.lax.cummin(share[middle:])
+    share = jnp.concatenate([falling_before, falling_after[1:]])
     best = heights.argmax(0)
-    apart = jnp.concatenate([shifts[best, np.arange(len(along_m))], turns[best][:, None]], axis=1)
+    offsets = jnp.concatenate([shifts[best, np.arange(len(along_m))], yaw_offsets[best][:, None]], axis=1)
     inside = (jnp.abs(points[0]).max(1) <= config.max_shift_m + RIDGE_STEP_M) | (along_m == 0)
     weight = jnp.where(inside, jnp.exp(-jnp.maximum(1 - share, 0) / RIDGE_DROP), 0)
-    outside = (np.abs(along_m) >= RIDGE_START_M).astype(np.float32)
-    return jnp.einsum("k,ki,kj->ij", weight * outside, apart, apart) / weight.sum()
+    beyond_peak = (np.abs(along_m) >= RIDGE_START_M).astype(np.float32)  # nearer samples are in the curvature
+    return jnp.einsum("k,ki,kj->ij", weight * beyond_peak, offsets, offsets) / weight.sum()
 
 
 def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m: float) -> Float[Array, " k"]:
-    """Low frequencies of a correlation at points (x, y) in metres, up to a common factor."""
+    """Correlation without high frequencies at points (x, y) in metres, up to a common factor.
+
+    `product` is the Fourier transform (`rfft2`) of the correlation. Only frequencies below `RIDGE_BAND` are used.
+    """
     size = product.shape[0]
     band = int(RIDGE_BAND * size)
     low = jnp.concatenate([product[-band:, :band], product[:band, :band]])
     phases = points * np.float32(2 * np.pi / (cell_m * size))
-    rows = jnp.exp(-1j * phases[:, 1:] * np.arange(-band, band, dtype=np.float32)[None])
+    rows = jnp.exp(-1j * phases[:, 1:] * np.arange(-band, band, dtype=np.float32)[None])  # rows run down, y runs up
     columns = jnp.exp(1j * phases[:, :1] * np.arange(band, dtype=np.float32)[None])
     counts = np.where(np.arange(band) == 0, 1, 2).astype(np.float32)  # half of a real image's spectrum is stored
     return ((rows @ low) * columns).real @ counts
@@ -137,31 +143,28 @@ class BevRegistration(NamedTuple):
     yaw: Float[AnyArray, "*b"]
     """Rotation of the query in the match's frame, in radians, counter-clockwise, from -pi to pi."""
     covariance: Float[AnyArray, "*b 3 3"]
-    """Covariance of x, y (metres) and yaw (radians), in the match's frame.
-
-    It follows the shape of the peak. That another peak may be the correct one does not count; see `second`.
-    """
+    """Covariance of x, y (metres) and yaw (radians), in the match's frame, if this peak is the correct one."""
     correlation: Float[AnyArray, "*b"]
     """Correlation at the peak: 1 for equal images, about 0 for unrelated ones."""
     second: Float[AnyArray, "*b"]
-    """Second-peak ratio: height of the second peak divided by the first. It is near 1 if another pose fits as well."""
+    """Second-peak ratio: correlation at the best other pose divided by that at this pose. It is near 1 if both fit."""
 
     @property
     def along_m(self) -> float:
-        """Standard deviation of the position of one alignment along its least certain direction, in metres."""
+        """Standard deviation of the position along its least certain direction, in metres. Not for arrays of poses."""
         return float(np.sqrt(np.linalg.eigvalsh(np.asarray(self.covariance)[:2, :2])[1]))
 
     def angle_to(self, yaw: float) -> float:
-        """Angle between the rotation and another one, in radians, from 0 to pi. NaN if the other one is unknown."""
+        """Angle between the yaw and another one, in radians, from 0 to pi. NaN if the other one is NaN."""
         return float(abs(wrap_angle(np.asarray(float(self.yaw) - float(yaw)))))
 
 
 REFINE_DEG = 3.0
-"""Range of the refinement to each side, in degrees, in `TURN_STEPS` steps."""
+"""Range of the refinement in rotation to each side, in degrees."""
 TURN_STEPS = 4
-"""Number of rotation steps of the refinement to each side."""
+"""Number of steps of this range."""
 RIDGE_TURNS = (0, 2, 6, 8)
-"""Indices of these rotations at which a bent ridge is searched."""
+"""Rotations at which a bent ridge is searched, besides that of the peak: indices from 0 to 2 * `TURN_STEPS`."""
 SHIFT_STEPS = 5
 """Number of steps of half a cell of the refinement to each side, in x and y."""
 
@@ -178,8 +181,9 @@ def align(
     Both are square images of counts in the orientation of eq. 1, with an even number of cells per side. Raises
     ValueError for other images.
     """
-    spectra = query_spectra(query, config=config), match_spectra(jnp.asarray(match)[None], config=config)
-    return refine(query, match, search(*spectra, config=config).at(0), config=config)
+    matches = match_spectra(jnp.asarray(match)[None], config=config)
+    peaks = search(query_spectra(query, config=config), matches, config=config)
+    return refine(query, match, peaks.at(0), config=config)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -190,36 +194,41 @@ def refine(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> BevRegistration:
-    """Register two images from a peak of `search`, on cells that are not merged. Raises the errors of `align`."""
-    second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
+    """Register two images near a peak of `search`, to a fraction of a cell. The images and errors are as in `align`."""
+    second_ratio = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
     query, match = prepare_image(query, config), prepare_image(match, config)
     pose, correlation, covariance = _refine_peak(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
     yaw = jnp.mod(pose[2] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return BevRegistration(pose[0], pose[1], yaw, covariance, correlation, second)
+    return BevRegistration(pose[0], pose[1], yaw, covariance, correlation, second_ratio)
 
 
 def _refine_peak(
     query: Float[Array, "m m"], match: Float[Array, "m m"], start: Float[Array, " 3"], config: VerificationConfig
 ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, "3 3"]]:
-    """Peak near the pose `start`: (x, y, yaw), its correlation, and the covariance of the pose."""
-    cell_m, step_rad = DENSITY_RESOLUTION_M, np.float32(np.radians(REFINE_DEG) / TURN_STEPS)
-    yaws = start[2] + jnp.arange(-TURN_STEPS, TURN_STEPS + 1) * step_rad
+    """Peak of the correlation near a pose `start`.
+
+    Returns its pose (x, y in metres, yaw in radians), its correlation, and the covariance of the pose.
+    """
+    cell_m, yaw_step = DENSITY_RESOLUTION_M, np.float32(np.radians(REFINE_DEG) / TURN_STEPS)
+    yaws = start[2] + jnp.arange(-TURN_STEPS, TURN_STEPS + 1) * yaw_step
     product = spectrum(match[None], cell_m, config) * jnp.conj(spectrum(rotate(query, yaws), cell_m, config))
     size = product.shape[1]
-    steps = np.arange(-SHIFT_STEPS, SHIFT_STEPS + 1, dtype=np.float32) * (cell_m / 2)
-    xs, ys = start[0] + steps, start[1] + steps
-    rows = _waves(-ys / cell_m, np.fft.fftfreq(size))
-    columns = _waves(xs / cell_m, np.fft.rfftfreq(size)) * column_counts(size)
-    volume = jnp.einsum("tij,yi,xj->xyt", product, rows, columns).real / size**2
+    shifts_m = np.arange(-SHIFT_STEPS, SHIFT_STEPS + 1, dtype=np.float32) * (cell_m / 2)
+    xs, ys = start[0] + shifts_m, start[1] + shifts_m
+    rows = _fourier_factors(-ys / cell_m, np.fft.fftfreq(size))  # rows run down, y runs up
+    columns = _fourier_factors(xs / cell_m, np.fft.rfftfreq(size)) * column_counts(size)
+    volume = jnp.einsum("tij,yi,xj->xyt", product, rows, columns).real / size**2  # correlation by x, y and yaw
     peak = jnp.unravel_index(jnp.argmax(volume), volume.shape)
-    middle = [jnp.clip(at, 1, n - 2) for at, n in zip(peak, volume.shape, strict=True)]
-    value, gradient, hessian = _parabola(jax.lax.dynamic_slice(volume, [at - 1 for at in middle], (3, 3, 3)))
+    centre = [jnp.clip(index, 1, n - 2) for index, n in zip(peak, volume.shape, strict=True)]
+    block = jax.lax.dynamic_slice(volume, [index - 1 for index in centre], (3, 3, 3))
+    value, gradient, hessian = _parabola(block)  # per step
     offset = jnp.clip(jnp.linalg.solve(hessian - 1e-6 * jnp.eye(3), -gradient), -1, 1)
-    sizes = jnp.array([cell_m / 2, cell_m / 2, step_rad])
-    pose = jnp.stack([xs[middle[0]], ys[middle[1]], yaws[middle[2]]]) + offset * sizes
+    steps = jnp.array([cell_m / 2, cell_m / 2, yaw_step])
+    pose = jnp.stack([xs[centre[0]], ys[centre[1]], yaws[centre[2]]]) + offset * steps
     correlation = value + gradient @ offset + offset @ hessian @ offset / 2
-    curvature = -hessian / (sizes[:, None] * sizes[None])
-    turns = jnp.concatenate([middle[2][None] + jnp.round(offset[2]).astype(int), np.array(RIDGE_TURNS)])
+    curvature = -hessian / (steps[:, None] * steps[None])
+    nearest_turn = centre[2][None] + jnp.round(offset[2]).astype(int)
+    turns = jnp.concatenate([nearest_turn, np.array(RIDGE_TURNS)])
     ridge = _ridge_covariance(product[turns], pose, yaws[turns], curvature, config)
     covariance = _peak_covariance(
         curvature,
@@ -231,16 +240,17 @@ def _refine_peak(
     return pose, correlation, covariance
 
 
-def _waves(shifts: Float[Array, " k"], frequencies: Float[np.ndarray, " f"]) -> Complex[Array, "k f"]:
-    """Factors of a Fourier series at shifts between cells."""
+def _fourier_factors(shifts: Float[Array, " k"], frequencies: Float[np.ndarray, " f"]) -> Complex[Array, "k f"]:
+    """Factors exp(2 pi i shift frequency) of a Fourier series, for shifts in cells and frequencies in cycles a cell."""
     return jnp.exp(2j * np.pi * shifts[:, None] * jnp.asarray(frequencies, jnp.float32)[None])
 
 
 def _parabola(block: Float[Array, "3 3 3"]) -> tuple[Float[Array, ""], Float[Array, " 3"], Float[Array, "3 3"]]:
-    """Value, gradient and Hessian at the centre of the least-squares parabola through 27 values."""
+    """Value, gradient and Hessian at the centre of the quadratic function that fits 27 values best (least squares)."""
     offsets = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), -1).reshape(27, 3)
     pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     columns = [np.ones(27), *offsets.T, *(offsets[:, i] * offsets[:, j] for i, j in pairs)]
-    fitted = jnp.asarray(np.linalg.pinv(np.stack(columns, 1)), jnp.float32) @ block.reshape(27)
-    half = jnp.zeros((3, 3)).at[tuple(np.array(pairs).T)].set(fitted[4:])
-    return fitted[0], fitted[1:4], half + half.T
+    # 10 coefficients: constant, 3 linear ones, and 6 products, which are the upper half of the Hessian.
+    coefficients = jnp.asarray(np.linalg.pinv(np.stack(columns, 1)), jnp.float32) @ block.reshape(27)
+    upper = jnp.zeros((3, 3)).at[tuple(np.array(pairs).T)].set(coefficients[4:])
+    return coefficients[0], coefficients[1:4], upper + upper.T

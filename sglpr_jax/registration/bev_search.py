@@ -1,7 +1,7 @@
-"""Search for the best pose of an image in another one, exactly or, at little cost, coarsely.
+"""Search for the best pose of an image in another one at all rotations and shifts.
 
-The coarse comparison has half as many rotations, cells and blurs twice as large, and takes a sixth of the time. It
-replaces the descriptors where these do not tell places apart, for instance among trunks.
+The coarse comparison uses half the rotations, and cells and blurs twice as large. It takes a sixth of the time, and
+selects the matches of the exact search where descriptors do not tell places apart, for instance among trunks.
 """
 
 import functools
@@ -20,7 +20,9 @@ from sglpr_jax.registration.config import VerificationConfig
 SECOND_M, SECOND_DEG = 3.0, 15.0
 """Minimum distance of the second peak from the best one, in metres or in degrees."""
 PRIOR_M, PRIOR_DEG = 2.0, 10.0
-"""Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""
+"""Maximum distance from an expected pose of a pose near it, in metres and degrees."""
+NO_PRIOR = np.full(3, np.nan)
+"""Expected pose (x, y, yaw) if there is none: NaN allows every pose."""
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -31,22 +33,23 @@ def coarse_correlations(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Float[Array, " k"]:
-    """Highest correlation of a query with each match at any pose, by the coarse comparison.
+    """Highest correlation of a query with each of k matches at any pose, on cells twice as large as in `search`.
 
-    The arguments are those of `search`. Matches beyond `count` get -1.
+    The arguments are those of `search`. Matches beyond the first `count` get -1.
     """
-    rotated = quarters(lower_half(jnp.asarray(query)[:, :, ::2].swapaxes(1, 2), config).swapaxes(1, 2))
+    every_other_turn = jnp.asarray(query)[:, :, ::2].swapaxes(1, 2)  # `lower_half` halves the last two axes
+    rotated = quarters(lower_half(every_other_turn, config).swapaxes(1, 2))
     matches = lower_half(jnp.asarray(matches), config)
-    reach = cell_count(config.max_shift_m, 2 * DENSITY_RESOLUTION_M * config.coarse)
+    max_shift = cell_count(config.max_shift_m, 2 * DENSITY_RESOLUTION_M * config.coarse)
 
-    def compare(k: Int[Array, ""], highest: Float[Array, " k"]) -> Float[Array, " k"]:
-        return highest.at[k].set(correlations(rotated, matches[k], reach).max((0, 2)).max())
+    def compare(row: Int[Array, ""], highest: Float[Array, " k"]) -> Float[Array, " k"]:
+        return highest.at[row].set(correlations(rotated, matches[row], max_shift).max((0, 2)).max())
 
     return jax.lax.fori_loop(0, len(matches) if count is None else count, compare, jnp.full(len(matches), -1.0))
 
 
 class CorrelationPeak(NamedTuple):
-    """The best pose of a query in the frame of a match, to a fraction of a merged cell."""
+    """Pose with the highest correlation of a query in the frame of a match, or an array of such poses."""
 
     x: Float[AnyArray, "*b"]
     y: Float[AnyArray, "*b"]
@@ -56,11 +59,11 @@ class CorrelationPeak(NamedTuple):
     correlation: Float[AnyArray, "*b"]
     """Correlation at the pose: 1 for equal images, about 0 for unrelated ones."""
     second: Float[AnyArray, "*b"]
-    """Highest correlation at any other pose, at least `SECOND_M` or `SECOND_DEG` away."""
+    """Highest correlation at poses more than `SECOND_M` or `SECOND_DEG` away."""
 
     def at(self, rows: int | slice) -> "CorrelationPeak":
-        """One of the peaks, or some of them."""
-        return CorrelationPeak(*(values[rows] for values in self))
+        """Select one peak by its row, or several by a slice."""
+        return CorrelationPeak(*(field[rows] for field in self))
 
 
 NO_PEAKS = CorrelationPeak(*[np.zeros(0, np.float32)] * len(CorrelationPeak._fields))
@@ -77,16 +80,16 @@ def search(
     """Return the best pose of a query in the frame of each of k matches.
 
     The arguments are results of `query_spectra` and `match_spectra`. With `count`, only the first matches are searched,
-    by the same compiled program for every count.
+    by one compiled program for every count. The other peaks are 0.
     """
-    rotated, matches, reach = quarters(jnp.asarray(query)), jnp.asarray(matches), _reach(config)
+    rotated, matches, max_shift = quarters(jnp.asarray(query)), jnp.asarray(matches), _max_shift_cells(config)
 
-    def search_one(k: Int[Array, ""], peaks: CorrelationPeak) -> CorrelationPeak:
-        peak = _peak(correlations(rotated, matches[k], reach), jnp.full(3, jnp.nan), config)
-        return jax.tree.map(lambda values, value: values.at[k].set(value), peaks, peak)
+    def search_row(row: Int[Array, ""], peaks: CorrelationPeak) -> CorrelationPeak:
+        peak = _highest_peak(correlations(rotated, matches[row], max_shift), jnp.asarray(NO_PRIOR, jnp.float32), config)
+        return jax.tree.map(lambda field, value: field.at[row].set(value), peaks, peak)
 
-    none = CorrelationPeak(*[jnp.zeros(len(matches))] * len(CorrelationPeak._fields))
-    return jax.lax.fori_loop(0, len(matches) if count is None else count, search_one, none)
+    zeros = CorrelationPeak(*[jnp.zeros(len(matches))] * len(CorrelationPeak._fields))
+    return jax.lax.fori_loop(0, len(matches) if count is None else count, search_row, zeros)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -102,35 +105,40 @@ def search_near(
     Arguments:
       query: Result of `query_spectra`.
       match: Row of `match_spectra`.
-      prior: Expected x, y (metres) and yaw (radians). NaN if there is no expected pose.
-      config: Settings of the comparison.
+      prior: Expected x, y (metres) and yaw (radians), or `NO_PRIOR`.
     """
-    volume = correlations(quarters(jnp.asarray(query)), jnp.asarray(match), _reach(config))
-    priors = jnp.stack([jnp.full(3, jnp.nan), jnp.asarray(prior, jnp.float32)])
-    return jax.lax.map(lambda prior: _peak(volume, prior, config), priors)
+    volume = correlations(quarters(jnp.asarray(query)), jnp.asarray(match), _max_shift_cells(config))
+    priors = jnp.stack([jnp.asarray(NO_PRIOR, jnp.float32), jnp.asarray(prior, jnp.float32)])
+    return jax.lax.map(lambda prior: _highest_peak(volume, prior, config), priors)
 
 
-def _reach(config: VerificationConfig) -> int:
-    """Maximum shift, in merged cells."""
+def _max_shift_cells(config: VerificationConfig) -> int:
+    """Maximum shift along x and along y, in merged cells (`config.coarse` cells per side)."""
     return cell_count(config.max_shift_m, DENSITY_RESOLUTION_M * config.coarse)
 
 
-def _peak(volume: Float[Array, "d t r"], prior: Float[Array, " 3"], config: VerificationConfig) -> CorrelationPeak:
-    """Highest peak of the correlations of all shifts and rotations, near the expected pose. NaN allows all poses."""
-    reach, step = len(volume) // 2, np.float32(2 * np.pi / config.turns)
+def _highest_peak(
+    volume: Float[Array, "d t r"], prior: Float[Array, " 3"], config: VerificationConfig
+) -> CorrelationPeak:
+    """Highest peak near the expected x, y (metres) and yaw (radians) or, with `NO_PRIOR`, anywhere.
+
+    `volume` is the correlation by row shift, rotation and column shift, the result of `correlations`.
+    """
+    max_shift, turn_rad = len(volume) // 2, np.float32(2 * np.pi / config.turns)
     cell_m = DENSITY_RESOLUTION_M * config.coarse
     x, y, yaw = prior
-    expected = reach - y / cell_m, yaw / step, reach + x / cell_m
+    has_prior = ~jnp.isnan(x)
+    expected = max_shift - y / cell_m, yaw / turn_rad, max_shift + x / cell_m  # rows run down, y runs up
     near_prior = _near(volume.shape, expected, PRIOR_M / cell_m, PRIOR_DEG)
-    highest = volume.max(0)  # a maximum along the slowest axis is fast
-    allowed = jnp.where(jnp.isnan(x), highest, jnp.where(near_prior, volume, -1.0).max(0))
-    turn, right = jnp.unravel_index(jnp.argmax(allowed), allowed.shape)
-    column = jnp.where(near_prior[:, turn, right] | jnp.isnan(x), volume[:, turn, right], -1.0)
-    cell = jnp.argmax(column), turn, right
-    second = _second_peak(volume, highest, cell, cell_m, config)
-    down, turn, right = (index + offset for index, offset in zip(cell, _offsets(volume, cell), strict=True))
-    x, y, yaw = (right - reach) * cell_m, (reach - down) * cell_m, jnp.mod(turn * step, 2 * np.pi)
-    return CorrelationPeak(x, y, yaw, volume[cell], second)
+    highest = volume.max(0)  # maximum over row shifts, the slowest axis, which is fast
+    allowed = jnp.where(has_prior, jnp.where(near_prior, volume, -1.0).max(0), highest)
+    turn, column = jnp.unravel_index(jnp.argmax(allowed), allowed.shape)
+    by_row = jnp.where(near_prior[:, turn, column] | ~has_prior, volume[:, turn, column], -1.0)
+    peak = jnp.argmax(by_row), turn, column
+    second = _second_peak(volume, highest, peak, cell_m, config)
+    row, turn, column = (index + offset for index, offset in zip(peak, _subcell_offsets(volume, peak), strict=True))
+    x, y, yaw = (column - max_shift) * cell_m, (max_shift - row) * cell_m, jnp.mod(turn * turn_rad, 2 * np.pi)
+    return CorrelationPeak(x, y, yaw, volume[peak], second)
 
 
 def _second_peak(
@@ -140,39 +148,50 @@ def _second_peak(
     cell_m: float,
     config: VerificationConfig,
 ) -> Float[Array, ""]:
-    """Highest correlation away from a peak. `highest` is the maximum over all shifts down."""
-    down, turn, right = peak
+    """Highest correlation more than `SECOND_M` or `SECOND_DEG` away from a peak, given by its index in `volume`.
+
+    The axes of `volume` are row shift, rotation and column shift, with shifts in steps of `cell_m` metres. `highest` is
+    its maximum over row shifts.
+    """
+    row, turn, column = peak
     near_turns = int(SECOND_DEG * config.turns / 360 + 1e-6)
     turns = jnp.mod(turn + np.arange(-near_turns, near_turns + 1), config.turns)
-    block = volume[:, turns]
-    near = _near(block.shape, (down, near_turns, right), SECOND_M / cell_m, 360.0)
+    block = volume[:, turns]  # only at these rotations, a shift can be near the peak
+    near = _near(block.shape, (row, near_turns, column), SECOND_M / cell_m, 360.0)
     other_turns = jnp.ones(config.turns, bool).at[turns].set(False)
     return jnp.maximum(jnp.max(jnp.where(other_turns[:, None], highest, 0.0)), jnp.max(jnp.where(~near, block, 0.0)))
 
 
-def _offsets(volume: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:
-    """Offset of the peak from its cell along each axis, from a parabola through three values."""
+def _subcell_offsets(volume: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:
+    """Offset of the maximum from the index of a peak along each axis, from -0.5 to 0.5, by a parabola.
+
+    The axes are row shift, rotation and column shift. Rotations wrap around. At the ends of the other axes, the
+    outermost value is repeated.
+    """
     offsets = []
     for axis, index in enumerate(peak):
         size = volume.shape[axis]
         before, after = index - 1, index + 1
-        if axis != 1:  # rotations wrap around, shifts end
+        if axis != 1:
             before, after = jnp.maximum(before, 0), jnp.minimum(after, size - 1)
-        low, best, high = (
+        low, middle, high = (
             volume[(*peak[:axis], neighbour, *peak[axis + 1 :])] for neighbour in (before % size, index, after % size)
         )
-        bend = low - 2 * best + high
-        offset = (low - high) / (2 * jnp.where(bend < 0, bend, -1e9))
+        curvature = low - 2 * middle + high
+        offset = (low - high) / (2 * jnp.where(curvature < 0, curvature, -1e9))  # 0 if the peak is flat
         offsets.append(jnp.clip(offset, -0.5, 0.5))
     return offsets
 
 
 def _near(
-    shape: tuple[int, ...], pose: Sequence[Float[Array, ""] | Int[Array, ""] | int], most_cells: float, most_deg: float
+    shape: tuple[int, ...], pose: Sequence[Float[Array, ""] | Int[Array, ""] | int], max_cells: float, max_deg: float
 ) -> Bool[Array, "d t r"]:
-    """Whether each index (down, rotation, right) is near a pose in these units."""
-    down, turn, right = (jnp.abs(jnp.arange(n) - index) for n, index in zip(shape, pose, strict=True))
-    turn = jnp.mod(turn, shape[1])
-    near_turn = jnp.minimum(turn, shape[1] - turn) * (360 / shape[1]) <= most_deg
-    near_down, near_right = (apart <= most_cells + 1e-6 for apart in (down, right))
-    return near_down[:, None, None] & near_turn[None, :, None] & near_right[None, None, :]
+    """Whether each element of a volume of this shape is within `max_cells` and `max_deg` of a pose.
+
+    The axes, and the indices of `pose`, are row shift, rotation (over the whole circle) and column shift.
+    """
+    rows, turns, columns = (jnp.abs(jnp.arange(n) - index) for n, index in zip(shape, pose, strict=True))
+    turns = jnp.mod(turns, shape[1])
+    near_turn = jnp.minimum(turns, shape[1] - turns) * (360 / shape[1]) <= max_deg
+    near_row, near_column = rows <= max_cells + 1e-6, columns <= max_cells + 1e-6
+    return near_row[:, None, None] & near_turn[None, :, None] & near_column[None, None, :]

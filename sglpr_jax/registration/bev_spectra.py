@@ -1,4 +1,4 @@
-"""The part of a density image that is compared, and its preparation for the comparison."""
+"""Spectra of density images: preparation for the comparison, and correlation of two images at all poses."""
 
 import functools
 from typing import Any, NamedTuple
@@ -18,9 +18,9 @@ AnyArray = Array | np.ndarray
 
 
 def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAULT) -> Num[AnyArray, "m m"]:
-    """Central part of an image that is compared. m is a multiple of two merged cells.
+    """Crop the central square of an image that covers `config.reach_m`. m is a multiple of `2 * config.coarse`.
 
-    Raises ValueError if the image is not square or has an odd number of cells.
+    Raises ValueError if the image is not square or has an odd number of cells per side.
     """
     if image.shape[0] != image.shape[1] or image.shape[0] % 2:
         raise ValueError(f"expected a square image of an even number of cells, found {image.shape}")
@@ -30,7 +30,7 @@ def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAU
 
 
 def prepare_image(image: Num[AnyArray, "h w"], config: VerificationConfig) -> Float[Array, "m m"]:
-    """Square root of the counts within reach. Other cells are zero. Raises the error of `within_reach`."""
+    """Square roots of the counts `within_reach`. Cells outside of the circle of radius `config.reach_m` are zero."""
     centre = within_reach(image, config)
     size = centre.shape[0]
     axis_m = (np.arange(size) - (size - 1) / 2) * DENSITY_RESOLUTION_M
@@ -39,21 +39,23 @@ def prepare_image(image: Num[AnyArray, "h w"], config: VerificationConfig) -> Fl
 
 
 def merge_cells(image: Float[Array, "m m"], side: int) -> Float[Array, "k k"]:
-    """Average pooling over squares of `side` cells."""
+    """Average pooling over squares of `side` x `side` cells."""
     size = image.shape[0] // side
     return image.reshape(size, side, size, side).mean((1, 3))
 
 
-def cell_count(metres: float, cell_m: float) -> int:
-    """Number of cells that cover a length, both in metres."""
-    return int(np.ceil(metres / cell_m))
+def cell_count(length_m: float, cell_m: float) -> int:
+    """Number of cells of `cell_m` metres that cover a length in metres."""
+    return int(np.ceil(length_m / cell_m))
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def query_spectra(query: Num[AnyArray, "h w"], *, config: VerificationConfig = DEFAULT) -> Complex[Array, "2 s t f"]:
-    """Compute the spectra of a query on merged cells, at the t rotations of the first and of the second quarter turn.
+    """Compute the spectra of a rotated query, for `search`.
 
-    The image is square, of counts in the orientation of eq. 1. Raises the error of `within_reach`.
+    The query is a square image of counts in the orientation of eq. 1. Its cells are merged, `config.coarse` per side.
+    The axes of the result are quarter turn (rotations from 0 and from 90 degrees), row frequency, rotation and column
+    frequency. `correlations` computes the other half turn from these. Raises the ValueError of `within_reach`.
     """
     angles = np.arange(config.turns // 4, dtype=np.float32) * np.float32(2 * np.pi / config.turns)
     images = rotate(merge_cells(prepare_image(query, config), config.coarse), jnp.asarray(angles))
@@ -63,11 +65,11 @@ def query_spectra(query: Num[AnyArray, "h w"], *, config: VerificationConfig = D
 
 @functools.partial(jax.jit, static_argnames="config")
 def match_spectra(matches: Num[AnyArray, "k h w"], *, config: VerificationConfig = DEFAULT) -> Complex[Array, "k s f"]:
-    """Compute the spectra of images on merged cells. Raises the error of `query_spectra`."""
+    """Compute spectra of images for `search`, by image, row frequency and column frequency. See `query_spectra`."""
 
     def image_spectrum(image: Num[Array, "h w"]) -> Complex[Array, "s f"]:
-        small = merge_cells(prepare_image(image, config), config.coarse)
-        return spectrum(small[None], DENSITY_RESOLUTION_M * config.coarse, config)[0]
+        merged = merge_cells(prepare_image(image, config), config.coarse)
+        return spectrum(merged[None], DENSITY_RESOLUTION_M * config.coarse, config)[0]
 
     return jax.lax.map(image_spectrum, jnp.asarray(matches))
 
@@ -78,24 +80,31 @@ def rotate(image: Float[Array, "m m"], angles: Float[Array, " t"]) -> Float[Arra
 
 
 def spectrum(images: Float[Array, "t m m"], cell_m: float, config: VerificationConfig) -> Complex[Array, "t s f"]:
-    """Band-passed Fourier transforms of unit power, padded so that no shift up to `max_shift_m` wraps around."""
-    size = fast_size(images.shape[-1] + cell_count(config.max_shift_m, cell_m))
-    frequencies = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
-    phases = np.exp(1j * np.pi * (images.shape[-1] - 1) * (frequencies[0] + frequencies[1]))  # relative to the centre
-    factors = _band_pass(*frequencies, cell_m, config) * phases
+    """Band-pass filtered Fourier transforms of images with cells of `cell_m` metres, scaled to unit power.
+
+    Images are padded with zeros, so that no shift up to `config.max_shift_m` wraps around.
+    """
+    cells = images.shape[-1]
+    size = fast_size(cells + cell_count(config.max_shift_m, cell_m))
+    rows, columns = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
+    centring = np.exp(1j * np.pi * (cells - 1) * (rows + columns))  # moves the origin to the centre of the image
+    factors = _band_pass(rows, columns, cell_m, config) * centring
     return _unit_power(jnp.fft.rfft2(images, (size, size)) * factors[None].astype(np.complex64))
 
 
 def lower_half(spectra: Complex[Array, "*k s f"], config: VerificationConfig) -> Complex[Array, "*k r g"]:
-    """Spectra on cells twice as large, with blurs twice as wide, from the lower frequencies of other spectra."""
+    """Spectra of the same images on cells twice as large and with blurs twice as wide.
+
+    They are the lower half of the frequencies, with the band-pass of the input replaced by one of twice the width.
+    """
     size, cell_m = spectra.shape[-2] // 2, DENSITY_RESOLUTION_M * config.coarse
     rows, columns = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
-    present = _band_pass(rows / 2, columns / 2, cell_m, config)
-    is_used = (np.abs(rows) < 0.5) & (columns < 0.5) & (present > 0)
-    wider = _band_pass(rows, columns, cell_m, config)
-    factors = np.where(is_used, wider / np.where(is_used, present, 1), 0).astype(np.float32)
-    low = spectra[..., : size // 2 + 1]
-    low = jnp.concatenate([low[..., : size // 2, :], low[..., -(size // 2) :, :]], axis=-2)
+    old_filter = _band_pass(rows / 2, columns / 2, cell_m, config)
+    new_filter = _band_pass(rows, columns, cell_m, config)
+    is_used = (np.abs(rows) < 0.5) & (columns < 0.5) & (old_filter > 0)
+    factors = np.where(is_used, new_filter / np.where(is_used, old_filter, 1), 0).astype(np.float32)
+    low_columns = spectra[..., : size // 2 + 1]
+    low = jnp.concatenate([low_columns[..., : size // 2, :], low_columns[..., -(size // 2) :, :]], axis=-2)
     return _unit_power(low * jnp.broadcast_to(factors, low.shape))
 
 
@@ -106,20 +115,20 @@ def fast_size(least: int) -> int:
 
 
 def column_counts(size: int) -> Float32[np.ndarray, "1 f"]:
-    """Number of times that each column of the half spectrum of a real image occurs in the full spectrum."""
+    """Number of times that each column of a half spectrum (`rfft2`) occurs in the full spectrum: once or twice."""
     return np.where(np.isin(np.arange(size // 2 + 1), (0, size / 2)), 1, 2).astype(np.float32)[None]
 
 
 def _band_pass(
     rows: Float[np.ndarray, "s 1"], columns: Float[np.ndarray, "1 f"], cell_m: float, config: VerificationConfig
 ) -> Float[np.ndarray, "s f"]:
-    """Response of the band-pass at frequencies in cycles a cell."""
+    """Response of the band-pass filter at row and column frequencies in cycles per cell."""
     exponent = 2 * (np.pi / cell_m) ** 2 * (rows**2 + columns**2)
     return np.exp(-exponent * config.blur_m**2) - np.exp(-exponent * config.wide_blur_m**2)
 
 
 def _unit_power(spectra: Complex[Array, "*k s f"]) -> Complex[Array, "*k s f"]:
-    """Scale half spectra so that the power of each image is 1."""
+    """Scale half spectra so that the sum of the squared cells of each image is 1."""
     size = spectra.shape[-2]
     weights = jnp.broadcast_to(column_counts(size), spectra.shape)
     power = jnp.sum(jnp.abs(spectra) ** 2 * weights, axis=(-2, -1), keepdims=True) / size**2
@@ -127,35 +136,39 @@ def _unit_power(spectra: Complex[Array, "*k s f"]) -> Complex[Array, "*k s f"]:
 
 
 def _rotate_by_90_degrees(spectra: Complex[Array, "t s f"]) -> Complex[Array, "t s f"]:
-    """Spectra of images with an even number of cells a side, after a further rotation by 90 degrees."""
-    t, size, width = spectra.shape
+    """Half spectra after a further rotation by 90 degrees: elements are reordered and change signs."""
+    turns, size, width = spectra.shape
     index, conjugate, sign = _rotated_indices(size)
-    values = spectra.reshape(t, -1)[:, index]
-    return jax.lax.complex(values.real * sign[None], values.imag * (sign * conjugate)[None]).reshape(t, size, width)
+    values = spectra.reshape(turns, -1)[:, index]
+    rotated = jax.lax.complex(values.real * sign[None], values.imag * (sign * conjugate)[None])
+    return rotated.reshape(turns, size, width)
 
 
 @functools.cache
 def _rotated_indices(size: int) -> tuple[Int[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """Value at row r and column c of a spectrum rotated by 90 degrees: that at row c and column -r.
+    """Source of each element of a half spectrum that is rotated by 90 degrees: row r, column c is row c, column -r.
 
-    Columns below 0 are conjugates of the opposite frequencies. Row size / 2 is stored as row -size / 2, which changes
-    the sign, because the centre of an even number of cells lies between two of them. Returns the index into the
-    flattened half spectrum, the factor of the imaginary part (-1 for conjugates), and the sign.
+    Columns below 0 are not stored, because they are conjugates of the opposite frequencies. Row size / 2 is stored as
+    row -size / 2, which changes the sign, because the centre of an even number of cells lies between two of them.
+    Returns the index into the flattened half spectrum, the factor of the imaginary part (-1 for conjugates), and the
+    sign.
     """
     rows = np.rint(np.fft.fftfreq(size) * size).astype(int)[:, None]
     columns = np.arange(size // 2 + 1)[None]
-    opposite = (rows > 0) & (columns >= 0)
-    index = np.where(opposite, -columns, columns) % size * (size // 2 + 1) + np.abs(rows)
-    sign = np.where(~opposite & (columns == size // 2), -1, 1)
-    conjugate = np.where(opposite, -1, 1)
+    is_conjugate = (rows > 0) & (columns >= 0)
+    index = np.where(is_conjugate, -columns, columns) % size * (size // 2 + 1) + np.abs(rows)
+    sign = np.where(~is_conjugate & (columns == size // 2), -1, 1)
+    conjugate = np.where(is_conjugate, -1, 1)
     return index.reshape(-1), conjugate.astype(np.float32).reshape(-1), sign.astype(np.float32).reshape(-1)
 
 
 class Halves(NamedTuple):
-    """Real and imaginary parts of spectra: rows of frequencies 0 to s/2, and rows of frequencies -1, -2 and so on."""
+    """Real and imaginary parts of spectra (row frequency, rotation, column frequency) by sign of the row frequency."""
 
-    low: tuple[Float[Array, "h t f"], Float[Array, "h t f"]]
-    high: tuple[Float[Array, "g t f"], Float[Array, "g t f"]]
+    positive: tuple[Float[Array, "h t f"], Float[Array, "h t f"]]
+    """Row frequencies 0 to size / 2."""
+    negative: tuple[Float[Array, "g t f"], Float[Array, "g t f"]]
+    """Row frequencies -1, -2 and so on."""
 
 
 def quarters(query: Complex[Array, "2 s t f"]) -> list[Halves]:
@@ -164,48 +177,58 @@ def quarters(query: Complex[Array, "2 s t f"]) -> list[Halves]:
 
 
 def correlations(query: list[Halves], match: Complex[Array, "s f"], reach: int) -> Float[Array, "d _ d"]:
-    """Correlation of a match with every rotated query at every shift: rows down, rotations, columns to the right.
+    """Correlation of a match with a query at every pose: by row shift, rotation (`config.turns`), column shift.
 
-    The query is the result of `quarters`. `reach` is the maximum shift down and to the right, in cells.
+    Arguments:
+      query: Result of `quarters`.
+      match: One row of `match_spectra`.
+      reach: Maximum shift in cells. Shifts run from -reach to reach, down and to the right.
     """
-    first, second = (jnp.split(_quarter(half, match, reach), 2, axis=1) for half in query)
-    return jnp.concatenate([first[0], second[0], first[1], second[1]], axis=1)
+    # Each call covers a quarter turn and the one opposite to it: 0 and 180 degrees, then 90 and 270.
+    from_0, from_180 = jnp.split(_correlations_of_quarter(query[0], match, reach), 2, axis=1)
+    from_90, from_270 = jnp.split(_correlations_of_quarter(query[1], match, reach), 2, axis=1)
+    return jnp.concatenate([from_0, from_90, from_180, from_270], axis=1)
 
 
-def _quarter(query: Halves, match: Complex[Array, "s f"], reach: int) -> Float[Array, "d _ d"]:
-    """Correlations (see `correlations`) for t rotations, followed by these rotations plus 180 degrees.
+def _correlations_of_quarter(query: Halves, match: Complex[Array, "s f"], reach: int) -> Float[Array, "d _ d"]:
+    """Correlations (see `correlations`) for the t rotations of a quarter, then for these plus 180 degrees.
 
-    Even and odd parts are transformed separately, for shifts of zero and more. At the opposite shift the cosine is the
-    same and the sine changes its sign. This takes a quarter of the multiplications of the full transform.
+    This is an inverse Fourier transform at few shifts, by matrix products. Even and odd parts are transformed
+    separately, for shifts of zero and more: at the opposite shift the cosine is the same and the sine changes its sign.
+    This takes a quarter of the multiplications of the full transform.
     """
-    size, (_, turns, width) = len(match), query.low[0].shape
-    cos_down, sin_down, cos_right, sin_right = map(jnp.asarray, _waves(reach, size))
+    size, (_, turns, width) = len(match), query.positive[0].shape
+    row_cosines, row_sines, column_cosines, column_sines = map(jnp.asarray, _waves(reach, size))
     match_halves = _halves(match[:, None])
-    low, high = _products(match_halves.low, query.low), _products(match_halves.high, query.high)
-    unpaired = ((1, len(low[0]) - len(high[0]) - 1), (0, 0), (0, 0))
-    even = [below + jnp.pad(above, unpaired) for below, above in zip(low, high, strict=True)]
-    odd = [below[1 : len(above) + 1] - above for below, above in zip(low, high, strict=True)]
-    cos_real, cos_imaginary = (cos_down @ part.reshape(len(part), -1) for part in even)
-    sin_real, sin_imaginary = (sin_down @ part.reshape(len(part), -1) for part in odd)
-    real = _all_shifts(cos_real, sin_imaginary, axis=0).reshape(-1, width)
-    imaginary = _all_shifts(cos_imaginary, -sin_real, axis=0).reshape(-1, width)
-    values = _all_shifts(real @ cos_right, imaginary @ sin_right, axis=1)
+    positive = _products(match_halves.positive, query.positive)
+    negative = _products(match_halves.negative, query.negative)
+    # Row frequencies 0 and, if size is even, size / 2 have no negative partner.
+    padding = ((1, len(positive[0]) - len(negative[0]) - 1), (0, 0), (0, 0))
+    even = [plus + jnp.pad(minus, padding) for plus, minus in zip(positive, negative, strict=True)]
+    odd = [plus[1 : len(minus) + 1] - minus for plus, minus in zip(positive, negative, strict=True)]
+    cosine_real, cosine_imaginary = (row_cosines @ part.reshape(len(part), -1) for part in even)
+    sine_real, sine_imaginary = (row_sines @ part.reshape(len(part), -1) for part in odd)
+    real = _all_shifts(cosine_real, sine_imaginary, axis=0).reshape(-1, width)
+    imaginary = _all_shifts(cosine_imaginary, -sine_real, axis=0).reshape(-1, width)
+    values = _all_shifts(real @ column_cosines, imaginary @ column_sines, axis=1)
     return values.reshape(-1, 2 * turns, values.shape[1])
 
 
 def _halves(spectra: Complex[Array, "s t f"]) -> Halves:
+    """Split spectra by the sign of the row frequency."""
     size = len(spectra)
-    low, high = spectra[: size // 2 + 1], spectra[::-1][: (size - 1) // 2]
-    return Halves((low.real, low.imag), (high.real, high.imag))
+    positive, negative = spectra[: size // 2 + 1], spectra[::-1][: (size - 1) // 2]
+    return Halves((positive.real, positive.imag), (negative.real, negative.imag))
 
 
 def _products(
     match: tuple[Float[Array, "h 1 f"], Float[Array, "h 1 f"]],
     query: tuple[Float[Array, "h t f"], Float[Array, "h t f"]],
 ) -> tuple[Float[Array, "h 2*t f"], Float[Array, "h 2*t f"]]:
-    """Products of a match's spectrum with the complex conjugates of the query's spectra, then with these spectra.
+    """Spectra of the correlations of a match with t query rotations, then with these rotations plus 180 degrees.
 
-    Returns real and imaginary parts.
+    Arguments and result are pairs of real and imaginary part. The correlation's spectrum is the match's times the
+    conjugate of the query's. A rotation by 180 degrees conjugates the query's spectrum.
     """
     (a, b), (c, d) = match, query
     real = jnp.concatenate([a * c + b * d, a * c - b * d], axis=1)
@@ -213,21 +236,26 @@ def _products(
 
 
 def _all_shifts(even: Float[Array, "a b"], odd: Float[Array, "a b"], *, axis: int) -> Float[Array, "*c"]:
-    """Values at all shifts in ascending order: even + odd at negative shifts, even - odd at the others."""
-    before = jnp.flip(jax.lax.slice_in_dim(even + odd, 1, None, axis=axis), axis)
-    return jnp.concatenate([before, even - odd], axis)
+    """Values at all shifts along `axis`, in ascending order, from even and odd part at shifts of 0 and more.
+
+    The values are even + odd at negative shifts, and even - odd at the others.
+    """
+    at_negative_shifts = jnp.flip(jax.lax.slice_in_dim(even + odd, 1, None, axis=axis), axis)
+    return jnp.concatenate([at_negative_shifts, even - odd], axis)
 
 
 @functools.cache
 def _waves(reach: int, size: int) -> tuple[Float32[np.ndarray, "_ _"], ...]:
-    """Cosines and sines: shifts from 0 to reach by frequencies down, and frequencies by shifts to the right.
+    """Cosines and sines of an inverse Fourier transform at shifts from 0 to `reach` cells.
 
-    The second pair is scaled for the inverse transform of a half spectrum. The sines down omit the frequencies that are
-    their own opposites.
+    Returns cosines and sines by row shift and row frequency, then cosines and sines by column frequency and column
+    shift. Row sines omit the frequencies without a negative partner (0 and size / 2). Column waves are scaled for the
+    inverse transform of a half spectrum.
     """
-    shifts, rows, columns = np.arange(reach + 1), np.arange(size // 2 + 1), np.arange(size // 2 + 1)
-    down, right = (2 * np.pi / size * np.outer(*pair) for pair in ((shifts, rows), (columns, shifts)))
+    shifts, frequencies = np.arange(reach + 1), np.arange(size // 2 + 1)
+    row_phases = 2 * np.pi / size * np.outer(shifts, frequencies)
+    column_phases = 2 * np.pi / size * np.outer(frequencies, shifts)
+    row_sines = np.sin(row_phases[:, 1 : (size - 1) // 2 + 1])
     scale = column_counts(size).T / size**2
-    sines = np.sin(down[:, 1 : (size - 1) // 2 + 1])
-    waves = np.cos(down), sines, np.cos(right) * scale, np.sin(right) * scale
+    waves = np.cos(row_phases), row_sines, np.cos(column_phases) * scale, np.sin(column_phases) * scale
     return tuple(values.astype(np.float32) for values in waves)

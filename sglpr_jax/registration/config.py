@@ -12,12 +12,13 @@ class VerificationConfig:
     max_shift_m: float = 12.0
     """Maximum distance between two scans of one place along x and along y, in metres."""
     turns: int = 72
-    """Number of rotations over the whole circle, a multiple of four."""
+    """Number of compared rotations over the whole circle, a multiple of four."""
     coarse: int = 2
-    """Number of cells per side that the exhaustive search merges into one."""
+    """Side of the squares of cells that are averaged into one merged cell for the exhaustive search, in cells."""
     blur_m: float = 0.4
+    """Standard deviation of the narrow blur of the band-pass filter, in metres."""
     wide_blur_m: float = 1.0
-    """Standard deviations of the two blurs, in metres. The wider blur is subtracted."""
+    """Standard deviation of the wide blur, in metres. The band-pass filter is the narrow blur minus the wide one."""
 
     def __post_init__(self):
         """Raises ValueError if the number of rotations is not a multiple of four."""

@@ -1,7 +1,7 @@
 """Registration of two scans in 6 degrees of freedom: GICP, and KISS-Matcher (extra `slam`) for a first guess.
 
 Neither method detects whether the scans show one place. If GICP starts 3 m off along a road, its result is 3 m off,
-too. The overlap shows such errors. It is the share of the space of one scan that the other scan fills, too.
+too. The overlap of the registered scans shows such errors.
 
 Points on one surface, ring or vehicle have correlated errors. For the covariance, their contributions are summed in
 blocks of space, and the scatter of the blocks gives the noise (a sandwich estimator). The constants were fitted on
@@ -18,28 +18,28 @@ from jaxtyping import Float, Float32, Int
 from sglpr_jax.se3 import transformed
 
 COARSE_VOXEL_M, VOXEL_M = 1.0, 0.25
-"""Edges of the voxels of KISS-Matcher and of GICP, in metres."""
+"""Edge lengths of the voxels of KISS-Matcher and of GICP, in metres."""
 NEIGHBOURS = 20
 """Number of neighbours from which the normal of a point is estimated. With 10, normals on the rings of 16 beams are
 arbitrary, and GICP aligns the rings of the two scans: roll and pitch were 0.3 degrees off."""
 MAX_APART_M, ITERATIONS = 1.0, 40
 """Maximum distance of corresponding points in GICP, in metres, and maximum number of iterations."""
 OVERLAP_VOXEL_M, OVERLAP_REACH_M = 1.0, 40.0
-"""Edge of the voxels of the overlap, and maximum distance from both sensors of points that count in it, in metres."""
+"""Edge length of the voxels of the overlap, and maximum distance of counted points from both sensors, in metres."""
 POINTS = 4000
 """Target number of points of the query for the covariance. Clouds with fewer points are not thinned."""
 BLOCK_M = 8.0
-"""Edge of the blocks of space with independent errors, in metres."""
+"""Edge length of the blocks of space with independent errors, in metres."""
 SCALE, HEIGHT_SCALE = 1.15, 0.8
 """Factor of all standard deviations, and additional factor of the height."""
 SPARSE, SPARSE_TILT = 3.2, 9.0
-"""Growth of standard deviations with the share of sparse ground: of x, y and yaw, and of roll and pitch. Ground is
+"""Relative growth of standard deviations if all ground is sparse: of x, y and yaw, and of roll and pitch. Ground is
 sparse where the neighbours of a point lie on one line, so that its normal is arbitrary."""
 FLAT_COSINE, LINE = 0.9, 0.05
 """Minimum cosine between the z axis and the normal of ground, and maximum ratio of the second to the first variance of
 neighbours that lie on a line."""
 SLIDING = 0.04
-"""Share of the squared components of all normals below which a direction is degenerate: scans can slide along it."""
+"""Share of the squared components of all normals along a direction, below which scans can slide along it."""
 UNKNOWN_M = 3.0
 """Standard deviation along a degenerate direction if the first guess has no covariance, in metres."""
 LEAST_POSITION_M, LEAST_ROTATION_DEG = 0.002, 0.005
@@ -55,7 +55,7 @@ class Registration(NamedTuple):
     """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations about x, y, z in
     radians."""
     overlap: float
-    """Share of the space near both sensors that both scans fill, from 0 to 1."""
+    """Overlap of the registered scans, from 0 to 1 (see `overlap`)."""
 
 
 def register(
@@ -98,7 +98,7 @@ def register(
         max_iterations=ITERATIONS,
     )
     pose = np.asarray(result.T_target_source)
-    order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp puts rotation first
+    order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp puts rotations before translations
     information = np.asarray(result.H)[order][:, order]
     covariance = _registration_covariance(information, query_cloud, match_cloud, match_tree, pose, initial_covariance)
     least = np.repeat([LEAST_POSITION_M, np.radians(LEAST_ROTATION_DEG)], 3) ** 2
@@ -117,23 +117,29 @@ def coarse_pose(query: Float32[np.ndarray, "n 3"], match: Float32[np.ndarray, "m
 def overlap(
     query: Float[np.ndarray, "n 3"], match: Float[np.ndarray, "m 3"], match_from_query: Float[np.ndarray, "4 4"]
 ) -> float:
-    """Number of voxels that both scans fill, divided by the number that the smaller scan fills, near both sensors."""
-    sensors, side, voxels = (np.zeros(3), match_from_query[:3, 3]), 2 * int(OVERLAP_REACH_M / OVERLAP_VOXEL_M) + 4, []
+    """Number of voxels with points of both scans, divided by the number of voxels of the scan that has fewer.
+
+    Only voxels within `OVERLAP_REACH_M` of both sensors count. The overlap is 0 if one of the scans has none.
+    """
+    sensors = np.zeros(3), match_from_query[:3, 3]
+    side = 2 * int(OVERLAP_REACH_M / OVERLAP_VOXEL_M) + 4  # of a cube of voxels around the match's sensor
+    voxels = []
     for cloud in (transformed(match_from_query, query), match):
         near = np.all([np.linalg.norm(cloud - sensor, axis=1) < OVERLAP_REACH_M for sensor in sensors], axis=0)
         x, y, z = np.floor(cloud[near] / OVERLAP_VOXEL_M).astype(np.int64).T + side // 2
         voxels.append(np.unique((z * side + y) * side + x))
-    fewer = min(map(len, voxels))
-    return len(np.intersect1d(*voxels, assume_unique=True)) / fewer if fewer else 0.0
+    smaller_count = min(map(len, voxels))
+    return len(np.intersect1d(*voxels, assume_unique=True)) / smaller_count if smaller_count else 0.0
 
 
 def _preprocess(cloud: Float32[np.ndarray, "n 3"]) -> tuple[Any, Any]:
-    """Downsample a cloud and estimate the covariances of its surface. Returns it with its search tree."""
+    """Downsample a cloud and estimate the covariance of the surface at each point. Returns cloud and search tree."""
     options = {"downsampling_resolution": VOXEL_M, "num_neighbors": NEIGHBOURS}
     return _library("small_gicp").preprocess_points(cloud.astype(np.float64), **options)
 
 
 def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray, "n 3"]:
+    """Remove points that are not finite. Raises ValueError, which names the scan, if fewer than 100 points are left."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
         raise ValueError(f"expected a {name} of 100 finite points or more to register, found {len(points)}")
@@ -148,62 +154,67 @@ def _registration_covariance(
     match_from_query: Float[np.ndarray, "4 4"],
     initial_covariance: Float[np.ndarray, "6 6"] | None,
 ) -> Float[np.ndarray, "6 6"]:
-    """Covariance of a small motion of the query in its own frame: metres, then radians.
+    """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations in radians.
 
-    `information` is GICP's matrix of the same motion. Clouds and search tree are results of `_preprocess`. The
-    covariance of the first guess stays along degenerate directions.
+    It is the inverse of `information` (GICP's matrix of the same motion), times the scatter of the gradients of blocks
+    of space, times the inverse again. Along directions in which the scans can slide, the covariance of the first guess
+    is added. Clouds and search tree are results of `_preprocess`.
     """
     rotation = match_from_query[:3, :3]
-    points, match_points = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))
-    stride = max(1, len(points) // POINTS)
-    moved = points[::stride] @ rotation.T + match_from_query[:3, 3]
-    nearest, squared = (np.asarray(values) for values in tree.batch_nearest_neighbor_search(moved))
-    near = np.flatnonzero(squared < MAX_APART_M**2)
-    points, nearest = points[::stride][near], nearest[near].astype(np.int64)
+    query_points, match_points = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))
+    # Pairs of a point of the thinned query and its nearest point of the match.
+    stride = max(1, len(query_points) // POINTS)
+    thinned = query_points[::stride]
+    moved = thinned @ rotation.T + match_from_query[:3, 3]
+    match_rows, squared_m = map(np.asarray, tree.batch_nearest_neighbor_search(moved))
+    near = np.flatnonzero(squared_m < MAX_APART_M**2)
+    points, match_rows = thinned[near], match_rows[near].astype(np.int64)
     query_surface = np.array([query.cov(int(row) * stride)[:3, :3] for row in near]).reshape(-1, 3, 3)
-    match_surface = np.array([match.cov(int(row))[:3, :3] for row in nearest]).reshape(-1, 3, 3)
+    match_surface = np.array([match.cov(int(row))[:3, :3] for row in match_rows]).reshape(-1, 3, 3)
     weights = np.linalg.inv(match_surface + rotation @ query_surface @ rotation.T)
-    # Scatter of the gradient of GICP's error over blocks of space.
-    pull = np.einsum("kij,kj->ki", weights, match_points[nearest] - moved[near]) @ rotation
-    gradient = np.concatenate([pull, np.cross(points, pull)], axis=1)
+    # Gradient of GICP's error by each pair, summed in blocks of space.
+    force = np.einsum("kij,kj->ki", weights, match_points[match_rows] - moved[near]) @ rotation
+    gradient = np.concatenate([force, np.cross(points, force)], axis=1)
     _, block = np.unique(np.floor(points / BLOCK_M).astype(np.int64), axis=0, return_inverse=True)
     sums = np.zeros((block.max(initial=-1) + 1, 6))
     np.add.at(sums, block.reshape(-1), gradient)
-    noise = sums.T @ sums * stride**2
+    scatter = sums.T @ sums * stride**2
     inverse = np.linalg.pinv(information, hermitian=True)
-    sparse = _sparse_ground(match_points, tree, nearest[::4])
-    growth = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * sparse), 3)
-    growth[[2, 5]] = SCALE * HEIGHT_SCALE, growth[0]
-    covariance = (inverse @ noise @ inverse) * np.outer(growth, growth)
+    sparse_share = _sparse_ground(match_points, tree, match_rows[::4])
+    growth = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * sparse_share), 3)
+    growth[2] = SCALE * HEIGHT_SCALE  # height does not grow
+    growth[5] = growth[0]  # yaw grows as x and y do
+    covariance = (inverse @ scatter @ inverse) * np.outer(growth, growth)
     normals = np.linalg.eigh(match_surface)[1][:, :, 0] @ rotation  # in the query's frame
-    covariance[:3, :3] += _sliding(normals, initial_covariance)
+    covariance[:3, :3] += _sliding_covariance(normals, initial_covariance)
     return covariance
 
 
-def _sliding(
+def _sliding_covariance(
     normals: Float[np.ndarray, "k 3"], initial_covariance: Float[np.ndarray, "6 6"] | None
 ) -> Float[np.ndarray, "3 3"]:
-    """Position covariance of the first guess along degenerate directions."""
-    strengths, directions = np.linalg.eigh(normals.T @ normals)
-    shares = strengths / max(strengths.sum(), 1e-9)
+    """Position covariance of the first guess along directions in which scans with these surface normals can slide."""
+    squared_sums, directions = np.linalg.eigh(normals.T @ normals)
+    shares = squared_sums / max(squared_sums.sum(), 1e-9)
     guess = np.eye(3) * UNKNOWN_M**2 if initial_covariance is None else initial_covariance[:3, :3]
-    variances = np.exp(-((shares / SLIDING) ** 2)) * np.einsum("ij,ik,kj->j", directions, guess, directions)
+    along_directions = np.einsum("ij,ik,kj->j", directions, guess, directions)
+    variances = np.exp(-((shares / SLIDING) ** 2)) * along_directions
     return (directions * variances) @ directions.T
 
 
 def _sparse_ground(cloud: Float[np.ndarray, "n 3"], tree: Any, rows: Int[np.ndarray, " k"]) -> float:
-    """Share of the points of flat ground whose neighbours lie on one line."""
+    """Share of the flat points among `rows` of a cloud whose neighbours lie on one line. 1 without flat points."""
     if not len(rows):
         return 1.0
     neighbours = cloud[np.asarray(tree.batch_knn_search(cloud[rows], NEIGHBOURS)[0]).astype(np.int64)]
     neighbours = neighbours - neighbours.mean(axis=1, keepdims=True)
-    spread, axes = np.linalg.eigh(np.einsum("kna,knb->kab", neighbours, neighbours))
-    flat = np.abs(axes[:, 2, 0]) > FLAT_COSINE
-    return float(np.mean(spread[flat, 1] < LINE * spread[flat, 2])) if flat.any() else 1.0
+    variances, axes = np.linalg.eigh(np.einsum("kna,knb->kab", neighbours, neighbours))
+    is_flat = np.abs(axes[:, 2, 0]) > FLAT_COSINE  # z of the normal, the axis of the least variance
+    return float(np.mean(variances[is_flat, 1] < LINE * variances[is_flat, 2])) if is_flat.any() else 1.0
 
 
 def is_installed() -> bool:
-    """Whether small-gicp is installed, which registers scans with a first guess."""
+    """Whether small-gicp is installed, which `register` needs if it has a first guess."""
     return importlib.util.find_spec("small_gicp") is not None
 
 
@@ -213,6 +224,7 @@ def check_installed() -> None:
 
 
 def _library(name: str) -> ModuleType:
+    """Import an optional library. Raises ImportError, which says how to install it, if it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Descriptor files of a method, reused only if they were made with the same settings; hashes of recordings."""
+"""Descriptor files that are reused if they were made with the same settings, and hashes of recordings."""
 
 import contextlib
 import dataclasses
@@ -65,7 +65,7 @@ def embed_or_reuse(
 
 
 def _check_settings(path: Path, stored: Any, wanted: dict[str, Any]) -> None:
-    """Raise ValueError if the settings of a descriptor file are others."""
+    """Raise ValueError if the settings stored in a descriptor file differ from the wanted ones. Names the first one."""
     stored = stored if isinstance(stored, dict) else {}
     for name in {**wanted, **stored}:
         if name not in stored or name not in wanted or stored[name] != wanted[name]:
@@ -76,23 +76,25 @@ def _check_settings(path: Path, stored: Any, wanted: dict[str, Any]) -> None:
 
 
 def fingerprint(recording: Recording, *, contents: Literal["none", "some", "all"] = "none") -> str:
-    """Hash a recording: ids, files, read options, mounting, positions and times.
+    """Return a hash of a recording: ids, files, read options, mounting, positions and times.
 
-    Files of scans and labels, or those of a bag, count by their size and modification time. Sizes and times may agree
-    by chance, so with `contents="some"` the bytes of the first, the middle and the last scan count, too. With "all" the
-    bytes of all files count instead. Copies then have equal hashes.
+    Files are hashed by size and modification time. With `contents="some"`, the bytes of the first, the middle and the
+    last scan are hashed, too, because sizes and times may agree by chance. With "all", the bytes of all files replace
+    sizes and times, so that copies have equal hashes.
     """
     files = (recording.containers or recording.paths, recording.label_paths)
-    state = _content_hash if contents == "all" else _size_and_time
-    scans, labels = ([None if path is None or not path.is_file() else state(path) for path in paths] for paths in files)
+    file_state = _content_hash if contents == "all" else _size_and_time
+    scans, labels = (
+        [file_state(path) if path is not None and path.is_file() else None for path in paths] for paths in files
+    )
     mounting = None if recording.mounting is None else recording.mounting.fields
     digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
     mountings = None
     if recording.mountings is not None:
         mountings = np.array([(mounting.height_m, *mounting.up) for mounting in recording.mountings])
-    for values in (recording.positions, recording.times, mountings):
-        if values is not None:
-            digest.update(values.tobytes())
+    for array in (recording.positions, recording.times, mountings):
+        if array is not None:
+            digest.update(array.tobytes())
     if contents == "some" and len(recording):
         for row in sorted({0, len(recording) // 2, len(recording) - 1}):
             digest.update(_scan_bytes(recording, row))

@@ -1,4 +1,4 @@
-"""Descriptor files, written by embedding and read by evaluation, for descriptors of any method."""
+"""Descriptor files (.npz): the descriptors of a recording by any method, with positions and times for evaluation."""
 
 import json
 from collections import Counter
@@ -50,7 +50,7 @@ class DescriptorFile:
     descriptors: np.ndarray
     """Descriptors (n, d) float32."""
     pose_source: str | None
-    """Source of `positions`, in words. A protocol gives other results for other poses."""
+    """Source of `positions`, in words. Evaluations with different sources are not comparable."""
     config: dict[str, Any]
     """How the descriptors were made, as JSON data."""
     weights_hash: str
@@ -89,24 +89,23 @@ class DescriptorFile:
         return scale
 
     @property
-    def recorded(self) -> np.ndarray:
-        """Mask over all scans of the recording, including skipped ones: whether each scan is in this file.
-
-        Raises ValueError if the skipped rows in `config` are invalid.
-        """
+    def is_described(self) -> np.ndarray:
+        """Flag of each scan of the recording, skipped ones included: whether the scan is in this file. Raises
+        ValueError if the skipped rows in `config` are invalid."""
         skipped = self.config.get(SKIPPED, [])
         n = len(self) + len(skipped) if isinstance(skipped, list) else 0
-        if not n or len({row for row in skipped if type(row) is int and 0 <= row < n}) < len(skipped):
+        valid_rows = {row for row in skipped if type(row) is int and 0 <= row < n} if n else set()
+        if not n or len(valid_rows) < len(skipped):
             raise ValueError(f"expected row numbers of the skipped scans, found {skipped!r:.60}")
         return ~np.isin(np.arange(n), skipped)
 
-    def only(self, rows: np.ndarray) -> "DescriptorFile":
-        """Return the file with only the scans that the mask `rows` selects."""
-        recorded = self.recorded
-        recorded[recorded] = rows
-        config = {**self.config, SKIPPED: np.flatnonzero(~recorded).tolist()}
-        arrays = {name: array[rows] for name, array in self._arrays.items()}
-        return replace(self, ids=tuple(np.array(self.ids)[rows].tolist()), config=config, **arrays)
+    def only(self, kept: np.ndarray) -> "DescriptorFile":
+        """Return the file with only the scans whose flag in `kept` is True. The others are noted as skipped."""
+        is_described = self.is_described
+        is_described[is_described] = kept
+        config = {**self.config, SKIPPED: np.flatnonzero(~is_described).tolist()}
+        arrays = {name: array[kept] for name, array in self._arrays.items()}
+        return replace(self, ids=tuple(np.array(self.ids)[kept].tolist()), config=config, **arrays)
 
     def save(self, path: Path | str) -> None:
         """Write the file atomically. If writing fails, the previous file at `path` stays."""
@@ -141,23 +140,21 @@ class DescriptorFile:
 
 
 def check_made_alike(expected: Mapping[str, Any], found: Mapping[str, Any], *, of: str = "descriptors") -> None:
-    """Raise ValueError if descriptors were made in another way than expected. A `found` value of None is not checked.
-
-    `of` names the descriptors in the message.
-    """
+    """Raise ValueError if a property of descriptors, such as "weights", differs from the expected one. A property that
+    is None in `found` is not checked. `of` names the descriptors in the message."""
     for name, value in found.items():
         if value is not None and value != expected[name]:
-            shown, shown_other = (json_in_short(one) or "(none)" for one in (expected[name], value))
-            raise ValueError(f"expected {of} with {name} {shown}, found {shown_other}: they are not comparable")
+            expected_text = json_in_short(expected[name]) or "(none)"
+            found_text = json_in_short(value) or "(none)"
+            raise ValueError(f"expected {of} with {name} {expected_text}, found {found_text}: they are not comparable")
 
 
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
-    """Raise ValueError unless the descriptors of two files can be compared: same method, model, weights and scale.
+    """Raise ValueError unless the descriptors of two files can be compared: same method, model, weights and scale. The
+    recordings and the rotations may differ."""
 
-    The recordings and the rotations may differ.
-    """
-
-    def made_by(file: DescriptorFile) -> dict[str, Any]:
+    def properties(file: DescriptorFile) -> dict[str, Any]:
+        """What must be equal in both files."""
         model = [file.config.get(name) for name in ("model", "grid")]
         return {
             "numbers": file.descriptors.shape[1],
@@ -168,11 +165,11 @@ def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
             "scale": file.scale,
         }
 
-    check_made_alike(made_by(a), made_by(b), of=f"descriptors of {b.sequence}, as those of {a.sequence},")
+    check_made_alike(properties(a), properties(b), of=f"descriptors of {b.sequence}, as those of {a.sequence},")
 
 
 def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
-    """Return the JSON part of the file. Raises ValueError if another program or version wrote it."""
+    """Parse the array `about` of a file (`ABOUT`). Raises ValueError if another program or version wrote it."""
     if text.ndim != 0 or text.dtype.kind != "U":
         raise ValueError(f"{path}: expected JSON in `about`, found an array {text.dtype} {text.shape}")
     about = parse_json(str(text), source=f"{path}, `about`")

@@ -1,8 +1,7 @@
 """Distance functions of descriptors, by the name in a descriptor file (`DescriptorFile.distance`).
 
-Every function takes queries (q, d) and a database (n, d), float32, and returns distances (q, n), float32. More similar
-places have smaller distances. Each function is pure, and works in blocks to need little memory besides the result. The
-method of the descriptors defines the meaning of their numbers.
+Every function takes queries (q, d) and a database (n, d), float32, and returns distances (q, n), float32. It works in
+blocks, to need little memory besides the result.
 """
 
 import difflib
@@ -17,12 +16,12 @@ from sglpr_jax.methods.pairwise import cosine, l2
 
 
 def smallest(values: Float[np.ndarray, "q n"], k: int) -> Int[np.ndarray, "q {k}"]:
-    """Return the columns of the k smallest values of each row, in ascending order. Ties keep the order of columns."""
+    """Return the columns of the k smallest values of each row, in ascending order. Ties are in the order of columns."""
     if k == 1:
         return np.argmin(values, axis=1)[:, None]
     columns = np.sort(np.argpartition(values, k - 1, axis=1)[:, :k], axis=1)
     largest = np.take_along_axis(values, columns, axis=1).max(axis=1, keepdims=True)
-    for row in np.flatnonzero((values <= largest).sum(axis=1) > k):  # Other columns tie with the last one.
+    for row in np.flatnonzero((values <= largest).sum(axis=1) > k):  # other columns tie with the k-th one
         columns[row] = np.sort(np.argsort(values[row], kind="stable")[:k])
     order = np.argsort(np.take_along_axis(values, columns, axis=1), axis=1, kind="stable")
     return np.take_along_axis(columns, order, axis=1)
@@ -37,11 +36,11 @@ DISTANCES: dict[str, DistanceFn] = {
 
 
 def distance_function(name: str) -> DistanceFn:
-    """Return the distance called `name`, or the learned distance of the weights that `name` states.
+    """Return the distance function `name`: one of `DISTANCES`, or a learned one, `METHOD:FOLDER#HASH` of its weights.
 
     Raises:
       FileNotFoundError: If the weights of a learned distance do not exist.
-      ValueError: If the name is unknown, with all names and the nearest one, or if the weights have changed.
+      ValueError: If the name is unknown (the message suggests one), or if the weights have another hash.
     """
     method = name.partition(":")[0]
     if method in LEARNED_NAMES:

@@ -1,4 +1,4 @@
-"""Computes the descriptor file of a recording, with a model or with any function of images or points."""
+"""Descriptors of the scans of a recording, the image of a scan that a model describes, and whitening."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -15,8 +15,8 @@ from sglpr_jax.data.scaled import SCALE, scale_of
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, require_content, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
-from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import Size, check_value
+from sglpr_jax.files import warn
 from sglpr_jax.methods.method import LABELLED, Method, check_descriptors
 from sglpr_jax.methods.registry import checked_view, network
 from sglpr_jax.models.config import WHITENING_POWER, ModelConfig
@@ -61,22 +61,25 @@ def embed(
     method = network(method) if isinstance(method, Params) else method
     require_content(method.name, method.takes, recording)
     check_value(batch, Size, "batch")
-    batch = min(batch, 2 ** max(len(recording) - 1, 0).bit_length())
+    batch = min(batch, 2 ** max(len(recording) - 1, 0).bit_length())  # the power of two for a short recording
     angles = None
     if rotation_seed is not None:
         angles = np.random.default_rng(rotation_seed).uniform(0, 2 * np.pi, len(recording))
 
     def prepare(row: int, scan: Scan) -> Any:
+        """Return the method's input for a scan, rotated by the angle of its row."""
         return method.prepare(scan, None if angles is None else float(angles[row]))
 
     options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD}
     rows, waiting, descriptors = [], [], []
+    """Rows of all described scans, inputs of the next batch, and descriptors of each batch."""
 
     def describe_waiting() -> None:
+        """Describe the waiting inputs as one batch, filled up with copies of the last input."""
         names = [_scan_name(recording, row) for row in rows[-len(waiting) :]]
         inputs = _stacked(method, waiting + [waiting[-1]] * (batch - len(waiting)), names)
         descriptors.append(method.describe(inputs))
-        if len(descriptors) > 1:  # JAX is still computing the last batch
+        if len(descriptors) > 1:  # JAX still computes the last batch; fetch the one before
             descriptors[-2] = np.asarray(descriptors[-2], np.float32)
         waiting.clear()
 
@@ -88,7 +91,7 @@ def embed(
                 describe_waiting()
     if waiting:
         describe_waiting()
-    return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
+    return _descriptor_file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
 
 
 def _scan_name(recording: Recording, row: int) -> str:
@@ -96,7 +99,7 @@ def _scan_name(recording: Recording, row: int) -> str:
 
 
 def _stacked(method: Method, inputs: list[Any], names: list[str]) -> Any:
-    """Stack the inputs of a batch along a new axis. Raises ValueError for an input of another shape."""
+    """Stack inputs (pytrees of arrays) along a new first axis. Raises ValueError if their shapes differ."""
     shapes = [[leaf.shape for leaf in jax.tree.leaves(content)] for content in inputs]
     for name, shape in zip(names, shapes, strict=False):
         if shape != shapes[0]:
@@ -105,20 +108,19 @@ def _stacked(method: Method, inputs: list[Any], names: list[str]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *inputs)
 
 
-def _file(
+def _descriptor_file(
     method: Method, recording: Recording, rows: list[int], descriptors: list[Any], *, rotation_seed: int | None
 ) -> DescriptorFile:
-    """Return the descriptor file of some rows. Raises ValueError if there are no rows.
-
-    `descriptors` are batches. The last one may have additional rows at its end.
-    """
+    """Return the descriptor file of the scans in `rows` of a recording. `descriptors` are batches (b, d). The last one
+    may have additional rows at its end, which are dropped. Raises ValueError if there are no rows, if batches differ in
+    width, or if a model's descriptors are invalid."""
     check_readable(recording, len(rows))
-    sizes = sorted({batch.shape[1] for batch in descriptors})
-    if len(sizes) > 1:
-        raise ValueError(f"{method.name}: expected descriptors of one length, found {sizes}")
-    together = np.concatenate([np.asarray(batch, np.float32) for batch in descriptors])[: len(rows)]
+    widths = sorted({batch.shape[1] for batch in descriptors})
+    if len(widths) > 1:
+        raise ValueError(f"{method.name}: expected descriptors of one length, found {widths}")
+    scan_descriptors = np.concatenate([np.asarray(batch, np.float32) for batch in descriptors])[: len(rows)]
     if method.weights_hash:
-        check_descriptors(method.name, together, [_scan_name(recording, row) for row in rows])
+        check_descriptors(method.name, scan_descriptors, [_scan_name(recording, row) for row in rows])
     config: dict[str, Any] = {"data": recording.name}
     if recording.mounting is not None:
         config["sensor"] = str(recording.mounting)
@@ -134,7 +136,7 @@ def _file(
         ids=tuple(recording.ids[row] for row in rows),
         positions=None if recording.positions is None else recording.positions[rows],
         times=None if recording.times is None else recording.times[rows],
-        descriptors=together,
+        descriptors=scan_descriptors,
         pose_source=recording.pose_source,
         config=config,
         weights_hash=method.weights_hash,

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.files import naming
 from sglpr_jax.retrieval.descriptor_file import check_made_alike
-from sglpr_jax.retrieval.index import check_asked, checked_rows
-from sglpr_jax.retrieval.parquet import KEY, about_of, usable
+from sglpr_jax.retrieval.index import check_result_count, descriptor_rows
+from sglpr_jax.retrieval.parquet import KEY, about_of, storage_errors
 
 if TYPE_CHECKING:
     import pyarrow
@@ -28,19 +28,19 @@ class FleetIndex:
       near = index.query(descriptor, 3, where="site = 'berlin' AND recording != 'town-1'")
     """
 
-    def __init__(self, place: Path | str, *, weights_hash: str | None = None, **options: Any):
+    def __init__(self, address: Path | str, *, weights_hash: str | None = None, **options: Any):
         """Open a table. If there is no table, the first `add` creates it.
 
         Arguments:
-          place: Folder, or address in object storage.
+          address: Folder, or address in object storage.
           weights_hash: Hash of the weights that the table must have, otherwise ValueError. None accepts any.
           options: Options of `lancedb.connect`, such as `storage_options` with keys of the object storage.
         """
-        self.place, self.weights_hash = str(place), weights_hash
-        with usable(self.place):
+        self.address, self.weights_hash = str(address), weights_hash
+        with storage_errors(self.address):
             import lancedb
 
-            self._connection = lancedb.connect(self.place, read_consistency_interval=timedelta(0), **options)
+            self._connection = lancedb.connect(self.address, read_consistency_interval=timedelta(0), **options)
             self.table: Any = None  # until the first `add`
             if TABLE in self._connection.list_tables().tables:
                 try:
@@ -52,22 +52,22 @@ class FleetIndex:
             self._check(self.about)
 
     def __len__(self) -> int:
-        with usable(self.place):
+        with storage_errors(self.address):
             return 0 if self.table is None else self.table.count_rows()
 
     @property
     def about(self) -> dict[str, Any]:
         """Width, scale and hash of the weights of the places."""
-        return about_of(self.table.schema, self.place)
+        return about_of(self.table.schema, self.address)
 
     def add(self, rows: "pyarrow.Table") -> int:
-        """Add the rows of `place_rows` or of a Parquet file, all or none. Returns how many are new."""
+        """Add the rows of `place_rows` or of a Parquet file, all or none. Returns the number of rows that were new."""
         self._check(about_of(rows.schema, "rows"))
-        with usable(self.place):
+        with storage_errors(self.address):
             if self.table is None:
                 self.table = self._connection.create_table(TABLE, schema=rows.schema, exist_ok=True)
-            adding = self.table.merge_insert(KEY).when_not_matched_insert_all()
-            return adding.execute(rows, timeout=timedelta(seconds=60)).num_inserted_rows
+            insertion = self.table.merge_insert(KEY).when_not_matched_insert_all()
+            return insertion.execute(rows, timeout=timedelta(seconds=60)).num_inserted_rows
 
     def query(
         self,
@@ -83,7 +83,7 @@ class FleetIndex:
 
         Arguments:
           descriptors: Descriptors of the weights of the index.
-          k: Number of places.
+          k: Number of places for each descriptor.
           where: Condition in SQL on the columns of the table. Only places that fulfil it are searched.
           columns: Further columns of the answer, such as "time" and "x".
           probes: Number of partitions of the index that are searched. None compares all places exactly.
@@ -93,10 +93,10 @@ class FleetIndex:
           Columns `place` (recording/scan), `query` (row of the query) and `distance`, nearest first.
         """
         if self.table is None:
-            raise ValueError(f"{self.place}: expected an index with places, found none")
-        queries = checked_rows(descriptors, self.table.schema.field("descriptor").type.list_size)
-        check_asked(k, queries=len(queries), places=k)
-        with usable(self.place):
+            raise ValueError(f"{self.address}: expected an index with places, found none")
+        queries = descriptor_rows(descriptors, self.table.schema.field("descriptor").type.list_size)
+        check_result_count(k, queries=len(queries), places=k)
+        with storage_errors(self.address):
             vectors = list(queries) if len(queries) > 1 else queries[0]
             search = self.table.search(vectors, vector_column_name="descriptor")
             search = search.distance_type("l2").select([KEY, *columns, "_distance"]).limit(k)
@@ -109,11 +109,12 @@ class FleetIndex:
         return answers.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
     def optimize(self, config: Any = None) -> None:
-        """Merge small files and index new places. Trains missing indexes first, or one by LanceDB's `config`."""
+        """Merge small files and add new places to the indexes of the columns. If there are no indexes, or with a
+        `config` of LanceDB for the index of descriptors, they are trained first."""
         from lancedb.index import Bitmap, BTree, IvfSq
 
         columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}
-        with usable(self.place):
+        with storage_errors(self.address):
             if config is not None or not self.table.list_indices():
                 indexes = columns | {"descriptor": config or IvfSq(distance_type="l2")}
                 for name, index in indexes.items():
@@ -121,9 +122,9 @@ class FleetIndex:
             self.table.optimize()
 
     def _check(self, about: dict[str, Any]) -> None:
-        """Raise ValueError if places are not comparable with those of the table, or have other weights than asked."""
+        """Raise ValueError if places have another width, scale or weights than the table, or than `weights_hash`."""
         expected = dict(about if self.table is None else self.about)
         if self.weights_hash is not None:
             expected["weights_hash"] = self.weights_hash
-        with naming(self.place):
+        with naming(self.address):
             check_made_alike(expected, about, of="places")

@@ -1,4 +1,4 @@
-"""Maps on the grid of the image: classes that the segmentation head predicts, and the strength of features."""
+"""Bird's-eye-view maps of a scan: predicted classes of its cells, and strengths of feature maps of the network."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 from PIL import Image
 
-from sglpr_jax.bev import uncropped
+from sglpr_jax.bev import uncrop_labels
 from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import view
@@ -22,7 +22,7 @@ from sglpr_jax.models.sglpr import forward, segment
 
 
 class SemanticMap(NamedTuple):
-    """Point counts and classes of the cells of a scan (h, w)."""
+    """Point counts and classes of the cells of a scan's bird's-eye-view image."""
 
     counts: Float[np.ndarray, "h w"]
     predicted: Int[np.ndarray, "h w"]
@@ -45,7 +45,7 @@ def semantic_map(params: Params, scan: Scan, *, min_confidence: float = 0.0) -> 
     Arguments:
       params: Weights of the model.
       scan: Scan, or ready-made image that is cropped to the model's grid. Cells above 0 are occupied. Labels of the
-        scan become the true map.
+        scan, if any, become `SemanticMap.truth`.
       min_confidence: Minimum probability of the most probable class. Cells below it stay unlabelled.
 
     Example:
@@ -64,7 +64,7 @@ def save_map(path: Path, found: SemanticMap, scan: Scan, *, categories: int) -> 
         pixels = found.predicted.astype(np.uint8)
     else:
         raw = to_raw(found.predicted, categories=categories)
-        pixels = label_image_pixels(uncropped(raw, shape=scan.image.shape))
+        pixels = label_image_pixels(uncrop_labels(raw, shape=scan.image.shape))
     with replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
 
@@ -73,23 +73,22 @@ def save_map(path: Path, found: SemanticMap, scan: Scan, *, categories: int) -> 
 def _predict(
     params: Params, counts: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
 ) -> tuple[Int[Array, "h w"], Int[Array, "h w"]]:
-    """Classes of the highest mean probability over the image and its mirror image, and the truth.
-
-    The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds more.
-    """
+    """Return the predicted classes and the truth, both `UNLABELLED` in cells that are empty or out of view. A cell is
+    predicted by the mean probability over the image and its mirror image, if it reaches `min_confidence`. The network
+    is equivariant to rotations of the scan but not to reflections, so only the mirror image adds more."""
     occupied = (counts > 0) & field_of_view(params.config)[0]
     logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
-    as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])
-    probability = (as_it_is + mirrored[:, ::-1]) / 2
+    upright, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])  # without class 0, unlabelled
+    probability = (upright + mirrored[:, ::-1]) / 2
     predicted = probability.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
-    sure = probability.max(-1) >= min_confidence
-    return jnp.where(occupied & sure, predicted, UNLABELLED), jnp.where(occupied, truth, UNLABELLED)
+    is_confident = probability.max(-1) >= min_confidence
+    return jnp.where(occupied & is_confident, predicted, UNLABELLED), jnp.where(occupied, truth, UNLABELLED)
 
 
 def heat_maps(
     params: Params, bev: Num[Array | np.ndarray, "h w"], labels: Int[Array | np.ndarray, "h w"] | None = None
 ) -> Mapping[str, Float[np.ndarray, "h w"]]:
-    """Compute the root mean square over the channels of some feature maps, scaled from 0 to 1.
+    """Compute the root mean square over the channels of feature maps, each scaled to the range from 0 to 1.
 
     The model selects the feature maps (`config.pictures`): those of its backbone, and the first of its place head.
 
@@ -102,23 +101,27 @@ def heat_maps(
       Maps by title, with NaN outside the field of view of the model.
     """
     strengths = jax.device_get(_strengths(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
-    shown = {title: strengths[name] - np.nanmin(strengths[name]) for title, name in params.config.pictures.items()}
-    return {title: values / max(np.nanmax(values), 1e-9) for title, values in shown.items()}
+    maps = {}
+    for title, name in params.config.pictures.items():
+        above_minimum = strengths[name] - np.nanmin(strengths[name])
+        maps[title] = above_minimum / max(np.nanmax(above_minimum), 1e-9)
+    return maps
 
 
 @jax.jit
 def _strengths(
     params: Params, bev: Num[Array, "h w"], labels: Int[Array, "h w"] | None
 ) -> dict[str, Float[Array, "h w"]]:
+    """Return strengths of the feature maps in `config.pictures` on the image's grid, NaN outside the field of view."""
     config, grid = params.config, params.config.grid
     outputs = forward(params, bev, labels, segment=0)
 
     def on_grid(features: Float[Array, "1 p q c"]) -> Float[Array, "h w"]:
         strength = jnp.sqrt(jnp.mean(features.astype(jnp.float32) ** 2, axis=-1, keepdims=True))
         if config.polar:
-            whole = from_polar(strength, grid)[0, ..., 0]
+            grid_strength = from_polar(strength, grid)[0, ..., 0]
         else:
-            whole = jax.image.resize(strength[0, ..., 0], (grid.height, grid.width), "linear")
-        return jnp.where(field_of_view(config)[0], whole, jnp.nan)
+            grid_strength = jax.image.resize(strength[0, ..., 0], (grid.height, grid.width), "linear")
+        return jnp.where(field_of_view(config)[0], grid_strength, jnp.nan)
 
     return {name: on_grid(outputs.intermediates[name]) for name in config.pictures.values()}

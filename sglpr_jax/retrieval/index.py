@@ -1,6 +1,5 @@
-"""An index of places: descriptors are added over time, searched for the nearest, and saved in a file.
+"""Index of place descriptors in memory, with exact search for the nearest places and a file format.
 
-The answers are exact: a float32 product selects a few additional rows, and their distances are recomputed in float64.
 A query takes time in proportion to the number of places; adding a place does not, and nothing is compiled.
 """
 
@@ -31,19 +30,20 @@ FORMAT = "sglpr-jax index 1"
 """Format in every file."""
 ABOUT = {"width": Size, "weights_hash": str, "distance": str, "scale": Scale, "ids": list}
 """JSON values in the header of every file. Older files have no scale, which is 1."""
-SPARE = 16
-"""Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
-FEW = 4
-"""If at most one of this many rows is allowed, only the allowed ones are compared."""
-BLOCK = 64
-"""Number of queries compared with all rows at a time."""
-MOST = 2**20
-"""Maximum number of answers to a query, unless an index has more places."""
-MOST_ANSWERS = 2**26
-"""Maximum number of answers to all queries of a call: 1 GiB of rows and distances. A single query may have more."""
+SPARE_ROWS = 16
+"""Number of rows beyond k that are compared in float64, because float32 may swap rows with almost equal distances."""
+GATHER_FRACTION = 1 / 4
+"""If at most this fraction of the places is allowed, only their descriptors are compared with the queries."""
+QUERY_BLOCK = 64
+"""Number of queries compared with the places at a time, to limit memory."""
+MAX_K = 2**20
+"""Maximum number of places returned for a query, unless the index has more places."""
+MAX_RESULTS = 2**26
+"""Maximum number of places returned for all queries of a call: 1 GiB of rows and distances. A single query may have
+more."""
 
 
-class Found(NamedTuple):
+class NearestPlaces(NamedTuple):
     """Nearest k places of each query, nearest first."""
 
     rows: Int[np.ndarray, "*q k"]
@@ -75,11 +75,11 @@ class Index:
     _lengths: GrowingArray = dataclasses.field(
         default_factory=lambda: GrowingArray(np.empty(0, np.float32)), repr=False
     )
-    """Squared lengths of the descriptors, up to the last query."""
+    """Squared length of each descriptor. Places added since the last query are missing."""
     scale: Scale = 1
     """Scale of the described scans (`data.scaled`)."""
-    _last: tuple[bytes, Float[np.ndarray, "1 n"]] | None = dataclasses.field(default=None, repr=False)
-    """The last query and its rough distances, until places are added or removed."""
+    _last_query: tuple[bytes, Float[np.ndarray, "1 n"]] | None = dataclasses.field(default=None, repr=False)
+    """Bytes of the last single query, and the result of `_relative_squared_distances`. None after places change."""
 
     @classmethod
     def empty(cls, width: int = 256, *, weights_hash: str = "", distance: str = "l2", scale: Scale = 1) -> "Index":
@@ -135,7 +135,7 @@ class Index:
         positions: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> None:
-        """Add one place, or several in order. Either all places of an index have times, or none; so for positions.
+        """Add one place or several. Either all places of an index have times or none, and likewise positions.
 
         Arguments:
           descriptors: One descriptor (d,) or several (n, d).
@@ -149,31 +149,33 @@ class Index:
             other fields than the places before.
         """
         self.check(weights=weights_hash)
-        rows = checked_rows(descriptors, self.width)
-        n = len(rows)
-        names = [f"{row:06d}" for row in range(len(self), len(self) + n)] if ids is None else ids
-        names = [names] if isinstance(names, str) else [str(name) for name in names]
-        if len(names) != n:
-            raise ValueError(f"expected {n} ids, one per descriptor, found {len(names)}")
-        new = {"descriptors": rows}
+        new_descriptors = descriptor_rows(descriptors, self.width)
+        n = len(new_descriptors)
+        if ids is None:
+            new_ids = [f"{row:06d}" for row in range(len(self), len(self) + n)]
+        else:
+            new_ids = [ids] if isinstance(ids, str) else [str(name) for name in ids]
+        if len(new_ids) != n:
+            raise ValueError(f"expected {n} ids, one per descriptor, found {len(new_ids)}")
+        new_columns = {"descriptors": new_descriptors}
         if times is not None:
-            new["times"] = _finite("times", np.reshape(times, -1), (n,))
+            new_columns["times"] = _finite_array("times", np.reshape(times, -1), (n,))
         if positions is not None:
-            new["positions"] = _finite("positions", np.reshape(positions, (-1, 3)), (n, 3))
-        if len(self) and set(new) != set(self._columns):
-            before, found = ", ".join(self._columns), ", ".join(new)
-            raise ValueError(f"expected places with {before}, like the existing places, found {found}")
+            new_columns["positions"] = _finite_array("positions", np.reshape(positions, (-1, 3)), (n, 3))
+        if len(self) and set(new_columns) != set(self._columns):
+            existing, found = ", ".join(self._columns), ", ".join(new_columns)
+            raise ValueError(f"expected places with {existing}, like the existing places, found {found}")
         if not n:  # a new column would require all later places to have it
             return
-        for name, values in new.items():
+        for name, values in new_columns.items():
             self._columns.setdefault(name, GrowingArray(values[:0])).extend(values)
-        self.ids += names
-        self._last = None
+        self.ids += new_ids
+        self._last_query = None
 
     def keep(self, flags: Bool[np.ndarray, " n"]) -> None:
-        """Remove the places without a flag. The others stay in order, with new rows."""
-        self._squares()
-        self._last = None
+        """Keep the places whose flag is True, in order, and remove the others. Rows are renumbered."""
+        self._squared_lengths()  # so that the column of lengths has a row for each flag
+        self._last_query = None
         for column in (self._lengths, *self._columns.values()):
             column.keep(flags)
         self.ids = list(itertools.compress(self.ids, flags))
@@ -185,23 +187,24 @@ class Index:
         *,
         exclude: ArrayLike | None = None,
         weights_hash: str | None = None,
-    ) -> Found:
+    ) -> NearestPlaces:
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d).
 
         Arguments:
           descriptors: One descriptor (d,) or several (q, d).
           k: Number of places for each descriptor.
-          exclude: Flag of each place, whether it is excluded (see `recent`).
+          exclude: Flag of each place: True excludes the place from the search (see `recent`).
           weights_hash: Hash of the weights that made the descriptors. None skips the check.
 
         Returns:
           Rows and distances, nearest first. Equal distances keep the order of the places. Missing rows are -1.
 
-        Raises ValueError if descriptors have another width or weights, or if too much is asked for (`check_asked`).
+        Raises ValueError if descriptors have another width or weights, or if there would be too many
+        results (`check_result_count`).
         """
         self.check(weights=weights_hash)
-        queries = checked_rows(descriptors, self.width)
-        check_asked(k, queries=len(queries), places=len(self))
+        queries = descriptor_rows(descriptors, self.width)
+        check_result_count(k, queries=len(queries), places=len(self))
         excluded = np.zeros(len(self), bool) if exclude is None else np.asarray(exclude)
         if excluded.dtype != bool and excluded.size:
             raise ValueError(f"expected flags (True or False) of places to exclude, found {excluded.dtype}")
@@ -211,19 +214,18 @@ class Index:
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
         count = min(k, int(allowed.sum()))
-        for start in range(0, len(queries), BLOCK) if count else ():
-            block = slice(start, start + BLOCK)
-            rows[block, :count], distances[block, :count] = self._nearest(queries[block], allowed, count)
+        for start in range(0, len(queries), QUERY_BLOCK):
+            block = slice(start, start + QUERY_BLOCK)
+            if count:
+                rows[block, :count], distances[block, :count] = self._nearest(queries[block], allowed, count)
         shape = (*np.shape(descriptors)[:-1], k)
-        return Found(rows.reshape(shape), distances.reshape(shape))
+        return NearestPlaces(rows.reshape(shape), distances.reshape(shape))
 
     def recent(
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
-        """Return which places are too recent to be a revisit: those less than `seconds` old at the time `now`.
-
-        Without times or without `now`, these are the last `frames` places.
-        """
+        """Return flags of the places less than `seconds` older than the time `now`: too recent for a revisit. Without
+        `now`, or if the places have no times, the last `frames` places are flagged."""
         if now is not None and self.times is not None:
             return self.times > now - seconds
         return np.arange(len(self)) >= len(self) - frames
@@ -234,9 +236,9 @@ class Index:
         with replacing(Path(path)) as temporary:
             temporary.write_bytes(content)
 
-    def to_bytes(self, more: Mapping[str, np.ndarray] | None = None) -> bytes:
-        """Return the content of the file that `save` writes, with additional arrays that `load_with` returns."""
-        arrays = {name: values.rows for name, values in self._columns.items()} | dict(more or {})
+    def to_bytes(self, additional: Mapping[str, np.ndarray] | None = None) -> bytes:
+        """Return the content of the file that `save` writes, with additional arrays that `load_with_arrays` returns."""
+        arrays = {name: values.rows for name, values in self._columns.items()} | dict(additional or {})
         about = {name: getattr(self, name) for name in ABOUT}
         text = json.dumps({"format": FORMAT, **about})
         arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
@@ -250,13 +252,15 @@ class Index:
           FileNotFoundError: If the file does not exist.
           ValueError: If the file is damaged or no index, or if the index has other weights. The message names the file.
         """
-        return cls.load_with(path, weights_hash=weights_hash)[0]
+        return cls.load_with_arrays(path, weights_hash=weights_hash)[0]
 
     @classmethod
-    def load_with(cls, path: Path | str, *, weights_hash: str | None = None) -> tuple["Index", dict[str, np.ndarray]]:
-        """Read the output of `to_bytes`: the index, and the additional arrays. Errors are those of `load`."""
+    def load_with_arrays(
+        cls, path: Path | str, *, weights_hash: str | None = None
+    ) -> tuple["Index", dict[str, np.ndarray]]:
+        """Read a file with the content of `to_bytes`: the index and its additional arrays. Errors as of `load`."""
         path = Path(path)
-        about, arrays = _read(path)
+        about, arrays = _read_index_file(path)
         columns = {name: GrowingArray(arrays.pop(name)) for name in COLUMNS if name in arrays}
         index = cls(**{name: about[name] for name in ABOUT}, _columns=columns)
         with naming(path):
@@ -270,39 +274,39 @@ class Index:
     def _nearest(
         self, queries: Float[np.ndarray, "q d"], allowed: Bool[np.ndarray, " n"], k: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed."""
-        rows = np.flatnonzero(allowed)
+        """Return the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed. L2
+        is exact: float32 products select a few rows more than k, and their distances are recomputed in float64."""
+        allowed_rows = np.flatnonzero(allowed)
         if self.distance != "l2":
-            distances = distance_function(self.distance)(queries, self.descriptors[rows])
+            distances = distance_function(self.distance)(queries, self.descriptors[allowed_rows])
             order = smallest(distances, k)
-            return rows[order], np.take_along_axis(distances, order, axis=1)
-        count = min(k + SPARE, len(rows))
-        if len(rows) * FEW <= len(self):
-            rough = self._squares()[rows] - 2 * queries @ self.descriptors[rows].T
-            near = rows[np.argpartition(rough, count - 1, axis=1)[:, :count]]
+            return allowed_rows[order], np.take_along_axis(distances, order, axis=1)
+        count = min(k + SPARE_ROWS, len(allowed_rows))
+        if len(allowed_rows) <= GATHER_FRACTION * len(self):
+            rough = self._squared_lengths()[allowed_rows] - 2 * queries @ self.descriptors[allowed_rows].T
+            near_rows = allowed_rows[np.argpartition(rough, count - 1, axis=1)[:, :count]]
         else:
-            near = np.argpartition(np.where(allowed, self._rough(queries), np.inf), count - 1, axis=1)[:, :count]
-        near = np.sort(near, axis=1)  # equal distances keep the order of the rows
-        pairs = zip(queries.astype(np.float64), near, strict=True)
-        distances = np.stack([np.linalg.norm(query - self.descriptors[row], axis=1) for query, row in pairs])
+            rough = np.where(allowed, self._relative_squared_distances(queries), np.inf)
+            near_rows = np.argpartition(rough, count - 1, axis=1)[:, :count]
+        near_rows = np.sort(near_rows, axis=1)  # equal distances keep the order of the rows
+        pairs = zip(queries.astype(np.float64), near_rows, strict=True)
+        distances = np.stack([np.linalg.norm(query - self.descriptors[rows], axis=1) for query, rows in pairs])
         order = np.argsort(distances, axis=1, kind="stable")[:, :k]
-        return np.take_along_axis(near, order, axis=1), np.take_along_axis(distances, order, axis=1)
+        return np.take_along_axis(near_rows, order, axis=1), np.take_along_axis(distances, order, axis=1)
 
-    def _rough(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
-        """Return the squared distances in float32, without the squared lengths of the queries.
-
-        Those of the last query are kept, because the loop search asks for its nearest places several times.
-        """
+    def _relative_squared_distances(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
+        """Return squared distances to all places minus the squared length of the query, which keeps their order. The
+        result for the last single query is kept, because the loop search repeats a query with other exclusions."""
         key = queries.tobytes() if len(queries) == 1 else None
-        last = self._last  # read once, because another thread may replace it
+        last = self._last_query  # read once, because another thread may replace it
         if last is not None and last[0] == key:
             return last[1]
-        distances = self._squares() - 2 * queries @ self.descriptors.T
-        self._last = None if key is None else (key, distances)
+        distances = self._squared_lengths() - 2 * queries @ self.descriptors.T
+        self._last_query = None if key is None else (key, distances)
         return distances
 
-    def _squares(self) -> Float[np.ndarray, " n"]:
-        """Return the squared lengths of all descriptors, after computing those of new places."""
+    def _squared_lengths(self) -> Float[np.ndarray, " n"]:
+        """Return the squared lengths of all descriptors. Only those of new places are computed."""
         new = self.descriptors[len(self._lengths) :]
         if len(new):
             self._lengths.extend(np.einsum("nd,nd->n", new, new))
@@ -310,6 +314,7 @@ class Index:
 
 
 def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:
+    """Return the SHA-256 of a file's JSON text and of the name, shape, type and bytes of each array."""
     digest = hashlib.sha256(about.encode())
     for name, values in sorted(arrays.items()):
         digest.update(f"{name} {values.shape} {values.dtype}".encode())
@@ -317,8 +322,8 @@ def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the JSON part and the arrays of an index. Raises ValueError if the file is damaged or no index."""
+def _read_index_file(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the JSON header (`ABOUT`) and the arrays of a file. Raises ValueError if it is damaged or no index."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an index, found {'a folder' if path.is_dir() else 'none'}")
     try:
@@ -331,7 +336,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if metadata.get("sha256") != _checksum(text, arrays):
         raise ValueError(f"{path}: expected an index with a valid checksum, found a damaged one")
     about = parse_json(text, source=f"{path}, `about`")
-    about = {"scale": 1, **about} if isinstance(about, dict) else about
+    if isinstance(about, dict):
+        about.setdefault("scale", 1)  # older files have none
     with naming(path):
         check_about(about, ABOUT, format=FORMAT)
         if not all(type(name) is str for name in about["ids"]):
@@ -341,26 +347,27 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return about, arrays
 
 
-def checked_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:
+def descriptor_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:
     """Return one descriptor or several as float32 rows. Raises ValueError for a wrong width, NaN or infinity."""
     try:
         rows = np.atleast_2d(np.asarray(descriptors, np.float32))
     except (TypeError, ValueError) as error:
         raise ValueError(f"expected descriptors of {width} numbers, found others ({in_short(error)})") from error
-    return _finite("descriptors", rows, (len(rows), width)).astype(np.float32)
+    return _finite_array("descriptors", rows, (len(rows), width), np.float32)
 
 
-def check_asked(k: int, *, queries: int, places: int) -> None:
-    """Raise ValueError if k is below 1 or exceeds both `MOST` and `places`, or if the answers to several queries exceed
-    `MOST_ANSWERS`."""
-    if not 1 <= k <= max(MOST, places):
-        raise ValueError(f"expected k from 1 up to {max(MOST, places)}, found {k}")
-    if queries > 1 and queries * k > MOST_ANSWERS:
-        raise ValueError(f"expected at most {MOST_ANSWERS // k} queries at a time for k = {k}, found {queries}")
+def check_result_count(k: int, *, queries: int, places: int) -> None:
+    """Raise ValueError if k is not from 1 to `MAX_K` or `places`, or if several queries have more than `MAX_RESULTS`
+    results."""
+    if not 1 <= k <= max(MAX_K, places):
+        raise ValueError(f"expected k from 1 up to {max(MAX_K, places)}, found {k}")
+    if queries > 1 and queries * k > MAX_RESULTS:
+        raise ValueError(f"expected at most {MAX_RESULTS // k} queries at a time for k = {k}, found {queries}")
 
 
-def _finite(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    values = np.asarray(values, np.float64 if name != "descriptors" else np.float32)
+def _finite_array(name: str, values: Any, shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
+    """Return `values` as an array. Raises ValueError, with `name`, for another shape, NaN or infinity."""
+    values = np.asarray(values, dtype)
     if values.shape != shape:
         raise ValueError(f"expected {name} of shape {shape}, found {values.shape}")
     if not np.isfinite(values).all():

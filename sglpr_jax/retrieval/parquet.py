@@ -1,4 +1,4 @@
-"""Rows of the places of a fleet, as Arrow tables. Parquet files and the index have the same columns."""
+"""Places of a fleet as rows of Arrow tables, in Parquet files of a store. `FleetIndex` has the same columns."""
 
 import contextlib
 import hashlib
@@ -38,7 +38,7 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def schema(about: dict[str, Any]) -> "pyarrow.Schema":
-    """Return the columns of places that were made as `about` states."""
+    """Return the columns of a table of places, with `about` (the values of `ABOUT`) in its metadata."""
     import pyarrow
 
     unique = {"lance-schema:unenforced-primary-key": "true"}  # concurrent writers add a place once
@@ -97,22 +97,25 @@ def place_rows(
 
 
 def about_of(stored: "pyarrow.Schema", source: str) -> dict[str, Any]:
-    """Return how the places of a table were made. Raises ValueError, naming `source`, if its columns are others."""
+    """Return the values of `ABOUT` in a table's metadata. Raises ValueError, naming `source`, if a column is missing or
+    has another type."""
     about = parse_json((stored.metadata or {}).get(b"about", b"null"), source=f"{source}, `about`")
     with naming(source):
         check_about(about, ABOUT, format=FORMAT)
         about = {name: about[name] for name in ABOUT}
-        kinds = {field.name: str(field.type) for field in stored}
+        stored_types = {field.name: str(field.type) for field in stored}
         for field in schema(about):
-            kind = kinds.get(field.name, "none")
-            if kind.replace("item:", "element:") != str(field.type).replace("item:", "element:"):
-                raise ValueError(f"expected a column {field.name} of {field.type}, found {kind}")
+            stored_type = stored_types.get(field.name, "none")
+            # Parquet and LanceDB name the elements of a list differently.
+            if stored_type.replace("item:", "element:") != str(field.type).replace("item:", "element:"):
+                raise ValueError(f"expected a column {field.name} of {field.type}, found {stored_type}")
     return about
 
 
 @contextlib.contextmanager
-def usable(address: str) -> Iterator[None]:
-    """Convert the exceptions of storage libraries, of many types, to a ValueError that names the address."""
+def storage_errors(address: str) -> Iterator[None]:
+    """Convert any exception of the block, which calls a storage library, to a ValueError that names the address. An
+    ImportError stays an ImportError, and says what to install."""
     try:
         yield
     except ImportError as error:
@@ -123,7 +126,7 @@ def usable(address: str) -> Iterator[None]:
         raise ValueError(f"{address}: expected a store that can be read and written, found: {reason}") from error
 
 
-class Stored(NamedTuple):
+class StoreResult(NamedTuple):
     """Result of `embed_to_store`."""
 
     address: str
@@ -134,7 +137,7 @@ class Stored(NamedTuple):
 
 def embed_to_store(
     store: str, method: Params | Method, recording: Recording, *, site: str = "", source: str = "", **options: Any
-) -> Stored:
+) -> StoreResult:
     """Describe a recording and write its places to a store, unless they are there already.
 
     Reads all files of the recording once to compute their hash.
@@ -157,15 +160,16 @@ def embed_to_store(
     settings_hash = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:12]
     name = file_name(f"{recording.name}-{fingerprint(recording, contents='all')}")
     address = f"{store.rstrip('/')}/{file_name(method.about['method'])}-{settings_hash}/{name}.parquet"
-    with usable(address):
+    with storage_errors(address):
         filesystem, path = _open(address)
         if filesystem.exists(path):
-            return Stored(address, None)
-    file, poses = embed(method, recording, **options), recording.world_from_lidar
-    rotations = None if poses is None else poses[file.recorded][:, :3, :3]
+            return StoreResult(address, None)
+    file = embed(method, recording, **options)
+    poses = recording.world_from_lidar
+    rotations = None if poses is None else poses[file.is_described][:, :3, :3]
     rows = place_rows(file, name, site=site, source=source, rotations=rotations)
     content = io.BytesIO()
-    with usable(address):
+    with storage_errors(address):
         import pyarrow.parquet
         from fsspec.implementations.local import LocalFileSystem
 
@@ -173,14 +177,14 @@ def embed_to_store(
         if isinstance(filesystem, LocalFileSystem):
             with replacing(Path(path)) as temporary:
                 temporary.write_bytes(content.getbuffer())
-        else:  # an object appears when it is complete
+        else:  # object storage shows only complete objects
             filesystem.pipe_file(path, content.getvalue())
-    return Stored(address, len(rows))
+    return StoreResult(address, len(rows))
 
 
 def stored_places(store: str) -> list[str]:
     """Return the addresses of all Parquet files of a store. Raises ValueError if it cannot be read."""
-    with usable(store):
+    with storage_errors(store):
         filesystem, path = _open(store)
         paths = [path for path in sorted(filesystem.find(path)) if path.endswith(".parquet")]
         return [filesystem.unstrip_protocol(path) for path in paths if not path.rpartition("/")[2].startswith(".")]
@@ -188,7 +192,7 @@ def stored_places(store: str) -> list[str]:
 
 def read_places(address: str) -> "pyarrow.Table":
     """Read the rows of one Parquet file. Raises ValueError if it contains other columns."""
-    with usable(address):
+    with storage_errors(address):
         import pyarrow.parquet
 
         filesystem, path = _open(address)

@@ -7,7 +7,7 @@ from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.loops import search
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl, write_tum
 
 from .conftest import SCANS, WALK, assert_one_line_error

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data.readers import stamped
+from sglpr_jax.data.readers import mulran_helipr_boreas_nclt
 
 NS, US = 1561000444390857630, 1326652795280148
 POINTS = np.array([[5.0, 1.0, -1.5], [7.0, -2.0, 0.5], [-3.0, 4.0, 2.0]], np.float32)
@@ -69,7 +69,7 @@ def helipr_scan(sensor: str, layout: str, shift: int = 0) -> bytes:
 
 def helipr_tree(root: Path) -> None:
     folder = root / "Roundabout01"
-    stamps = [stamped.AEVA_CHANGED + 1 + i * 10**8 for i in range(2)]
+    stamps = [mulran_helipr_boreas_nclt.AEVA_CHANGED + 1 + i * 10**8 for i in range(2)]
     for sensor, layout in HELIPR.items():
         for i, stamp in enumerate(stamps):
             write(folder / f"LiDAR/{sensor}/{stamp}.bin", helipr_scan(sensor, layout, i))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.bin_records import detect_point_format, unusual_record
+from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti, detect_point_format
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers import open_recording as open_any
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))
 FIRING = np.arange(16).reshape(2, 8).T.reshape(-1)
@@ -80,7 +80,7 @@ def test_a_broken_file_among_others_does_not_hide_it(tmp_path):
     (tmp_path / "4.bin").write_bytes(np.random.default_rng(0).bytes(48000))
     (tmp_path / "0.bin").write_bytes(b"")
     assert detect_point_format(sorted(tmp_path.iterdir()))[0] == "float32x6"
-    assert unusual_record(sorted(tmp_path.iterdir())) == "float32x6"
+    assert detect_format_unless_kitti(sorted(tmp_path.iterdir())) == "float32x6"
 
 
 @pytest.mark.parametrize(

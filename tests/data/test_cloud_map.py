@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, TILE_M, on_trail, remove_hidden_points, tiled_cloud
 from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 
 def plane(x, y, step=0.1):
@@ -40,7 +40,7 @@ STREET = plane((-5, 5), (-5, 5))
         (STREET[np.abs(STREET).max(axis=1) > 1], sheet((-0.9, 0.9), (0.2, 1.5)), False),  # it stayed
     ],
 )
-def test_low_things_on_ground_that_was_seen_are_removed(ground, thing, moved):
+def test_low_objects_on_visible_ground_are_removed(ground, thing, moved):
     points = np.concatenate([ground, thing]).astype(np.float32)
     found = on_trail(points)
     assert not found[: len(ground)].any()
@@ -59,7 +59,7 @@ def as_rows(points):
     return {tuple(row) for row in points.tolist()}
 
 
-def test_agreement_with_a_plain_loop():
+def test_hidden_points_agree_with_a_plain_loop():
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(400, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -148,7 +148,7 @@ def test_a_tiled_cloud_has_one_point_per_voxel_near_the_trajectory(tmp_path):
     cloud = rng.uniform([-150, -150, -3], [150, 150, 3], (40_000, 3))
     positions = np.array([[0.0, 0, 0], [60, 0, 0]])
     found = tiled_cloud(np.array_split(cloud, 7), positions=positions, reach_m=30.0, source=tmp_path)
-    assert found.read == len(cloud)
+    assert found.total == len(cloud)
     np.testing.assert_array_equal((found.lowest, found.highest), (cloud.min(axis=0), cloud.max(axis=0)))
     everything = {tuple(row) for row in cloud.astype(np.float32).tolist()}
     assert {tuple(row) for row in found.points.tolist()} <= everything

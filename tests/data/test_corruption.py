@@ -15,7 +15,7 @@ from sglpr_jax.data.corruption import (
     Corruption,
     corrupt,
     corruption_named,
-    keep_rings,
+    is_on_kept_ring,
     ring_numbers,
 )
 from sglpr_jax.data.corruption import corrupted as corrupted_recording
@@ -88,13 +88,13 @@ def turn(elevations_deg, *, azimuths=90, wobble_deg=0.0, seed=0):
 @pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 64))
-def test_elevations_that_stand_apart_tell_the_ring_in_any_order(seed, rings):
+def test_separate_elevations_give_the_rings_in_any_order(seed, rings):
     points, expected = turn(HDL64E_DEG[:rings], seed=seed)
     order = np.random.default_rng(seed).permutation(len(points))
     np.testing.assert_array_equal(ring_numbers(points[order]), expected[order])
 
 
-def test_rings_that_waver_are_told_by_the_order_of_the_points_or_by_laser_numbers_in_any_order():
+def test_overlapping_rings_are_separated_by_the_order_of_points_or_laser_numbers():
     points, expected = turn(HDL64E_DEG, wobble_deg=0.5)
     sample = np.random.default_rng(0).random(len(points)) < 0.7
     np.testing.assert_array_equal(ring_numbers(points[sample]), expected[sample])
@@ -112,7 +112,7 @@ def test_points_without_rings_are_refused():
 @pytest.mark.parametrize(("found", "beams", "every"), [(64, 32, 2), (61, 16, 4), (16, 16, 1)])
 def test_every_second_or_fourth_ring_is_kept(found, beams, every):
     rings = np.random.default_rng(0).permutation(np.repeat(np.arange(found), 5))
-    kept = keep_rings(rings, beams)
+    kept = is_on_kept_ring(rings, beams)
     assert sorted(set(rings[kept])) == list(range(0, found, every))
     assert set(rings[~kept]) == set(range(found)) - set(range(0, found, every))
 

@@ -55,7 +55,7 @@ def test_a_point_high_in_the_air_takes_no_memory():
 
 
 @pytest.mark.parametrize("outside", [(25.0, 0, 0), (0, 0, -1.2001), (np.nan, 0, 0), (0, 0, np.inf)])
-def test_what_is_outside_the_crop_leaves_no_trace(outside):
+def test_points_outside_the_crop_change_nothing(outside):
     points = cloud(outside)
     assert not density_image(points).any()
     assert not density_label_image(points, np.array([9])).any()

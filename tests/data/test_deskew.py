@@ -63,7 +63,7 @@ def test_a_constant_velocity_is_removed(roll, pitch, yaw, x, y, z):
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.floats(-2, 2), min_size=6, max_size=6), st.floats(-0.5, 1.5))
-def test_interpolation_is_that_of_the_matrix_logarithm(numbers, share):
+def test_interpolation_equals_the_matrix_logarithm(numbers, share):
     start = expm(twist(numbers[3:], numbers[:3]))
     end = start @ expm(twist(numbers[:3], numbers[3:]) / 2)
     expected = start @ expm(share * np.real(logm(np.linalg.inv(start) @ end)))

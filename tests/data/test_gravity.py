@@ -15,7 +15,7 @@ import sglpr_jax
 from sglpr_jax.data.gravity import GROUND_TILT_DEG, ODOMETRY_TILT_DEG, GroundFilter, mounted, with_odometry
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 SCANS = 30
 

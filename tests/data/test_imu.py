@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 IMU, DURATION_S, BEGIN_S = "sensor_msgs/msg/Imu", 40.0, 1000.0
 STAMPS = BEGIN_S + np.arange(0, DURATION_S, 0.01)

@@ -27,10 +27,10 @@ from dataset_trees import (
 )
 from PIL import Image
 
-from sglpr_jax.data.formats.pose_files import read_stamped_rows
+from sglpr_jax.data.formats.pose_files import read_timed_rows
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.packed import packed
-from sglpr_jax.data.readers import kitti_raw, open_recording, recording_names, stamped
+from sglpr_jax.data.readers import kitti_raw, mulran_helipr_boreas_nclt, open_recording, recording_names
 from sglpr_jax.retrieval.descriptor_cache import fingerprint
 
 
@@ -81,7 +81,7 @@ LAYOUTS = {
         f"helipr {sensor}": Layout(
             helipr_tree,
             f"Roundabout01-{sensor}",
-            (str(stamped.AEVA_CHANGED + 1), str(stamped.AEVA_CHANGED + 1 + 10**8)),
+            (str(mulran_helipr_boreas_nclt.AEVA_CHANGED + 1), str(mulran_helipr_boreas_nclt.AEVA_CHANGED + 1 + 10**8)),
             [[0, 2, 3], [1, 2, 3]],
             [0.1],
             POINTS + 1,
@@ -252,7 +252,7 @@ def test_missing_files_are_named(tree):
     with pytest.raises(FileNotFoundError, match=r"v1\.0-trainval/sample\.json: expected a table, found none"):
         open_recording(root, "scene-0999")
     with pytest.raises(FileNotFoundError, match=r"none\.csv: expected a table of poses, found none"):
-        read_stamped_rows(root / "none.csv", columns=2)
+        read_timed_rows(root / "none.csv", columns=2)
 
 
 def test_kitti_has_labels_and_two_pose_files(tree):
@@ -297,12 +297,12 @@ def test_ready_made_images(bev_root):
 
 
 def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
-    path = tmp_path / f"{stamped.AEVA_CHANGED}.bin"
+    path = tmp_path / f"{mulran_helipr_boreas_nclt.AEVA_CHANGED}.bin"
     path.write_bytes(helipr_scan("Aeva", "fffffiB"))
-    np.testing.assert_array_equal(stamped.read_helipr(path, sensor="Aeva").points, POINTS)
+    np.testing.assert_array_equal(mulran_helipr_boreas_nclt.read_helipr(path, sensor="Aeva").points, POINTS)
     path.write_bytes(bytes(29))
     with pytest.raises(ValueError, match=r"expected 25 bytes for each point \(Aeva\), found 29 bytes in total"):
-        stamped.read_helipr(path, sensor="Aeva")
+        mulran_helipr_boreas_nclt.read_helipr(path, sensor="Aeva")
 
 
 def test_kitti_raw_without_gps(tree):
@@ -322,7 +322,7 @@ def test_the_ground_truth_of_nclt_is_found_in_any_of_three_places(tree, place):
 
 def test_long_times_keep_all_their_digits(tmp_path):
     write(tmp_path / "poses.csv", f"{NS},1\n{NS + 1}.000,2\n1.5e3,3\n")
-    times, numbers = read_stamped_rows(tmp_path / "poses.csv", columns=2)
+    times, numbers = read_timed_rows(tmp_path / "poses.csv", columns=2)
     assert times.tolist() == [NS, NS + 1, 1500] and numbers.tolist() == [[1], [2], [3]]
 
 

@@ -14,7 +14,7 @@ from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting, upright_from_lidar
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.methods.registry import handcrafted
@@ -98,7 +98,7 @@ def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
 
 @settings(max_examples=25, deadline=None)
 @given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda up: np.linalg.norm(up) > 0.1), st.floats(0, 4))
-def test_levelling_is_rigid_and_turns_up_to_z(up, height):
+def test_level_is_rigid_and_rotates_up_to_z(up, height):
     unit = np.array(up) / np.linalg.norm(up)
     mounting = Mounting(height, tuple(unit.tolist()))
     rotation = upright_from_lidar(mounting)[:3, :3]

@@ -64,7 +64,7 @@ def test_a_scan_whose_bytes_have_changed_is_refused_and_the_others_are_not(recor
         found.points(2)
 
 
-def test_a_pack_of_the_time_before_checksums_is_read(recording, tmp_path):
+def test_a_pack_without_checksums_is_read(recording, tmp_path):
     packed(recording, tmp_path / "cache")
     (file,) = (tmp_path / "cache").rglob("pack.json")
     about = json.loads(file.read_text())

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.pose_files import frame_rows, read_poses, read_rows, read_times, read_trajectory
+from sglpr_jax.data.formats.pose_files import read_poses, read_rows, read_times, read_trajectory, rows_of_frames
 from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, time_unit_problem, times_of, unit_change
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n"
 SECONDS = np.arange(280) / 10
@@ -106,11 +106,11 @@ def test_frames_are_rows(write):
     path = write("rows.txt", "# t,x\n1,2\n# a stop\n3,4\n")
     assert read_rows(path, columns=2, separator=",").tolist() == [[1, 2], [3, 4]]
     rows = np.arange(53.0)
-    assert frame_rows(rows, ["000000", "000052"], path=path).tolist() == [0, 52]
+    assert rows_of_frames(rows, ["000000", "000052"], path=path).tolist() == [0, 52]
     with pytest.raises(ValueError, match=r"rows\.txt: expected at least 53 rows \(frame 52\), found 52"):
-        frame_rows(rows[:52], ["000000", "000052"], path=path)
+        rows_of_frames(rows[:52], ["000000", "000052"], path=path)
     with pytest.raises(ValueError, match="such as 000052, found 'front'"):
-        frame_rows(rows, ["front"], path=path)
+        rows_of_frames(rows, ["front"], path=path)
 
 
 @pytest.mark.parametrize("start", [0.0, 12.5, 1.7e9])

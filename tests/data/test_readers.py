@@ -5,7 +5,7 @@ import pytest
 
 from sglpr_jax.data import readers
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 MULE = """
 from sglpr_jax.data.formats.scan_files import scan_of_file

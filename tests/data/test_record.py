@@ -90,7 +90,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_no_place_is_refused_on_every_road_to_an_image(as_installed, kind):
+def test_unusable_scans_are_refused_wherever_an_image_is_computed(as_installed, kind):
     points, found = BAD[kind]
     roads = (
         lambda: check_cloud(points, name="scan 7"),

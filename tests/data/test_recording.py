@@ -79,7 +79,7 @@ CLOUDS = {Path(f"{i}.bin"): np.ones((5, 3), np.float32) for i in range(3)}
         ({"ids": ("0", "1", "1")}, "expected a unique id for each scan, found '1' twice"),
     ],
 )
-def test_what_is_not_there_once_for_each_scan_is_refused(fields, message):
+def test_a_recording_needs_one_value_per_scan(fields, message):
     assert len(of_scans(CLOUDS)) == 3
     with pytest.raises(ValueError, match=message):
         of_scans(CLOUDS, **fields)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.poses import have_poses, interpolate_poses, poses_of
 from sglpr_jax.data.readers import open_recording, recording_names, ros
-from sglpr_jax.data.scan_stream import readable
+from sglpr_jax.data.scan_stream import only_readable
 
 LATE_S = 1000.0
 """The recorder's clock runs so much ahead of the sensors'."""
@@ -101,7 +101,7 @@ def test_an_empty_cloud_among_others_is_named_and_can_be_skipped(tmp_path):
     with pytest.raises(ValueError, match=r"scan 000001: .*drive.*: expected a cloud with points on /points"):
         recording.points(1)
     told = []
-    assert readable(recording, on_bad_scan=lambda scan, error: told.append(scan)).ids == ("000000", "000002")
+    assert only_readable(recording, on_bad_scan=lambda scan, error: told.append(scan)).ids == ("000000", "000002")
     assert told == ["000001"]
 
 

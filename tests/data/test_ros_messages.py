@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sglpr_jax.data.formats.ros_messages import RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 
 @pytest.mark.parametrize("driver", DRIVERS)

@@ -13,7 +13,7 @@ from sglpr_jax.data.formats import clouds as limits
 from sglpr_jax.data.formats.pcd_ply import decompress_lzf
 from sglpr_jax.data.formats.scan_files import (
     cloud_blocks,
-    named_format,
+    format_by_name,
     read_labels,
     read_scan,
     read_scan_file,
@@ -92,7 +92,7 @@ def test_records_without_a_header(tmp_path):
     ],
 )
 def test_format_and_id_come_from_the_name(name, format, stem):
-    assert named_format(Path(name)) == format and scan_id(Path(name)) == stem
+    assert format_by_name(Path(name)) == format and scan_id(Path(name)) == stem
 
 
 def array_header(shape) -> bytes:

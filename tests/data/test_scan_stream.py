@@ -8,7 +8,7 @@ import pytest
 from recordings import of_scans, with_points
 
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.data.scan_stream import readable, scan_stream
+from sglpr_jax.data.scan_stream import only_readable, scan_stream
 
 SCANS = 6
 CLOUDS = {Path(f"{i}.bin"): np.full((5, 3), i + 1, np.float32) for i in range(SCANS)}
@@ -73,7 +73,7 @@ def test_after_a_stop_no_scan_is_read_and_those_that_were_are_yielded(ahead):
 
 
 @pytest.mark.parametrize("ahead", [0, 3])
-def test_this_thread_reads_and_others_look_ahead(ahead):
+def test_this_thread_reads_and_other_threads_compute(ahead):
     reading, looking, here = set(), set(), threading.get_ident()
     read = with_points(WHOLE, lambda path: reading.add(threading.get_ident()) or CLOUDS[path])
     list(scan_stream(read, lambda row, scan: looking.add(threading.get_ident()), ahead=ahead))
@@ -81,12 +81,12 @@ def test_this_thread_reads_and_others_look_ahead(ahead):
     assert (here in looking) == (not ahead)
 
 
-def test_what_belongs_to_a_bad_scan_goes_with_it():
+def test_fields_of_a_bad_scan_are_removed_with_the_scan():
     whole = of_scans(CLOUDS, positions=np.arange(18.0).reshape(6, 3), times=np.arange(6.0))
     bad = []
-    found = readable(with_points(whole, points_with_bad_ones), on_bad_scan=lambda scan, error: bad.append(scan))
+    found = only_readable(with_points(whole, points_with_bad_ones), on_bad_scan=lambda scan, error: bad.append(scan))
     assert found.ids == ("0", "3", "4", "5") and bad == ["1", "2"]
     assert found.times.tolist() == [0, 3, 4, 5] and found.positions[:, 0].tolist() == [0, 9, 12, 15]
     np.testing.assert_array_equal(found.points(1), CLOUDS[Path("3.bin")])
     with pytest.raises(ValueError, match="sequence 08: expected at least one readable scan, found none"):
-        readable(of_scans({Path("1.bin"): FAR}), on_bad_scan=lambda *_: None)
+        only_readable(of_scans({Path("1.bin"): FAR}), on_bad_scan=lambda *_: None)

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.submap import SubmapBuilder, submaps
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 
 WORLD = np.random.default_rng(0).uniform(-30, 30, (2000, 3)).astype(np.float32)
 WORLD[:, 2] *= 0.1

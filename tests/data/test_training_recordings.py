@@ -13,7 +13,7 @@ def write_map(path, raw: int) -> None:
     Image.fromarray(np.full((5, 7), raw, np.uint16)).save(path)
 
 
-def test_images_without_labels_get_those_there_are(bev_root, tmp_path):
+def test_images_without_labels_get_pseudo_labels(bev_root, tmp_path):
     recording = open_recording(bev_root, "06")
     write_map(tmp_path / "maps/06/000001.png", 50)
     write_map(tmp_path / "maps/06/000009.png", 50)  # of no image

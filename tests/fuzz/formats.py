@@ -17,7 +17,8 @@ from sglpr_jax.data.formats.png import read_label_image
 from sglpr_jax.data.formats.pose_files import Trajectory, read_times, read_trajectory
 from sglpr_jax.data.formats.scan_files import read_labels, read_scan
 from sglpr_jax.data.packed import open_pack, packed
-from sglpr_jax.data.readers import bev_images, open_recording, stamped
+from sglpr_jax.data.readers import bev_images, open_recording
+from sglpr_jax.data.readers.mulran_helipr_boreas_nclt import read_nclt_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation.inputs import read_input
@@ -182,7 +183,7 @@ FORMATS = {
     "TUM poses": Format("a.tum", text(np.column_stack([TIMES, POSITIONS, [[0, 0, 0, 1]] * N])), read_trajectory),
     "csv poses": Format("a.csv", b"t,x,y,z\n" + text(np.column_stack([TIMES, POSITIONS]), ","), read_trajectory),
     "times": Format("times.txt", text(TIMES[:, None]), read_times),
-    "NCLT ground truth": Format("groundtruth_2012-01-15.csv", text(UTIMES, ","), stamped.read_ground_truth),
+    "NCLT ground truth": Format("groundtruth_2012-01-15.csv", text(UTIMES, ","), read_nclt_poses),
     **{
         f"nuScenes {Path(name).stem}": Format(name, NUSCENES[name], read_scenes, NUSCENES)
         for name in NUSCENES

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from sglpr_jax.live.ros_messages import Received
+from sglpr_jax.live.ros_encoding import Received
 from tests import bags
 
 ODOMETRY = bags.ODOMETRY

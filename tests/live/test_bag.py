@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from sglpr_jax.live.endpoints import open_source
 from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.sources_and_sinks import open_source
 from tests.bags import CLOUD, POSE, cloud, pose, write_bag
 
 POINTS = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)

@@ -17,11 +17,11 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sglpr_jax.live.dds import DdsTransport
-from sglpr_jax.live.endpoints import open_sink, open_source
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros_messages import EDGE, TRANSFORMS
+from sglpr_jax.live.ros_encoding import EDGE, TRANSFORMS
+from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 from tests.live.messages import decoded, transforms
-from tests.live.test_ros_messages import edge
+from tests.live.test_ros_encoding import edge
 
 LOOPBACK = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.live import folder
-from sglpr_jax.live.endpoints import open_source
 from sglpr_jax.live.folder import GrowingPoses
 from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.sources_and_sinks import open_source
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import transform
 
@@ -59,7 +59,7 @@ def test_scans_of_a_folder_come_in_order_once_they_are_complete(incoming, said):
         for start in range(0, len(content), 800):
             file.write(content[start : start + 800])
             file.flush()
-            assert looked(source, folder.LOOK_S / 2) == [] or start + 800 >= len(content)
+            assert looked(source, folder.POLL_S / 2) == [] or start + 800 >= len(content)
     assert [frame.time for frame in taken(source, 1)] == [STAMP + 11] and not said
 
 
@@ -96,7 +96,7 @@ def test_poses_of_a_folder_are_those_of_their_line_or_time(incoming, tmp_path, s
 def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
     path = tmp_path / "poses.txt"
     found = GrowingPoses(path, "lidar", "auto")
-    found.look()
+    found.read_appended()
     assert found.of(0, None) is None
     row = np.eye(4)[:3].reshape(-1)
     with path.open("w") as file:
@@ -105,9 +105,9 @@ def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
             file.write("# comment\n" * (i == 0) + ("broken" if i == 1 else " ".join(map(str, row))) + "\n")
         file.write("1 0 0")  # not whole yet
     with pytest.raises(ValueError, match=r"poses.txt, line 3: expected 12 numbers, found 1"):
-        found.look()
-    found.look()
+        found.read_appended()
+    found.read_appended()
     assert found.of(1, None) is None and found.of(3, None) is None
     assert found.of(2, None)[0, 3] == 2 and found.of(0, None)[0, 3] == 0
     with pytest.raises(ValueError, match="pass --pose-format kitti or lidar"):
-        GrowingPoses(path, "auto", "auto").look()
+        GrowingPoses(path, "auto", "auto").read_appended()

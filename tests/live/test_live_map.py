@@ -11,8 +11,8 @@ import pytest
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.frame_log import FrameLog
-from sglpr_jax.live.live_map import FRAMES, LOOPS, OLD, SETTINGS, LiveMap
-from sglpr_jax.live.results import write_results
+from sglpr_jax.live.live_map import FRAMES_LOG, LOOPS_FILE, OLD_LOG, SETTINGS_FILE, LiveMap
+from sglpr_jax.live.result_files import write_results
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
@@ -42,7 +42,7 @@ def whole(drive, params, tmp_path_factory):
     """Folder and edges of a map of the drive with odometry, made by one process."""
     folder = tmp_path_factory.mktemp("whole")
     live = opened(params, folder, lambda kind, text: None)
-    assert live.recall() == []
+    assert live.restore() == []
     poses = drive.poses.world_from_lidar
     edges = [edge for i in range(SCANS) for edge in live.add(live_frame(drive, i, pose=poses[i]))]
     live.close()
@@ -57,37 +57,37 @@ def test_edges_of_a_drive_are_true_and_on_disk(drive, whole):
         assert np.linalg.norm(drive.positions[edge.query] - drive.positions[edge.match]) < 12
         assert edge.query_time - edge.match_time == pytest.approx(drive.times[edge.query] - drive.times[edge.match])
         assert np.array_equal(edge.world_from_match, drive.poses.world_from_lidar[edge.match])
-    assert pairs(read_loops_jsonl(folder / LOOPS)) == pairs(edges)
+    assert pairs(read_loops_jsonl(folder / LOOPS_FILE)) == pairs(edges)
 
 
 @pytest.mark.slow
 def test_a_map_is_recalled_and_its_unfinished_end_removed(params, whole, tmp_path, said):
     folder, edges = whole
-    shutil.copy(folder / SETTINGS, tmp_path)
-    content, lines = (folder / FRAMES).read_bytes(), (folder / LOOPS).read_bytes()
-    (tmp_path / FRAMES).write_bytes(content[:-5])
+    shutil.copy(folder / SETTINGS_FILE, tmp_path)
+    content, lines = (folder / FRAMES_LOG).read_bytes(), (folder / LOOPS_FILE).read_bytes()
+    (tmp_path / FRAMES_LOG).write_bytes(content[:-5])
     kept = len(edges) - 4
-    (tmp_path / LOOPS).write_bytes(b"".join(lines.splitlines(True)[:kept]) + lines[:9])  # the next line is cut
+    (tmp_path / LOOPS_FILE).write_bytes(b"".join(lines.splitlines(True)[:kept]) + lines[:9])  # the next line is cut
     live = opened(params, tmp_path, said)
-    missed = live.recall()
+    missed = live.restore()
     assert len(live) == SCANS - 1 and said.kinds == ["cut", "recall", "log"]
     found = pairs(live.detector.loops)
     assert kept < len(found) <= len(edges) and found == pairs(edges)[: len(found)]
-    assert pairs(missed) == found[kept:] and pairs(read_loops_jsonl(tmp_path / LOOPS)) == found
+    assert pairs(missed) == found[kept:] and pairs(read_loops_jsonl(tmp_path / LOOPS_FILE)) == found
     assert live.names == {f"scan {i}" for i in range(SCANS - 1)}
     live.close()
-    assert (tmp_path / FRAMES).stat().st_size < len(content) - 5
+    assert (tmp_path / FRAMES_LOG).stat().st_size < len(content) - 5
 
 
 @pytest.mark.slow
 def test_a_damaged_scan_costs_itself_alone(drive, params, whole, tmp_path, said):
     folder, edges = whole
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    content = bytearray((folder / FRAMES).read_bytes())
+    content = bytearray((folder / FRAMES_LOG).read_bytes())
     content[content.index(b"\x93FR1", len(content) * 9 // 10) + 50] ^= 1
-    (tmp_path / FRAMES).write_bytes(content)
+    (tmp_path / FRAMES_LOG).write_bytes(content)
     live = opened(params, tmp_path, said)
-    live.recall()
+    live.restore()
     assert said.kinds[0] == "lost" and "1 damaged scans are left out" in said[0][1]
     assert len(live) == SCANS and len(set(live.detector.finder.motion.segments.tolist())) == 1
     lost = [i for i in range(SCANS) if f"scan {i}" not in live.names]
@@ -99,13 +99,13 @@ def test_a_damaged_scan_costs_itself_alone(drive, params, whole, tmp_path, said)
 @pytest.mark.slow
 def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(drive, params, whole, tmp_path, said):
     poses = drive.poses.world_from_lidar
-    shutil.copy(whole[0] / SETTINGS, tmp_path)
-    log = FrameLog(tmp_path / FRAMES)
-    for number, scan in itertools.islice(FrameLog(whole[0] / FRAMES).records(), HALF):
+    shutil.copy(whole[0] / SETTINGS_FILE, tmp_path)
+    log = FrameLog(tmp_path / FRAMES_LOG)
+    for number, scan in itertools.islice(FrameLog(whole[0] / FRAMES_LOG).records(), HALF):
         log.append(number, scan)
     log.close()
     live = opened(params, tmp_path, said, expects_odometry=True)
-    assert live.map_from_world is None and live.recall() == [] and len(live) == HALF
+    assert live.map_from_world is None and live.restore() == [] and len(live) == HALF
     edges, again = [], inverse(poses[HALF]) @ poses[HALF:]
     for i, pose in enumerate(again, HALF):
         edges += live.add(live_frame(drive, i, pose=pose, received=float(drive.times[i]) + 1e9))
@@ -134,17 +134,17 @@ def test_a_map_of_other_settings_or_of_an_earlier_version_is_not_continued(param
     opened(params, tmp_path, said).close()
     with pytest.raises(ValueError, match=r"settings.json: .*same settings, found another sensor_height; use the flags"):
         opened(params, tmp_path, said, sensor_height=2.0)
-    (tmp_path / SETTINGS).write_text("{}")
+    (tmp_path / SETTINGS_FILE).write_text("{}")
     with pytest.raises(ValueError, match=r"settings.json: expected the settings of a live map .* found others"):
         opened(params, tmp_path, said)
-    (tmp_path / OLD).touch()
+    (tmp_path / OLD_LOG).touch()
     with pytest.raises(ValueError, match=r"expected a map of this version, found journal\.bin of an earlier one"):
         opened(params, tmp_path, said)
 
 
 def test_scans_of_nothing_are_left_out_or_hold_no_place(drive, params, tmp_path, said):
     live = opened(params, tmp_path, said)
-    live.recall()
+    live.restore()
     frame = live_frame(drive, 0)
     nothing = dataclasses.replace(frame.scan, points=np.full((5, 3), np.nan, np.float32))
     with pytest.raises(ValueError, match="scan 0: expected points, found none"):
@@ -156,7 +156,7 @@ def test_scans_of_nothing_are_left_out_or_hold_no_place(drive, params, tmp_path,
 
 def test_a_full_disk_is_reported_and_the_map_lives_on(drive, params, tmp_path, said, monkeypatch):
     live = opened(params, tmp_path, said)
-    live.recall()
+    live.restore()
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", lambda *given: (_ for _ in ()).throw(OSError(28, "No space left on device")))
         for i in range(2):

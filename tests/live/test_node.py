@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.live.endpoints import open_sink
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.live.messages import AGAIN_S, FrameStatus, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.node import Node
+from sglpr_jax.live.node_messages import AGAIN_S, FrameStatus, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.sources_and_sinks import open_sink
 
 EDGE = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, np.eye(4), None, 0.01)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.live.odometry_input import HOLD_S, SCANS, WAIT_S, Clock, Continuity, FirstScans
+from sglpr_jax.live.odometry_input import HOLD_S, MOUNTING_SCANS, WAIT_S, FixedMounting, OdometryContinuity, ScanClock
 from sglpr_jax.se3 import transform
 
 
@@ -11,7 +11,7 @@ def at(x: float, y: float = 0.0) -> np.ndarray:
     return transform(float(x), float(y), 0.0)
 
 
-def times(clock: Clock, stamps, received=None) -> list[float]:
+def times(clock: ScanClock, stamps, received=None) -> list[float]:
     received = np.arange(len(stamps)) * 0.1 + 50 if received is None else received
     return [clock.time(stamp, at) for stamp, at in zip(stamps, received, strict=True)]
 
@@ -19,24 +19,24 @@ def times(clock: Clock, stamps, received=None) -> list[float]:
 @pytest.mark.parametrize("other", [1e9 - 3600, 1e9 + 365 * 86400])
 def test_a_clock_that_jumps_is_followed(said, other):
     stamps = [1e9, 1e9 + 0.1, other, other + 0.1, other + 0.2, 1e9 + 0.5]
-    np.testing.assert_allclose(np.diff(times(Clock(said), stamps)), 0.1, atol=1e-6)
+    np.testing.assert_allclose(np.diff(times(ScanClock(said), stamps)), 0.1, atol=1e-6)
     assert said.kinds == ["clock", "clock"]
 
 
 @pytest.mark.parametrize("missing", [0.0, np.nan])
 def test_scans_without_a_time_get_that_of_their_arrival(said, missing):
-    found = times(Clock(said), [1e9, missing, 1e9 + 0.2, missing])
+    found = times(ScanClock(said), [1e9, missing, 1e9 + 0.2, missing])
     np.testing.assert_allclose(found, 1e9 + np.arange(4) * 0.1)
     assert said.kinds == ["time", "time"]
 
 
 def test_a_clock_continues_after_a_restart(said):
-    clock = Clock(said)
+    clock = ScanClock(said)
     clock.resume(1e9 + 7, 1e9, received=40.0)
     assert clock.time(1e9 + 10, 50.0) == 1e9 + 17 and not said
 
 
-def placed(continuity: Continuity, given) -> list[bool | None]:
+def placed(continuity: OdometryContinuity, given) -> list[bool | None]:
     """Whether each scan continues; None: left out."""
     found = [continuity.add(pose, time) for time, pose in given]
     return [None if one is None else one.continues for one in found]
@@ -44,14 +44,14 @@ def placed(continuity: Continuity, given) -> list[bool | None]:
 
 def test_odometry_that_jumps_or_is_reset_begins_anew(said):
     drive = [(0.0, at(0)), (0.1, at(1)), (0.2, at(90)), (0.3, at(91)), (0.4, at(97)), (0.5, at(5)), (0.6, at(0))]
-    found = placed(Continuity(said, expected=True), drive)
+    found = placed(OdometryContinuity(said, expected=True), drive)
     assert found == [True, True, False, True, True, False, False]
     assert said.kinds == ["jump"] * 3
 
 
 def test_odometry_that_stops_holds_scans_back_for_a_while(said):
     given = [(0.0, at(0)), (HOLD_S - 0.1, None), (HOLD_S, None), (HOLD_S + 0.1, None), (HOLD_S + 0.2, at(1))]
-    continuity = Continuity(said, expected=True)
+    continuity = OdometryContinuity(said, expected=True)
     assert placed(continuity, given) == [True, None, False, False, False]
     assert placed(continuity, [(HOLD_S + 0.3, at(1.1)), (HOLD_S + 0.5, None), (HOLD_S + 0.6, at(1.2))]) == [
         True,
@@ -62,9 +62,9 @@ def test_odometry_that_stops_holds_scans_back_for_a_while(said):
 
 
 def test_the_first_scans_wait_for_odometry(said):
-    continuity = Continuity(said, expected=True)
+    continuity = OdometryContinuity(said, expected=True)
     assert placed(continuity, [(5.0, None), (6.0, at(0))]) == [None, True]
-    late = Continuity(said, expected=True)
+    late = OdometryContinuity(said, expected=True)
     assert placed(late, [(5.0, None), (5.0 + WAIT_S, None), (16.0, at(0))]) == [None, True, True]
     assert late.add(at(0), 17.0).pose is None
     assert said.kinds == ["wait", "wait", "wait over", "odometry", "odometry"]
@@ -81,7 +81,7 @@ def test_the_first_scans_wait_for_odometry(said):
     ],
 )
 def test_after_a_restart_the_way_is_known_only_if_the_odometry_continues(said, last, pose, seconds, continues):
-    continuity = Continuity(said, expected=False)
+    continuity = OdometryContinuity(said, expected=False)
     continuity.resume(last, 100.0)
     first = continuity.add(pose, 100.0 + seconds)
     assert first.continues == continues and said.kinds == ["restart"]
@@ -89,7 +89,7 @@ def test_after_a_restart_the_way_is_known_only_if_the_odometry_continues(said, l
 
 
 def test_the_mounting_is_that_of_the_first_scans(drive):
-    first = FirstScans()
-    found = [first.add(drive.points(i)) for i in range(SCANS + 1)]
+    first = FixedMounting()
+    found = [first.add(drive.points(i)) for i in range(MOUNTING_SCANS + 1)]
     assert found[-1] == found[-2] and abs(found[-1].height_m - 1.73) < 0.15
-    assert FirstScans(2.5).add(drive.points(0)).height_m == 2.5
+    assert FixedMounting(2.5).add(drive.points(0)).height_m == 2.5

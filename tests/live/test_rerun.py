@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.live.endpoints import open_sink
-from sglpr_jax.live.messages import FrameStatus, LoopEdge
+from sglpr_jax.live.node_messages import FrameStatus, LoopEdge
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.rerun import RerunSink
+from sglpr_jax.live.sources_and_sinks import open_sink
 from sglpr_jax.se3 import transform
 
 STATUS = FrameStatus(7, 1_700_000_000.25, 0.012, 0.02, 3, 8, 40_000)

@@ -6,10 +6,10 @@ import time as clock
 import numpy as np
 import pytest
 
-from sglpr_jax.live.messages import FrameStatus, LoopEdge
+from sglpr_jax.live.node_messages import FrameStatus, LoopEdge
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros import TAKEN_OVER_S, RosSink, RosSource, domain_of
-from sglpr_jax.live.ros_messages import CLOUD, MARKERS, TRANSFORMS
+from sglpr_jax.live.ros import TAKEOVER_S, RosSink, RosSource, domain_of
+from sglpr_jax.live.ros_encoding import CLOUD, MARKERS, TRANSFORMS
 from tests.live.messages import LIVOX, ODOMETRY, POINTS, cloud, decoded, odometry, received
 
 
@@ -71,7 +71,7 @@ def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(tran
         ("a", 1.0, True),
         ("b", 1.1, False),
         ("a", 1.2, True),
-        ("b", 1.3 + TAKEN_OVER_S, True),
+        ("b", 1.3 + TAKEOVER_S, True),
     ):
         transport.receive["/points"](received(CLOUD, cloud(at), publisher=publisher, at=at))
         assert (next(frames) is not None) == taken

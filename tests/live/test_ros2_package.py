@@ -15,7 +15,7 @@ import yaml
 from sglpr_jax.cli.live import LiveCommand
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros import RosSource, Transport
-from sglpr_jax.live.ros_messages import CLOUD, EDGE, TRANSFORMS
+from sglpr_jax.live.ros_encoding import CLOUD, EDGE, TRANSFORMS
 from tests.live.messages import ODOMETRY, POINTS, cloud, odometry, received
 from tests.live.test_ros import Memory
 

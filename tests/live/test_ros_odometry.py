@@ -6,8 +6,8 @@ import time as clock
 import numpy as np
 import pytest
 
-from sglpr_jax.live.ros_messages import TRANSFORMS
-from sglpr_jax.live.ros_odometry import STATIC_S, LiveOdometry
+from sglpr_jax.live.ros_encoding import TRANSFORMS
+from sglpr_jax.live.ros_odometry import MOUNTING_WAIT_S, LiveOdometry
 from tests.live.messages import ODOMETRY, odometry, received, transforms
 
 HALF = np.sqrt(0.5)
@@ -61,7 +61,7 @@ def test_the_mounting_comes_from_tf_static(live, said):
 def test_a_mounting_that_tf_does_not_state_is_waited_for_and_then_left_out(live, said):
     drive(live, 10.0, 10.1, child="base")
     assert live.pose(10.1, "lidar", wait_s=0.0) is None
-    live._began -= STATIC_S
+    live._first_received -= MOUNTING_WAIT_S
     np.testing.assert_allclose(live.pose(10.1, "lidar", wait_s=0.0)[:3, 3], [20.2, 0, 0])
     assert "/tf_static: expected base and lidar, found no path" in said.of("mounting")[0]
     live.receive_static(received(TRANSFORMS, transforms(0, [("base", "lidar", (9, 0, 0), (0, 0, 0, 1))])))

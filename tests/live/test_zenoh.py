@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import zenoh
 
-from sglpr_jax.live.endpoints import open_sink, open_source
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros_messages import CLOUD, EDGE, TRANSFORMS
+from sglpr_jax.live.ros_encoding import CLOUD, EDGE, TRANSFORMS
+from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 from sglpr_jax.live.zenoh import ZenohTransport
 from tests.live.messages import cloud, decoded, transforms
 from tests.live.test_dds import STILL, until
-from tests.live.test_ros_messages import edge
+from tests.live.test_ros_encoding import edge
 
 SCANS = "sensor_msgs::msg::dds_::PointCloud2_/RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
 TF = "tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"

@@ -9,14 +9,14 @@ import pytest
 from drives import along, drifted, rooms, town, true_loops, wrong_loops
 from recordings import of_scans
 
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import acceptance
 from sglpr_jax.loops.acceptance import accept_loops, check_odometry, count_revisit_segments
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.drift import deviations
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
-from sglpr_jax.pose_graph.optimize import solved_graph
+from sglpr_jax.pose_graph.optimize import solve_pose_graph
 from sglpr_jax.registration.gicp import Registration
 from sglpr_jax.se3 import transform, travelled
 
@@ -41,7 +41,7 @@ def test_of_places_that_repeat_no_loop_is_accepted_and_the_odometry_stays(scene)
     assert len(wrong) >= 50 and deviations(wrong, DrivenPath(odometry)).min() > 8
     kept, rejected = accept_loops(wrong, DrivenPath(odometry))
     assert not kept and {one.reason for one in rejected} == {"contradicts the odometry"}
-    found = solved_graph({0: odometry}, wrong)
+    found = solve_pose_graph({0: odometry}, wrong)
     np.testing.assert_array_equal(found.poses, odometry)
     assert not found.inliers.any() and str(found).startswith(f"trajectory not corrected: {len(wrong)} loops need")
 

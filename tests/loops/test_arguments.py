@@ -11,7 +11,7 @@ from recordings import of_scans
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.arguments import as_pose, as_poses, as_scan, as_seconds
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector

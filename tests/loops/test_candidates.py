@@ -1,4 +1,4 @@
-"""A finder compares each scan with the right earlier ones, follows the motion, and stores what it has to."""
+"""The candidate search compares each scan with the right earlier scans, estimates the motion, and stores scans."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def finder_of(params, candidates: CandidateConfig = CandidateConfig(), **limits)
 
 
 def seen_by(finder: CandidateSearch, image: np.ndarray) -> Keyframe:
-    """An image with a descriptor of nothing."""
+    """An image with a descriptor of zeros."""
     return Keyframe(np.zeros(finder.index.width, np.float32), image, None)
 
 
@@ -116,7 +116,7 @@ def test_between_plain_walls_the_sensor_moves_on_and_drifts(params):
 
 @pytest.mark.slow
 def test_rings_on_the_floor_do_not_hold_the_motion(params, monkeypatch):
-    """Without the average of earlier images."""
+    """Without the average of earlier images, only the medians of rings are subtracted."""
     monkeypatch.setattr(background.Background, "add", lambda *_: None)
     finder = finder_of(params)
     posts = np.random.default_rng(0).uniform(-60, 60, (200, 2))

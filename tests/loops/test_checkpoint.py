@@ -12,13 +12,13 @@ from recordings import with_points
 
 import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import acceptance, checkpoint, search
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.pose_graph.folder import write_found
+from sglpr_jax.pose_graph.folder import write_loop_folder
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.registration.gicp import Registration
@@ -54,7 +54,7 @@ def whole(twice, params, tmp_path_factory):
 
 
 def contents(found, folder) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in write_found(found, folder)}
+    return {path.name: path.read_bytes() for path in write_loop_folder(found, folder)}
 
 
 def stopping_after(frames: int, asked: list):
@@ -81,7 +81,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
         assert done[0] == (reached[-2] if len(reached) > 1 else 1)
     assert reached == [3, 7, 16, 24]
     assert contents(found, tmp_path / "found") == files
-    checkpoint.remove(tmp_path / "kept")
+    checkpoint.delete_checkpoint(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
 
 

@@ -9,7 +9,7 @@ from scenes import place, seen_from
 from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 
@@ -24,7 +24,7 @@ def image(seed: int, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), *, nois
 
 
 def street(**more: tuple[float, np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Poses and images of places 60 m apart on a line, and of others at x = `more`."""
+    """Poses and images of places 60 m apart on a line, and of further places at x = `more`."""
     scans = [(60.0 * k, image(k)) for k in range(PLACES)] + list(more.values())
     poses, images = zip(*sorted(scans, key=lambda one: one[0]), strict=True)
     return [transform(x, 0.0, 0.0) for x in poses], list(images)
@@ -37,7 +37,7 @@ def compared(
     joined: Sequence[tuple[int, int]] = (),
     shown: np.ndarray | None = None,
 ) -> list[Candidate]:
-    """Candidates of an image, by default of place `TRUE`. The poses are those of the stored scans, and its own."""
+    """Candidates of an image, by default of place `TRUE`. The last pose is that of the image, the others are stored."""
     comparer, stored = comparer_along(poses, joined=joined), StoredScans(Index.empty(2))
     for frame, one in enumerate(images):
         stored.add(frame, np.ones(2, np.float32), one)
@@ -90,7 +90,7 @@ def test_one_other_place_shows_that_places_repeat(lookalike):
 
 
 def test_a_second_pose_that_fits_as_well_makes_a_match_ambiguous():
-    """Seen from the middle of a place that looks the same from behind."""
+    """The query stands in the middle of a place that looks the same after a rotation by 180 degrees."""
     points = place(TRUE)
     twice = np.concatenate([points, -points])
     one, turned = (seen_from(twice, pose, seed=1).astype(np.uint8) for pose in ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
@@ -100,7 +100,7 @@ def test_a_second_pose_that_fits_as_well_makes_a_match_ambiguous():
 
 
 def test_passes_that_a_loop_joins_do_not_compete():
-    """The second pass is 5.5 m off: more than the drift on the way to it, and less than the drift up to the query."""
+    """The second pass is 5.5 m off: more than the drift between the passes, and less than the drift up to the query."""
     poses, images = street()
     poses += [transform(125.5, 0.0, 0.0), transform(540.0, 0.0, 0.0), transform(125.5 + 1.2, -0.8, 2.5)]
     images += [image(TRUE), image(9)]

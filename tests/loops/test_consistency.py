@@ -1,4 +1,4 @@
-"""Right loops agree with each other whatever the odometry has drifted, wrong ones do not; the largest set is found."""
+"""Correct loops are consistent at any drift of the odometry and wrong ones are not. The largest set is found."""
 
 import itertools
 
@@ -12,7 +12,7 @@ from session_pairs import loops_between, two_drives
 from sglpr_jax.loops.closure import LoopClosure, planar_loop
 from sglpr_jax.loops.consistency import MIN_LOOPS, accept_between, are_consistent, largest_consistent_set
 from sglpr_jax.odometry.bev_odometry import BevOdometry
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform
@@ -64,7 +64,7 @@ def test_a_loop_in_the_other_direction_agrees_with_one_in_the_same():
 
 
 def chosen_by_the_letter(pairs: np.ndarray, starts: int = 20) -> list[int]:
-    """The largest set as its docstring says, with all degrees taken anew for each member."""
+    """Greedy search as in `largest_consistent_set`, but with the degrees counted from scratch for each member."""
     pairs, best = pairs & pairs.T, []
     for start in np.argsort(-pairs.sum(1), kind="stable")[:starts]:
         members, left = [start], np.flatnonzero(pairs[start] & (np.arange(len(pairs)) != start))
@@ -86,7 +86,7 @@ def test_the_set_is_the_one_that_all_degrees_taken_anew_choose(n, share, seed):
 
 
 def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
-    """Unsure along the match's x; the query is turned by 90 degrees, so along its own y."""
+    """The position is uncertain along the match's x axis, which is the y axis of the query, turned by 90 degrees."""
     covariance = np.diag([4.0, 0.01, 0.001])
     loop = planar_loop(9, 1, BevRegistration(1.0, 2.0, np.pi / 2, covariance, 0.8, 0.3), probability=0.9)
     np.testing.assert_allclose(loop.covariance.diagonal()[[0, 1, 5]], [0.01, 4.0, 0.001], atol=1e-9)
@@ -104,7 +104,7 @@ MOTION = BevOdometry.joined([BevOdometry.of(FIRST), BevOdometry.of(SECOND)])
 
 
 def joined_loops(true: np.ndarray) -> list[LoopClosure]:
-    """Loops by this transform, with the rows of both recordings, one after the other."""
+    """Loops that follow this transform. Their frames count through both recordings, one after the other."""
     rng = np.random.default_rng(3)
     return [
         loop_at(len(FIRST) + one.query, one.match, one.match_from_query, rng)

@@ -10,7 +10,7 @@ from session_pairs import loops_between, two_drives
 
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.frame_alignment import align_frames
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import inverse, transform, transform_covariance, travelled, yaw_of
 
 EXACT = DriftModel(metres_per_metre=0.0, degrees_per_metre=0.0)

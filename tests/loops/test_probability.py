@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sglpr_jax.loops.probability import (
-    ADDED,
-    ALL,
     KNOTS,
     RISING,
+    SUM_OF_SUPPORT,
     TESTED,
     AdditiveModel,
     Evidence,
@@ -55,10 +54,10 @@ def test_weights_are_as_good_as_pairs_that_stand_several_times():
     np.testing.assert_allclose(one(values), other(values), atol=0.02)
 
 
-@given(values=st.lists(st.floats(-1, 6), min_size=8, max_size=8), name=st.sampled_from(ALL))
+@given(values=st.lists(st.floats(-1, 6), min_size=8, max_size=8), name=st.sampled_from(Evidence._fields))
 def test_log_odds_never_fall_where_the_evidence_is_stronger(values, name):
     one, other = (Evidence.of(*half) for half in (values[:4], values[4:]))
-    better = other._replace(**{field: getattr(one, field) for field in ALL if field != name})
+    better = other._replace(**{field: getattr(one, field) for field in Evidence._fields if field != name})
     stronger = (
         getattr(better, name) >= getattr(one, name) if name in RISING else getattr(better, name) <= getattr(one, name)
     )
@@ -72,7 +71,7 @@ FITTED = model_of(*pairs())
 def test_neighbours_add_their_support_to_what_a_pair_says_alone():
     evidence = Evidence.of(0.7, 0.1, 3.0, 2.0)
     np.testing.assert_allclose(FITTED.tested_log_odds(evidence, np.array(2.5)), FITTED.log_odds(evidence) + 2.5)
-    assert FITTED.tested is ADDED and set(default_model().tested.curves) == set(TESTED)
+    assert FITTED.tested is SUM_OF_SUPPORT and set(default_model().tested.curves) == set(TESTED)
 
 
 def test_pairs_that_can_be_told_apart_give_finite_curves():
@@ -130,5 +129,5 @@ def test_models_go_to_a_file_and_back(tmp_path):
 def test_the_shipped_model_tells_clear_pairs():
     model = default_model()
     loop, none = Evidence.of(0.3, 0.03, 0.5, 12.0), Evidence.of(1.0, 3.0, 4.0, 0.0)
-    assert set(model.alone.curves) == set(ALL) and isinstance(model.alone, AdditiveModel)
+    assert set(model.alone.curves) == set(Evidence._fields) and isinstance(model.alone, AdditiveModel)
     assert model.probability(loop) > 0.99 and model.probability(none) < 0.01

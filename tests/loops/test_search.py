@@ -16,7 +16,7 @@ from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import search
 from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure
 from sglpr_jax.loops.comparison import NO_FITS
@@ -35,7 +35,7 @@ CONFIG = DetectorConfig()
 
 @functools.cache
 def there_and_back() -> np.ndarray:
-    """Poses along a bend, 2 m apart, and back, now nearer to the first lane, now farther from it."""
+    """Poses 2 m apart along a bend and back, at a varying distance from the first lane."""
     there = np.stack([transform(20 * np.sin(a), 20 - 20 * np.cos(a), a) for a in np.arange(N) / 10])
     aside = np.stack([transform(0.0, 3 + 2 * np.sin(i), np.pi) for i in np.arange(N)])
     return np.concatenate([there, (there @ aside)[::-1]])
@@ -43,7 +43,7 @@ def there_and_back() -> np.ndarray:
 
 @pytest.fixture
 def found(params, compare_only, monkeypatch):
-    """What `find_loops` makes of a drive of which each frame of the way back has its true loop. Nothing is described.
+    """Result of `find_loops` for a drive on which each frame of the way back has its true loop. Nothing is described.
 
     `wrong` has frames before that, each with a match that looks as if it was the same place. Poses are divided by
     `scale`.

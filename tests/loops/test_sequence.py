@@ -1,4 +1,4 @@
-"""Neighbours count by travelled distance: for a loop if they agree with it, and against it otherwise."""
+"""Neighbours support a loop if they are consistent with it, and oppose it otherwise, by travelled distance."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.config import INDEPENDENT_M
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.sequence import WINDOW_M, Pair, neighbour_weights, rejection_reason
-from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.se3 import inverse, transform
 

@@ -32,8 +32,8 @@ def test_a_map_in_another_frame_is_moved_to_the_existing_one(places, second):
 
 @pytest.mark.slow
 def test_maps_without_common_places_have_no_transform(places):
-    assert align_maps(places, places.some([])) is None
-    assert align_maps(places, places.some([0, 1])) is None
+    assert align_maps(places, places.subset([])) is None
+    assert align_maps(places, places.subset([0, 1])) is None
 
 
 def test_a_moved_map_has_the_same_places_elsewhere_and_known_places_are_left_out(places, second):
@@ -41,6 +41,6 @@ def test_a_moved_map_has_the_same_places_elsewhere_and_known_places_are_left_out
     np.testing.assert_allclose(moved.world_from_place, WORLD_FROM_OTHER @ places.world_from_place)
     np.testing.assert_allclose(moved.index.positions, moved.world_from_place[:, :3, 3], atol=1e-4)
     assert moved.index.ids == places.index.ids
-    assert places.some([2, 0]).index.ids == [places.index.ids[i] for i in (2, 0)]
+    assert places.subset([2, 0]).index.ids == [places.index.ids[i] for i in (2, 0)]
     assert len(without_known_places(places, moved)) == 0
     assert without_known_places(places, second).index.ids == second.index.ids

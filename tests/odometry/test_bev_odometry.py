@@ -16,7 +16,7 @@ def link(
 
 
 def moved(links: list[BevRegistration | None], *, factor: float = 1.0) -> BevOdometry:
-    """The motion of frames 0.1 s apart with these links to the keyframe. All times are multiplied by `factor`."""
+    """Motion of frames 0.1 s apart with these registrations with the keyframe. Times are multiplied by `factor`."""
     motion = BevOdometry()
     for frame, one in enumerate(links):
         motion.add(0.1 * factor * frame, link=one)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from drives import along, drifted
 
-from sglpr_jax.odometry.config import DriftModel
 from sglpr_jax.odometry.drift_check import OdometryCheck
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform, yaw_of
 

@@ -1,4 +1,4 @@
-"""Odometry from the scans of a simulated street, and what is said of scans that do not carry it."""
+"""Odometry from the scans of a simulated street, and warnings about scans that do not overlap or have few points."""
 
 import dataclasses
 import sys
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, TimeField
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.odometry import kiss_icp
 from sglpr_jax.odometry.config import OdometryConfig
@@ -54,9 +54,9 @@ def test_a_stopped_run_resumes_with_the_same_poses(start, tmp_path, monkeypatch)
     assert len(part) == 7 and kept.exists()
     add = kiss_icp._FrontEnd.add
 
-    def counted(self, given, *, known=None):
-        aligned.extend([1] if known is None else [])
-        return add(self, given, known=known)
+    def counted(self, cloud, *, known_pose=None):
+        aligned.extend([1] if known_pose is None else [])
+        return add(self, cloud, known_pose=known_pose)
 
     monkeypatch.setattr(kiss_icp._FrontEnd, "add", counted)
     whole = kiss_icp.scan_odometry(start, **options)
@@ -111,7 +111,9 @@ def test_unreadable_scans_are_skipped_or_an_error(start):
 def test_scaled_scans_give_poses_in_metres(start):
     poses = kiss_icp.scan_odometry(start, scale=2)
     assert trajectory_error(poses, np.asarray(start.positions)) < 0.5
-    assert ", points up to 50 m, voxels of 0.5 m, without" in kiss_icp.about(start, OdometryConfig(), scale=2)
+    assert ", points up to 50 m, voxels of 0.5 m, without" in kiss_icp.describe_odometry(
+        start, OdometryConfig(), scale=2
+    )
 
 
 def test_the_motion_within_scans_is_removed():
@@ -131,7 +133,7 @@ def test_the_motion_within_scans_is_removed():
     still, moved = (kiss_icp.scan_odometry(one)[:, 0, 3] for one in (timed, plain))
     np.testing.assert_allclose(still, 3 * times**2, atol=0.06)
     assert moved[-1] - 3 * times[-1] ** 2 > 0.3
-    assert kiss_icp.about(timed, OdometryConfig(), scale=1).endswith("motion within scans removed")
+    assert kiss_icp.describe_odometry(timed, OdometryConfig(), scale=1).endswith("motion within scans removed")
 
 
 def test_images_and_a_missing_library_are_clear_errors(start, tmp_path, monkeypatch):

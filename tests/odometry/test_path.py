@@ -1,4 +1,4 @@
-"""A path adds up what a sum over its steps gives, whether its poses come one by one or at once."""
+"""The integrals of a path equal sums over its steps, whether its poses are added one by one or at once."""
 
 import numpy as np
 import pytest

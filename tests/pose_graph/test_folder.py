@@ -10,11 +10,11 @@ from session_pairs import found_pair
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl
-from sglpr_jax.pose_graph.folder import FIRST_VERTEX, unique_names, vertices, write_found
+from sglpr_jax.pose_graph.folder import FIRST_VERTEX, unique_names, vertex_numbers, write_loop_folder
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import inverse, transform
 
@@ -47,7 +47,7 @@ def with_session(found: LoopSearchResult, **change) -> LoopSearchResult:
 
 
 def test_all_files_are_of_the_searched_frames(found, tmp_path):
-    paths = write_found(found, tmp_path / "out")
+    paths = write_loop_folder(found, tmp_path / "out")
     assert sorted(path.name for path in paths) == sorted(path.name for path in (tmp_path / "out").iterdir())
     graph = read_g2o(tmp_path / "out" / "loops.g2o")
     assert len(graph.poses) == 5 and [(i, j) for i, j, *_ in graph.edges] == [(0, 1), (1, 2), (2, 3), (3, 4), (0, 4)]
@@ -65,7 +65,7 @@ def test_frames_keep_the_numbers_of_the_recording_and_rejected_pairs_have_a_file
     images = {tmp_path / f"{i:06d}.png": np.eye(8, dtype=np.float32) for i in range(80)}
     some = only(of_images(images), [70, 71, 72, 75, 76, 77])
     rejected = RejectedClosure(LoopClosure(3, 1, transform(2.0, 0.0, 0.0), np.eye(6), 0.25), "repeats")
-    write_found(dataclasses.replace(with_session(found, recording=some), rejected=(rejected,)), tmp_path / "out")
+    write_loop_folder(dataclasses.replace(with_session(found, recording=some), rejected=(rejected,)), tmp_path / "out")
     assert table(tmp_path / "out/loops.csv") == [(76, 70)]
     first, second = (json.loads((tmp_path / "out" / f"{name}.jsonl").read_text()) for name in ("loops", "rejected"))
     assert (first["query"], first["query_id"], first["match_id"]) == (76, "000076", "000070")
@@ -76,7 +76,7 @@ def test_frames_keep_the_numbers_of_the_recording_and_rejected_pairs_have_a_file
 
 
 def test_one_graph_has_all_trajectories_in_one_frame_and_all_loops(pair, tmp_path):
-    write_found(pair, tmp_path)
+    write_loop_folder(pair, tmp_path)
     graph = read_g2o(tmp_path / "loops.g2o")
     first, second = (len(one.recording) for one in pair.sessions)
     assert sorted(graph.poses) == [*range(first), *range(FIRST_VERTEX, FIRST_VERTEX + second)]
@@ -89,7 +89,7 @@ def test_one_graph_has_all_trajectories_in_one_frame_and_all_loops(pair, tmp_pat
 
 
 def test_rows_name_the_recordings_and_the_transform_is_in_frames_json(pair, tmp_path):
-    write_found(dataclasses.replace(pair, rejected=(RejectedClosure(pair.loops[0], "repeats"),)), tmp_path)
+    write_loop_folder(dataclasses.replace(pair, rejected=(RejectedClosure(pair.loops[0], "repeats"),)), tmp_path)
     loops = read_loops_jsonl(tmp_path / "loops.jsonl")
     assert [loop.query - FIRST_VERTEX for loop in loops] == [loop.query for loop in pair.loops]
     assert table(tmp_path / "loops.csv") == [(loop.query, loop.match) for loop in loops]
@@ -105,19 +105,19 @@ def test_rows_name_the_recordings_and_the_transform_is_in_frames_json(pair, tmp_
 
 
 def test_trajectories_of_several_sessions_have_names_and_older_ones_a_warning(pair, tmp_path):
-    write_found(pair, tmp_path, optimized=corrected(pair))
+    write_loop_folder(pair, tmp_path, optimized=corrected(pair))
     names = {path.name for path in tmp_path.iterdir() if path.suffix == ".tum"}
     assert names == {f"trajectory{kind}-{day}.tum" for kind in ("", "-optimized") for day in ("monday", "tuesday")}
     for name in ("trajectory-tuesday", "trajectory-optimized-tuesday"):
         np.testing.assert_allclose(read_tum(tmp_path / f"{name}.tum")[0], pair.sessions[1].odometry, atol=1e-6)
     with pytest.warns(DataWarning, match=r"trajectory-tuesday.tum, frames.json are from an earlier run"):
-        write_found(pair.within(0), tmp_path)
+        write_loop_folder(pair.within(0), tmp_path)
 
 
 def test_without_a_common_place_each_trajectory_stays_in_its_frame(pair, tmp_path):
     apart = dataclasses.replace(pair, loops=(), transforms=())
     assert str(apart).splitlines()[-1] == "monday and tuesday: no common place found"
-    write_found(apart, tmp_path)
+    write_loop_folder(apart, tmp_path)
     graph = read_g2o(tmp_path / "loops.g2o")
     np.testing.assert_allclose(graph.poses[FIRST_VERTEX], pair.sessions[1].odometry[0], atol=1e-9)
     assert json.loads((tmp_path / "frames.json").read_text())["no_common_place"] == [["monday", "tuesday"]]
@@ -126,9 +126,9 @@ def test_without_a_common_place_each_trajectory_stays_in_its_frame(pair, tmp_pat
 def test_names_and_vertices_of_sessions_do_not_collide(pair):
     same = dataclasses.replace(pair, sessions=(pair.sessions[0],) * 3)
     assert unique_names(same) == ["monday", "monday~2", "monday~3"]
-    assert [int(rows[0]) for rows in vertices(same)] == [0, FIRST_VERTEX, 2 * FIRST_VERTEX]
+    assert [int(rows[0]) for rows in vertex_numbers(same)] == [0, FIRST_VERTEX, 2 * FIRST_VERTEX]
     recording = pair.sessions[0].recording
     recording = dataclasses.replace(recording, rows=np.arange(len(recording)) + FIRST_VERTEX)
     long = dataclasses.replace(pair.sessions[0], recording=recording)
-    found = vertices(dataclasses.replace(pair, sessions=(long, long)))
+    found = vertex_numbers(dataclasses.replace(pair, sessions=(long, long)))
     assert [int(rows[0]) for rows in found] == [FIRST_VERTEX, 11 * FIRST_VERTEX]

@@ -4,7 +4,7 @@ import numpy as np
 
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.pose_graph.incremental import LOOP_EVERY_M, IncrementalTrajectory
-from sglpr_jax.pose_graph.optimize import solved_graph, trajectory_error
+from sglpr_jax.pose_graph.optimize import solve_pose_graph, trajectory_error
 from sglpr_jax.se3 import inverse, transform
 
 from .conftest import LOOP_COVARIANCE
@@ -30,7 +30,7 @@ def last_error(trajectory, true, odometry) -> float:
 
 def test_loops_correct_the_last_pose_and_the_path(two_laps, two_laps_odometry, second_lap_loops):
     trajectory = driven(two_laps_odometry, second_lap_loops)
-    batch = solved_graph({0: two_laps_odometry}, second_lap_loops).poses
+    batch = solve_pose_graph({0: two_laps_odometry}, second_lap_loops).poses
     np.testing.assert_allclose(trajectory.poses[:, :3, 3], batch[:, :3, 3], atol=0.5)
     true = two_laps[:, :3, 3]
     assert trajectory_error(trajectory.poses, true) < 0.4 * trajectory_error(two_laps_odometry, true)
@@ -75,6 +75,6 @@ def test_a_route_driven_again_and_again_needs_few_loops():
     found = [LoopClosure(i, i - steps, np.eye(4), LOOP_COVARIANCE, 0.99) for i in range(steps, len(poses))]
     trajectory = driven(poses, found)
     np.testing.assert_allclose(trajectory.poses, poses, atol=1e-4)
-    loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._nodes)
+    loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._node_frames)
     travelled = 3 * 2 * np.pi * 40
     assert travelled / LOOP_EVERY_M - 2 <= loops <= travelled / LOOP_EVERY_M + 1

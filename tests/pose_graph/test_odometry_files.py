@@ -8,7 +8,7 @@ import pytest
 from recordings import of_scans
 
 from sglpr_jax.pose_graph.files import write_g2o, write_kitti, write_tum
-from sglpr_jax.pose_graph.odometry_files import at_scans, read_odometry, read_stamped
+from sglpr_jax.pose_graph.odometry_files import match_to_scans, read_odometry, read_stamped
 from sglpr_jax.se3 import transform
 
 
@@ -33,7 +33,7 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
     recording = of_scans(clouds, times=times, positions=np.arange(18.0).reshape(6, 3))
     path = tmp_path / "odometry.tum"
     write_tum(path, poses, np.arange(5.0))
-    found, given = at_scans(recording, *read_stamped(path, time_unit="s"), path)
+    found, given = match_to_scans(recording, *read_stamped(path, time_unit="s"), path)
     assert found.ids == ("1", "2", "3", "4") and found.numbers.tolist() == [1, 2, 3, 4]
     np.testing.assert_array_equal(found.positions, recording.positions[1:5])
     at = np.array([0.5, 1.25, 4.0, 4.0])
@@ -46,9 +46,9 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
     late = dataclasses.replace(recording, times=times + 3)
     message = r"odometry\.tum: expected 6 poses, one for each scan of 08.* 2\.5 to 9\.0 s, found 5 from 0\.0 to"
     with pytest.raises(ValueError, match=message):
-        at_scans(late, *read_stamped(path, format="tum", time_unit="s"), path)
+        match_to_scans(late, *read_stamped(path, format="tum", time_unit="s"), path)
     with pytest.raises(ValueError, match=r"found 5, and the file has no times .*row numbers 0, 1, 2"):
-        at_scans(recording, *read_stamped(path), path)
+        match_to_scans(recording, *read_stamped(path), path)
 
 
 @pytest.mark.parametrize(("stamps", "by_row"), [(5e-4, True), (0.02, False), ("numbers", True)])
@@ -58,7 +58,7 @@ def test_as_many_poses_as_scans_go_row_by_row_only_where_their_times_are_the_sam
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(5)}, times=times)
     path = tmp_path / "odometry.tum"
     write_tum(path, poses, np.arange(5.0) if stamps == "numbers" else times + stamps)
-    found, given = at_scans(recording, poses, read_stamped(path)[1], path)
+    found, given = match_to_scans(recording, poses, read_stamped(path)[1], path)
     assert len(found) == 5 and (found is recording and given is poses) == by_row
     np.testing.assert_allclose(given[1:, 0, 3], poses[1:, 0, 3] - (0 if by_row else 0.02 / 0.9), atol=1e-3)
 
@@ -67,7 +67,7 @@ def test_as_many_poses_of_another_clock_are_told_and_of_other_steps_refused(tmp_
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(5)}, times=np.arange(5.0))
     path = tmp_path / "odometry.tum"
     write_tum(path, poses, 1.6e9 + np.arange(5.0))
-    found, given = at_scans(recording, poses, read_stamped(path)[1], path)
+    found, given = match_to_scans(recording, poses, read_stamped(path)[1], path)
     assert given is poses and len(found) == 5
     said = "row by row: the scans have the same intervals and start -1600000000.0 s later"
     assert found.found == (f"odometry: 5 poses of odometry.tum, {said}",)
@@ -76,17 +76,17 @@ def test_as_many_poses_of_another_clock_are_told_and_of_other_steps_refused(tmp_
         r"odometry\.tum: expected 5 poses.*0\.0 to 4\.0 s, found 5 from 1600000000\.0 to .*write 12 numbers a line"
     )
     with pytest.raises(ValueError, match=message):
-        at_scans(recording, poses, read_stamped(path)[1], path)
+        match_to_scans(recording, poses, read_stamped(path)[1], path)
 
 
 def test_scans_without_times_get_those_of_a_tum_file(tmp_path, poses):
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(5)}, times=None)
     write_tum(tmp_path / "odometry.tum", poses, 1.6e9 + np.arange(5.0))
     write_kitti(tmp_path / "kitti.txt", poses)
-    found, given = at_scans(recording, poses, np.arange(5.0) + 1.6e9, tmp_path / "odometry.tum")
+    found, given = match_to_scans(recording, poses, np.arange(5.0) + 1.6e9, tmp_path / "odometry.tum")
     np.testing.assert_array_equal(found.times, 1.6e9 + np.arange(5.0))
     assert given is poses and found.found[-1] == "times: from odometry.tum"
-    assert at_scans(recording, poses, None, tmp_path / "kitti.txt")[0] is recording
+    assert match_to_scans(recording, poses, None, tmp_path / "kitti.txt")[0] is recording
 
 
 @pytest.mark.parametrize(

@@ -12,16 +12,16 @@ from recordings import of_images
 from scipy.spatial.transform import Rotation
 from session_pairs import found_pair, two_drives
 
-from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o
 from sglpr_jax.pose_graph.optimize import (
-    MOST_RISEN_M,
+    MAX_HEIGHT_CHANGE_M,
     OptimizedTrajectory,
     optimize_trajectory,
     placements,
-    solved_graph,
+    solve_pose_graph,
     trajectory_error,
 )
 from sglpr_jax.se3 import from_quaternions, inverse, transform
@@ -30,7 +30,7 @@ from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
 
 
 def optimized(odometry: np.ndarray, loops: Sequence[LoopClosure]) -> OptimizedTrajectory:
-    return solved_graph({0: odometry}, loops)
+    return solve_pose_graph({0: odometry}, loops)
 
 
 def test_the_error_of_a_drifted_drive_falls(two_laps, two_laps_odometry, second_lap_loops):
@@ -137,4 +137,4 @@ def test_heights_that_move_by_metres_are_told(two_laps, two_laps_odometry, secon
     moved = LoopSearchResult((Session(of_images(images), LAPS_FRAMES, low),), second_lap_loops)
     with pytest.warns(DataWarning, match="08: expected heights near those of the odometry, found them moved by"):
         corrected = optimize_trajectory(moved)
-    assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MOST_RISEN_M
+    assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MAX_HEIGHT_CHANGE_M

@@ -1,4 +1,4 @@
-"""The exhaustive search against one by whole Fourier transforms in numpy."""
+"""The exhaustive search is compared with a search by full inverse Fourier transforms in numpy."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ SMALL = VerificationConfig(reach_m=12.8, max_shift_m=4.0)
 
 
 def correlations(query: np.ndarray, match: np.ndarray) -> np.ndarray:
-    """Of all rotations and shifts (rotation, down, right), by inverse transforms of the whole spectra."""
+    """Correlation by rotation, row shift and column shift, from full inverse Fourier transforms in numpy."""
     angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
     cell_m = DENSITY_RESOLUTION_M * SMALL.coarse
     small = [merge_cells(prepare_image(image, SMALL), SMALL.coarse) for image in (query, match)]
@@ -70,7 +70,7 @@ def test_the_pose_lies_between_the_cells():
 
 
 def test_the_lower_half_of_a_spectrum_is_that_of_larger_cells():
-    """Of an image without high frequencies, up to a factor: the power is 1 for both."""
+    """The image has no high frequencies, so both spectra are equal after the scaling to unit power."""
     size, cell_m = 40, DENSITY_RESOLUTION_M * SMALL.coarse
     down, right = (np.arange(size) - (size - 1) / 2) * cell_m, (np.arange(size // 2) - (size // 2 - 1) / 2) * 2 * cell_m
 

@@ -112,12 +112,14 @@ def test_descriptors_of_another_method_or_model_cannot_be_compared(file, change,
 
 
 def test_scans_that_are_left_out_are_remembered_by_their_rows(file):
-    assert file.recorded.tolist() == [True, True, True]
+    assert file.is_described.tolist() == [True, True, True]
     fewer = file.only(np.array([True, False, True]))
-    assert fewer.ids == ("000000", "ÄÖ-9") and fewer.recorded.tolist() == [True, False, True]
+    assert fewer.ids == ("000000", "ÄÖ-9") and fewer.is_described.tolist() == [True, False, True]
     np.testing.assert_array_equal(fewer.descriptors, file.descriptors[[0, 2]])
     last = dataclasses.replace(fewer, positions=None).only(np.array([False, True]))
-    assert last.recorded.tolist() == [False, False, True] and last.times.tolist() == [0.2] and last.positions is None
+    assert (
+        last.is_described.tolist() == [False, False, True] and last.times.tolist() == [0.2] and last.positions is None
+    )
     for skipped in ("3", [1, 1], [5], [-1], [0.5], {"0": 1}):
         with pytest.raises(ValueError, match="expected row numbers of the skipped scans, found"):
-            _ = dataclasses.replace(file, config={"skipped": skipped}).recorded
+            _ = dataclasses.replace(file, config={"skipped": skipped}).is_described

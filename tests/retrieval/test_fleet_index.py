@@ -42,12 +42,12 @@ def test_conditions_hold_before_the_search(filled):
     for where in ("site = 'south'", "recording != 'first'", "site = 'south' AND time >= 0"):
         assert set(filled.query(draw(1), 30, where=where, columns=["recording"])["recording"].to_pylist()) == {"second"}
     assert filled.query(draw(1), 60, where="time BETWEEN 2 AND 3").num_rows == 6
-    with pytest.raises(ValueError, match=rf"^{filled.place}: expected a store .* No field named town"):
+    with pytest.raises(ValueError, match=rf"^{filled.address}: expected a store .* No field named town"):
         filled.query(draw(1), where="town = 'x'")
 
 
 def test_a_place_is_added_once_and_all_processes_see_it(filled):
-    other = FleetIndex(filled.place)
+    other = FleetIndex(filled.address)
     assert other.add(place_rows(file_of(31), "first", site="north")) == 1
     assert len(filled) == 61 and other.about == {"width": 8, "weights_hash": "abc", "scale": 1}
 
@@ -67,9 +67,9 @@ def test_an_approximate_index_finds_nearest_places_and_those_added_later(tmp_pat
 
 
 def test_places_of_other_weights_are_refused(filled):
-    message = rf"^{filled.place}: expected places with weights_hash xyz, found abc: they are"
+    message = rf"^{filled.address}: expected places with weights_hash xyz, found abc: they are"
     with pytest.raises(ValueError, match=message):
-        FleetIndex(filled.place, weights_hash="xyz")
+        FleetIndex(filled.address, weights_hash="xyz")
     with pytest.raises(ValueError, match="expected places with weights_hash abc, found xyz"):
         filled.add(place_rows(file_of(3, weights_hash="xyz"), "third"))
     with pytest.raises(ValueError, match=r"shape \(1, 8\), found \(1, 9\)"):

@@ -1,4 +1,4 @@
-"""The node: scans from a topic, through the map of `bin/live`, to topics of loops."""
+"""The ROS 2 node: the live node of `bin/live`, with scans from a topic and loops to topics."""
 
 import contextlib
 import sys
@@ -9,7 +9,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from sglpr_jax.cli.live import LiveCommand, run_node
-from sglpr_jax.live.messages import Report, Reports
+from sglpr_jax.live.node_messages import Report, Reports
 from sglpr_jax.live.ros import RosSink, RosSource, Transport
 from sglpr_ros.parameters import command_of, defaults
 from sglpr_ros.transport import RclpyTransport
@@ -23,13 +23,11 @@ def run(
     say: Callable[[str], object],
     should_stop: Callable[[], bool],
 ) -> None:
-    """Find loops until `should_stop` is true. `connect` opens a connection: one for the source, one for the sink.
-
-    The other arguments and the errors are those of `run_node`.
-    """
+    """Find loops until `should_stop` is true. `connect` opens a connection to ROS, once for the source and once for the
+    sink. The other arguments and the errors are those of `run_node`."""
     run_node(
         command,
-        lambda found: RosSource(connect(), command, report),
+        lambda live_map: RosSource(connect(), command, report),
         lambda: [RosSink(connect(), command)],
         report=report,
         say=say,
@@ -38,22 +36,28 @@ def run(
 
 
 def main() -> None:
-    """The entry point."""
+    """Run the node until ROS shuts down. Entry point of `ros2 run`."""
     rclpy.init()
-    ros = rclpy.create_node("sglpr")
-    values = {name: ros.declare_parameter(name, value).value for name, value in defaults().items()}
-    log = ros.get_logger()
+    node = rclpy.create_node("sglpr")
+    values = {name: node.declare_parameter(name, value).value for name, value in defaults().items()}
+    log = node.get_logger()
     report = Reports(log.warning)
-    threading.Thread(target=_spin, args=(ros,), daemon=True).start()
-    stop = {"say": log.info, "should_stop": lambda: not rclpy.ok()}
+    threading.Thread(target=_spin, args=(node,), daemon=True).start()
     try:
-        run(command_of(values), lambda: RclpyTransport(ros, report), report, **stop)
+        run(
+            command_of(values),
+            lambda: RclpyTransport(node, report),
+            report,
+            say=log.info,
+            should_stop=lambda: not rclpy.ok(),
+        )
     except (ValueError, OSError, ImportError) as error:
         sys.exit(f"error: {error}")
     finally:
         rclpy.try_shutdown()
 
 
-def _spin(ros) -> None:
+def _spin(node) -> None:
+    """Serve the callbacks of the node until ROS shuts down."""
     with contextlib.suppress(ExternalShutdownException):
-        rclpy.spin(ros)
+        rclpy.spin(node)

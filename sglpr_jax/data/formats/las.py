@@ -12,23 +12,25 @@ from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_scan
 from sglpr_jax.data.scan import Scan, time_field_of
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
-"""Minimum size of a variable-length record before and after the points, in bytes."""
+"""Minimum size of a variable-length record (before the points) and of an extended one (after them), in bytes."""
 _COMPRESSED = 0x80
-"""Bit of the point format in the header of a .laz file."""
+"""Bit that is set in the point format of a .laz file."""
+_SHORTEST_HEADER, _LONGEST_HEADER = 227, 375
+"""Size of the header of versions 1.0 and 1.4, in bytes."""
 
 
 def las_scan(path: Path) -> Scan:
-    """Read the points of a .las file in metres, scaled by the header, and their times. The axes are not changed."""
-    with _laspy(path, one_scan=True).open(path) as stream:
-        points = stream.read()
+    """Read the points of a .las file in metres, and their times if it has any. The axes are not changed."""
+    with _checked_laspy(path, one_scan=True).open(path) as stream:
+        points = stream.read()  # laspy applies the scale and offset of the header to x, y and z
     time = time_field_of(list(points.point_format.dimension_names))
     names = ("x", "y", "z") if time is None else ("x", "y", "z", time)
     return cloud_scan({name: np.asarray(points[name]) for name in names}, time=time)
 
 
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the points of a .las or .laz file of any size in parts, in metres. .laz files need lazrs."""
-    laspy = _laspy(path, one_scan=False)
+    """Yield the points of a .las or .laz file in blocks of `BLOCK_POINTS`, in metres. .laz files need lazrs."""
+    laspy = _checked_laspy(path, one_scan=False)
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
         raise ImportError(".laz files need lazrs (pip install 'sglpr-jax[las]')")
     with laspy.open(path) as stream:
@@ -36,10 +38,10 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
             yield np.stack([np.asarray(axis, np.float64) for axis in (block.x, block.y, block.z)], axis=1)
 
 
-def _laspy(path: Path, *, one_scan: bool) -> ModuleType:
-    """Return the library after a check of the sizes in the header: laspy would read 2**32 missing records.
+def _checked_laspy(path: Path, *, one_scan: bool) -> ModuleType:
+    """Check the sizes in the header of a .las file, which laspy does not check, and return the module laspy.
 
-    Raises ValueError if the file is shorter than its header declares, or larger than a scan if it is one.
+    Raises ValueError if the file is shorter than its header declares or, with `one_scan`, has too many points.
     """
     try:
         import laspy
@@ -47,20 +49,24 @@ def _laspy(path: Path, *, one_scan: bool) -> ModuleType:
         raise ImportError(".las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
     size = path.stat().st_size
     with path.open("rb") as stream:
-        header = stream.read(375).ljust(375, b"\0")
-    if header[:4] != b"LASF" or size < 227:
+        header = stream.read(_LONGEST_HEADER).ljust(_LONGEST_HEADER, b"\0")
+    if header[:4] != b"LASF" or size < _SHORTEST_HEADER:
         raise ValueError(f"expected a .las file, found an unreadable one ({size} bytes, which begin {header[:4]!r})")
-    header_size, start, records, kind, width, points = struct.unpack_from("<HIIBHI", header, 94)
-    extended_start = extended = 0
-    if header[25] >= 4:  # version 1.4 has numbers of 64 bits
+    minor_version = header[25]
+    header_size, points_start, records, point_format, width, points = struct.unpack_from("<HIIBHI", header, 94)
+    extended_start = extended = 0  # offset and number of the extended records
+    if minor_version >= 4:
         extended_start, extended, points = struct.unpack_from("<QIQ", header, 235)
-    missing = header_size + records * _RECORD_HEADER > start
-    if missing or (extended and extended_start + extended * _EXTENDED_RECORD_HEADER > size):
+    records_end = header_size + records * _RECORD_HEADER
+    extended_end = extended_start + extended * _EXTENDED_RECORD_HEADER
+    if records_end > points_start or (extended and extended_end > size):
         raise ValueError(f"expected {records} and {extended} records by the header, found {size} bytes in total")
     if one_scan:
         check_points(points, bytes_each=width)
-    available = max(size - start, 0) // max(width, 1)
-    # The size of compressed points is not known. Versions from 1.3 on may have records behind the points.
-    if not kind & _COMPRESSED and (points > available or (points < available and header[25] < 3)):
+    if point_format & _COMPRESSED:
+        return laspy  # the size of compressed points is not known
+    available = max(size - points_start, 0) // max(width, 1)
+    # Versions from 1.3 on may have records after the points.
+    if points > available or (points < available and minor_version < 3):
         raise ValueError(f"expected {points} points by the header, found {available}")
     return laspy

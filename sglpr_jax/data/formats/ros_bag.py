@@ -8,7 +8,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, POINT, RosMessage, read_custom_msg, read_point_cloud2
+from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, LIVOX_FIELDS, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short
 
@@ -17,26 +17,23 @@ CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
 METADATA = "metadata.yaml"
 """File that describes a ROS 2 recording. The recorder writes it at the end."""
 COMPRESSED = (".db3.zstd", ".mcap.zstd")
-"""Endings of compressed files, which only their metadata describe."""
+"""Endings of compressed files, which can only be opened by their metadata."""
 T = TypeVar("T")
 
 
 class RosBag:
-    """An open bag. It is closed when the object is garbage-collected.
-
-    Each method that reads messages raises ValueError if the bag is broken.
-    """
+    """One or more bags that are read as one. Each method that reads messages raises ValueError if a bag is broken."""
 
     def __init__(self, paths: Sequence[Path]):
         self.paths = tuple(paths)
         self.name = self.paths[0].name
-        self._reader = _open(self.paths)
+        self._reader = _open_reader(self.paths)
         self._lock = threading.Lock()
-        weakref.finalize(self, self._reader.close)
+        weakref.finalize(self, self._reader.close)  # closes the bags when the object is garbage-collected
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files of all bags, in order."""
+        """Files of all bags, in order. A bag of ROS 2 may be a folder."""
         return tuple(file for path in self.paths for file in (sorted(path.iterdir()) if path.is_dir() else (path,)))
 
     @property
@@ -45,67 +42,71 @@ class RosBag:
         return {connection.topic: connection.msgtype for connection in self._reader.connections}
 
     @property
-    def parts(self) -> list[tuple[Path, int, int]]:
+    def time_spans(self) -> list[tuple[Path, int, int]]:
         """Path of each bag with messages, and the recorder's times (ns) of its first and last message."""
-        spans = zip(self.paths, self._reader.readers, strict=True)
-        return [(path, part.start_time, part.end_time) for path, part in spans if part.message_count]
+        readers = zip(self.paths, self._reader.readers, strict=True)
+        return [(path, reader.start_time, reader.end_time) for path, reader in readers if reader.message_count]
 
-    def topics_of(self, kinds: Container[str]) -> tuple[str, ...]:
-        """Return the topics with one of some message types, in order of their names."""
-        return tuple(sorted(topic for topic, kind in self.topics.items() if kind in kinds))
+    def topics_of(self, message_types: Container[str]) -> tuple[str, ...]:
+        """Return the topics whose message type is in `message_types`, in order of their names."""
+        return tuple(sorted(topic for topic, message_type in self.topics.items() if message_type in message_types))
 
     @property
     def cloud_topics(self) -> tuple[str, ...]:
         """Point cloud topics. Raises ValueError, with a list of all topics, if the bag has no point clouds."""
-        clouds = self.topics_of(CLOUDS)
-        if not clouds:
+        cloud_topics = self.topics_of(CLOUDS)
+        if not cloud_topics:
             topics = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.topics.items())) or "no topics"
             expected = f"a topic of point clouds ({' or '.join(CLOUDS)})"
             raise ValueError(f"{self.paths[0]}: expected {expected}, found {topics}")
-        return clouds
+        return cloud_topics
 
-    def cloud(self, topic: str, time: int, nth: int) -> Scan:
-        """Return the `nth` cloud among those of a topic recorded at `time` (ns). Raises ValueError if it is empty."""
-        kind, message = self.topics[topic], self.message(topic, time, nth)
+    def cloud(self, topic: str, recorder_ns: int, nth: int) -> Scan:
+        """Return a point cloud. `recorder_ns` and `nth` are those of `message`. Raises ValueError if it is invalid."""
+        message_type = self.topics[topic]
+        message = self.message(topic, recorder_ns, nth)
         try:
-            if kind in CUSTOM_MSG:
+            if message_type in CUSTOM_MSG:
                 return read_custom_msg(message)
-            return read_point_cloud2(self._reader.deserialize(message.raw, kind), name=str(self.paths[0]))
-        except Exception as error:  # the bag defines the types and names of the fields
+            return read_point_cloud2(self._reader.deserialize(message.raw, message_type), name=str(self.paths[0]))
+        except Exception as error:  # many types, because the bag defines the types and names of the fields
             found = f"found an invalid one ({in_short(error)})"
             raise ValueError(f"{self.paths[0]}: expected a cloud with points on {topic}, {found}") from error
 
-    def fields(self, topic: str, time: int) -> str:
+    def describe_fields(self, topic: str, recorder_ns: int) -> str:
         """Return a description of the fields of a cloud: "x y z intensity ring (22 bytes a point)"."""
         if self.topics[topic] in CUSTOM_MSG:
-            return f"Livox, {' '.join(POINT)}"
-        with _naming(self.paths[0]):
-            cloud = self._reader.deserialize(self.message(topic, time).raw, self.topics[topic])
+            return f"Livox, {' '.join(LIVOX_FIELDS)}"
+        with _bag_errors(self.paths[0]):
+            cloud = self._reader.deserialize(self.message(topic, recorder_ns).raw, self.topics[topic])
         return f"{' '.join(field.name for field in cloud.fields)} ({cloud.point_step} bytes a point)"
 
-    def message(self, topic: str, time: int, nth: int = 0) -> RosMessage:
-        """Return the `nth` message among those of a topic recorded at `time` (ns)."""
-        return self.read(topic, lambda messages: next(itertools.islice(messages, nth, None))[1], time)
+    def message(self, topic: str, recorder_ns: int, nth: int = 0) -> RosMessage:
+        """Return message `nth`, counted from 0, of the messages of a topic that were recorded at `recorder_ns`."""
+        return self.read(topic, lambda messages: next(itertools.islice(messages, nth, None))[1], recorder_ns)
 
-    def read(self, topic: str, decode: Callable[[Iterator[tuple[int, RosMessage]]], T], time: int | None = None) -> T:
-        """Decode the messages of a topic with their times (ns), or only those recorded at one time."""
-        with self._lock, _naming(self.paths[0]):
-            return decode(self._messages(topic, time))
+    def read(
+        self, topic: str, decode: Callable[[Iterator[tuple[int, RosMessage]]], T], recorder_ns: int | None = None
+    ) -> T:
+        """Call `decode` with the messages of a topic (recorded at `recorder_ns`) and the recorder time (ns) of each."""
+        with self._lock, _bag_errors(self.paths[0]):
+            return decode(self._messages(topic, recorder_ns))
 
     def _messages(self, topic: str, time: int | None) -> Iterator[tuple[int, RosMessage]]:
-        """Messages with their times. Raises ValueError after the last message if the bag declares more."""
+        """Yield the messages of `read`. Raises ValueError after the last message if the bag declares more."""
         connections = [connection for connection in self._reader.connections if connection.topic == topic]
         stop = None if time is None else time + 1
         count = 0
-        for _, recorded, raw in self._reader.messages(connections=connections, start=time, stop=stop):
+        for _, recorder_ns, raw in self._reader.messages(connections=connections, start=time, stop=stop):
             count += 1
-            yield recorded, RosMessage(raw, cdr=self._reader.is2)
+            yield recorder_ns, RosMessage(raw, cdr=self._reader.is2)
         declared = sum(connection.msgcount for connection in connections)
         if time is None and count < declared:
             raise ValueError(f"expected {declared} messages on {topic} by its statistics, found {count}")
 
 
-def _open(paths: tuple[Path, ...]) -> Any:
+def _open_reader(paths: tuple[Path, ...]) -> Any:
+    """Open bags with rosbags. Raises ValueError for compressed files and bags that are broken or still recorded."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -115,14 +116,14 @@ def _open(paths: tuple[Path, ...]) -> Any:
         raise ValueError(f"{paths[0]}: expected a file that is not compressed{_metadata_hint(paths[0])}")
     for path in paths:
         _check_closed(path)
-    with _naming(paths[0]):
+    with _bag_errors(paths[0]):
         reader = AnyReader(list(paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
         return reader
 
 
 @contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def _bag_errors(path: Path) -> Iterator[None]:
     """Convert exceptions of rosbags to a ValueError that names the bag."""
     try:
         yield
@@ -134,18 +135,19 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def _metadata_hint(path: Path) -> str:
-    """Hint about the metadata of a broken ROS 2 recording. A recorder that is killed writes none."""
-    metadata = path.parent / METADATA
+    """Return how to open a broken ROS 2 recording with its metadata. A recorder that is killed writes no metadata."""
     if path.is_dir():
         return f"; {METADATA} or a file that it lists is damaged"
-    if path.suffix == ".bag":
+    if path.suffix == ".bag":  # ROS 1 has no metadata file
         return ""
-    missing = f"; {metadata} is missing (ros2 bag reindex writes it)"
-    return f"; open the folder with {metadata}" if metadata.is_file() else missing
+    metadata = path.parent / METADATA
+    if metadata.is_file():
+        return f"; open the folder with {metadata}"
+    return f"; {metadata} is missing (ros2 bag reindex writes it)"
 
 
 def _check_closed(path: Path) -> None:
-    """Raise ValueError if SQLite has a log beside a file of a bag: it holds messages that the file lacks."""
+    """Raise ValueError if SQLite left a log beside a .db3 file of a bag: the log holds messages that the file lacks."""
     for file in sorted(path.glob("*.db3")) if path.is_dir() else (path,):
         for log in (file.with_name(f"{file.name}-wal"), file.with_name(f"{file.name}-journal")):
             if log.is_file() and log.stat().st_size:

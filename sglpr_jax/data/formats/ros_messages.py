@@ -1,7 +1,7 @@
 """Reads serialised ROS messages field by field. rosbags is slower, because it creates an object for each part.
 
-ROS 1 packs the fields without padding, in little-endian order. ROS 2 (CDR) begins with four bytes that contain the byte
-order. After them, each number is aligned to its size.
+ROS 1 packs the fields without padding, in little-endian order. A message of ROS 2 (CDR) begins with four bytes that
+state the byte order. After them, each number is aligned to its size.
 """
 
 import dataclasses
@@ -18,18 +18,20 @@ from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
 from sglpr_jax.data.scan import TIME_FIELDS, Scan, time_field_of
 from sglpr_jax.data.times import time_unit_problem
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 from sglpr_jax.se3 import from_quaternions
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Numpy types by the number `datatype` of sensor_msgs/PointField."""
 _LEAST_M, _MOST_M = 1e-3, 1e4
 """Range of most nonzero coordinates, in metres. Numbers in the other byte order are spread over 10**-38 to 10**38."""
 _LASERS = ("ring", "channel", "line", "laser_id", "laser")
 """Field names that drivers use for the laser number of a point."""
 CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-POINT = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
-"""Fields of a point, and their numpy types."""
-UNIT = 0.01
+"""Message types of Livox scans."""
+LIVOX_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
+"""Fields of a point of Livox, and their numpy types."""
+QUATERNION_TOLERANCE = 0.01
 """Maximum deviation of the length of a quaternion from 1."""
 IMU = "sensor_msgs/msg/Imu"
 """Message type of an IMU."""
@@ -43,17 +45,17 @@ class Header(NamedTuple):
 
 
 class RosMessage:
-    """A message and a read position. Reading beyond the end raises ValueError."""
+    """A serialised message of ROS 1 or (`cdr`) ROS 2. Its methods read part after part; ValueError beyond the end."""
 
     def __init__(self, raw: bytes, *, cdr: bool):
         self.raw = raw
         self._cdr = cdr
-        self._order = ">" if cdr and not raw[1] & 1 else "<"
-        self._at = 4 if cdr else 0
+        self._byte_order = ">" if cdr and not raw[1] & 1 else "<"
+        self._position = 4 if cdr else 0
 
-    def numbers(self, kind: str, count: int = 1) -> np.ndarray:
-        """Read the next `count` numbers of a type such as "f8"."""
-        dtype = np.dtype(f"{self._order}{kind}")
+    def numbers(self, number_type: str, count: int = 1) -> np.ndarray:
+        """Read the next `count` numbers of a numpy type such as "f8"."""
+        dtype = np.dtype(f"{self._byte_order}{number_type}")
         return np.frombuffer(self._bytes(dtype.itemsize, count * dtype.itemsize), dtype)
 
     def text(self) -> str:
@@ -69,70 +71,73 @@ class RosMessage:
         return Header(seconds + nanoseconds / 1e9, self.text())
 
     def records(self, fields: dict[str, str]) -> np.ndarray:
-        """Read the next sequence of records. Fields of 4 bytes must precede fields of 1 byte."""
+        """Read the next sequence of records as a structured array. Fields of 4 bytes must precede fields of 1 byte."""
         count = int(self.numbers("u4")[0])
-        layout = [(name, f"{self._order}{kind}") for name, kind in fields.items()]
-        padding = -np.dtype(layout).itemsize % 4 if self._cdr else 0
+        layout = [(name, f"{self._byte_order}{number_type}") for name, number_type in fields.items()]
+        padding = -np.dtype(layout).itemsize % 4 if self._cdr else 0  # to 4 bytes after each record but the last
         padded = np.dtype([*layout, ("padding", f"V{padding}")])
-        content = self._bytes(4, max(count * padded.itemsize - padding, 0))  # the last record has no padding
+        content = self._bytes(4, max(count * padded.itemsize - padding, 0))
         return np.frombuffer(content + bytes(padding if count else 0), padded)
 
     def _bytes(self, alignment: int, size: int) -> bytes:
-        """Read the next bytes, in CDR from a multiple of `alignment` on."""
-        start = self._at - ((self._at - 4) % -alignment if self._cdr else 0)
-        self._at = start + size
-        if self._at > len(self.raw):
-            raise ValueError(f"expected a message of at least {self._at} bytes, found {len(self.raw)}")
-        return self.raw[start : self._at]
+        """Read the next `size` bytes. In CDR, they start at a multiple of `alignment` after the first 4 bytes."""
+        padding = (4 - self._position) % alignment if self._cdr else 0
+        start = self._position + padding
+        self._position = start + size
+        if self._position > len(self.raw):
+            raise ValueError(f"expected a message of at least {self._position} bytes, found {len(self.raw)}")
+        return self.raw[start : self._position]
 
 
 def read_point_cloud2(message: Any, *, name: str = "cloud") -> Scan:
-    """Return the points in the axes of a sensor_msgs/PointCloud2, and their lasers and times if it has such fields.
+    """Return the points of a sensor_msgs/PointCloud2 in its axes, with laser numbers and times if it has such fields.
 
     Some drivers set `is_bigendian` for little-endian data. If only the little-endian numbers are metres, they are
     returned, with a warning that begins with `name`.
     """
     data = _point_bytes(message)
-    records = data.view(_record(message, ">" if message.is_bigendian else "<"))
-    if message.is_bigendian and not _in_metres(records):
-        others = data.view(_record(message, "<"))
-        if _in_metres(others):
+    points = data.view(_point_type(message, ">" if message.is_bigendian else "<"))
+    if message.is_bigendian and not _in_metres(points):
+        swapped = data.view(_point_type(message, "<"))
+        if _in_metres(swapped):
             warn(f"{name}: expected big-endian points, as is_bigendian states, found little-endian points")
-            records = others
-    names = records.dtype.names or ()
+            points = swapped
+    names = points.dtype.names or ()
     laser = next((field for field in _LASERS if field in names), None)
-    return cloud_scan(records, time=time_field_of(names), laser=laser)
+    return cloud_scan(points, time=time_field_of(names), laser=laser)
 
 
 def _point_bytes(message: Any) -> UInt8[np.ndarray, " n"]:
-    """Bytes of all points, without the padding of rows."""
-    width, height, step, row = message.width, message.height, message.point_step, message.row_step
-    check_points(width * height, bytes_each=step)
-    row = max(row, width * step)
+    """Return the bytes of all points of a PointCloud2, without the padding between the rows of its image."""
+    width, height, point_bytes = message.width, message.height, message.point_step
+    check_points(width * height, bytes_each=point_bytes)
+    row_bytes = max(message.row_step, width * point_bytes)
     data = np.frombuffer(bytes(message.data), np.uint8)
-    if not step or len(data) < row * (height - 1) + width * step:
-        raise ValueError(f"expected {height} rows of {width} points of {step} bytes, found {len(data)} bytes")
-    return np.concatenate([data[start : start + width * step] for start in range(0, row * height, row)])
+    if not point_bytes or len(data) < row_bytes * (height - 1) + width * point_bytes:
+        raise ValueError(f"expected {height} rows of {width} points of {point_bytes} bytes, found {len(data)} bytes")
+    starts = range(0, row_bytes * height, row_bytes)
+    return np.concatenate([data[start : start + width * point_bytes] for start in starts])
 
 
-def _in_metres(records: np.ndarray) -> bool:
-    """Whether most coordinates are those of a scan. Zeros and NaN are ignored."""
-    size = np.abs(np.stack([records[axis].astype(np.float64) for axis in "xyz"]))
+def _in_metres(points: np.ndarray) -> bool:
+    """Whether most coordinates are between 1 mm and 10 km. Zeros and NaN are ignored."""
+    size = np.abs(np.stack([points[axis].astype(np.float64) for axis in "xyz"]))
     size = size[size > 0]
     return not size.size or bool(np.mean((size >= _LEAST_M) & (size <= _MOST_M)) > 0.5)
 
 
-def _record(message: Any, order: str) -> np.dtype:
-    """Numpy type of a point with the coordinates, lasers and times of a PointCloud2, in a byte order."""
+def _point_type(message: Any, byte_order: str) -> np.dtype:
+    """Return the numpy type of a point of a PointCloud2, with the fields for coordinates, laser number and time."""
     fields = {field.name: field for field in message.fields}
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
     names = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
     names += [name for name in TIME_FIELDS if name in fields and fields[name].datatype in _TYPES]
-    types = [_TYPES.get(fields[name].datatype) for name in names]
-    if None in types:
-        raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in names]}")
-    formats, offsets = [f"{order}{kind}" for kind in types], [fields[name].offset for name in names]
+    datatypes = [fields[name].datatype for name in names]
+    if not set(datatypes) <= set(_TYPES):
+        raise ValueError(f"expected numbers of types 1 to 8, found {datatypes}")
+    formats = [f"{byte_order}{_TYPES[datatype]}" for datatype in datatypes]
+    offsets = [fields[name].offset for name in names]
     try:
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step})
     except (ValueError, OverflowError) as error:
@@ -140,18 +145,18 @@ def _record(message: Any, order: str) -> np.dtype:
 
 
 def read_custom_msg(message: RosMessage) -> Scan:
-    """Return the points in the axes of a Livox message, their line numbers and their times."""
+    """Return the points of a Livox message in its axes, with their line numbers and times."""
     message.header()
-    for kind, count in (("u8", 1), ("u4", 1), ("u1", 4)):  # time base, number of points, LiDAR and reserved bytes
-        message.numbers(kind, count)
-    points = message.records(POINT)
+    for number_type, count in (("u8", 1), ("u4", 1), ("u1", 4)):  # skip time base, point count, LiDAR and reserved
+        message.numbers(number_type, count)
+    points = message.records(LIVOX_FIELDS)
     if not len(points):
         raise ValueError("expected at least one point, found none")
     return cloud_scan(points, time="offset_time", laser="line")
 
 
 class StampedPose(NamedTuple):
-    """Pose of a child frame in a frame, with its time."""
+    """Pose of a child frame, such as that of the robot, in a reference frame."""
 
     time: float
     """Time in the header of the message, in seconds."""
@@ -163,20 +168,22 @@ class StampedPose(NamedTuple):
     """Position x, y, z in metres, and quaternion x, y, z, w."""
 
 
-def _pose(message: RosMessage, *, with_child: bool = True) -> StampedPose:
-    header, child = message.header(), message.text() if with_child else ""
+def _read_pose(message: RosMessage, *, with_child: bool = True) -> StampedPose:
+    """Read header, child frame (unless the message type has none), position and quaternion."""
+    header = message.header()
+    child = message.text() if with_child else ""
     return StampedPose(header.time, child, header.frame, message.numbers("f8", 7))
 
 
 def read_transforms(message: RosMessage) -> Iterator[StampedPose]:
     """Read the transforms of a tf message. Each is the pose of its child frame in the frame of its header."""
     for _ in range(int(message.numbers("u4")[0])):
-        yield _pose(message)
+        yield _read_pose(message)
 
 
 POSES: dict[str, Callable[[RosMessage], StampedPose]] = {
-    "nav_msgs/msg/Odometry": _pose,
-    "geometry_msgs/msg/PoseStamped": partial(_pose, with_child=False),
+    "nav_msgs/msg/Odometry": _read_pose,
+    "geometry_msgs/msg/PoseStamped": partial(_read_pose, with_child=False),
 }
 """Message types with poses of the vehicle, and their readers."""
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -186,32 +193,32 @@ TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 class Stamps(NamedTuple):
     """Timestamps of the messages of a topic."""
 
-    recorded: Int64[np.ndarray, " n"]
-    """Times of the recorder, in nanoseconds."""
-    own: Float[np.ndarray, " n"]
+    recorder_ns: Int64[np.ndarray, " n"]
+    """Times at which the recorder received the messages, in nanoseconds."""
+    header_s: Float[np.ndarray, " n"]
     """Times in the headers of the messages, in seconds."""
 
     @classmethod
     def of(cls, times: Iterable[tuple[int, float]]) -> "Stamps":
-        """Stamps of messages from recorder times (ns) and header times (s)."""
+        """Create stamps from a recorder time (ns) and a header time (s) for each message."""
         pairs = list(times)
-        return cls(np.array([time for time, _ in pairs], np.int64), np.array([time for _, time in pairs], np.float64))
+        return cls(np.array([pair[0] for pair in pairs], np.int64), np.array([pair[1] for pair in pairs], np.float64))
 
     @property
-    def orderly(self) -> bool:
+    def headers_are_valid(self) -> bool:
         """Whether the header times are positive, never decrease, and can be seconds (`times.time_unit_problem`)."""
-        ordered = len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all()
-        return bool(ordered and not time_unit_problem(self.own, numbers=False))
+        ordered = len(self.header_s) and (self.header_s > 0).all() and (np.diff(self.header_s) >= 0).all()
+        return bool(ordered and not time_unit_problem(self.header_s, numbers=False))
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:
-        """Header times in seconds if they are orderly, or else the recorder's times."""
-        return self.own if self.orderly else self.recorded / 1e9
+        """Header times in seconds if all are valid, or else the recorder's times."""
+        return self.header_s if self.headers_are_valid else self.recorder_ns / 1e9
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Track:
-    """Poses of a topic."""
+    """Poses of one child frame in one reference frame, from the messages of a topic."""
 
     stamps: Stamps
     numbers: Float[np.ndarray, "n 7"]
@@ -225,32 +232,33 @@ class Track:
 
     @classmethod
     def of(cls, messages: Iterable[tuple[int, StampedPose]]) -> "Track":
-        """Create a track from recorder times (ns) and poses, without poses with non-finite positions.
+        """Create a track from a recorder time (ns) and a pose for each message. Drops poses with non-finite positions.
 
-        If most poses have a rotation, those without one are dropped, too.
+        If most poses have a rotation (a quaternion of length 1), poses without a rotation are dropped, too.
         """
         pairs = list(messages)
         numbers = np.array([pose.numbers for _, pose in pairs], np.float64).reshape(-1, 7)
-        valid = np.isfinite(numbers[:, :3]).all(axis=1)
-        rotated = valid & _are_unit(numbers[:, 3:])
-        rows = np.flatnonzero(rotated if 2 * rotated.sum() > valid.sum() else valid)
-        stamps = Stamps.of((pairs[row][0], pairs[row][1].time) for row in rows)
-        child, frame = (pairs[rows[0]][1].child, pairs[rows[0]][1].frame) if len(rows) else ("", "")
-        return cls(stamps, numbers[rows], child, frame, len(pairs) - len(rows))
+        has_position = np.isfinite(numbers[:, :3]).all(axis=1)
+        has_rotation = has_position & _have_length_1(numbers[:, 3:])
+        rows = np.flatnonzero(has_rotation if 2 * has_rotation.sum() > has_position.sum() else has_position)
+        kept = [pairs[row] for row in rows]
+        stamps = Stamps.of((recorder_ns, pose.time) for recorder_ns, pose in kept)
+        child, frame = (kept[0][1].child, kept[0][1].frame) if kept else ("", "")
+        return cls(stamps, numbers[rows], child, frame, dropped=len(pairs) - len(rows))
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     @property
-    def turned(self) -> bool:
-        """Whether the messages contain rotations that change. A GPS receiver writes zeros or a constant."""
-        return _turn(self.numbers[:, 3:])
+    def rotates(self) -> bool:
+        """Whether all poses have a rotation and the rotations change. A GPS receiver writes zeros or a constant."""
+        return _are_changing_rotations(self.numbers[:, 3:])
 
     @property
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
         """Poses, with identity rotations if not all quaternions are valid."""
         positions, quaternions = self.numbers[:, :3], self.numbers[:, 3:]
-        return from_quaternions(positions, quaternions) if _are_unit(quaternions).all() else poses_of(positions)
+        return from_quaternions(positions, quaternions) if _have_length_1(quaternions).all() else poses_of(positions)
 
     @property
     def moves(self) -> bool:
@@ -261,56 +269,57 @@ class Track:
         return f"{len(self)} poses of {self.child or 'a body'} in {self.frame or 'a frame'}"
 
 
-def _are_unit(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
-    """Whether each quaternion has length 1."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= UNIT
+def _have_length_1(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity have another length
+        return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= QUATERNION_TOLERANCE
 
 
-def _turn(quaternions: Float[np.ndarray, "n 4"]) -> bool:
-    """Whether the quaternions are valid rotations that change."""
-    return bool(len(quaternions) and _are_unit(quaternions).all() and np.ptp(quaternions, axis=0).any())
+def _are_changing_rotations(quaternions: Float[np.ndarray, "n 4"]) -> bool:
+    return bool(len(quaternions) and _have_length_1(quaternions).all() and np.ptp(quaternions, axis=0).any())
 
 
-def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
-    """Group tf transforms into one track for each pair of child and parent frame."""
+def tracks_of_transforms(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
+    """Group tf transforms, each with its recorder time (ns), into a track for each pair of child and parent frame."""
     groups: dict[tuple[str, str], list[tuple[int, StampedPose]]] = defaultdict(list)
-    for time, pose in transforms:
-        child, frame = pose.child.strip("/"), pose.frame.strip("/")
-        groups[child, frame].append((time, pose._replace(child=child, frame=frame)))
+    for recorder_ns, pose in transforms:
+        child, frame = pose.child.strip("/"), pose.frame.strip("/")  # ROS 1 may write "/base_link"
+        groups[child, frame].append((recorder_ns, pose._replace(child=child, frame=frame)))
     return [Track.of(poses) for _, poses in sorted(groups.items())]
 
 
-def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
-    """Times of messages and of scans in seconds: header times, or recorder times if the headers do not overlap."""
-    if scans.orderly and stamps.orderly and have_poses(stamps.own, scans.own).mean() >= LEAST_SHARE:
-        return stamps.own, scans.own
-    return stamps.recorded / 1e9, scans.recorded / 1e9
+def times_on_one_clock(messages: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
+    """Return the times of messages and of scans in seconds: header times, or recorder times if those do not overlap."""
+    valid = scans.headers_are_valid and messages.headers_are_valid
+    if valid and have_poses(messages.header_s, scans.header_s).mean() >= LEAST_SHARE:
+        return messages.header_s, scans.header_s
+    return messages.recorder_ns / 1e9, scans.recorder_ns / 1e9
 
 
-def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
+def static_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
     """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
     neighbours: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:
-        if len(track) and not track.moves and _are_unit(track.numbers[:, 3:]).all():
+        if len(track) and not track.moves and _have_length_1(track.numbers[:, 3:]).all():
             frame_from_child = track.poses[0]
             neighbours[track.frame].append((track.child, frame_from_child))
             neighbours[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
-    reached, queue = {frame: np.eye(4)}, [frame]
-    for here in queue:
-        for there, here_from_there in neighbours[here]:
-            if there not in reached:
-                reached[there] = reached[here] @ here_from_there
-                queue.append(there)
-    return reached.get(other)
+    frame_from: dict[str, np.ndarray] = {frame: np.eye(4)}
+    queue = [frame]  # breadth-first search, which appends to the queue
+    for current in queue:
+        for neighbour, current_from_neighbour in neighbours[current]:
+            if neighbour not in frame_from:
+                frame_from[neighbour] = frame_from[current] @ current_from_neighbour
+                queue.append(neighbour)
+    return frame_from.get(other)
 
 
 def read_imu(messages: Iterable[tuple[int, RosMessage]]) -> tuple[Stamps, str, Imu]:
-    """Decode timestamps, frame and samples of an IMU from its messages and the times (ns) of their recorder."""
-    samples = [(time, message.header(), message.numbers("f8", 37)) for time, message in messages]
+    """Decode timestamps, frame and samples of an IMU from sensor_msgs/Imu messages and their recorder times (ns)."""
+    samples = [(recorder_ns, message.header(), message.numbers("f8", 37)) for recorder_ns, message in messages]
+    # Orientation and its covariance (4 + 9 numbers), angular velocity (3 + 9), linear acceleration (3 + 9).
     numbers = np.array([numbers for _, _, numbers in samples], np.float64).reshape(-1, 37)
     quaternions, rates, accelerations = numbers[:, :4], numbers[:, 13:16], numbers[:, 25:28]
-    known = _turn(quaternions) and numbers[0, 4] != -1  # the first covariance is -1 without orientation
-    stamps = Stamps.of((time, header.time) for time, header, _ in samples)
+    has_orientation = _are_changing_rotations(quaternions) and numbers[0, 4] != -1  # ROS: -1 means unknown
+    stamps = Stamps.of((recorder_ns, header.time) for recorder_ns, header, _ in samples)
     frame = next((header.frame for _, header, _ in samples if header.frame), "")
-    return stamps, frame, Imu(stamps.own, rates, accelerations, quaternions if known else None)
+    return stamps, frame, Imu(stamps.header_s, rates, accelerations, quaternions if has_orientation else None)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import is_record, read_records, unusual_record
+from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti, is_headerless, read_records
 from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_scan
 from sglpr_jax.data.formats.las import las_blocks, las_scan
 from sglpr_jax.data.formats.pcd_ply import parse_pcd, parse_ply, table_blocks, table_scan
@@ -21,38 +21,34 @@ from sglpr_jax.files import in_short
 from sglpr_jax.numpy_files import read_array
 
 ARRAY_NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
-"""Names of the array with the points in an .npz file with several arrays, in order of preference."""
+"""Names of the array of points in an .npz file with several arrays. The first name that exists is used."""
 
 
 def array_scan(path: Path) -> Scan:
-    """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields.
-
-    In an .npz file, they are the first array of `ARRAY_NAMES`, or the only one. Pickled objects are not read.
-    """
+    """Read the points of an .npy or .npz file: rows of numbers that begin with x, y, z, or records with such fields."""
     if path.suffix.lower() == ".npz":
-        array = _archived_array(path)
+        array = _read_npz(path)
     else:
         with path.open("rb") as stream:
             array = read_array(stream, size=path.stat().st_size)
     if {"x", "y", "z"} <= set(array.dtype.names or ()):
         array = np.stack([array[axis].reshape(-1) for axis in "xyz"], axis=1)
-    numbers = array.dtype.kind in "fiu"
-    if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not 0 < len(array) <= MOST_POINTS:
+    is_numeric = array.dtype.kind in "fiu"
+    if not is_numeric or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not 0 < len(array) <= MOST_POINTS:
         raise ValueError(f"expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}")
-    return cloud_scan(dict(zip("xyz", array.T, strict=False)))
+    return cloud_scan({"x": array[:, 0], "y": array[:, 1], "z": array[:, 2]})
 
 
-def _archived_array(path: Path) -> np.ndarray:
+def _read_npz(path: Path) -> np.ndarray:
+    """Return the only array of an .npz file, or the first one that exists of `ARRAY_NAMES`."""
     with zipfile.ZipFile(path) as archive:
-        members = {
-            file.filename.removesuffix(".npy"): file for file in archive.infolist() if file.filename.endswith(".npy")
-        }
-        named = [name for name in ARRAY_NAMES if name in members]
-        if not named and len(members) != 1:
-            raise ValueError(
-                f"expected one array, or one named {', '.join(ARRAY_NAMES)}, found {', '.join(members) or 'none'}"
-            )
-        member = members[(named or list(members))[0]]
+        files = [file for file in archive.infolist() if file.filename.endswith(".npy")]
+        members = {file.filename.removesuffix(".npy"): file for file in files}
+        names = list(members) if len(members) == 1 else [name for name in ARRAY_NAMES if name in members]
+        if not names:
+            expected, found = ", ".join(ARRAY_NAMES), ", ".join(members) or "none"
+            raise ValueError(f"expected one array, or one named {expected}, found {found}")
+        member = members[names[0]]
         check_bytes(member.file_size)
         with archive.open(member) as stream:
             return read_array(stream, size=member.file_size)
@@ -72,11 +68,11 @@ BLOCKS: dict[str, Callable[[Path], Iterator[Float64[np.ndarray, "_ 3"]]]] = {
     ".las": las_blocks,
     ".laz": las_blocks,
 }
-"""Readers of point cloud maps in parts by file ending, so that a map may be larger than the memory."""
+"""Readers of point cloud maps, by file ending. They yield blocks of points: a map may be larger than the memory."""
 ENDINGS = (".bin", ".pcd", ".ply")
 """File endings of scans."""
 ARRAY_ENDINGS = (".npy", ".npz", ".las")
-"""File endings of scans in folders without files of `ENDINGS`. Beside them, they are descriptors, poses or a map."""
+"""File endings of scans in folders without `ENDINGS`. In other folders, such files are descriptors, poses or maps."""
 
 
 def scan_id(path: Path) -> str:
@@ -85,10 +81,10 @@ def scan_id(path: Path) -> str:
     return Path(name).stem if Path(name).suffix.lower()[1:] in READERS else name
 
 
-def named_format(path: Path) -> ScanFormat | None:
-    """Return the format that the name of a scan file defines, or None: that of most .bin files is in their content.
+def format_by_name(path: Path) -> ScanFormat | None:
+    """Return the format of a scan by its name: the ending, `*.pcd.bin` (nuscenes) or the folder `velodyne_sync` (nclt).
 
-    `*.pcd.bin` is nuscenes, and a file in a folder `velodyne_sync` is nclt.
+    Returns None for other .bin files, whose names do not define the format.
     """
     if (ending := path.suffix.lower()[1:]) in READERS:
         return ending
@@ -98,8 +94,8 @@ def named_format(path: Path) -> ScanFormat | None:
 
 
 def detect_format(path: Path) -> ScanFormat:
-    """Return the format of one scan by its name or its content."""
-    return named_format(path) or unusual_record([path]) or "kitti"
+    """Return the format of one scan by its name, or else by its content (kitti if the content does not contradict)."""
+    return format_by_name(path) or detect_format_unless_kitti([path]) or "kitti"
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
@@ -135,12 +131,12 @@ def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFo
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a scan, found none")
     check_value(format, ScanFormat, f"{path}, format")
-    known = (named_format(path) or records) if format == "auto" else format
-    if is_record(known):
-        return read_records(path, known)
-    with _naming(path, known):
+    file_format = (format_by_name(path) or records) if format == "auto" else format
+    if is_headerless(file_format):
+        return read_records(path, file_format)
+    with _format_errors(path, file_format):
         check_bytes(path.stat().st_size)
-        return READERS[known](path)
+        return READERS[file_format](path)
 
 
 def scan_of_file(
@@ -151,9 +147,9 @@ def scan_of_file(
     format: ScanFormat = "auto",
     records: RecordFormat = "kitti",
 ) -> Scan:
-    """Read a scan and its labels for a `Recording`, each file once. The scan always has its laser numbers.
+    """Read a scan, and the labels of its points if `labels` is given. This is the `Recording.read` of scan files.
 
-    `format` and `records` are those of `read_scan_file`.
+    `format` and `records` are those of `read_scan_file`. `lasers` is ignored: laser numbers are always read.
     """
     scan = read_scan_file(path, format=format, records=records)
     if labels is None:
@@ -178,17 +174,17 @@ def is_cloud_file(path: Path) -> bool:
 
 def cloud_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
     """Yield the points of a map in parts, in metres."""
-    with _naming(path, path.suffix.lower()[1:]):
+    with _format_errors(path, path.suffix.lower()[1:]):
         yield from BLOCKS[path.suffix.lower()](path)
 
 
 @contextlib.contextmanager
-def _naming(path: Path, format: str) -> Iterator[None]:
-    """Name the file in each error of a block. Libraries raise many types for damaged files."""
+def _format_errors(path: Path, format: str) -> Iterator[None]:
+    """Convert each error of a reader to a ValueError, or ImportError for a missing library, that names the file."""
     try:
         yield
     except ImportError as error:
         raise ImportError(f"{path}: {error}") from error
-    except Exception as error:
+    except Exception as error:  # libraries raise many types for damaged files
         why = in_short(error, most=300)
         raise ValueError(f"{path}: expected a readable .{format} file, found an invalid one: {why}") from error

@@ -1,4 +1,4 @@
-"""Reproducible safetensors files: equal arrays give equal bytes."""
+"""Writes safetensors files reproducibly: equal arrays and metadata give equal bytes."""
 
 import json
 from collections.abc import Mapping
@@ -10,12 +10,13 @@ import safetensors.numpy
 def tensors_as_bytes(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> bytes:
     """Return the content of a safetensors file of C-contiguous arrays, with `metadata` sorted by name.
 
-    The safetensors library itself writes metadata in arbitrary order.
+    The safetensors library writes metadata in arbitrary order, so the header of its file is replaced. A file consists
+    of the size of the header (8 bytes), the header in JSON, and the arrays.
     """
     content = safetensors.numpy.save(dict(arrays), dict(metadata))
-    size = int.from_bytes(content[:8], "little")
-    header = json.loads(content[8 : 8 + size])
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)  # the arrays after the header are aligned to 8 bytes
-    return b"".join([len(text).to_bytes(8, "little"), text, memoryview(content)[8 + size :]])
+    header_bytes = json.dumps(header, separators=(",", ":")).encode()
+    header_bytes += b" " * (-len(header_bytes) % 8)  # the arrays after the header are aligned to 8 bytes
+    return b"".join([len(header_bytes).to_bytes(8, "little"), header_bytes, memoryview(content)[end:]])

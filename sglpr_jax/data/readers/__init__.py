@@ -1,6 +1,6 @@
-"""Readers of datasets on disk. Modules that define `READER`, or several as `READERS`, are found automatically.
+"""Opens recordings in any supported layout (`open_recording`). There is a module in this folder for each layout.
 
-To support a new layout, add a module to this folder and a test.
+To support a new layout, add a module with a `READER` (or several as `READERS`) and a test. It is found automatically.
 """
 
 import functools
@@ -11,7 +11,7 @@ from pathlib import Path
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
-from sglpr_jax.data.readers.listing import other_contents
+from sglpr_jax.data.readers.listing import describe_contents
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
@@ -19,7 +19,7 @@ from sglpr_jax.data.times import check_jumps, check_order
 
 @functools.cache
 def readers() -> tuple[Reader, ...]:
-    """Return all readers, in the order in which they are tried."""
+    """Return the `READER` or `READERS` of all modules in this folder, by `Reader.rank`, then by file name."""
     readers = []
     for name in sorted(module.name for module in pkgutil.iter_modules(__path__)):
         module = importlib.import_module(f"{__name__}.{name}")
@@ -33,7 +33,7 @@ def recording_names(root: Path | str) -> tuple[str, ...]:
 
     Raises FileNotFoundError, with the supported layouts, for another folder, and ValueError if a table is malformed.
     """
-    return _reader_of(Path(root))[1]
+    return _find_reader(Path(root))[1]
 
 
 def open_recording(
@@ -78,20 +78,30 @@ def open_recording(
       recording = open_recording("KITTI", "08")
     """
     root = Path(root)
-    reader, names = _reader_of(root)
+    reader, names = _find_reader(root)
     if name is None and len(names) == 1:
         name = names[0]
     if name is None or name not in names:
-        asked = "the name of one sequence" if name is None else f"sequence {name!r}"
-        raise FileNotFoundError(f"{root}: expected {asked}, found {', '.join(names)}")
-    pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
+        expected = "the name of one sequence" if name is None else f"sequence {name!r}"
+        raise FileNotFoundError(f"{root}: expected {expected}, found {', '.join(names)}")
+    pose_file = None if poses is None else Path(poses)
+    times_file = None if times is None else Path(times)
     if (pose_file or times_file) and not reader.takes_poses:
         expected = "poses or times for a plain folder of scans"
         raise ValueError(f"{pose_file or times_file}: expected {expected}, found {root}: {reader.layout}")
     for kind, topic in (("pose", pose_topic), ("IMU", imu_topic)):
         if topic is not None and not reader.takes_topics:
             raise ValueError(f"{root}: expected a bag with the {kind} topic {topic}, found {reader.layout}")
-    options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, time_unit, pose_topic, imu_topic)
+    options = ReadOptions(
+        pose_source=pose_source,
+        format=format,
+        poses=pose_file,
+        pose_format=pose_format,
+        times=times_file,
+        time_unit=time_unit,
+        pose_topic=pose_topic,
+        imu_topic=imu_topic,
+    )
     recording = reader.open(root, name, options)
     if recording.times is not None:
         check_order(recording.times, source=f"{root}, sequence {name}")
@@ -99,18 +109,17 @@ def open_recording(
     return mounted(recording, sensor_height, gravity=gravity, known=reader.knows_mounting)
 
 
-def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
-    """Return the first reader that finds recordings in `root`, and their names."""
+def _find_reader(root: Path) -> tuple[Reader, tuple[str, ...]]:
+    """Return the first reader that finds recordings in `root`, and their names, or raise FileNotFoundError."""
     for reader in readers():
-        names = reader.recording_names(root)
-        if names:
+        if names := reader.recording_names(root):
             return reader, names
     if root.is_file():
-        scan_hint = "; put the scans into a folder, or read a single scan with read_scan"
-        hint = scan_hint if root.name.endswith((*ENDINGS, *ARRAY_ENDINGS)) else ""
+        is_scan = root.name.endswith((*ENDINGS, *ARRAY_ENDINGS))
+        hint = "; put the scans into a folder, or read a single scan with read_scan" if is_scan else ""
         raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{hint}")
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: expected the folder of a recording, or a bag, found no such folder")
     *layouts, last = (reader.layout for reader in readers() if reader.layout)
-    contents = other_contents(root, ()) or "no files"
+    contents = describe_contents(root) or "no files"
     raise FileNotFoundError(f"{root}: found no known layout: {contents}; expected {', '.join(layouts)} or {last}")

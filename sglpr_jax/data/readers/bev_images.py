@@ -13,7 +13,7 @@ from jaxtyping import Float32
 
 from sglpr_jax.data.density_image import as_counts
 from sglpr_jax.data.formats.png import image_scan, read_grey_png
-from sglpr_jax.data.formats.pose_files import frame_rows, read_poses
+from sglpr_jax.data.formats.pose_files import read_poses, rows_of_frames
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
@@ -21,27 +21,29 @@ from sglpr_jax.grid import DENSITY_RESOLUTION_M
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open `root/<name>`. Raises FileNotFoundError without images, and ValueError if an image has no valid pose."""
+    """Open the sequence `root/<name>`. Raises FileNotFoundError without images."""
     folder = root / name
     paths = scans_in(folder / "imgs", ".png", kind="images")
     ids = tuple(path.stem for path in paths)
     labels = {path.stem: path for path in files_in(folder / "labels", ".png")}
     pose_file = folder / "pose.txt"
-    has_poses = pose_file.is_file()
+    positions = None
+    if pose_file.is_file():
+        positions = rows_of_frames(read_poses(pose_file), ids, path=pose_file)[:, :, 3]
     return Recording(
         name=name,
         ids=ids,
         paths=paths,
         read=partial(image_scan, read=read_image),
-        positions=frame_rows(read_poses(pose_file), ids, path=pose_file)[:, :, 3] if has_poses else None,
-        pose_source=f"{name}/pose.txt" if has_poses else None,
-        label_paths=tuple(labels.get(image) for image in ids),
+        positions=positions,
+        pose_source=None if positions is None else f"{name}/pose.txt",
+        label_paths=tuple(labels.get(image_id) for image_id in ids),
         resolution_m=DENSITY_RESOLUTION_M,
     )
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Return an 8-bit image in the orientation of eq. 1, in counts 0..10."""
+    """Return an 8-bit density image as counts 0..10 in the orientation of eq. 1: x to the right, y up."""
     return as_counts(read_grey_png(path, bits=8))
 
 

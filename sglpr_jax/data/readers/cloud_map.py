@@ -1,10 +1,10 @@
-"""Reader of a point cloud map that another tool made (.pcd, .ply, .las, .laz), with the trajectory of its LiDAR.
+"""Reader of a point cloud map of another tool (.pcd, .ply, .las, .laz), with the trajectory of its LiDAR.
 
 - `town.pcd`: points in metres.
 - `trajectory.tum`: poses of the LiDAR in the frame of the points.
 
-The recording has a scan for each pose. A scan is computed from the map on access: the visible points within the reach
-of an image. Poses without points around them are left out.
+The recording has a scan for each pose. A scan is computed from the map on access: the points that are visible from the
+pose within `REACH_M`. Poses without points around them are left out.
 """
 
 from functools import partial
@@ -21,12 +21,12 @@ from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.data.warning import warn
+from sglpr_jax.files import warn
 
 REACH_M = 36.0
 """Maximum distance of a point from the sensor, in metres: the corner of an image of 50 m."""
 AROUND_M = 20.0
-"""Distance in x, y and z within which a pose has points of the map, in metres."""
+"""Maximum distance in x, y and z from a pose to the nearest points of the map, in metres. Other poses are left out."""
 POSES_CHECKED = 11
 """Number of poses whose height above the ground is measured, spread over the trajectory."""
 LOWEST_M = 0.25
@@ -39,9 +39,9 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Read a map, and open the scans that its LiDAR would measure at each pose. Warns if the poses look wrong.
+    """Read a map, and open the scans that its LiDAR would measure at each pose.
 
-    Raises ValueError without poses, or if no pose has points around it or the map is too large.
+    Raises ValueError without `options.poses`, if no pose has points around it, or if the map is too large.
     """
     poses = options.poses
     if poses is None:
@@ -49,18 +49,18 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
             f"{root}: expected a point cloud map with the poses of its LiDAR (--poses trajectory.tum), found no poses;"
             " put single scans into a folder, or read them with read_scan"
         )
-    track = read_trajectory(poses, format=options.pose_format, times=options.times, time_unit=options.time_unit)
-    cloud = tiled_cloud(cloud_blocks(root), positions=track.positions, reach_m=REACH_M, source=root)
-    has_points = _have_points(cloud, track.positions, root, poses)
-    world_from_lidar = _raise_poses(cloud, track.poses, np.flatnonzero(has_points), poses)
+    trajectory = read_trajectory(poses, format=options.pose_format, times=options.times, time_unit=options.time_unit)
+    cloud = tiled_cloud(cloud_blocks(root), positions=trajectory.positions, reach_m=REACH_M, source=root)
+    has_points = _have_points(cloud, trajectory.positions, root, poses)
+    world_from_lidar = _raise_poses_on_ground(cloud, trajectory.poses, np.flatnonzero(has_points), poses)
     ids = tuple(f"{row:06d}" for row in range(len(has_points)))
-    used = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
+    used = f"{cloud.total} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
     recording = Recording(
         name=root.stem,
         ids=ids,
         positions=world_from_lidar[:, :3, 3],
-        times=track.times,
-        pose_source=track.source,
+        times=trajectory.times,
+        pose_source=trajectory.source,
         paths=tuple(map(Path, ids)),
         read=partial(_read, cloud=cloud, world_from_lidar=world_from_lidar),
         on_disk=False,
@@ -74,12 +74,13 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 def _read(
     path: Path, labels: Path | None, lasers: bool, *, cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"]
 ) -> Scan:
+    """Compute the scan of a pose for a `Recording`. `path` is its id, which is the row of the pose."""
     points = _points_at(cloud, world_from_lidar[int(path.name)])
     return Scan(points=remove_hidden_points(points, spacing_m=cloud.spacing_m, reach_m=REACH_M))
 
 
 def _points_at(cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "4 4"]) -> np.ndarray:
-    """All points around a pose, in the LiDAR frame."""
+    """Return all points of the map within `REACH_M` of a pose, in the LiDAR frame."""
     return cloud.near(world_from_lidar[:3, 3], REACH_M) @ world_from_lidar[:3, :3].astype(np.float32)
 
 
@@ -89,34 +90,35 @@ def _have_points(
     """Whether the map has points around each position. Warns if some have none, raises ValueError if all have none."""
     from scipy.spatial import KDTree  # imported here because the import is slow
 
-    cells = np.unique(np.round(cloud.points / AROUND_M).astype(np.int32), axis=0)
+    occupied_cells = np.unique(np.round(cloud.points / AROUND_M).astype(np.int32), axis=0)
     has_points = np.zeros(len(positions), bool)
-    if len(cells):
-        has_points = KDTree(cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
-    covered, lost = _box(cloud.lowest, cloud.highest), np.flatnonzero(~has_points)
+    if len(occupied_cells):
+        has_points = KDTree(occupied_cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
+    map_extent = _describe_extent(cloud.lowest, cloud.highest)
     if not has_points.any():
-        area = _box(positions.min(axis=0), positions.max(axis=0))
-        expected = f"poses in the frame of {root.name}, which covers {covered}"
-        raise ValueError(f"{poses}: expected {expected}, found poses at {area}")
-    if len(lost):
-        first = ", ".join(f"{value:.1f}" for value in positions[lost[0]])
+        pose_extent = _describe_extent(positions.min(axis=0), positions.max(axis=0))
+        expected = f"poses in the frame of {root.name}, which covers {map_extent}"
+        raise ValueError(f"{poses}: expected {expected}, found poses at {pose_extent}")
+    empty_rows = np.flatnonzero(~has_points)
+    if len(empty_rows):
+        first = ", ".join(f"{value:.1f}" for value in positions[empty_rows[0]])
         warn(
-            f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at {len(lost)} of"
-            f" {len(positions)} poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers"
-            f" {covered}"
+            f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at"
+            f" {len(empty_rows)} of {len(positions)} poses, which are left out, the first in row {empty_rows[0] + 1} at"
+            f" ({first}); the map covers {map_extent}"
         )
     return has_points
 
 
-def _box(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, "3"]) -> str:
-    ends = zip("xyz", lowest, highest, strict=True)
-    return ", ".join(f"{axis} {low:.0f} to {high:.0f} m" for axis, low, high in ends)
+def _describe_extent(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, "3"]) -> str:
+    ranges = zip("xyz", lowest, highest, strict=True)
+    return ", ".join(f"{axis} {low:.0f} to {high:.0f} m" for axis, low, high in ranges)
 
 
-def _raise_poses(
+def _raise_poses_on_ground(
     cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"], rows: np.ndarray, poses: Path
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses, or poses above them with a warning if they are at the height of the ground."""
+    """If the poses (by those in some `rows`) are on the ground, warn and raise them to the height of a LiDAR."""
     sample = rows[np.unique(np.linspace(0, len(rows) - 1, POSES_CHECKED).astype(int))]
     mounting = common_mounting(estimate_mounting(_points_at(cloud, world_from_lidar[row])) for row in sample)
     if mounting is None or abs(mounting.height_m) > LOWEST_M:
@@ -126,9 +128,9 @@ def _raise_poses(
         f"{poses}: expected poses of the LiDAR, found poses {mounting.height_m:.2f} m above the ground, as of the"
         f" robot's base; the scans are computed {raised_m:.2f} m above them"
     )
-    lidar = np.eye(4)
-    lidar[:3, 3] = raised_m * np.array(mounting.up)
-    return world_from_lidar @ lidar
+    base_from_lidar = np.eye(4)
+    base_from_lidar[:3, 3] = raised_m * np.array(mounting.up)
+    return world_from_lidar @ base_from_lidar
 
 
 READER = Reader(

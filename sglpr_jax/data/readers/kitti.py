@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
-from sglpr_jax.data.formats.bin_records import describe_format, unusual_record
-from sglpr_jax.data.formats.pose_files import frame_rows, read_poses, read_times
+from sglpr_jax.data.formats.bin_records import describe_format, detect_format_unless_kitti
+from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of_frames
 from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
@@ -29,70 +29,69 @@ SIMULATION = "simulation.json"
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open `root/sequences/<name>`. Scans that do not fit KITTI's record but clearly another one are read as that one.
-
-    Raises FileNotFoundError without scans or the named pose file, and ValueError if a scan is not named by its row.
-    """
+    """Open the sequence `root/sequences/<name>`. If its scans do not fit KITTI's format, the format is detected."""
     folder = root / "sequences" / name
     paths = scans_in(folder / "velodyne", ".bin")
     ids = tuple(path.stem for path in paths)
-    pose_file, times_file = _pose_file(root, name, options.pose_source), folder / "times.txt"
+    pose_file = _choose_pose_file(root, name, options.pose_source)
     positions = None
     if pose_file is not None:
-        poses = read_poses(root / pose_file)
-        positions = frame_rows(positions_from_camera(poses), ids, path=root / pose_file)
+        all_positions = positions_from_camera(read_poses(root / pose_file))
+        positions = rows_of_frames(all_positions, ids, path=root / pose_file)
+    times_file = folder / "times.txt"
     times = read_times(times_file, unit=options.time_unit) if times_file.is_file() else None
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
-    (read, format), mounting = _format(paths, options.format), _mounting(root)
+    read, format_description = _scan_reader(paths, options.format)
+    mounting = _simulated_mounting(root)
     return Recording(
         name=name,
         ids=ids,
         paths=paths,
         read=read,
         positions=positions,
-        times=None if times is None else frame_rows(times, ids, path=times_file),
+        times=None if times is None else rows_of_frames(times, ids, path=times_file),
         pose_source=pose_file,
         label_paths=tuple(labels.get(scan) for scan in ids),
         mounting=mounting,
-        found=(f"format: {format}", *([] if mounting is None else [f"sensor: {mounting}, as simulated"])),
+        found=(f"format: {format_description}", *([] if mounting is None else [f"sensor: {mounting}, as simulated"])),
     )
 
 
-def _mounting(root: Path) -> Mounting | None:
-    """Mounting in a simulated dataset, or None if the sensor is mounted as the models assume."""
+def _simulated_mounting(root: Path) -> Mounting | None:
+    """Return the mounting of the sensor of a simulated dataset, or None for a height of 1.73 m (KITTI)."""
     path = root / SIMULATION
     if not path.is_file():
         return None
     settings = read_json(path)
     try:
-        height = float(settings["sensor"]["height_m"])
+        height_m = float(settings["sensor"]["height_m"])
     except (TypeError, KeyError, ValueError) as error:
         expected = "the settings of a simulated dataset with sensor.height_m"
         raise ValueError(f"{path}: expected {expected}, found none") from error
-    with naming(path):
-        return None if height == MODEL_HEIGHT_M else Mounting(height)
+    with naming(path):  # `Mounting` raises ValueError for implausible heights
+        return None if height_m == MODEL_HEIGHT_M else Mounting(height_m)
 
 
-def _format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:
-    """Function that reads a scan, and its format in words."""
+def _scan_reader(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:
+    """Return a function that reads a scan of the sequence, and a description of the format."""
     if format != "auto":
         return partial(scan_of_file, format=format), f"{format}, as given"
-    unusual = None
+    other_format = None
     with contextlib.suppress(ValueError):  # scans that fit no format are read as KITTI's
-        unusual = unusual_record(paths)
-    if unusual is None:
+        other_format = detect_format_unless_kitti(paths)
+    if other_format is None:
         return scan_of_file, describe_format("kitti")
-    return partial(scan_of_file, format=unusual), f"{describe_format(unusual)}, not KITTI's"
+    return partial(scan_of_file, format=other_format), f"{describe_format(other_format)}, not KITTI's"
 
 
-def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
-    """Name of the chosen pose file. "auto" prefers SemanticKITTI's, and returns None without any file."""
+def _choose_pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
+    """Return the path of the chosen pose file in `root`. "auto" prefers SemanticKITTI's; without any, returns None."""
     files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
-    choices = list(files.values()) if choice == "auto" else [files[choice]]
-    path = next((file for file in choices if (root / file).is_file()), None)
-    if path is None and choice != "auto":
-        raise FileNotFoundError(f"{root}: expected poses in {choices[0]}, found none")
-    return path
+    candidates = list(files.values()) if choice == "auto" else [files[choice]]
+    pose_file = next((file for file in candidates if (root / file).is_file()), None)
+    if pose_file is None and choice != "auto":
+        raise FileNotFoundError(f"{root}: expected poses in {candidates[0]}, found none")
+    return pose_file
 
 
 READER = Reader(

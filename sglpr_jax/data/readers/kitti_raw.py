@@ -23,6 +23,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import in_short
 
 EARTH_M = 6378137.0
+"""Radius of the earth at the equator (WGS84), in metres."""
 OXTS_COLUMNS = 30
 POLE_DEG = 90.0
 
@@ -33,49 +34,49 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Open a drive: scans, GPS positions (if none is missing) and timestamps (if any), matched by number."""
+    """Open a drive: scans, GPS positions (if every scan has an oxts file) and timestamps (if the file exists)."""
     folder = next(folder for folder in _drives(root) if folder.name == name)
     paths = scans_in(folder / "velodyne_points" / "data", ".bin")
-    oxts = [folder / "oxts" / "data" / f"{path.stem}.txt" for path in paths]
-    has_gps = all(path.is_file() for path in oxts)
+    oxts_files = [folder / "oxts" / "data" / f"{path.stem}.txt" for path in paths]
+    has_gps = all(path.is_file() for path in oxts_files)
     return Recording(
         name=name,
         ids=tuple(path.stem for path in paths),
         paths=paths,
         read=partial(scan_of_file, format="kitti"),
-        positions=_positions(oxts) if has_gps else None,
-        times=_times(folder / "velodyne_points" / "timestamps.txt", paths),
+        positions=_gps_positions(oxts_files) if has_gps else None,
+        times=_read_times(folder / "velodyne_points" / "timestamps.txt", paths),
         pose_source="oxts (GPS)" if has_gps else None,
         found=("format: KITTI raw",),
     )
 
 
 def _drives(root: Path) -> tuple[Path, ...]:
-    """Folders of the drives, in order of their names."""
-    scans = (path for pattern in ("", "*/", "*/*/") for path in root.glob(f"{pattern}velodyne_points"))
-    return tuple(sorted((path.parent.resolve() for path in scans), key=lambda folder: folder.name))
+    """Return the folders of the drives, in order of their names. `root` is a drive, a day, or a folder of days."""
+    scan_folders = (path for pattern in ("", "*/", "*/*/") for path in root.glob(f"{pattern}velodyne_points"))
+    return tuple(sorted((path.parent.resolve() for path in scan_folders), key=lambda drive: drive.name))
 
 
-def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
-    """Positions relative to the first GPS position, in metres east, north and up."""
+def _gps_positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
+    """Return positions by the first row of each file, relative to the first position: metres east, north and up."""
     rows = [read_rows(file, columns=OXTS_COLUMNS)[:1] for file in files]
     latitude, longitude, altitude = np.concatenate(rows)[:, :3].T
-    wrong = np.flatnonzero(np.abs(latitude) >= POLE_DEG)
-    if wrong.size:
-        found = f"found {latitude[wrong[0]]}"
-        raise ValueError(f"{files[wrong[0]]}: expected a latitude below {POLE_DEG:g} degrees, {found}")
-    scale = math.cos(math.radians(latitude[0]))
+    invalid = np.flatnonzero(np.abs(latitude) >= POLE_DEG)
+    if invalid.size:
+        found = f"found {latitude[invalid[0]]}"
+        raise ValueError(f"{files[invalid[0]]}: expected a latitude below {POLE_DEG:g} degrees, {found}")
+    scale = math.cos(math.radians(latitude[0]))  # Mercator projection, true to scale at the first position
     east = scale * EARTH_M * np.radians(longitude)
     north = scale * EARTH_M * np.log(np.tan(np.radians(90 + latitude) / 2))
     positions = np.stack([east, north, altitude], axis=1)
     return positions - positions[0]
 
 
-def _times(file: Path, paths: tuple[Path, ...]) -> Float[np.ndarray, " n"] | None:
-    """Times of the scans in seconds since 1970, or None if the file does not exist."""
+def _read_times(file: Path, paths: tuple[Path, ...]) -> Float[np.ndarray, " n"] | None:
+    """Return the times of the scans in seconds since 1970, or None if `timestamps.txt` does not exist."""
     if not file.is_file():
         return None
-    lines = file.read_text(errors="replace").splitlines()  # blank lines count, too: scan i is line i
+    lines = file.read_text(errors="replace").splitlines()  # with blank lines: scan i is line i
     try:
         stamps = np.array([lines[int(path.stem)].strip().replace(" ", "T") for path in paths], "datetime64[ns]")
         if np.isnat(stamps).any():  # numpy converts a blank line to NaT

@@ -1,4 +1,4 @@
-"""Lists the recordings of a folder, and its scan files in natural order."""
+"""Lists folders for the readers of datasets: scan files in natural order, and names of sequences."""
 
 import re
 from collections import Counter
@@ -7,23 +7,22 @@ from decimal import Decimal
 from pathlib import Path
 
 _DECIMAL = re.compile(r"(\d+\.\d+)(\.[A-Za-z]\w*)*$")
-"""File name that is a decimal number, such as a timestamp, followed by its extensions."""
+"""File name that is a decimal number, such as a timestamp, with its extensions: 1561000444.39.bin."""
 
 
 def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
-    """Return the files of a folder with one of some extensions in lower case, in natural order. Case is ignored.
+    """Return the files of a folder with one of the lower-case `endings`, in natural order. The files may be upper-case.
 
     Hidden files are skipped: macOS writes a `._000003.bin` beside each scan that it copies.
     """
     if not folder.is_dir():
         return ()
-    return in_order(
-        path for path in folder.iterdir() if path.name.lower().endswith(endings) and not path.name.startswith(".")
-    )
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return in_natural_order(path for path in visible if path.name.lower().endswith(endings))
 
 
 def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ...]:
-    """Return the files of a folder like `files_in`. Raises FileNotFoundError if the folder has no such file."""
+    """Return the files of a folder with one of the `endings`. Raises FileNotFoundError if the folder has none."""
     paths = files_in(folder, *endings)
     if not paths:
         expected = ", ".join(f"*{ending}" for ending in endings)
@@ -32,29 +31,29 @@ def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ..
 
 
 def names_of(root: Path, *, pattern: str) -> tuple[str, ...]:
-    """Return the names of the folders in `root` that a pattern such as "sequences/*/velodyne/" finds, in order."""
-    at = next(i for i, part in enumerate(Path(pattern).parts) if "*" in part or "[" in part)
-    return tuple(sorted({path.relative_to(root).parts[at] for path in root.glob(pattern)}))
+    """Return the sorted names that the first wildcard of a pattern matches: 00, 01, ... for "sequences/*/velodyne/"."""
+    wildcard_level = next(level for level, part in enumerate(Path(pattern).parts) if "*" in part or "[" in part)
+    return tuple(sorted({path.relative_to(root).parts[wildcard_level] for path in root.glob(pattern)}))
 
 
-def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
+def in_natural_order(paths: Iterable[Path]) -> tuple[Path, ...]:
     """Sort paths by name, with numbers compared as numbers: full2 before full10.
 
     If all names are decimal numbers, such as timestamps, they are compared as decimals: 1.25 before 1.5.
     """
     files = list(paths)
-    times = {path: time[1] for path in files if (time := _DECIMAL.match(path.name))}
-    if len(times) == len(files):
-        return tuple(sorted(files, key=lambda path: (Decimal(times[path]), path.name)))
-    return tuple(sorted(files, key=lambda path: _natural(path.name)))
+    decimals = {path: match[1] for path in files if (match := _DECIMAL.match(path.name))}
+    if len(decimals) == len(files):
+        return tuple(sorted(files, key=lambda path: (Decimal(decimals[path]), path.name)))
+    return tuple(sorted(files, key=lambda path: _natural_key(path.name)))
 
 
-def other_contents(folder: Path, taken: Iterable[Path]) -> str:
-    """Return a summary of the other contents of a folder: numbers of files by extension, and subfolders."""
-    known = set(taken)
-    others = [path for path in folder.iterdir() if path not in known and not path.name.startswith(".")]
-    folders = in_order(path for path in others if path.is_dir())
-    endings = Counter(path.suffix or path.name for path in others if not path.is_dir())
+def describe_contents(folder: Path, *, without: Iterable[Path] = ()) -> str:
+    """Return a summary of a folder, such as "2 .txt, 1 folder (images)", without some paths and hidden files."""
+    excluded = set(without)
+    paths = [path for path in folder.iterdir() if path not in excluded and not path.name.startswith(".")]
+    folders = in_natural_order(path for path in paths if path.is_dir())
+    endings = Counter(path.suffix or path.name for path in paths if not path.is_dir())
     contents = [f"{count} {ending}" for ending, count in sorted(endings.items())]
     if folders:
         names = ", ".join(path.name for path in folders[:3]) + (", ..." if len(folders) > 3 else "")
@@ -62,7 +61,7 @@ def other_contents(folder: Path, taken: Iterable[Path]) -> str:
     return ", ".join(contents)
 
 
-def _natural(name: str) -> tuple[tuple[int, int, int, str], ...]:
-    """Sort key: the parts of a name, numbers before text, and equal numbers by their number of digits."""
+def _natural_key(name: str) -> tuple[tuple[int, int, int, str], ...]:
+    """Return a sort key of the parts of a name: numbers before text, and equal numbers by their number of digits."""
     parts = re.findall(r"\d+|\D+", name)
     return tuple((0, int(part), len(part), "") if part.isdecimal() else (1, 0, 0, part) for part in parts)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.json_tables import poses_in_table, read_table
-from sglpr_jax.data.formats.pose_files import frame_rows
+from sglpr_jax.data.formats.pose_files import rows_of_frames
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers.listing import files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -50,16 +50,16 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     ids = tuple(path.stem for path in paths)
     pose_file, times_file = folder / "poses.json", folder / "timestamps.json"
     poses = poses_in_table(pose_file, read_table(pose_file), position="position", rotation="heading")
-    poses = frame_rows(poses, ids, path=pose_file)
-    times = frame_rows(_times(times_file), ids, path=times_file)
+    poses = rows_of_frames(poses, ids, path=pose_file)
+    times = rows_of_frames(_read_times(times_file), ids, path=times_file)
     check_order(times, source=times_file)
     missing = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
-    digest = hashlib.sha256(pose_file.read_bytes()).hexdigest()
+    poses_hash = hashlib.sha256(pose_file.read_bytes()).hexdigest()
     return Recording(
         name=name,
         ids=ids,
         paths=paths,
-        read=partial(_read, poses=dict(zip(paths, poses, strict=True)), poses_hash=digest),
+        read=partial(_read, poses=dict(zip(paths, poses, strict=True)), poses_hash=poses_hash),
         positions=poses[:, :3, 3],
         times=times,
         pose_source=str(POSES),
@@ -67,24 +67,26 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     )
 
 
-def _times(path: Path) -> Float[np.ndarray, " n"]:
-    values = read_json(path)
+def _read_times(path: Path) -> Float[np.ndarray, " n"]:
+    """Read a list of times in seconds from a JSON file. Raises ValueError for other content."""
+    content = read_json(path)
     try:
-        times = np.array(values, np.float64)
+        times = np.array(content, np.float64)
     except (TypeError, ValueError):
-        times = np.array([np.nan])
+        times = np.array([np.nan])  # rejected below
     if times.ndim != 1 or not np.isfinite(times).all():
-        raise ValueError(f"{path}: expected a list of seconds, found {str(values)[:60]}")
+        raise ValueError(f"{path}: expected a list of seconds, found {str(content)[:60]}")
     return times
 
 
 def _read(
     path: Path, labels: Path | None, lasers: bool, *, poses: dict[Path, Float[np.ndarray, "4 4"]], poses_hash: str
 ) -> Scan:
-    """Read a scan. Caches of its points use `poses_hash` to detect changed poses."""
-    world_from_lidar = poses[path]
-    x, y, z = ((read_scan(path, format="npy") - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]).T
-    return Scan(points=np.stack([y, -x, z], axis=1).astype(np.float32))
+    """Read a scan for a `Recording`, transformed from the world to the LiDAR frame with x forward."""
+    world_from_lidar = poses[path]  # `poses_hash` is not used: caches of the scan compare the options of this function
+    in_lidar = (read_scan(path, format="npy") - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]
+    right, forward, up = in_lidar.T
+    return Scan(points=np.stack([forward, -right, up], axis=1).astype(np.float32))
 
 
 READER = Reader(

@@ -11,10 +11,7 @@ from sglpr_jax.fields import check_value, field_types
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options of `open_recording` for a reader, which ignores those that do not apply to it.
-
-    Raises ValueError if a choice is unknown.
-    """
+    """Options of `open_recording` that are passed to a reader. A reader ignores options that do not apply to it."""
 
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"
@@ -35,8 +32,7 @@ class Reader:
     """Reader for one dataset layout."""
 
     layout: str
-    """Pattern of the files for error messages: "sequences/NN/velodyne/*.bin (KITTI)". Empty if the layout is always
-    rejected."""
+    """Pattern of the files for error messages: "sequences/NN/velodyne/*.bin (KITTI)". Empty for a rejected layout."""
     recording_names: Callable[[Path], tuple[str, ...]]
     """Returns the names of the recordings in a folder, in order. Empty if the folder has another layout."""
     open: Callable[[Path, str, ReadOptions], Recording]
@@ -44,8 +40,7 @@ class Reader:
     knows_mounting: bool = True
     """Whether the layout defines the sensor mounting. Otherwise the mounting is estimated."""
     rank: int = 5
-    """Priority if several layouts fit a folder. The lowest rank is used, then the first file name in alphabetical
-    order."""
+    """Priority if several layouts fit a folder: the lowest rank, then the alphabetical order of the modules."""
     takes_poses: bool = False
     """Whether `ReadOptions.poses` and `times` apply. Otherwise the layout has its own pose files."""
     takes_topics: bool = False

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import check_record, describe_format, detect_point_format, is_record
-from sglpr_jax.data.formats.pose_files import check_order, read_times, read_trajectory
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id, scan_of_file
+from sglpr_jax.data.formats.bin_records import describe_format, detect_point_format, is_headerless, warn_of_other_format
+from sglpr_jax.data.formats.pose_files import read_times, read_trajectory, warn_of_jumps
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_name, scan_id, scan_of_file
 from sglpr_jax.data.poses import poses_at_scans, poses_of
-from sglpr_jax.data.readers.listing import files_in, other_contents, scans_in
+from sglpr_jax.data.readers.listing import describe_contents, files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 
@@ -28,26 +28,26 @@ TIMES_FILE = "times.txt"
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return the name of the folder if it contains scans, or else an empty tuple."""
-    return (root.resolve().name,) if _scans(root) else ()
+    return (root.resolve().name,) if _scan_files(root) else ()
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """Open the folder `root`. Warns if the format looks wrong or consecutive poses are far apart.
 
-    Raises ValueError if two files differ only by their ending, or if the record of the .bin files cannot be detected.
+    Raises ValueError if two files differ only by their ending, or if the format of the .bin files cannot be detected.
     """
-    paths = _scans(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
-    files = {scan_id(path): path for path in reversed(paths)}
-    twice = next((path for path in paths if files[scan_id(path)] is not path), None)
-    if twice is not None:
-        first = files[scan_id(twice)]
-        raise ValueError(f"{root}: expected one file for each scan, found {first.name} and {twice.name}")
-    ids = tuple(map(scan_id, paths))
-    positions, times, source = _trajectory(root, len(paths), options)
-    records, format = _formats(paths, options.format)
-    aside = other_contents(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
+    paths = _scan_files(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
+    path_by_id: dict[str, Path] = {}
+    for path in paths:
+        first = path_by_id.setdefault(scan_id(path), path)
+        if first is not path:
+            raise ValueError(f"{root}: expected one file for each scan, found {first.name} and {path.name}")
+    ids = tuple(path_by_id)
+    positions, times, source = _read_trajectory(root, len(paths), options)
+    records, format_description = _bin_format(paths, options.format)
+    unused = describe_contents(root, without=[*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
     if positions is not None:
-        check_order(positions, ids, path=options.poses or root / str(source))
+        warn_of_jumps(positions, ids, path=options.poses or root / str(source))
     return Recording(
         name=root.resolve().name,
         ids=ids,
@@ -56,57 +56,61 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         positions=positions,
         times=times,
         pose_source=source,
-        found=(f"format: {format}", *([f"left aside: {aside}"] if aside else [])),
+        found=(f"format: {format_description}", *([f"left aside: {unused}"] if unused else [])),
     )
 
 
-def _scans(root: Path) -> tuple[Path, ...]:
-    """Scan files in a folder. Arrays count as scans if there are no other scans."""
+def _scan_files(root: Path) -> tuple[Path, ...]:
+    """Return the scan files in a folder: .bin, .pcd and .ply or, without such files, .npy, .npz and .las."""
     return files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
 
 
-def _trajectory(
+def _read_trajectory(
     root: Path, scans: int, options: ReadOptions
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
-    """Positions in metres, times in seconds and the source of the poses; each may be unknown (None)."""
-    beside = [root / name for name in POSE_FILES if (root / name).is_file()]
-    if options.poses is None and len(beside) > 1:
-        raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")
-    path = options.poses or next(iter(beside), None)
+    """Return positions (m) and times (s) of the scans and the source of the poses, each None if there is no file."""
+    files_in_root = [root / name for name in POSE_FILES if (root / name).is_file()]
+    if options.poses is None and len(files_in_root) > 1:
+        raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in files_in_root)}")
+    pose_file = options.poses or next(iter(files_in_root), None)
     times_file = options.times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
     times = None if times_file is None else read_times(times_file, unit=options.time_unit)
     if times is not None and len(times) != scans:
         raise ValueError(f"{times_file}: expected {scans} rows, one per scan, found {len(times)}")
-    if path is None:
+    if pose_file is None:
         return None, times, None
-    twelve = "lidar" if options.poses is None else None
-    track = read_trajectory(path, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve)
-    of = f"scan of {root.resolve().name}"
-    kept, poses, how = poses_at_scans(str(path), poses_of(track.positions), track.times, times, scans=scans, of=of)
-    if times is not None and not kept.all():
-        late = times[~kept]
+    twelve_numbers = "lidar" if options.poses is None else None  # the file in the folder has z up
+    trajectory = read_trajectory(
+        pose_file, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve_numbers
+    )
+    poses, item = poses_of(trajectory.positions), f"scan of {root.resolve().name}"
+    has_pose, poses, how = poses_at_scans(str(pose_file), poses, trajectory.times, times, scans=scans, item=item)
+    if times is not None and not has_pose.all():
+        uncovered = times[~has_pose]
         raise ValueError(
-            f"{path}: expected poses at the times of all {scans} scans, found none for {len(late)}, the first at "
-            f"{late[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
+            f"{pose_file}: expected poses at the times of all {scans} scans, found none for {len(uncovered)}, the first"
+            f" at {uncovered[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
         )
-    source = track.source if options.poses is not None else path.name
-    return poses[:, :3, 3], track.times if times is None else times, f"{source}, {how}" if how else source
+    source = trajectory.source if options.poses is not None else pose_file.name
+    scan_times = trajectory.times if times is None else times
+    return poses[:, :3, 3], scan_times, f"{source}, {how}" if how else source
 
 
-def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
-    """Record of the .bin files whose name does not define it, and a description of all formats."""
+def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
+    """Return the format of .bin files whose name does not define it, and a description of the formats of all files."""
     if format != "auto":
-        if is_record(format):
-            check_record(paths, format)
-        return "kitti", describe_format(format)
-    names = [named_format(path) for path in paths]
-    unnamed = [path for path, name in zip(paths, names, strict=True) if name is None]
-    detected, how = detect_point_format(unnamed) if unnamed else (None, "")
-    records: RecordFormat = detected or "kitti"
-    counts = Counter(name or records for name in names)
-    texts = {name: describe_format(name) for name in counts}
-    kinds = ", ".join(texts[name] if len(counts) == 1 else f"{count} {texts[name]}" for name, count in counts.items())
-    return records, f"{kinds}, {how}" if unnamed else kinds
+        if is_headerless(format):
+            warn_of_other_format(paths, format)
+        return "kitti", describe_format(format)  # all files have the given format, so "kitti" is not used
+    formats = [format_by_name(path) for path in paths]
+    unknown = [path for path, name in zip(paths, formats, strict=True) if name is None]
+    detected, how = detect_point_format(unknown) if unknown else (None, "")
+    bin_format: RecordFormat = detected or "kitti"
+    counts = Counter(name or bin_format for name in formats)
+    description = ", ".join(f"{count} {describe_format(name)}" for name, count in counts.items())
+    if len(counts) == 1:
+        description = describe_format(next(iter(counts)))
+    return bin_format, f"{description}, {how}" if unknown else description
 
 
 READER = Reader(

@@ -1,4 +1,4 @@
-"""Reader of NCLT, MulRan, HeLiPR and Boreas: scans that are named by their time, and a table of poses with other times.
+"""Readers of MulRan, HeLiPR, Boreas and NCLT: scans named by their time, and a table of poses at other times.
 
 - NCLT: `2012-01-15/velodyne_sync/1326652795280148.bin`, in a record of its own; `groundtruth_2012-01-15.csv`, also in
   the date's folder or in `ground_truth/`: utime, x, y, z, roll, pitch, yaw of the body. World axes are north, east,
@@ -13,7 +13,7 @@
   laser, time; `applanix/lidar_poses.csv`: GPSTime, easting, northing, altitude and nine other columns.
 
 Names and times of MulRan and HeLiPR are in nanoseconds, the others in microseconds. Except for NCLT, positions are
-those of the LiDAR. A new layout of this kind is one more entry of `LAYOUTS`.
+those of the LiDAR. To support another dataset with such files, add an entry to `LAYOUTS`.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN, describe_format, read_record_file, read_records
-from sglpr_jax.data.formats.pose_files import read_stamped_rows
+from sglpr_jax.data.formats.pose_files import read_timed_rows
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.listing import scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -34,15 +34,17 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.times import check_order, check_unit, nearest_rows
 
 StampedPositions = tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
-"""Times in ticks, and positions in metres, z up."""
+"""Times in the unit of the dataset (`Layout.time_unit_s`), and positions in metres, z up."""
 OUSTER_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
 """Position of MulRan's Ouster in the car's frame by the dataset's calibration, in metres."""
 FORWARD_FROM_OUSTER = np.array([-1, -1, 1], np.float32)
+"""Rotation by 180 degrees about z, as factors of x, y and z."""
 
 
 def _record(fields: str) -> np.dtype:
-    """Numpy type of a point of three float32 coordinates and more fields, little-endian without padding."""
-    return np.dtype([("xyz", "<f4", 3), *((name, f"<{kind}") for name, kind in map(str.split, fields.split(",")))])
+    """Return the numpy type of a point: float32 x, y, z, and fields such as "line u1, time f4"; no padding."""
+    names_and_types = [field.split() for field in fields.split(",")]
+    return np.dtype([("xyz", "<f4", 3), *((name, f"<{kind}") for name, kind in names_and_types)])  # little-endian
 
 
 BOREAS = _record("intensity f4, ring f4, time f4")
@@ -52,72 +54,74 @@ HELIPR = {
     "Ouster": _record("intensity f4, t u4, reflectivity u2, line u2, ambient u2"),
     "Velodyne": _record("intensity f4, line u2, time f4"),
 }
-"""Record of one point, for each sensor."""
-AEVA_BEFORE = _record("reflectivity f4, velocity f4, offset_time i4, line u1")
+"""Record of one point, for each sensor of HeLiPR."""
+AEVA_WITHOUT_INTENSITY = _record("reflectivity f4, velocity f4, offset_time i4, line u1")
 AEVA_CHANGED = 1691936557946849179
-"""Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
+"""Time in nanoseconds. Aeva scans up to this time have the record `AEVA_WITHOUT_INTENSITY`."""
 
 
-def read_ground_truth(path: Path) -> StampedPositions:
-    """Read the poses of a session of NCLT. Rows with NaN are dropped."""
-    stamps, numbers = read_stamped_rows(path, columns=7, finite=False)
-    known = np.isfinite(numbers).all(axis=1)
-    if not known.any():
-        raise ValueError(f"{path}: expected poses, found NaN in all {len(numbers)} rows")
-    check_order(stamps[known] * 1e-6, source=path)
-    return stamps[known], numbers[known, :3] * Z_UP_FROM_Z_DOWN
+def read_nclt_poses(path: Path) -> StampedPositions:
+    """Return times (us) and positions of an NCLT session: utime, x, y, z, roll, pitch, yaw. Drops rows with NaN."""
+    times, poses = read_timed_rows(path, columns=7, finite=False)
+    is_known = np.isfinite(poses).all(axis=1)
+    if not is_known.any():
+        raise ValueError(f"{path}: expected poses, found NaN in all {len(poses)} rows")
+    check_order(times[is_known] * 1e-6, source=path)
+    return times[is_known], poses[is_known, :3] * Z_UP_FROM_Z_DOWN
 
 
 def read_mulran_poses(path: Path) -> StampedPositions:
-    """Read the poses of the car, and return the positions of its Ouster."""
-    stamps, numbers = read_stamped_rows(path, columns=13)
-    world_from_base = numbers.reshape(-1, 3, 4)
-    return stamps, world_from_base[:, :, :3] @ OUSTER_IN_BASE_M + world_from_base[:, :, 3]
+    """Read the poses of MulRan's car (time and 12 numbers), and return the positions of its Ouster."""
+    times, rows = read_timed_rows(path, columns=13)
+    world_from_base = rows.reshape(-1, 3, 4)
+    return times, world_from_base[:, :, :3] @ OUSTER_IN_BASE_M + world_from_base[:, :, 3]
 
 
 def read_positions(path: Path, *, columns: int, header_lines: int = 0) -> StampedPositions:
-    """Read a table of poses whose second to fourth columns are positions of the LiDAR."""
-    stamps, numbers = read_stamped_rows(path, columns=columns, header_lines=header_lines)
-    return stamps, np.ascontiguousarray(numbers[:, :3])
+    """Return the times (first column) and positions (second to fourth column) of a table of LiDAR poses."""
+    times, rows = read_timed_rows(path, columns=columns, header_lines=header_lines)
+    return times, np.ascontiguousarray(rows[:, :3])
 
 
 def read_helipr(path: Path, *, sensor: str) -> Scan:
-    """Read the points of a scan, their line numbers and their times."""
-    before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
-    return read_record_file(path, AEVA_BEFORE if before else HELIPR[sensor], format=sensor)
+    """Read a scan of a HeLiPR sensor ("Avia", "Aeva", ...) with laser numbers and times of its points."""
+    has_old_record = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED  # the file name is the time
+    return read_record_file(path, AEVA_WITHOUT_INTENSITY if has_old_record else HELIPR[sensor], format=sensor)
 
 
 class Layout(NamedTuple):
-    """Files of a sequence, and how they are read."""
+    """Location of the files of one sequence or sensor, and the functions that read them."""
 
     scans: str
-    """Folder of the scans, in that of the sequence."""
+    """Folder of the scans, relative to the folder of the sequence."""
     poses: tuple[str, ...]
     """Possible paths of the pose file. `{}` stands for the name of the sequence."""
-    tick_s: float
-    """Unit of the names and times, in seconds."""
+    time_unit_s: float
+    """Unit of scan names and pose times, in seconds: 1e-9 for nanoseconds."""
     read_scan: Callable[[Path], Scan]
     read_poses: Callable[[Path], StampedPositions]
-    found: str
-    """Format in words."""
+    description: str
+    """Description of the format for the user."""
     suffix: str = ""
-    """End of the name of the recording, after that of the sequence."""
+    """Suffix that is appended to the name of the sequence to form the name of the recording: "-Ouster"."""
     folders: str = "*"
-    """Pattern of the names of sequences. With another pattern than the default, a missing pose file is an error."""
+    """Pattern of the names of sequences. With "*", only folders with a pose file are sequences."""
     max_gap_s: float = 0.1
     """Maximum time between a scan and its pose, in seconds, by default the duration of one sweep."""
     mounting: Mounting | None = None
-    """Mounting of the frame of the points."""
+    """Mounting of the frame of the points, if the dataset defines it."""
 
     def pose_file(self, folder: Path) -> Path | None:
-        """Return the pose file of the sequence in a folder, or None."""
-        paths = (folder / path.format(folder.resolve().name) for path in self.poses)
-        return next((path for path in paths if path.is_file()), None)
+        """Return the pose file of the sequence in a folder, or None if no file of `poses` exists."""
+        candidates = [folder / path.format(folder.resolve().name) for path in self.poses]
+        return next((path for path in candidates if path.is_file()), None)
 
     def sequences(self, root: Path) -> tuple[Path, ...]:
         """Return the folders of the sequences in `root`, which may be a sequence itself."""
         folders = [folder for folder in (root, *sorted(root.glob(self.folders))) if (folder / self.scans).is_dir()]
-        return tuple(folder for folder in folders if self.folders != "*" or self.pose_file(folder) is not None)
+        if self.folders == "*":
+            folders = [folder for folder in folders if self.pose_file(folder) is not None]
+        return tuple(folders)
 
 
 LAYOUTS: dict[str, tuple[Layout, ...]] = {
@@ -125,10 +129,10 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
         Layout(
             scans="velodyne_sync",
             poses=("../groundtruth_{}.csv", "groundtruth_{}.csv", "../ground_truth/groundtruth_{}.csv"),
-            tick_s=1e-6,
+            time_unit_s=1e-6,
             read_scan=partial(read_records, format="nclt"),
-            read_poses=read_ground_truth,
-            found="sensor: coordinates are relative to the ground below it",
+            read_poses=read_nclt_poses,
+            description="sensor: coordinates are relative to the ground below it",
             folders="[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]",
             max_gap_s=0.5,  # a Segway moves half a metre in this time
             mounting=Mounting(0.0),
@@ -138,20 +142,20 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
         Layout(
             scans="Ouster",
             poses=("global_pose.csv",),
-            tick_s=1e-9,
+            time_unit_s=1e-9,
             read_scan=lambda path: Scan(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
             read_poses=read_mulran_poses,
-            found=f"format: MulRan, {describe_format('kitti')}, rotated to x forward",
+            description=f"format: MulRan, {describe_format('kitti')}, rotated to x forward",
         ),
     ),
     "NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)": tuple(
         Layout(
             scans=f"LiDAR/{sensor}",
             poses=(f"LiDAR_GT/{sensor}_gt.txt",),
-            tick_s=1e-9,
+            time_unit_s=1e-9,
             read_scan=partial(read_helipr, sensor=sensor),
             read_poses=partial(read_positions, columns=8),
-            found=f"format: HeLiPR's {sensor} ({record.itemsize} bytes a point)",
+            description=f"format: HeLiPR's {sensor} ({record.itemsize} bytes a point)",
             suffix=f"-{sensor}",
         )
         for sensor, record in HELIPR.items()
@@ -160,21 +164,21 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
         Layout(
             scans="lidar",
             poses=("applanix/lidar_poses.csv",),
-            tick_s=1e-6,
+            time_unit_s=1e-6,
             read_scan=partial(read_record_file, record=BOREAS, format="float32x6"),
             read_poses=partial(read_positions, columns=13, header_lines=1),
-            found=f"format: Boreas, {describe_format('float32x6')}",
+            description=f"format: Boreas, {describe_format('float32x6')}",
         ),
     ),
 }
-"""Layouts of the sequences of each dataset. A layout per sensor if a sequence has several."""
+"""Layouts of each dataset, one per sensor. The keys are shown in error messages."""
 
 
 def _recordings(root: Path, layouts: tuple[Layout, ...]) -> dict[str, tuple[Path, Layout]]:
-    """Folder and layout of each recording, by name."""
-    sequences = [(folder, layout) for layout in layouts for folder in layout.sequences(root)]
-    sequences.sort(key=lambda sequence: sequence[0].name)
-    return {f"{folder.resolve().name}{layout.suffix}": (folder, layout) for folder, layout in sequences}
+    """Return the sequence folder and the layout of each recording, by the name of the recording."""
+    recordings = [(folder, layout) for layout in layouts for folder in layout.sequences(root)]
+    recordings.sort(key=lambda recording: recording[0].name)
+    return {f"{folder.resolve().name}{layout.suffix}": (folder, layout) for folder, layout in recordings}
 
 
 def recording_names(root: Path, *, layouts: tuple[Layout, ...]) -> tuple[str, ...]:
@@ -183,41 +187,42 @@ def recording_names(root: Path, *, layouts: tuple[Layout, ...]) -> tuple[str, ..
 
 
 def open_recording(root: Path, name: str, options: ReadOptions, *, layouts: tuple[Layout, ...]) -> Recording:
-    """Open the scans that have a pose near in time, each with the nearest pose."""
+    """Open the scans with a pose within `Layout.max_gap_s`, each with the position of the nearest pose in time."""
     folder, layout = _recordings(root, layouts)[name]
-    pose_file, tick_s, scans = layout.pose_file(folder), layout.tick_s, folder / layout.scans
+    scan_folder, pose_file = folder / layout.scans, layout.pose_file(folder)
     if pose_file is None:
         expected = " or ".join(path.format(name) for path in layout.poses)
         raise FileNotFoundError(f"{folder}: expected {expected}, found none")
-    stamps, positions = layout.read_poses(pose_file)
-    paths = scans_in(scans, ".bin")
+    pose_times, positions = layout.read_poses(pose_file)
+    paths = scans_in(scan_folder, ".bin")
     misnamed = next((path.name for path in paths if not path.stem.isdecimal()), None)
     if misnamed:
-        raise ValueError(f"{scans}: expected scans named by their time, as 1561000444390857630.bin, found {misnamed}")
-    times = np.array([int(path.stem) for path in paths], np.int64)
-    order = np.argsort(stamps, kind="stable")
-    check_unit(stamps[order] * tick_s, source=pose_file)
-    check_unit(times * tick_s, source=scans)
-    nearest = order[nearest_rows(stamps[order], times)]
-    gaps_s = np.abs(stamps[nearest] - times) * tick_s
-    rows = np.flatnonzero(gaps_s <= layout.max_gap_s)
+        expected = "scans named by their time, as 1561000444390857630.bin"
+        raise ValueError(f"{scan_folder}: expected {expected}, found {misnamed}")
+    scan_times = np.array([int(path.stem) for path in paths], np.int64)
+    order = np.argsort(pose_times, kind="stable")
+    check_unit(pose_times[order] * layout.time_unit_s, source=pose_file)
+    check_unit(scan_times * layout.time_unit_s, source=scan_folder)
+    pose_rows = order[nearest_rows(pose_times[order], scan_times)]
+    gaps_s = np.abs(pose_times[pose_rows] - scan_times) * layout.time_unit_s
+    scan_rows = np.flatnonzero(gaps_s <= layout.max_gap_s)
     within = f"within {layout.max_gap_s:g} s"
-    if not len(rows):
-        expected, found = f"poses {within} of the scans in {scans}", f"the nearest {gaps_s.min():g} s away"
-        raise ValueError(f"{pose_file}: expected {expected}, found {found}")
-    missing = len(paths) - len(rows)
+    if not len(scan_rows):
+        expected = f"poses {within} of the scans in {scan_folder}"
+        raise ValueError(f"{pose_file}: expected {expected}, found the nearest {gaps_s.min():g} s away")
+    missing = len(paths) - len(scan_rows)
     left_out = f" ({missing} of {len(paths)} scans left out: no pose {within})" if missing else ""
     return Recording(
         name=name,
-        ids=tuple(paths[row].stem for row in rows),
-        paths=tuple(paths[row] for row in rows),
+        ids=tuple(paths[row].stem for row in scan_rows),
+        paths=tuple(paths[row] for row in scan_rows),
         read=lambda path, labels, lasers: layout.read_scan(path),
-        positions=positions[nearest[rows]],
-        times=times[rows] * tick_s,
+        positions=positions[pose_rows[scan_rows]],
+        times=scan_times[scan_rows] * layout.time_unit_s,
         pose_source=f"{pose_file.name}{left_out}",
-        rows=rows,
+        rows=scan_rows,
         mounting=layout.mounting,
-        found=(layout.found,),
+        found=(layout.description,),
     )
 
 
@@ -229,5 +234,5 @@ READERS = tuple(
         knows_mounting=layouts[0].mounting is not None,
         rank=rank,
     )
-    for rank, (pattern, layouts) in enumerate(LAYOUTS.items(), start=2)
+    for rank, (pattern, layouts) in enumerate(LAYOUTS.items(), start=2)  # after KITTI and BEV images
 )

@@ -1,7 +1,8 @@
-"""Sources of scans and sinks of loops, by name. The module `live/NAME.py` is imported when its name is asked for.
+"""Sources of scans and sinks of loops for the live node: what each must implement, and how one is opened by name.
 
-A module has `open_source(where, options, report, taken)`, `open_sink(where, options, report)` or, for a connection to
-ROS, `open_transport(where, report)`. To support another source or sink, add a module and its name.
+The module `live/NAME.py` is imported when it is used. It has `open_source(where, options, report, taken)`,
+`open_sink(where, options, report)` or, for a connection to ROS, `open_transport(where, report)`. To support another
+source or sink, add a module and its name.
 """
 
 import importlib
@@ -9,16 +10,16 @@ from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
-from sglpr_jax.live.messages import FrameStatus, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.node_messages import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
 SINKS = {"json": None, "dds": "live", "zenoh": "live", "rerun": "view"}
-"""Names of sources and sinks, with the extra that each needs."""
+"""Names of sources and sinks, with the extra of the package that each needs."""
 TRANSPORTS = ("dds", "zenoh")
 """Connections to ROS, each a source and a sink."""
 Taken = Callable[[str], bool]
-"""Whether a scan with this `Scan.name` is in the map already."""
+"""Function that says whether a scan with this `Scan.name` is in the map already."""
 
 
 @runtime_checkable
@@ -28,23 +29,23 @@ class Source(Protocol):
     def frames(self) -> Iterator[LiveFrame | None]:
         """Yield scans as they arrive, and None after `WAIT_S` seconds without a scan, so that the node can react to
         signals. Ends if no more scans can come."""
-        ...
 
     @property
     def dropped(self) -> int:
         """Number of scans that were replaced by newer ones before they were taken."""
-        ...
 
     def close(self) -> None: ...
 
 
 @runtime_checkable
 class Sink(Protocol):
-    """Receiver of results. A sink that raises an error is reported once and left out."""
+    """Receiver of results. After an error it is not used again."""
 
-    def frame(self, status: FrameStatus) -> None: ...
+    def frame(self, status: FrameStatus) -> None:
+        """Publish the status after a scan."""
 
-    def loop(self, edge: LoopEdge) -> None: ...
+    def loop(self, edge: LoopEdge) -> None:
+        """Publish a loop."""
 
     def close(self) -> None: ...
 
@@ -52,11 +53,11 @@ class Sink(Protocol):
 def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken = lambda name: False) -> Source:
     """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
 
-    `report` takes trouble with single scans and messages. Scans of files that are `taken` do not come again. Raises
+    `report` receives errors of single scans and messages. Scans of files for which `taken` is true are skipped. Raises
     ValueError if no source has this name, and ImportError if its extra is not installed.
     """
-    name, where = check_name(text, SOURCES, kind="sources")
-    module = _module(name, SOURCES[name])
+    name, where = split_known_name(text, SOURCES, kind="sources")
+    module = _import_module(name, SOURCES[name])
     if name not in TRANSPORTS:
         return module.open_source(where, options, report, taken)
     from sglpr_jax.live.ros import RosSource  # needs the same extra
@@ -66,8 +67,8 @@ def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken
 
 def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
     """Open the sink that a text names, such as `json:loops.jsonl`, as `open_source` does."""
-    name, where = check_name(text, SINKS, kind="sinks")
-    module = _module(name, SINKS[name])
+    name, where = split_known_name(text, SINKS, kind="sinks")
+    module = _import_module(name, SINKS[name])
     if name not in TRANSPORTS:
         return module.open_sink(where, options, report)
     from sglpr_jax.live.ros import RosSink  # needs the same extra
@@ -75,7 +76,7 @@ def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
     return RosSink(module.open_transport(where, report), options)
 
 
-def check_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str]:
+def split_known_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str]:
     """Split `NAME:WHERE`. Raises ValueError if the name is not known. `kind` is "sources" or "sinks"."""
     name, _, where = text.partition(":")
     if name not in known:
@@ -83,7 +84,7 @@ def check_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[s
     return name, where
 
 
-def _module(name: str, extra: str | None) -> ModuleType:
+def _import_module(name: str, extra: str | None) -> ModuleType:
     """Import the module of a source or sink. Raises ImportError, which names the extra, if a package is missing."""
     try:
         return importlib.import_module(f"sglpr_jax.live.{name}")

@@ -1,4 +1,4 @@
-"""Results of a live map for other programs: loops, rejected pairs and trajectories."""
+"""Files that the live node writes at its end for other programs: loops, rejected pairs and trajectories."""
 
 from functools import partial
 from pathlib import Path
@@ -16,14 +16,16 @@ TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
 def write_results(live: LiveMap, folder: Path) -> list[Path]:
     """Write the loops as g2o and csv, the rejected pairs, and the odometry and its correction as tum, if there is any.
 
-    The graph has no edge between scans whose motion is unknown, as before and after a restart. The correction lacks
-    parts that no loop connects with the first one. Returns the paths. Raises WriteError if a file cannot be written.
+    The graph has no edge between scans whose motion is unknown, such as before and after a restart. The corrected
+    trajectory lacks the parts that loops do not connect with the first one. Returns the paths. Raises
+    WriteError if a file cannot be written.
     """
     detector, odometry = live.detector, live.odometry
     chains = []
     if len(odometry):
-        parts = np.split(np.arange(len(odometry)), np.flatnonzero(np.diff(detector.finder.motion.segments)) + 1)
-        chains = [(frames, odometry[frames]) for frames in parts]
+        segment_starts = np.flatnonzero(np.diff(detector.finder.motion.segments)) + 1  # where the motion is unknown
+        segments = np.split(np.arange(len(odometry)), segment_starts)
+        chains = [(frames, odometry[frames]) for frames in segments]
     files = graph_files(detector.loops, detector.rejected, chains, drift=detector.config.drift)
     if len(odometry):
         files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)

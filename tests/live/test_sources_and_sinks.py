@@ -2,8 +2,8 @@
 
 import pytest
 
-from sglpr_jax.live.endpoints import open_sink, open_source
 from sglpr_jax.live.options import LiveOptions
+from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 
 
 def test_unknown_names_missing_folders_and_extras_are_named(tmp_path, said, monkeypatch):
@@ -13,7 +13,7 @@ def test_unknown_names_missing_folders_and_extras_are_named(tmp_path, said, monk
         open_sink("", LiveOptions(), said)
     with pytest.raises(FileNotFoundError, match=r"folder:.*: expected a folder"):
         open_source(f"folder:{tmp_path}/none", LiveOptions(), said)
-    monkeypatch.setattr("sglpr_jax.live.endpoints.importlib.import_module", missing)
+    monkeypatch.setattr("sglpr_jax.live.sources_and_sinks.importlib.import_module", missing)
     with pytest.raises(ImportError, match=r"dds: expected the package cyclonedds, found none; pip install .*\[live\]"):
         open_source("dds", LiveOptions(), said)
 

@@ -1,4 +1,4 @@
-"""Values that pass through the live node: scans, status, loop edges, and reports of trouble."""
+"""What the live node receives and publishes: scans from a source, loop edges and status for sinks, and reports."""
 
 import math
 import sys
@@ -15,9 +15,9 @@ from sglpr_jax.data.scan import Scan
 WAIT_S = 0.2
 """Maximum time that `Source.frames` blocks before it yields None, in seconds."""
 AGAIN_S = 30.0
-"""Minimum time between two lines of the same kind, in seconds."""
+"""Minimum time between two printed reports of the same kind, in seconds."""
 Report = Callable[[str, str], None]
-"""Function of the kind of an event and its description. Equal kinds share a line every `AGAIN_S` seconds."""
+"""Function of the kind and the text of a warning or note. `Reports` limits how often a kind is printed."""
 T = TypeVar("T")
 
 
@@ -52,8 +52,8 @@ class FrameStatus(NamedTuple):
     nbytes: int
     """Memory of the stored scans, in bytes."""
     map_from_world: Float[np.ndarray, "4 4"] | None = None
-    """Correction of the odometry by all loops so far. None without odometry or gtsam, and while no loop connects the
-    odometry with that before a restart."""
+    """Transform from the odometry's frame to the map, by all loops so far. None without odometry or gtsam, and after a
+    restart until a loop connects the odometry with that before."""
 
 
 class LoopEdge(NamedTuple):
@@ -73,8 +73,8 @@ class LoopEdge(NamedTuple):
     """Probability that both scans show one place."""
     world_from_query: Float[np.ndarray, "4 4"] | None
     world_from_match: Float[np.ndarray, "4 4"] | None
-    """Poses by odometry, in its present frame. None without odometry, and for scans of another odometry frame, such as
-    those before a restart."""
+    """Poses of both LiDARs in the odometry frame of the latest scan. None without odometry, and for a scan with
+    another odometry frame, such as one before a restart."""
     latency_s: float
     """Time from the arrival of the latest scan to the loop, in seconds. A loop may belong to a scan before it."""
 
@@ -86,34 +86,32 @@ class LatestScan(Generic[T]):
         self.dropped = 0
         """Number of items that were replaced before they were taken."""
         self._item: T | None = None
-        self._changed = threading.Condition()
+        self._new_item = threading.Condition()
 
     def put(self, item: T) -> None:
         """Make this the newest item."""
-        with self._changed:
+        with self._new_item:
             self.dropped += self._item is not None
             self._item = item
-            self._changed.notify()
+            self._new_item.notify()
 
     def take(self, timeout: float) -> T | None:
         """Remove and return the newest item, or return None after `timeout` seconds without one."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._item is not None, timeout)
+        with self._new_item:
+            self._new_item.wait_for(lambda: self._item is not None, timeout)
             item, self._item = self._item, None
             return item
 
 
 class Reports:
-    """Prints the first event of each kind at once. Later ones are counted and printed every `AGAIN_S` seconds.
-
-    An instance is a `Report`. It may be called from several threads.
-    """
+    """Prints the first event of each kind at once. Later ones are counted, and one is printed every `AGAIN_S` seconds.
+    An instance is a `Report`. It may be called from several threads."""
 
     def __init__(self, write: Callable[[str], object] | None = None, *, clock: Callable[[], float] = time.monotonic):
         self._write = write or (lambda text: print(text, file=sys.stderr, flush=True))
         self._clock = clock
         self._printed: dict[str, tuple[float, int]] = {}
-        """Time of the last line of each kind, and number of events since."""
+        """Time of the last line of each kind, in seconds, and number of events since."""
 
     def __call__(self, kind: str, text: str) -> None:
         """Print an event, or count it if its kind was printed in the last `AGAIN_S` seconds."""

@@ -1,6 +1,6 @@
-"""ROS messages as they travel: decoding of scans, encoding of loop edges, markers and transforms (CDR, XCDR1).
+"""Encoding of loop edges, markers and transforms as ROS messages (CDR), and decoding of scans, for live ROS topics.
 
-Messages are encoded by rosbags. Scans and poses are decoded by the readers of bags (`data.formats`).
+Messages are encoded by rosbags. `data.formats.ros_messages` decodes scans and poses, also those of bags.
 """
 
 import functools
@@ -15,21 +15,21 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, Header, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short
-from sglpr_jax.live.messages import LoopEdge
+from sglpr_jax.live.node_messages import LoopEdge
 from sglpr_jax.se3 import quaternions
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
-CLOUDS = (CLOUD, CUSTOM_MSG[1])
+CLOUD_TYPES = (CLOUD, CUSTOM_MSG[1])
 """Types of scans: PointCloud2, and CustomMsg of livox_ros_driver2."""
 EDGE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-LIVOX = (
+LIVOX_CUSTOM_MSG = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 )
 LINE_LIST = 5
-"""Type of a marker that draws a line between each two points."""
+"""Value of `type` of a marker that draws a line between points 0 and 1, 2 and 3, and so on."""
 LINE_M = 0.3
 """Width of the lines of loops, in metres."""
 
@@ -42,7 +42,7 @@ class Received(NamedTuple):
     raw: bytes
     """The encoded message."""
     publisher: Any
-    """Value that tells one publisher of the topic from others."""
+    """Value that identifies the publisher, or None if it is unknown."""
     at: float
     """Time of arrival by `time.monotonic()`, in seconds."""
 
@@ -51,23 +51,22 @@ class Received(NamedTuple):
 def typestore() -> Any:
     """Definitions of messages by rosbags: those of ROS 2 Jazzy, and Livox's CustomMsg."""
     types = get_typestore(Stores.ROS2_JAZZY)
-    for name, definition in (("CustomPoint", LIVOX_POINT), ("CustomMsg", LIVOX)):
+    for name, definition in (("CustomPoint", LIVOX_POINT), ("CustomMsg", LIVOX_CUSTOM_MSG)):
         types.register(get_types_from_msg(definition, f"livox_ros_driver2/msg/{name}"))
     return types
 
 
 def encode(kind: str, fields: Mapping[str, Any]) -> bytes:
-    """Encode a message, with the four bytes of the encapsulation header. Fields that are not given are zero.
-
-    The fields of a message within the message are a mapping, too.
-    """
+    """Encode a message of a type, with the four bytes of the encapsulation header. Missing fields are zero or empty. A
+    field that is a message is a mapping of its fields."""
     return bytes(typestore().serialize_cdr(_message(kind, fields), kind))
 
 
 def _message(kind: str, fields: Mapping[str, Any]) -> Any:
-    """Message of rosbags with these fields."""
+    """Return the message object of rosbags. Missing fields are zero or empty."""
 
     def value(node: Any, definition: Any, content: Any) -> Any:
+        """Return a field's value from its type (kind and definition of rosbags) and its content, None if missing."""
         if node.name == "NAME":
             return _message(definition, content or {})
         if node.name == "BASE":
@@ -83,10 +82,8 @@ def _message(kind: str, fields: Mapping[str, Any]) -> Any:
 
 
 def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Scan]:
-    """Decode a scan, a message of one of the types `CLOUDS`.
-
-    Raises ValueError if the message is damaged, or the cloud has no x, y and z.
-    """
+    """Decode a scan from a message of type `kind`, one of `CLOUD_TYPES`. Raises ValueError if the message is damaged,
+    or the cloud has no x, y and z."""
     try:
         header = RosMessage(raw, cdr=True).header()
         if kind == CLOUD:
@@ -97,22 +94,23 @@ def decode_cloud(raw: bytes, kind: str) -> tuple[Header, Scan]:
 
 
 def edge_message(edge: LoopEdge) -> bytes:
-    """Loop edge as geometry_msgs/PoseWithCovarianceStamped.
+    """Encode a loop edge as geometry_msgs/PoseWithCovarianceStamped.
 
     The stamp is the time of the query, and the frame is `match/SECONDS.NANOSECONDS`, with the time of the match. The
     pose is that of the query's LiDAR in the frame of the match's LiDAR. As ROS defines it, the covariance is along and
     about the axes of the match's frame: x, y, z in metres, then rotations about x, y, z in radians.
     """
+    # Block-diagonal: turns translations and rotations from the axes of the query to those of the match.
     rotation = np.kron(np.eye(2), edge.match_from_query[:3, :3])
     covariance = np.ascontiguousarray(rotation @ edge.covariance @ rotation.T, np.float64).reshape(-1)
-    seconds, nanoseconds = _split(edge.match_time)
-    position, orientation = _pose(edge.match_from_query)
+    seconds, nanoseconds = _seconds_and_nanoseconds(edge.match_time)
+    position, orientation = _position_and_quaternion(edge.match_from_query)
     pose = {"pose": {"position": position, "orientation": orientation}, "covariance": covariance}
     return encode(EDGE, {"header": header(edge.query_time, f"match/{seconds}.{nanoseconds:09d}"), "pose": pose})
 
 
 def marker_message(ends: Sequence[Float[np.ndarray, "2 3"]], *, time: float, frame: str) -> bytes:
-    """Lines between the positions of the scans of each loop, as visualization_msgs/MarkerArray with one marker."""
+    """Encode lines between the positions of the two scans of each loop as a visualization_msgs/MarkerArray."""
     marker = {
         "header": header(time, frame),
         "ns": "loops",
@@ -126,27 +124,28 @@ def marker_message(ends: Sequence[Float[np.ndarray, "2 3"]], *, time: float, fra
 
 
 def transform_message(frame_from_child: Float[np.ndarray, "4 4"], *, time: float, frame: str, child: str) -> bytes:
-    """Pose of a child frame in a frame, as tf2_msgs/TFMessage."""
-    translation, rotation = _pose(frame_from_child)
+    """Encode the pose of the frame `child` in `frame` as tf2_msgs/TFMessage."""
+    translation, rotation = _position_and_quaternion(frame_from_child)
     transform = {"translation": translation, "rotation": rotation}
     stamped = {"header": header(time, frame), "child_frame_id": child, "transform": transform}
     return encode(TRANSFORMS, {"transforms": [stamped]})
 
 
 def header(time: float, frame: str) -> dict[str, Any]:
-    """Fields of a std_msgs/Header."""
-    seconds, nanoseconds = _split(time)
+    """Return the fields of a std_msgs/Header."""
+    seconds, nanoseconds = _seconds_and_nanoseconds(time)
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
 
-def _pose(frame_from_body: Float[np.ndarray, "4 4"]) -> tuple[dict[str, float], dict[str, float]]:
-    """Position and quaternion of a pose."""
+def _position_and_quaternion(frame_from_body: Float[np.ndarray, "4 4"]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the fields x, y, z and x, y, z, w of a pose's position and quaternion."""
+    position = frame_from_body[:3, 3].tolist()
     quaternion = quaternions(frame_from_body[None])[0].tolist()
-    return dict(zip("xyz", frame_from_body[:3, 3].tolist(), strict=True)), dict(zip("xyzw", quaternion, strict=True))
+    return dict(zip("xyz", position, strict=True)), dict(zip("xyzw", quaternion, strict=True))
 
 
-def _split(time: float) -> tuple[int, int]:
-    """Seconds and nanoseconds of a time. Times that no stamp can hold become 0."""
+def _seconds_and_nanoseconds(time: float) -> tuple[int, int]:
+    """Return the seconds and nanoseconds of a time. Times that a ROS stamp cannot hold become 0."""
     if not math.isfinite(time) or not 0 <= time < 2**31:
         return 0, 0
     return divmod(round(time * 1e9), 10**9)

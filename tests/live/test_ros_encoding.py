@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.live.messages import LoopEdge
-from sglpr_jax.live.ros_messages import (
+from sglpr_jax.live.node_messages import LoopEdge
+from sglpr_jax.live.ros_encoding import (
     CLOUD,
     EDGE,
     TRANSFORMS,
