@@ -21,11 +21,11 @@ import tyro
 import sglpr_jax
 from benchmarks.learned.data import HELD_OUT, TRAIN, TRAIN_IMAGES, folders, recordings_of
 from sglpr_jax.cli.peers import RATES
-from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.names import LEARNED_NAMES
 from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.stop_request import stop_on_signal
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.metrics_log import read_metrics

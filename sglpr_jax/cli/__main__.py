@@ -23,26 +23,26 @@ COMMANDS = {
     "simulate": ("SimulateCommand", "write_simulation"),
     "train": ("TrainCommand", "train_and_test"),
 }
-"""The dataclass of each command's flags and the function that runs it, in the module of that name."""
+"""Name of each command, which is also its module: the dataclass of its flags and the function that runs it."""
 
 
 def load_command(name: str) -> tuple[type, Callable]:
     """Return the dataclass and the function of a command."""
     module = importlib.import_module(f"sglpr_jax.cli.{name}")
-    flags, work = COMMANDS[name]
-    return getattr(module, flags), getattr(module, work)
+    flags_class, function = COMMANDS[name]
+    return getattr(module, flags_class), getattr(module, function)
 
 
 def main() -> None:
-    """Run the command of this process."""
+    """Run the command that `sglpr-NAME`, or the first argument of `python -m sglpr_jax.cli`, names."""
     if not Path(sys.argv[0]).name.startswith(INSTALLED_AS):
         if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
-            found = " ".join(sys.argv[1:2]) or "none"
+            found = sys.argv[1] if len(sys.argv) > 1 else "none"
             sys.exit(f"error: expected a command, one of {', '.join(COMMANDS)}, found {found}")
         sys.argv = [f"bin/{sys.argv[1]}", *sys.argv[2:]]
     name = Path(sys.argv[0]).stem.removeprefix(INSTALLED_AS)
-    flags, work = load_command(name)
-    run(lambda: parse_command(flags, name), work)
+    flags_class, function = load_command(name)
+    run(lambda: parse_command(flags_class, name), function)
 
 
 if __name__ == "__main__":

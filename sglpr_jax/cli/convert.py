@@ -43,16 +43,16 @@ def convert(command: ConvertCommand) -> None:
 
     if command.out.exists():
         raise FileExistsError(f"{command.out}: expected a folder that does not exist yet, found one")
-    fresh = init(jax.random.key(command.seed), config=load_preset(command.preset).model)
+    random_params = init(jax.random.key(command.seed), config=load_preset(command.preset).model)
     if command.network == "swin-t":
-        params, copied, unused = import_swin_t(fresh, command.checkpoint)
+        params, copied, unused = import_swin_t(random_params, command.checkpoint)
     else:
-        params, unused = import_swin_unet(fresh, command.checkpoint), ()
+        params, unused = import_swin_unet(random_params, command.checkpoint), ()
         copied = tuple(name for name in by_name(params.weights) if not name.startswith("place_head/"))
     save(params, command.out)
     sizes = {name: leaf.size for name, leaf in by_name(params.weights).items()}
-    taken, total = sum(sizes[name] for name in copied), sum(sizes.values())
-    share = f"{taken / 1e6:.1f} of {total / 1e6:.1f} million numbers ({taken / total:.0%})"
+    copied_size, total_size = sum(sizes[name] for name in copied), sum(sizes.values())
+    share = f"{copied_size / 1e6:.1f} of {total_size / 1e6:.1f} million numbers ({copied_size / total_size:.0%})"
     print(f"{command.out}: {share} of {command.checkpoint.name}, the rest random (seed {command.seed})")
     if unused:
         print(f"not used by {command.preset}: {', '.join(unused[:5])}{', ...' if len(unused) > 5 else ''}")

@@ -9,7 +9,7 @@ from sglpr_jax.cli.embed import EmbedCommand, embed_recording
 from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
 from sglpr_jax.cli.loops import LoopsCommand, loops_of_recording
 from sglpr_jax.cli.recording import PosedRecordingOptions
-from sglpr_jax.cli.runtime import own_names
+from sglpr_jax.cli.runtime import with_installed_names
 from sglpr_jax.methods.names import SHIPPED, UNTRAINED
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -18,9 +18,10 @@ AZIMUTH_STEPS = 450
 STEPS = 20
 """Training steps."""
 TESTED = "00"
+"""Recording whose loops are searched. It is not trained on."""
 PRESET = "circular"
 WEIGHTS = DEFAULT_WEIGHTS
-BESIDE = (UNTRAINED, SHIPPED)
+COMPARED_METHODS = (UNTRAINED, SHIPPED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +39,6 @@ class DemoCommand:
 
 
 def demo(command: DemoCommand) -> None:
-    """Run the command."""
     from sglpr_jax.cli.datasets import simulate  # slow imports, not needed for --help
     from sglpr_jax.cli.train import TrainCommand, train_and_test
     from sglpr_jax.evaluation.evaluation_page import PAGE
@@ -49,20 +49,20 @@ def demo(command: DemoCommand) -> None:
     simulate(town, scans=command.scans, azimuth_steps=AZIMUTH_STEPS, seed=0)
     source = PosedRecordingOptions(seq=TESTED)
 
-    _title(f"loops of recording {TESTED}: bin/loops")
+    _print_title(f"loops of recording {TESTED}: bin/loops")
     loops_of_recording(LoopsCommand(town, source=source, weights=WEIGHTS, out=out / "loops"))
-    _title("its descriptors and their score: bin/embed, bin/evaluate")
+    _print_title("its descriptors and their score: bin/embed, bin/evaluate")
     file = out / f"{TESTED}.npz"
     embed_recording(EmbedCommand(data=town, source=source, weights=WEIGHTS, out=str(file)))
     evaluate_file(EvaluateCommand(file, data=town, source=source, weights=WEIGHTS))
-    _title(f"{STEPS} steps of training, to show the command; thousands would be needed: bin/train")
+    _print_title(f"{STEPS} steps of training, to show the command; thousands would be needed: bin/train")
     if (out / "run").exists():
         shutil.rmtree(out / "run")
     config = dataclasses.replace(load_preset(PRESET), steps=STEPS, score_every=STEPS)
-    train = TrainCommand(seq=TESTED, data=town, preset=PRESET, method=BESIDE, out=out / "run", config=config)
-    train_and_test(train, go_on="the next demo restarts its training")
+    train = TrainCommand(seq=TESTED, data=town, preset=PRESET, method=COMPARED_METHODS, out=out / "run", config=config)
+    train_and_test(train, stop_advice="the next demo restarts its training")
     print(f"\npages: {out / 'loops' / LOOPS_PAGE}, {out / TESTED / PAGE}")
 
 
-def _title(text: str) -> None:
-    print(own_names(f"\n{text}"), file=sys.stderr)
+def _print_title(text: str) -> None:
+    print(with_installed_names(f"\n{text}"), file=sys.stderr)

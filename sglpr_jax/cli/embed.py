@@ -65,7 +65,6 @@ class EmbedCommand:
 
 
 def embed_recording(command: EmbedCommand) -> None:
-    """Run the command."""
     from sglpr_jax.data.corruption import ROTATION, corrupted, corruption_named  # slow imports, not needed for --help
     from sglpr_jax.data.scaled import scaled
     from sglpr_jax.methods.registry import method_named
@@ -73,17 +72,17 @@ def embed_recording(command: EmbedCommand) -> None:
     from sglpr_jax.retrieval.parquet import embed_to_store
 
     corruption = None if command.corruption is None else corruption_named(command.corruption)
-    in_store = "://" in command.out or command.out.endswith("/")
-    if not in_store:
+    writes_store = "://" in command.out or command.out.endswith("/")
+    if not writes_store:
         _check_file(command)
     elif corruption is not None:
         raise ValueError(f"{command.out}: expected a descriptor file with --corruption, found a store")
-    trained, params = _load_weights(command)
+    learned_method, params = _load_weights(command)
     recording = command.submap.open(command.source, command.data)
     if corruption not in (None, ROTATION):
         recording = corrupted(recording, corruption, seed=command.seed)
     recording = scaled(recording, resolved_scale(command.scale, recording))
-    method = method_named(command.method, params, ready_made=recording.has_images) if trained is None else trained
+    method = learned_method or method_named(command.method, params, ready_made=recording.has_images)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         options = {
             "rotation_seed": command.seed if command.rotate or corruption == ROTATION else None,
@@ -91,12 +90,12 @@ def embed_recording(command: EmbedCommand) -> None:
             "on_bad_scan": report_bad_scan if command.skip_bad else None,
             "on_progress": show,
         }
-        if in_store:
-            about = {"site": command.site, "source": str(command.data.absolute())}
-            stored = embed_to_store(command.out, method, recording, **about, **options)
+        if writes_store:
+            origin = {"site": command.site, "source": str(command.data.absolute())}
+            stored = embed_to_store(command.out, method, recording, **origin, **options)
         else:
             file = embed(method, recording, **options)
-    if in_store:
+    if writes_store:
         print(f"{stored.address}: {'already there' if stored.added is None else f'{stored.added} places'}")
         return
     file.save(Path(command.out))
@@ -105,7 +104,10 @@ def embed_recording(command: EmbedCommand) -> None:
 
 
 def _load_weights(command: EmbedCommand) -> "tuple[Method | None, Params | None]":
-    """Load a learned method or the weights of the network. Raises ValueError if the weights do not fit the method."""
+    """Load --weights: a learned method, or weights of this package's network. Returns None twice without --weights.
+
+    Raises ValueError if --weights do not fit --method.
+    """
     from sglpr_jax.methods.learned import LEARNED
     from sglpr_jax.methods.registry import trained_method
     from sglpr_jax.models.weights_file import load
@@ -127,7 +129,7 @@ def _load_weights(command: EmbedCommand) -> "tuple[Method | None, Params | None]
 
 
 def _check_file(command: EmbedCommand) -> None:
-    """Raise an error before long work if the descriptor file cannot be written."""
+    """Raise ValueError or OSError before long work if the descriptor file cannot be written."""
     from sglpr_jax.files import check_writable
 
     out = Path(command.out)

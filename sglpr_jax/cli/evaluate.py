@@ -67,26 +67,25 @@ class EvaluateCommand:
 
 
 def evaluate_file(command: EvaluateCommand) -> None:
-    """Run the command."""
     from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_evaluation  # slow imports, not needed for --help
     from sglpr_jax.evaluation.sessions import evaluate_sessions
     from sglpr_jax.files import check_writable
 
     _check_options(command)
-    folder, pictures = command.out or _folder(command.file), None
+    folder, pictures = command.out or _default_folder(command.file), None
     check_writable(folder / NUMBERS)
     if command.database is not None:
         files = (command.file, *command.more)
-        found = evaluate_sessions(command.database, files, command.protocol, published=command.published)
-        console().print(found)
+        evaluation = evaluate_sessions(command.database, files, command.protocol, published=command.published)
+        console().print(evaluation)
     else:
-        found, pictures = _evaluate_recording(command)
-    for path in (*write_evaluation(found, folder, pictures), record_command(command, folder)):
+        evaluation, pictures = _evaluate_recording(command)
+    for path in (*write_evaluation(evaluation, folder, pictures), record_command(command, folder)):
         print(f"written: {path}")
 
 
 def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures | None]":
-    """Score the methods and print the table. Returns the results, and pictures if there is a dataset."""
+    """Score FILE and the files of --compare, and print the table. With --data, also return pictures."""
     from sglpr_jax.data.formats.pose_files import read_trajectory
     from sglpr_jax.evaluation import figures
     from sglpr_jax.evaluation.evaluation_page import take_pictures
@@ -107,14 +106,20 @@ def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures
         sequence=command.source.seq or (None if recording is None else recording.name),
         distance=command.distance,
     )
-    source = next(iter(methods.values()))
+    first_method = next(iter(methods.values()))
     if recording is not None:
-        recording_rows(recording, source)  # raises an error before scoring if the frames differ
-    found = evaluate_methods(methods, command.protocol, published=command.published, file=command.file)
-    console().print(found)
+        recording_rows(recording, first_method)  # raises an error before scoring if the frames differ
+    evaluation = evaluate_methods(methods, command.protocol, published=command.published, file=command.file)
+    console().print(evaluation)
     if not figures.can_draw():
         print("no drawings: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
+<<<<<<< HEAD
     return found, None if recording is None else take_pictures(recording, params, source, found.worst_false_positives)
+=======
+    if recording is None:
+        return evaluation, None
+    return evaluation, take_pictures(recording, params, first_method, evaluation.worst_false_positives)
+>>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
 
 
 def _check_options(command: EvaluateCommand) -> None:
@@ -122,10 +127,12 @@ def _check_options(command: EvaluateCommand) -> None:
     from sglpr_jax.evaluation.protocols import check_names
 
     if command.database is not None:
-        silent = ("poses", "times", "distance", "compare", "data", "weights")
-        given = [name for name in silent if getattr(command, name)] + ["seq"] * bool(command.source.seq)
-        if given:
-            raise ValueError(f"expected only descriptor files with --database, found --{given[0]}")
+        unused = ("poses", "times", "distance", "compare", "data", "weights")
+        stated = [name for name in unused if getattr(command, name)]
+        if command.source.seq:
+            stated.append("seq")
+        if stated:
+            raise ValueError(f"expected only descriptor files with --database, found --{stated[0]}")
         return
     if command.more:
         raise ValueError(
@@ -139,6 +146,6 @@ def _check_options(command: EvaluateCommand) -> None:
     check_names(command.protocol)
 
 
-def _folder(file: Path) -> Path:
-    """Return the file without its suffix. If it has no suffix, append "-results"."""
+def _default_folder(file: Path) -> Path:
+    """Return the path of a file without its suffix, or with "-results" appended if it has no suffix."""
     return file.with_suffix("") if file.suffix else file.with_name(f"{file.name}-results")

@@ -1,4 +1,4 @@
-"""bin/export: prepare weights for use by others, without the parts that only training needs."""
+"""bin/export: write weights, or a program that contains them, without the parts that only training needs."""
 
 import dataclasses
 from pathlib import Path

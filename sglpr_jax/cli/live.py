@@ -10,10 +10,11 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import DetectorFlags
-from sglpr_jax.cli.runtime import print_error, stop_on_signal
+from sglpr_jax.cli.runtime import print_error
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
     from sglpr_jax.live.live_map import LiveMap
@@ -58,17 +59,17 @@ def live(command: LiveCommand) -> int:
     from sglpr_jax.live.node_messages import Reports
     from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 
-    _check(command)
+    _check_endpoints(command)
     report = Reports()
 
-    def source(live_map: "LiveMap") -> "Source":
+    def open_source_of(live_map: "LiveMap") -> "Source":
         return open_source(command.source, command, report, taken=live_map.names.__contains__)
 
-    def sinks() -> Iterator["Sink"]:
-        return (open_sink(text, command, report) for text in command.sinks)
+    def open_sinks() -> Iterator["Sink"]:
+        return (open_sink(sink, command, report) for sink in command.sinks)
 
     with stop_on_signal() as stop:
-        run_node(command, source, sinks, report=report, say=print_error, should_stop=stop)
+        run_node(command, open_source_of, open_sinks, report=report, say=print_error, should_stop=stop)
     return stop.exit_status
 
 
@@ -81,9 +82,10 @@ def run_node(
     say: Callable[[str], object],
     should_stop: Callable[[], bool],
 ) -> None:
-    """Find loops until the source ends or `should_stop` is true, and write the results.
+    """Find loops until the source ends or `should_stop()` is true, and write the results.
 
-    The functions open the source for a map and the sinks. `report` receives trouble, `say` lines about the progress.
+    `open_source` opens the source, which skips the scans that the map already contains, and `open_sinks` the receivers
+    of loops and status. `report` receives errors that do not end the command, `say` lines about the progress.
 
     Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
     cannot be written.
@@ -91,18 +93,18 @@ def run_node(
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.result_files import write_results
 
-    with exclusive_lock(command.out), contextlib.ExitStack() as opened:
+    with exclusive_lock(command.out), contextlib.ExitStack() as exit_stack:
         live_map = _open_map(command, report)
-        opened.callback(live_map.close)
-        missed = live_map.restore()
+        exit_stack.callback(live_map.close)
+        unpublished = live_map.restore()
         sinks = []
         for sink in open_sinks():
-            opened.callback(_close, sink, report)
+            exit_stack.callback(_close_sink, sink, report)
             sinks.append(sink)
         source = open_source(live_map)
-        opened.callback(source.close)
+        exit_stack.callback(source.close)
         node = Node(live_map, sinks, report=report, say=say)
-        node.publish(missed)
+        node.publish(unpublished)
         say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
         try:
             node.run(source, should_stop=should_stop)
@@ -112,16 +114,16 @@ def run_node(
             say(f"{command.out}: {', '.join(path.name for path in paths)}")
 
 
-def _check(command: LiveCommand) -> None:
-    """Raises ValueError before any work for an unknown source or sink, or if an input would be overwritten."""
+def _check_endpoints(command: LiveCommand) -> None:
+    """Raise ValueError before any work if --poses would be overwritten. `split_known_name` for unknown names."""
     from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
     from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, split_known_name
 
     split_known_name(command.source, SOURCES, kind="sources")
-    for text in command.sinks:
-        split_known_name(text, SINKS, kind="sinks")
-    written = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
-    if command.poses is not None and command.poses.resolve() in written:
+    for sink in command.sinks:
+        split_known_name(sink, SINKS, kind="sinks")
+    output_files = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
+    if command.poses is not None and command.poses.resolve() in output_files:
         raise ValueError(
             f"{command.poses}: expected odometry that this run does not overwrite, found an output file; "
             "choose another --out"
@@ -129,7 +131,7 @@ def _check(command: LiveCommand) -> None:
 
 
 def _open_map(command: LiveCommand, report: "Report") -> "LiveMap":
-    """Open the map, with all programs compiled."""
+    """Open the map in the output folder, and compile all programs before the first scan arrives."""
     from sglpr_jax.live.live_map import LiveMap
     from sglpr_jax.live.node import warm_up
     from sglpr_jax.loops.detector import LoopDetector
@@ -142,8 +144,8 @@ def _open_map(command: LiveCommand, report: "Report") -> "LiveMap":
     return live_map
 
 
-def _close(sink: "Sink", report: "Report") -> None:
-    """Close a sink, and report if it fails: the other results are still written."""
+def _close_sink(sink: "Sink", report: "Report") -> None:
+    """Close a sink. An error is only reported, so that the other results are still written."""
     try:
         sink.close()
     except Exception as error:  # a sink may use any library

@@ -16,16 +16,16 @@ from sglpr_jax.cli.recording import (
     open_with_odometry,
     report_bad_scan,
 )
-from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import stop_on_signal
 
 UNFINISHED = "unfinished"
-"""Checkpoint directory of a running command, inside the output folder."""
+"""Folder of the checkpoint of a running command, inside the output folder."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,13 +101,13 @@ class LoopsCommand(DetectorFlags):
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
-    _check(command)
+    _check_flags(command)
     with exclusive_lock(command.out / UNFINISHED):
-        return _search(command)
+        return _search_and_write(command)
 
 
-def _check(command: LoopsCommand) -> None:
-    """Raises ValueError or ImportError before the search, if it would end in an error or overwrite an input."""
+def _check_flags(command: LoopsCommand) -> None:
+    """Raise ValueError if flags are inconsistent or an input would be overwritten, ImportError without an extra."""
     from sglpr_jax.pose_graph.factor_graph import gtsam_library
     from sglpr_jax.pose_graph.folder import TRAJECTORIES
 
@@ -128,15 +128,17 @@ def _check(command: LoopsCommand) -> None:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
     if command.optimize:
         gtsam_library()
-    for path in filter(None, (*files, command.source.poses, command.source.times)):
-        is_ours = path.name in TRAJECTORIES or path.name.startswith("trajectory-")
-        if is_ours and path.resolve().parent == command.out.resolve():
+    for path in (*files, command.source.poses, command.source.times):
+        if path is None or path.resolve().parent != command.out.resolve():
+            continue
+        if path.name in TRAJECTORIES or path.name.startswith("trajectory-"):
             raise ValueError(
                 f"{path}: expected inputs that this run does not overwrite, found an output file; choose another --out"
             )
 
 
-def _search(command: LoopsCommand) -> int:
+def _search_and_write(command: LoopsCommand) -> int:
+    """Find the loops, write all files of the command and print a summary. Returns the exit status."""
     from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.checkpoint import delete_checkpoint
@@ -147,7 +149,8 @@ def _search(command: LoopsCommand) -> int:
     from sglpr_jax.pose_graph.folder import write_loop_folder
     from sglpr_jax.pose_graph.optimize import optimize_trajectory
 
-    params, detector, out, checkpoint = load(command.weights), command.detector, command.out, command.out / UNFINISHED
+    params, out, checkpoint = load(command.weights), command.out, command.out / UNFINISHED
+    detector = command.detector  # raises an error for invalid settings before the recordings are opened
     odometry_checkpoints = [out / f"unfinished-{number}.odometry.log" for number in range(len(command.recordings))]
     effective, recordings, odometry = open_with_odometry(
         command,
@@ -161,9 +164,10 @@ def _search(command: LoopsCommand) -> int:
         missing = "small-gicp is not installed: pip install 'sglpr-jax[slam]'"
         reason = "they are ready-made images" if unregistrable.has_images else missing
         print(f"{unregistrable.name}: loops are not registered, because {reason}", file=sys.stderr)
-    name = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"
-    steps = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
-    with stop_on_signal() as stop, progress_bar(f"loops {name}", steps) as show:
+    title = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"
+    # Each scan is compared within its recording, and then with every earlier recording.
+    comparisons = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
+    with stop_on_signal() as stop, progress_bar(f"loops {title}", comparisons) as show:
         result = find_loops(
             recordings,
             params,
@@ -187,7 +191,7 @@ def _search(command: LoopsCommand) -> int:
     if optimized is not None:
         print(optimized)
     print(f"{out}: {', '.join(path.name for path in paths)}")
-    if not result.whole:
+    if not result.whole:  # a signal stopped the search
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     if len(recordings) > 1:

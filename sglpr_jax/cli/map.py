@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
-from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.files import exclusive_lock, naming
@@ -16,6 +15,7 @@ from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from sglpr_jax.models.params import Params
 
 UNFINISHED = ".unfinished"
-"""Suffix of the checkpoint directory of a running command, beside the map."""
-TRAJECTORY, ODOMETRY = ".odometry.tum", ".odometry.log"
+"""Suffix of the folder of a running command's checkpoint, beside the map."""
+ODOMETRY, ODOMETRY_CHECKPOINT = ".odometry.tum", ".odometry.log"
 """Suffixes of the odometry of --poses auto and of its checkpoint, beside the map."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MapCommand:
-    """Store the places of a recording in one file. Each place has a descriptor, an image and a pose.
+    """Store places along a recording in one file. Each place is a scan with its descriptor, image and pose.
 
     Ctrl-C writes the places found until then. The same command continues a run that was interrupted or killed.
 
@@ -85,11 +85,12 @@ def write_map(command: MapCommand) -> int:
     if command.out.is_dir():
         raise IsADirectoryError(f"{command.out}: expected a file to write, found a folder")
     params = load(command.weights)
-    with exclusive_lock(command.out.with_suffix(UNFINISHED)):  # until the new map replaces the one that is read
-        return _add_places(command, params)
+    with exclusive_lock(command.out.with_suffix(UNFINISHED)):  # also protects --add-to if it is the same file as --out
+        return _build_and_write(command, params)
 
 
-def _add_places(command: MapCommand, params: "Params") -> int:
+def _build_and_write(command: MapCommand, params: "Params") -> int:
+    """Build the map and write it, unless a stopped run would replace a larger map. Returns the exit status."""
     from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
@@ -97,27 +98,27 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     from sglpr_jax.pose_graph.files import write_tum
     from sglpr_jax.retrieval.descriptor_file import check_made_alike
 
-    before = None
+    existing_map = None
     if command.add_to is not None:
-        before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
-    files = AUTO if command.poses == AUTO else (command.poses,)
-    odometry_checkpoint = command.out.with_suffix(ODOMETRY)
+        existing_map = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
+    pose_files = AUTO if command.poses == AUTO else (command.poses,)
+    odometry_checkpoint = command.out.with_suffix(ODOMETRY_CHECKPOINT)
     effective, (recording,), (poses,) = open_with_odometry(
         command,
         (command.recording,),
-        files,
+        pose_files,
         format=command.pose_format,
         checkpoint=lambda number: odometry_checkpoint,
     )
     if command.poses == AUTO:
         times = recording.numbers.astype(float) if recording.times is None else recording.times
-        write_tum(command.out.with_suffix(TRAJECTORY), poses, times)
-    if before is not None:
+        write_tum(command.out.with_suffix(ODOMETRY), poses, times)
+    if existing_map is not None:
         with naming(f"{command.add_to}"):
-            check_made_alike({"scale": effective.scale}, {"scale": before.scale})
+            check_made_alike({"scale": effective.scale}, {"scale": existing_map.scale})
     unfinished = command.out.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
-        places, scans, skipped = map_recording(
+        new_map, scans, skipped = map_recording(
             recording,
             params,
             poses,
@@ -128,21 +129,23 @@ def _add_places(command: MapCommand, params: "Params") -> int:
             should_stop=stop,
             on_progress=show,
         )
-    stopped = scans < len(recording)
-    if stopped and before is not None and command.frame == "align":
+    is_stopped = scans < len(recording)
+    if is_stopped and existing_map is not None and command.frame == "align":
         print("the new map is not aligned and added before it is complete")
-    elif len(places):
-        place_map = places if before is None else _added(command, before, places, poses_by_id(recording, poses))
-        if stopped and _holds_more(command.out, len(place_map)):
-            print(f"{command.out}: unchanged, because it has more places than the {len(place_map)} found until now")
+    elif len(new_map):
+        whole_map, new_places = new_map, len(new_map)
+        if existing_map is not None:
+            whole_map = _merge_maps(command, existing_map, new_map, poses_by_id(recording, poses))
+            new_places = len(whole_map) - len(existing_map)
+        if is_stopped and _has_more_places(command.out, len(whole_map)):
+            print(f"{command.out}: unchanged, because it has more places than the {len(whole_map)} found until now")
         else:
-            place_map.save(command.out)
-            new = len(place_map) - (0 if before is None else len(before))
-            left_out = f", {len(skipped)} scans skipped" if skipped else ""
-            count = f"{scans} of {len(recording)}" if stopped else f"{scans}"
-            new_places = f"{new} of them from {count} scans of {recording.name}{left_out}"
-            print(f"{command.out}: {len(place_map)} places, {new_places}")
-    if stopped:
+            whole_map.save(command.out)
+            scans_text = f"{scans} of {len(recording)} scans" if is_stopped else f"{scans} scans"
+            skipped_text = f", {len(skipped)} scans skipped" if skipped else ""
+            source = f"{new_places} of them from {scans_text} of {recording.name}{skipped_text}"
+            print(f"{command.out}: {len(whole_map)} places, {source}")
+    if is_stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     delete_checkpoint(unfinished)
@@ -150,18 +153,20 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     return 0
 
 
-def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]) -> "PlaceMap":
-    """The existing map with the places of the new one, in the frame that the flag states."""
+def _merge_maps(
+    command: MapCommand, existing: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]
+) -> "PlaceMap":
+    """Return the existing map with the places of the new one. `drive` has the pose of every new scan, by its id."""
     from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
 
     print("comparing up to 300 of the new places with the existing map", file=sys.stderr)
     if command.frame == "check":
-        check_one_frame(before, new)
-        return before.merged(new, drive=drive)
-    new = without_known_places(before, new)
+        check_one_frame(existing, new)
+        return existing.merged(new, drive=drive)
+    new = without_known_places(existing, new)
     if not len(new):
-        return before
-    alignment = align_maps(before, new)
+        return existing
+    alignment = align_maps(existing, new)
     if alignment is None:
         raise ValueError(
             f"{command.add_to}: expected places in common with {command.recording} to align the two world frames, "
@@ -169,11 +174,12 @@ def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict
         )
     print(f"{command.recording}: {alignment}")
     world_from_new = alignment.old_from_new
-    return before.merged(new.moved(world_from_new), drive={id: world_from_new @ pose for id, pose in drive.items()})
+    moved_drive = {scan_id: world_from_new @ pose for scan_id, pose in drive.items()}
+    return existing.merged(new.moved(world_from_new), drive=moved_drive)
 
 
-def _holds_more(path: Path, places: int) -> bool:
-    """Whether the path already holds a map with more places. A smaller map must not replace it."""
+def _has_more_places(path: Path, places: int) -> bool:
+    """Return whether the file is a map with more than `places` places."""
     from sglpr_jax.maps.place_map import PlaceMap
 
     try:

@@ -9,16 +9,16 @@ import tyro
 from rich.table import Table
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import StopRequest, cache_folder, console, print_error, stop_on_signal
+from sglpr_jax.cli.runtime import cache_folder, console, print_error
 from sglpr_jax.fields import CountOrNone, NotNegative, Positive
 from sglpr_jax.methods.names import LearnedName
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import StopRequest, stop_on_signal
 
 if TYPE_CHECKING:
     from sglpr_jax.methods.learned.method import LearnedMethod
     from sglpr_jax.training.peer_inputs import TrainingInputs
     from sglpr_jax.training.peers import ScoreFn
-
 
 RATES = "rates"
 """Folder of the search of the learning rate, in the folder of the run."""
@@ -79,7 +79,7 @@ def run_peers(command: PeersCommand) -> None:
         raise ValueError("expected bin/peers train METHOD DATA... --out RUN, found no METHOD, DATA or --out")
     method, out = LEARNED[command.method], command.out
     resume = _has_run(out, resume=command.resume)
-    data, score = _inputs(command, method)
+    data, score = _training_inputs(command, method)
     with stop_on_signal() as stopped:
         rate = _learning_rate(command, method, data, score, out, stopped)
         settings = RunSettings(rate, seed=command.seed, seconds=command.seconds, images=command.images)
@@ -93,9 +93,9 @@ def run_peers(command: PeersCommand) -> None:
 
 
 def _has_run(out: Path, *, resume: bool) -> bool:
-    """Return whether the folder has a training, which is more than a stopped search of the learning rate.
+    """Return whether the folder has a training. A stopped search of the learning rate does not count.
 
-    Raises FileExistsError or FileNotFoundError if the folder does not fit `resume`.
+    Raises FileExistsError for a training without `resume`, and FileNotFoundError if there is nothing to resume.
     """
     has_run = (out / "config.json").exists()
     if has_run and not resume:
@@ -105,8 +105,8 @@ def _has_run(out: Path, *, resume: bool) -> bool:
     return has_run
 
 
-def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
-    """Prepare the training recordings and the held-out ones. Raises ValueError if one of them does not fit."""
+def _training_inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
+    """Prepare the training recordings. Also returns the score on the recordings of --held-out, or None without them."""
     from sglpr_jax.cli.datasets import all_recordings
     from sglpr_jax.training.peer_inputs import prepare_inputs
     from sglpr_jax.training.peers import held_out_score
@@ -120,8 +120,8 @@ def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingIn
         return prepare_inputs(method, recordings, cache, progress=progress_bar), None
     held_out = all_recordings(command.held_out, title="held out")
     require_revisits(held_out)
-    tested = prepare_inputs(method, held_out, cache, progress=progress_bar)
-    return prepare_inputs(method, recordings, cache, progress=progress_bar), held_out_score(method, tested)
+    held_out_inputs = prepare_inputs(method, held_out, cache, progress=progress_bar)
+    return prepare_inputs(method, recordings, cache, progress=progress_bar), held_out_score(method, held_out_inputs)
 
 
 def _learning_rate(
@@ -132,13 +132,13 @@ def _learning_rate(
     out: Path,
     stopped: StopRequest,
 ) -> float:
-    """Return the stated learning rate, the best of a search, or the published one."""
+    """Return --learning-rate, or else the best rate of a search if there is a score, or else the published rate."""
     from sglpr_jax.training.peers import Stopped, best_rate
 
     if command.learning_rate is not None:
         return command.learning_rate
     if score is None:
-        return method.recipe.learning_rates[1]
+        return method.recipe.learning_rates[1]  # the published one
     options = {"stopped": stopped, "report": print_error, "progress": progress_bar}
     try:
         return best_rate(method, data, score, out / RATES, seconds=command.search_seconds, seed=command.seed, **options)

@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data.choices import (
     Gravity,
     PoseChoice,
@@ -22,6 +21,7 @@ from sglpr_jax.odometry.config import OdometryFormat
 from sglpr_jax.odometry.drift_model import DRIFT_DEG_PER_100M, DRIFT_PERCENT, DriftModel
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -60,12 +60,12 @@ class RecordingOptions:
     """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, reports times whose steps
     contradict this, and ignores row numbers (0, 1, 2, ...)."""
 
-    def open(self, root: Path, **more: Any) -> "Recording":
-        """Open the recording, with `more` options, and describe it on stderr."""
+    def open(self, root: Path, **more_options: Any) -> "Recording":
+        """Open the recording with the flags, which `more_options` override, and describe it on stderr."""
         from sglpr_jax.data.readers import open_recording  # slow import, not needed for --help
 
-        options: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "seq"} | more
-        recording = open_recording(root, self.seq, **options)
+        flags: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "seq"}
+        recording = open_recording(root, self.seq, **flags | more_options)
         print("\n".join(recording.description), file=sys.stderr)
         return recording
 
@@ -96,11 +96,16 @@ class SubmapOptions:
 
     @property
     def flag(self) -> str | None:
-        """Name of the selected flag that needs poses, or None."""
-        return "--submap-m" if self.submap_m else "--deskew" if self.deskew else None
+        """Name of the stated flag that needs poses, or None."""
+        if self.submap_m:
+            return "--submap-m"
+        return "--deskew" if self.deskew else None
 
-    def prepared(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
-        """Return the recording deskewed and with submaps, as selected, with these poses or those of its bag."""
+    def deskewed_submaps(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
+        """Return the recording with deskewed scans and with submaps, as far as the flags ask for them.
+
+        Without `poses`, those of the recording's bag are used. Raises ValueError if both are missing.
+        """
         if self.flag is None:
             return recording
         from sglpr_jax.data.deskew import deskewed  # slow imports, not needed for --help
@@ -113,9 +118,10 @@ class SubmapOptions:
                 "--odometry"
             )
         scans = deskewed(recording, poses) if self.deskew else recording
-        prepared = submaps(scans, poses, length_m=self.submap_m)
-        print(*prepared.found[len(recording.found) :], sep="\n", file=sys.stderr)
-        return prepared
+        result = submaps(scans, poses, length_m=self.submap_m)
+        new_messages = result.found[len(recording.found) :]
+        print(*new_messages, sep="\n", file=sys.stderr)
+        return result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,10 +138,11 @@ class OdometrySubmapOptions(SubmapOptions):
     def open(self, source: RecordingOptions, root: Path) -> "Recording":
         """Open a recording, deskewed and with submaps if these are selected. Scans without a pose are then removed."""
         if self.odometry is None:
-            return self.prepared(source.open(root), None)
+            return self.deskewed_submaps(source.open(root), None)
         if self.flag is None:
             raise ValueError(f"{self.odometry}: expected --submap-m or --deskew with --odometry, found neither")
-        return self.prepared(*open_with_poses(source, root, self.odometry, format=self.odometry_format))
+        recording, poses = open_with_poses(source, root, self.odometry, format=self.odometry_format)
+        return self.deskewed_submaps(recording, poses)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -180,15 +187,15 @@ def open_with_poses(
     if is_bag_of_recording(path, root):
         return take_bag_odometry(source.open(root), root)
     odometry = read_stamped(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly
-    opened = source.open(root)
-    recording, poses = match_to_scans(opened, *odometry, path)
-    if recording is not opened:
+    whole_recording = source.open(root)
+    recording, poses = match_to_scans(whole_recording, *odometry, path)
+    if recording is not whole_recording:  # its last message says how many scans were removed
         print(recording.found[-1], file=sys.stderr)
     return recording, poses
 
 
 def resolved_scale(choice: ScaleChoice, *recordings: "Recording") -> Scale:
-    """Return the stated scale or, with `auto`, the smallest scale that fits a recording, and print it."""
+    """Return the stated scale. With `auto`, return and print the smallest of the scales that fit the recordings."""
     from sglpr_jax.data.scaled import chosen_scale  # slow import, not needed for --help
 
     if choice != "auto":
@@ -211,17 +218,17 @@ def open_with_odometry(
     format: OdometryFormat,
     checkpoint: "Callable[[int], Path]",
 ) -> "tuple[Any, list[Recording], list[Float[np.ndarray, 'n 4 4']]]":
-    """Open the recordings of a `LoopsCommand` or `MapCommand`, deskewed and with submaps, with odometry.
+    """Open the recordings of a `LoopsCommand` or `MapCommand` with their odometry, deskewed and with submaps.
 
     Arguments:
       command: Command with its flags.
       paths: Recordings.
-      odometry: `auto`, a file for each recording, or none.
+      odometry: `auto`, a file for each recording, or an empty sequence.
       format: Format of the files.
       checkpoint: Returns the checkpoint file of the odometry of a recording, given its number.
 
     Returns:
-      The command with the settings in effect, the recordings, and their odometry (or none).
+      The command with the values that replace `auto`, the recordings, and a list of their odometry or an empty list.
     """
     from sglpr_jax.data.deskew import has_point_times  # slow imports, not needed for --help
     from sglpr_jax.odometry.kiss_icp import check_installed
@@ -237,19 +244,20 @@ def open_with_odometry(
         command = dataclasses.replace(command, submap=submap, scan_odometry=command.scan_odometry.effective)
     elif odometry:
         files = zip(paths, odometry, strict=True)
-        opened = [open_with_poses(command.source, path, file, format=format) for path, file in files]
-        recordings, poses = map(list, zip(*opened, strict=True))
+        pairs = [open_with_poses(command.source, path, file, format=format) for path, file in files]
+        recordings, poses = map(list, zip(*pairs, strict=True))
     else:
         recordings = [command.source.open(path) for path in paths]
+    poses_or_none = poses or [None] * len(recordings)
     recordings = [
-        command.submap.prepared(recording, poses[number] if poses else None)
-        for number, recording in enumerate(recordings)
+        command.submap.deskewed_submaps(recording, recording_poses)
+        for recording, recording_poses in zip(recordings, poses_or_none, strict=True)
     ]
     return dataclasses.replace(command, scale=resolved_scale(command.scale, *recordings)), recordings, poses
 
 
 def _odometry_of(recording: "Recording", command: Any, checkpoint: Path) -> "Float[np.ndarray, 'n 4 4']":
-    """Compute the odometry of a recording, with progress on stderr. If it is interrupted, the command ends."""
+    """Compute the odometry of a recording, with progress on stderr. Exits if a signal stops it before the end."""
     from sglpr_jax.odometry.kiss_icp import describe_odometry, scan_odometry
 
     if not recording.has_images:

@@ -61,7 +61,6 @@ class RelocalizeCommand:
 
 
 def relocalize(command: RelocalizeCommand) -> None:
-    """Run the command."""
     from sglpr_jax.files import check_writable, naming, write_json  # slow imports, not needed for --help
     from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.maps.query import query_of, read_query
@@ -74,17 +73,17 @@ def relocalize(command: RelocalizeCommand) -> None:
     if command.frame is None and command.submap.flag:
         raise ValueError(f"{command.scan}: expected --frame with {command.submap.flag}, found a single scan")
     params = load(command.weights)
-    places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
+    place_map = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     with naming(command.map):
-        check_made_alike({"scale": command.scale or places.scale}, {"scale": places.scale})
+        check_made_alike({"scale": command.scale or place_map.scale}, {"scale": place_map.scale})
     name = command.scan.name
     if command.frame is None:
-        scan = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
+        scan = read_query(command.scan, place_map, format=command.format, sensor_height=command.sensor_height)
     else:
         options = RecordingOptions(command.seq, format=command.format, sensor_height=command.sensor_height)
         recording = command.submap.open(options, command.scan)
         scan, name = query_of(recording, command.frame), f"frame {command.frame} of {name}"
-    answers = places.relocate(params, scan, candidates=command.candidates)
+    answers = place_map.relocate(params, scan, candidates=command.candidates)
     if not answers:
         raise ValueError(f"{name}: expected a scan that shows a place, found an almost empty one")
     if command.out is not None:
@@ -98,13 +97,14 @@ def relocalize(command: RelocalizeCommand) -> None:
             for answer in answers
         ]
         write_json(command.out, values)
-    console().print(_table(name, answers))
+    console().print(_answer_table(name, answers))
 
 
-def _table(name: str, answers: "list[Relocalization]") -> Table:
+def _answer_table(name: str, answers: "list[Relocalization]") -> Table:
     title = escape(f"{name} in the map")  # rich interprets brackets as styles
-    shared = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
-    caption = shared if len(answers) > 1 else None
+    caption = None
+    if len(answers) > 1:
+        caption = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
     table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)
     for answer in answers:
         pose = answer.world_from_query

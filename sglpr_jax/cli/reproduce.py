@@ -8,20 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.runtime import console, stop_on_signal
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.cli.train import exit_unless_finished
 from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.reproduce.experiments import EXPERIMENTS
+from sglpr_jax.stop_request import stop_on_signal
 from sglpr_jax.training.config import TrainConfig
 
 if TYPE_CHECKING:
     from sglpr_jax.reproduce.plan import Plan
     from sglpr_jax.reproduce.reproduction import Reproduction
 
-    What = str
+    ExperimentName = str
 else:
-    What = Literal[("all", *EXPERIMENTS)]
+    ExperimentName = Literal[("all", *EXPERIMENTS)]
 PAPER_SEQUENCES = ("00", "02", "05", "06", "07", "08")
 
 
@@ -40,7 +41,7 @@ class ReproduceCommand:
       bin/reproduce table1 table2 --data KITTI --weights sglpr runs/rinet --no-train
     """
 
-    what: tyro.conf.Positional[tuple[What, ...]]
+    what: tyro.conf.Positional[tuple[ExperimentName, ...]]
     """Names of tables and figures."""
     data: Path | None = None
     """Folder of the dataset: KITTI's layout, or ready-made BEV images. None: the simulated recordings."""
@@ -69,7 +70,6 @@ class ReproduceCommand:
 
 
 def reproduce(command: ReproduceCommand) -> None:
-    """Run the command."""
     from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
     from sglpr_jax.data.readers import recording_names
     from sglpr_jax.reproduce.plan import check_inputs, make_plan, time_a_step
@@ -96,23 +96,23 @@ def reproduce(command: ReproduceCommand) -> None:
         print(plan.text(time_a_step(reproduction, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
         if command.plan:
             return
-        _train(reproduction, plan)
+        _train_missing(reproduction, plan)
     record_command(command, command.out)
-    _write(reproduction, names)
+    _write_results(reproduction, names)
 
 
-def _train(reproduction: "Reproduction", plan: "Plan") -> None:
-    """Train the missing runs. If a run is asked to stop, save it and exit."""
-    for done, (variant, seq) in enumerate(plan.missing):
-        print(f"run {done + 1} of {len(plan.missing)}: {variant}, {seq}", file=sys.stderr)
+def _train_missing(reproduction: "Reproduction", plan: "Plan") -> None:
+    """Train the missing runs: a variant of the network and the recording to test on. Exits if a signal stops one."""
+    for number, (variant, seq) in enumerate(plan.missing, start=1):
+        print(f"run {number} of {len(plan.missing)}: {variant}, {seq}", file=sys.stderr)
         with stop_on_signal() as stopped:
             result = reproduction.train(variant, seq, stopped=stopped)
         print(result, file=sys.stderr)
-        exit_unless_finished(result, stopped, go_on="run the same command again to continue")
+        exit_unless_finished(result, stopped, stop_advice="run the same command again to continue")
 
 
-def _write(reproduction: "Reproduction", names: list[str]) -> None:
-    """Compute, write and print the tables and figures of finished runs."""
+def _write_results(reproduction: "Reproduction", names: list[str]) -> None:
+    """Compute, write and print the tables and figures with these names (`table1`, `figure5`) from finished runs."""
     from sglpr_jax.reproduce.figures import write_figures
     from sglpr_jax.reproduce.tables import write_tables
 

@@ -1,6 +1,5 @@
-"""Common parts of all commands: compilation cache, orderly interruption, one-line errors."""
+"""Common parts of all commands: command line, compilation cache, one-line errors."""
 
-import contextlib
 import dataclasses
 import functools
 import gc
@@ -10,11 +9,10 @@ import json
 import logging
 import os
 import re
-import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -22,19 +20,19 @@ from typing import Annotated, TypeVar
 import tyro
 from rich.console import Console
 
-from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, with_defaults
+from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, split_settings
 from sglpr_jax.fields import check_value, field_types, has_bounds
 from sglpr_jax.files import DataWarning, in_short, printable
 
 _TABLE_WIDTH = 140
 INSTALLED_AS = "sglpr-"
 """Prefix of the commands that `pip install` creates."""
-_OBJECTS_BETWEEN_COLLECTIONS = 100_000
+_ALLOCATIONS_PER_COLLECTION = 100_000
 """Allocations between garbage collections. Imports and tracing create permanent objects; with Python's default of 700,
 the collections took an eighth of the start-up time."""
-_ENDED_BY_READER = 141
+_BROKEN_PIPE_STATUS = 141
 """Exit status after a write to a pipe without a reader, as in shells (128 + SIGPIPE)."""
-_MOST_OF_AN_ERROR = 2000
+_MAX_ERROR_LENGTH = 2000
 """Maximum number of characters of an error message. File names and tables may contain long names."""
 T = TypeVar("T")
 
@@ -46,15 +44,15 @@ def cache_folder() -> Path:
     """
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax"
-    except RuntimeError:  # neither HOME nor an entry for the user
+    except RuntimeError:  # the user has no home folder
         return Path(_temporary_folder().name)
 
 
 _temporary_folder = functools.cache(functools.partial(tempfile.TemporaryDirectory, prefix="sglpr-jax-"))
 
 
-def own_names(text: str) -> str:
-    """Replace command names in `text` by those of this installation: bin/embed by sglpr-embed after `pip install`.
+def with_installed_names(text: str) -> str:
+    """Replace names of commands by those that `pip install` creates, if this command is one: bin/embed by sglpr-embed.
 
     Paths stay unchanged: /home/me/bin/embed, bin/08.npz, bin/map/08.npz.
     """
@@ -68,39 +66,39 @@ def own_names(text: str) -> str:
 def parse_command(command: type[T], name: str, arguments: list[str] | None = None) -> T:
     """Parse the flags of a command. With --dump-config, print their values and exit.
 
-    Flags override the file of --config, the file overrides the preset, and the preset overrides the defaults.
+    Flags override the file of --config, the file overrides the preset, and the preset overrides the defaults. Raises
+    ValueError if a number is outside the bounds of its annotation (`fields.py`), or if the file is invalid.
 
     Arguments:
       command: Dataclass of the command.
       name: Name of the command in `bin/`.
       arguments: Command line without the name. None: that of this process.
-
-    Raises:
-      ValueError: If a number is outside the bounds of its annotation (`fields.py`), or if the file of --config is
-        invalid.
     """
-    line_type = dataclasses.make_dataclass(
+    command_line_type = dataclasses.make_dataclass(
         "Line",
         [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
     )
-    about = inspect.getdoc(command) or ""
-    defaults, arguments = with_defaults(command, arguments)
+    description = inspect.getdoc(command) or ""
+    defaults, arguments = split_settings(command, arguments)
     if hasattr(defaults, "config"):
         from sglpr_jax.training.presets import preset_names  # slow import, not needed by most commands
 
-        about += f"\nPresets: {', '.join(preset_names())}"
+        description += f"\nPresets: {', '.join(preset_names())}"
     hide_nested(defaults)
-    default = line_type(defaults, ConfigFlags())
-    line = tyro.cli(
-        line_type, args=arguments, prog=own_names(f"bin/{name}"), description=own_names(about), default=default
+    parsed = tyro.cli(
+        command_line_type,
+        args=arguments,
+        prog=with_installed_names(f"bin/{name}"),
+        description=with_installed_names(description),
+        default=command_line_type(defaults, ConfigFlags()),
     )
     for field, annotation in field_types(command).items():
         if has_bounds(annotation):
-            check_value(getattr(line.command, field), annotation, f"--{field.replace('_', '-')}")
-    if line.common.dump_config:
-        print(json.dumps(flag_values(line.command), indent=2))
+            check_value(getattr(parsed.command, field), annotation, f"--{field.replace('_', '-')}")
+    if parsed.common.dump_config:
+        print(json.dumps(flag_values(parsed.command), indent=2))
         sys.exit(0)
-    return line.command
+    return parsed.command
 
 
 def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
@@ -109,12 +107,11 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     Invalid input gives one line on stderr and exit status 1, Ctrl-C gives 130. If the reader of the output ends early,
     as `head` does, the command ends without a message.
     """
-    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    for chatty in ("absl", "asyncio"):  # they log pages about a failed checkpoint, which orbax also raises
-        logging.getLogger(chatty).setLevel(logging.CRITICAL)
-    warnings.filterwarnings(
-        "ignore", "coroutine .* was never awaited", RuntimeWarning
-    )  # a failed checkpoint again, at exit
+    gc.set_threshold(_ALLOCATIONS_PER_COLLECTION)
+    # Orbax raises an error for a failed checkpoint. These loggers and this warning would repeat it.
+    for logger in ("absl", "asyncio"):
+        logging.getLogger(logger).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", DataWarning)
     if sys.unraisablehook is sys.__unraisablehook__:
@@ -128,13 +125,13 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
 
             jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-        ended = work(command)
-        if isinstance(ended, int):
-            sys.exit(ended)
+        exit_status = work(command)
+        if isinstance(exit_status, int):
+            sys.exit(exit_status)
     except BrokenPipeError:
-        sys.exit(_ENDED_BY_READER)
+        sys.exit(_BROKEN_PIPE_STATUS)
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
-        sys.exit(_one_line(error))
+        sys.exit(_error_line(error))
     except (RuntimeError, AssertionError):  # JAX raises these for a missing device
         _check_devices()
         raise
@@ -143,12 +140,13 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     finally:
         try:
             sys.stdout.flush()
-        except BrokenPipeError:  # Python would report it at exit
+        except BrokenPipeError:  # Python would flush again at exit, and report the error
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _one_line(error: Exception) -> str:
-    return own_names(f"error: {printable(' '.join(str(error).split()), most=_MOST_OF_AN_ERROR)}")
+def _error_line(error: Exception) -> str:
+    one_line = " ".join(str(error).split())
+    return with_installed_names(f"error: {printable(one_line, most=_MAX_ERROR_LENGTH)}")
 
 
 def _check_devices() -> None:
@@ -162,7 +160,7 @@ def _check_devices() -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:
         reason = f"expected a device that JAX finds, found none ({in_short(error)})"
-        sys.exit(_one_line(ValueError(f"JAX_PLATFORMS={platforms}: {reason}")))
+        sys.exit(_error_line(ValueError(f"JAX_PLATFORMS={platforms}: {reason}")))
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
@@ -187,42 +185,3 @@ def print_error(text: str) -> None:
 def console() -> Console:
     """Return a console for standard output. Without a terminal it is wide enough for the tables."""
     return Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, highlight=False)
-
-
-@dataclasses.dataclass
-class StopRequest:
-    """Callable that returns whether the work was asked to stop. It also stores the signal."""
-
-    signal: int | None = None
-
-    def __call__(self) -> bool:
-        return self.signal is not None
-
-    @property
-    def exit_status(self) -> int:
-        """130 after Ctrl-C, as in shells. 0 after SIGTERM, which ends a run that will be resumed later."""
-        return 130 if self.signal == signal.SIGINT else 0
-
-    def exit(self, text: str) -> None:
-        """Print a text on stderr and exit."""
-        print_error(text)
-        sys.exit(self.exit_status)
-
-
-@contextlib.contextmanager
-def stop_on_signal() -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a stop request, so that work ends without losses. A second one kills it."""
-    request = StopRequest()
-
-    def ask(number, _frame):
-        if request():
-            raise KeyboardInterrupt
-        request.signal = number
-        print("stopping after this step; repeat to stop at once", file=sys.stderr)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield request
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -45,7 +45,6 @@ class SegmentCommand:
 
 
 def segment(command: SegmentCommand) -> None:
-    """Run the command."""
     from sglpr_jax.evaluation.segmentation import segment_recording  # slow imports, not needed for --help
     from sglpr_jax.files import check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
@@ -55,18 +54,21 @@ def segment(command: SegmentCommand) -> None:
     params = load(command.weights)
     if not params.config.segments:
         raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none")
-    recording, least = command.source.open(command.data), command.min_confidence
+    recording = command.source.open(command.data)
     command.out.mkdir(parents=True, exist_ok=True)
-    labelled = cells = 0
+    labelled_cells = occupied_cells = 0
 
-    def save(row: int, scan: "Scan", semantic_map: "SemanticMap") -> None:
-        nonlocal labelled, cells
+    def write_semantic_map(row: int, scan: "Scan", semantic_map: "SemanticMap") -> None:
+        nonlocal labelled_cells, occupied_cells
         path = command.out / f"{file_name(recording.ids[row])}.png"
         save_map(path, semantic_map, scan, categories=params.config.categories)
-        labelled, cells = labelled + semantic_map.seen.sum(), cells + (semantic_map.counts > 0).sum()
+        labelled_cells += semantic_map.seen.sum()
+        occupied_cells += (semantic_map.counts > 0).sum()
 
-    scores = segment_recording(params, recording, command.out, on_map=save, min_confidence=least, progress=progress_bar)
-    print(f"{command.out}: {len(recording)} semantic maps of {labelled / max(cells, 1):.0%} of the cells with points")
+    options = {"min_confidence": command.min_confidence, "progress": progress_bar}
+    scores = segment_recording(params, recording, command.out, on_map=write_semantic_map, **options)
+    share = labelled_cells / max(occupied_cells, 1)
+    print(f"{command.out}: {len(recording)} semantic maps of {share:.0%} of the cells with points")
     if scores is not None:
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())

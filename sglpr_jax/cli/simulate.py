@@ -56,7 +56,6 @@ class SimulateCommand:
 
 
 def write_simulation(command: SimulateCommand) -> None:
-    """Run the command."""
     from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
 
     options = {field.name: getattr(command, field.name) for field in dataclasses.fields(command)}

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.recording import report_bad_scan
-from sglpr_jax.cli.runtime import StopRequest, console, stop_on_signal
+from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.files import file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
 from sglpr_jax.progress import progress_bar
+from sglpr_jax.stop_request import StopRequest, stop_on_signal
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_seq", "pose_source")
 """Flags that must be equal in a resumed run, beside its configuration."""
-SETTINGS_SINCE = ("format", "sensor_height", "skip_bad")
+NEWER_SETTINGS = ("format", "sensor_height", "skip_bad")
 """More flags of this kind, which older runs do not know. They are stored only if they differ from their defaults."""
 
 
@@ -88,15 +89,15 @@ class TrainCommand:
     )
 
 
-def train_and_test(command: TrainCommand, *, go_on: str = "continue with --resume") -> None:
-    """Run the command. `go_on` is printed as advice if the training is stopped."""
+def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with --resume") -> None:
+    """Run the command. If a signal stops the training, print `stop_advice` and exit."""
     from sglpr_jax.evaluation.final_test import final_test  # slow imports, not needed for --help
     from sglpr_jax.training.devices import connected, is_first_host
 
     folder = run_folder(command)
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
-        recordings, also, test = _recordings(command)
-        result = _train(command, recordings, also, test, go_on=go_on)
+        recordings, also, test = _open_recordings(command)
+        result = _train(command, recordings, also, test, stop_advice=stop_advice)
     if is_first_host():
         out, seed = folder / "test", command.config.seed
         console().print(final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar))
@@ -110,8 +111,8 @@ def run_folder(command: TrainCommand) -> Path:
 
 
 def settings(command: TrainCommand) -> dict[str, object]:
-    """Return the flags that the run stores beside its configuration."""
-    newer = [name for name in SETTINGS_SINCE if getattr(command, name) != getattr(TrainCommand, name)]
+    """Return the flags that the run stores in config.json beside its configuration, by name."""
+    newer = [name for name in NEWER_SETTINGS if getattr(command, name) != getattr(TrainCommand, name)]
     return {name: getattr(command, name) for name in (*SETTINGS, *newer)}
 
 
@@ -121,9 +122,9 @@ def _train(
     also: "Sequence[Recording]",
     test: "Recording",
     *,
-    go_on: str,
+    stop_advice: str,
 ) -> "TrainResult":
-    """Train. If the training is asked to stop, save its state and exit."""
+    """Train with the flags of the command. If a signal stops the training, save its state and exit."""
     from sglpr_jax.evaluation.learning_curves import LearningCurves
     from sglpr_jax.training.callbacks import EVENTS, Callbacks, EventFiles, ProgressBar
     from sglpr_jax.training.devices import is_first_host
@@ -147,19 +148,18 @@ def _train(
         )
     if is_first_host():
         print(result, file=sys.stderr)
-    exit_unless_finished(result, stopped, go_on=go_on)
+    exit_unless_finished(result, stopped, stop_advice=stop_advice)
     return result
 
 
-def exit_unless_finished(result: "TrainResult", stopped: StopRequest, *, go_on: str) -> None:
-    """Exit if the training was asked to stop: with status 0 after SIGTERM, with 130 after Ctrl-C."""
+def exit_unless_finished(result: "TrainResult", stopped: StopRequest, *, stop_advice: str) -> None:
+    """Exit if a signal stopped the training before its last step: with status 0 after SIGTERM, 130 after Ctrl-C."""
     if not result.finished:
-        stopped.exit(f"stopped at step {result.steps} of {result.config.steps}; {go_on}")
+        stopped.exit(f"stopped at step {result.steps} of {result.config.steps}; {stop_advice}")
 
 
-def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":
-    """Open the training recordings, those of --also, and the test recording. Raises ValueError if one cannot be
-    used."""
+def _open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":
+    """Open the training recordings, those of --also, and the test recording. Raises ValueError if --also is --data."""
     from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
 
     root = dataset_root(command.data)
@@ -174,11 +174,12 @@ def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[R
         *readable, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
         recordings, also = readable[: len(recordings)], readable[len(recordings) :]
     if command.pseudo_labels is not None:
-        recordings = _pseudo_labelled(recordings, command.pseudo_labels, without_untrained_head(command.config))
+        recordings = _add_pseudo_labels(recordings, command.pseudo_labels, without_untrained_head(command.config))
     return recordings, also, test
 
 
-def _pseudo_labelled(recordings: "Sequence[Recording]", folder: Path, config: TrainConfig) -> "Sequence[Recording]":
+def _add_pseudo_labels(recordings: "Sequence[Recording]", folder: Path, config: TrainConfig) -> "Sequence[Recording]":
+    """Return the recordings with the label images of the folder. Raises ValueError if no loss would use them."""
     from sglpr_jax.data.training_recordings import with_pseudo_labels
 
     if not config.model.segments:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.loss import TERM_NAMES
+from sglpr_jax.training.loss_terms import TERM_NAMES
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.trainer import METRICS_FILE
 

@@ -13,22 +13,24 @@ from jaxtyping import Float32, Int
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.training.batches import Batch, mix, read_batch, tuple_pool
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.devices import own_part
+from sglpr_jax.training.devices import host_slice
 from sglpr_jax.training.mining import DescriptorCache, refresh_cache
 from sglpr_jax.training.step import TrainState
 from sglpr_jax.training.tuples import TuplePool
 
 T = TypeVar("T")
 DescribeFn = Callable[[TrainState, Int[np.ndarray, "n"]], Float32[np.ndarray, "n d"]]
-"""Describes places, given as frame numbers of a pool, with the weights of a state."""
+"""`(state, places) -> descriptors`. The places are numbers of a `TuplePool`; the state has the weights."""
 
 
 class TupleBatches:
-    """Batches of the tuples that a pool draws. A batch depends only on the seed, the step and the mined descriptors."""
+    """Batches of the tuples (anchor, positives, negatives) that a pool draws.
+
+    A batch depends only on the seed, the step and the descriptors that select hard negatives (`refresh`).
+    """
 
     refresh_steps: int = 0
-    """Number of steps between calls of `refresh`, or 0 for no refresh. A batch at or after a refresh step may only be
-    requested after that call."""
+    """Number of steps between calls of `refresh`, or 0. A call precedes the batches from its step on."""
 
     def __init__(
         self,
@@ -42,20 +44,17 @@ class TupleBatches:
         run: Path | None = None,
         random_places: bool = False,
     ):
-        """Define the batches.
+        """Define batches with `tuples` tuples of the pool, which has places of the `recordings`.
 
         Arguments:
-          recordings: Recordings of the pool.
-          pool: Pool of the tuples.
-          read: Reads the batch of frames, one row per tuple.
-          seed: Seed of the tuples.
-          tuples: Number of tuples per step.
-          describe: Computes the descriptors that select hard negatives, if `pool.config` mines them.
+          read: Reads the scans of place numbers (tuple, place of the tuple) and returns their batch.
+          describe: Computes the descriptors that select hard negatives, if `pool.config.mining` is "hardest".
           run: Folder of the run, which stores these descriptors.
           random_places: Draw any places instead of tuples.
         """
         self._recordings, self._pool, self._read, self._seed = recordings, pool, read, seed
-        self._describe, self._run, self._cache = describe, run, None
+        self._describe, self._run = describe, run
+        self._descriptor_cache: DescriptorCache | None = None
         draw = pool.draw_places if random_places else pool.draw
         self._draw = functools.partial(draw, seed=seed, tuples=tuples)
         if describe is not None and pool.config.mining == "hardest":
@@ -63,44 +62,48 @@ class TupleBatches:
 
     def batch(self, step: int) -> Any:
         """Return this host's part of the batch of a step."""
-        return self._read(self._frames(step))
+        return self._read(self._draw_step(step))
 
     def refresh(self, step: int, state: TrainState) -> None:
-        """Recompute the descriptors that select hard negatives, with the state before `step`."""
+        """Recompute the descriptors that select hard negatives, with the weights in `state`, which precedes `step`."""
         assert self._describe is not None and self._run is not None
         describe = functools.partial(self._describe, state)
-        self._cache = refresh_cache(step, describe, len(self._pool), self._pool.config, self._run, seed=self._seed)
+        pool = self._pool
+        self._descriptor_cache = refresh_cache(step, describe, len(pool), pool.config, self._run, seed=self._seed)
 
-    def places(self, step: int) -> str:
-        """Name the recordings and scans in the batch of a step."""
-        frames, names = np.unique(self._frames(step)), []
+    def scan_names(self, step: int) -> str:
+        """Return the recordings and scan ids of the batch of a step, as text for an error message."""
+        places, names = np.unique(self._draw_step(step)), []
         for number, recording in enumerate(self._recordings):
-            ids = [recording.ids[self._pool.frame[frame]] for frame in frames[self._pool.recording[frames] == number]]
-            names += [f"recording {recording.name} frames {' '.join(ids)}"] if ids else []
+            rows = self._pool.frame_of[places[self._pool.recording_of[places] == number]]
+            if len(rows):
+                names.append(f"recording {recording.name} frames {' '.join(recording.ids[row] for row in rows)}")
         return "; ".join(names)
 
-    def _frames(self, step: int) -> Int[np.ndarray, "t k"]:
-        mined: dict[str, DescriptorCache] = {} if self._cache is None else {"cache": self._cache}
-        return self._draw(step=step, **mined)
+    def _draw_step(self, step: int) -> Int[np.ndarray, "t k"]:
+        """Draw the place numbers of a step (tuple, place of the tuple)."""
+        if self._descriptor_cache is None:  # `TuplePool.draw_places` has no argument `cache`
+            return self._draw(step=step)
+        return self._draw(step=step, cache=self._descriptor_cache)
 
 
 class MixedBatches(TupleBatches):
-    """Batches with tuples of two datasets, which `mix` joins."""
+    """Batches with tuples of two datasets, which `mix` joins. Only the first dataset has mined hard negatives."""
 
-    def __init__(self, main: TupleBatches, also: TupleBatches, mix: Callable[[Batch, Batch], Batch]):
-        self._main, self._also, self._mix = main, also, mix
-        self.refresh_steps, self.refresh = main.refresh_steps, main.refresh
+    def __init__(self, first: TupleBatches, second: TupleBatches, mix: Callable[[Batch, Batch], Batch]):
+        self._first, self._second, self._mix = first, second, mix
+        self.refresh_steps, self.refresh = first.refresh_steps, first.refresh
 
     def batch(self, step: int) -> Batch:
         """Return the batch of a step."""
-        return self._mix(self._main.batch(step), self._also.batch(step))
+        return self._mix(self._first.batch(step), self._second.batch(step))
 
-    def places(self, step: int) -> str:
-        """Name the recordings and scans of both datasets in the batch of a step."""
-        return "; ".join(filter(None, (self._main.places(step), self._also.places(step))))
+    def scan_names(self, step: int) -> str:
+        """Return the recordings and scan ids of both datasets in the batch of a step, as text."""
+        return "; ".join(filter(None, (self._first.scan_names(step), self._second.scan_names(step))))
 
 
-def batches_of(
+def training_batches(
     recordings: Sequence[Recording],
     pool: TuplePool,
     config: TrainConfig,
@@ -109,30 +112,34 @@ def batches_of(
     describe: DescribeFn | None = None,
     run: Path | None = None,
 ) -> TupleBatches:
-    """Return the batches of a configuration, with `config.also_tuples` tuples of each step from `also`."""
-    share = config.share_negatives
+    """Return the batches of a configuration, with tuples of `recordings` from the pool.
+
+    `also` are recordings of a second dataset, which provide `config.also_tuples` of the tuples of each step. If the
+    configuration mines hard negatives, `describe` computes their descriptors, which the folder `run` stores.
+    """
     read = functools.partial(
         read_batch,
         max_points=config.max_points,
-        share_negatives=share,
+        share_negatives=config.share_negatives,
         categories=config.model.categories,
         image=config.model.image,
     )
     tuples = config.tuples - config.also_tuples
-    main_read = functools.partial(read, recordings, pool, part=own_part(tuples))
-    main = TupleBatches(recordings, pool, main_read, seed=config.seed, tuples=tuples, describe=describe, run=run)
+    read_first = functools.partial(read, recordings, pool, part=host_slice(tuples))
+    first = TupleBatches(recordings, pool, read_first, seed=config.seed, tuples=tuples, describe=describe, run=run)
     if not also:
-        return main
-    other = tuple_pool(also, config)
+        return first
+    second_pool = tuple_pool(also, config)
     second = TupleBatches(
         also,
-        other,
-        functools.partial(read, also, other),
+        second_pool,
+        functools.partial(read, also, second_pool),
         seed=config.seed,
         tuples=config.also_tuples,
         random_places=not config.also_triplets,
     )
-    return MixedBatches(main, second, functools.partial(mix, triplets=config.also_triplets, share_negatives=share))
+    join = functools.partial(mix, triplets=config.also_triplets, share_negatives=config.share_negatives)
+    return MixedBatches(first, second, join)
 
 
 def batches_in_order(
@@ -141,20 +148,20 @@ def batches_in_order(
     *,
     start: int,
     stop: int,
-    place: Callable[[Any], Any] = lambda batch: batch,
+    to_devices: Callable[[Any], Any] = lambda batch: batch,
 ) -> Generator[Any, None, None]:
-    """Yield the batches of the steps from `start` to `stop` - 1, and refresh the source when it is due.
+    """Yield the batches of the steps from `start` to `stop` - 1.
 
-    Batches are read ahead up to the next refresh. `state` returns the state before the next step. `place` moves a batch
-    to the devices; it runs in the reading thread.
+    Every `source.refresh_steps` steps, and at `start`, `source.refresh` is called with the state that `state` returns.
+    Batches are read ahead up to the next refresh. `to_devices` moves a batch; it runs in the reading thread.
     """
-    every = source.refresh_steps
     while start < stop:
-        end = min(start - start % every + every, stop) if every else stop
-        if every:
+        next_refresh = stop
+        if source.refresh_steps:
             source.refresh(start, state())
-        yield from read_ahead(lambda step: place(source.batch(step)), start=start, stop=end)
-        start = end
+            next_refresh = min(start - start % source.refresh_steps + source.refresh_steps, stop)
+        yield from read_ahead(lambda step: to_devices(source.batch(step)), start=start, stop=next_refresh)
+        start = next_refresh
 
 
 def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 2) -> Iterator[T]:
@@ -162,13 +169,13 @@ def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 
 
     An exception of `make` is raised when its value is due. Closing the iterator stops the thread.
     """
-    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as pool:
-        ahead = collections.deque(pool.submit(make, step) for step in range(start, min(start + depth, stop)))
+    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
+        pending = collections.deque(thread.submit(make, step) for step in range(start, min(start + depth, stop)))
         try:
             for step in range(start, stop):
-                value = ahead.popleft().result()
+                value = pending.popleft().result()
                 if step + depth < stop:
-                    ahead.append(pool.submit(make, step + depth))
+                    pending.append(thread.submit(make, step + depth))
                 yield value
         finally:
-            pool.shutdown(cancel_futures=True)
+            thread.shutdown(cancel_futures=True)

@@ -1,9 +1,4 @@
-"""A batch of training tuples: read from files on the host, rotated and rasterised on the device.
-
-A batch may mix two sources, such as real images without labels and simulated scans with labels. The segmentation head
-sees every n-th image of the network's order, so labelled places of a second source are put there. The head then spends
-no time on images without labels.
-"""
+"""A batch of training tuples: read from files on the host, rotated and rasterised on the device."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -27,16 +22,16 @@ from sglpr_jax.training.tuples import TuplePool
 class Batch:
     """Training tuples as arrays: t tuples of k = 1 + k_p + k_n places, flattened to b = t k places.
 
-    A batch has either `images` with `maps`, or `points` with `count` and `classes`. If no recording has
-    labels, `maps` and `classes` stay None.
+    k_p and k_n are the numbers of positives and negatives of an anchor. A batch has either `images` with `maps`, or
+    `points` with `count` and `classes`. Batches without labels have neither `maps` nor `classes`.
     """
 
     labelled: Any
-    """Whether each place has labels (b,), including the places of `also`."""
+    """Whether each place has labels (b,), including the places of `second`."""
     negatives: Any
-    """Whether each place is a negative of each anchor (t, b). Covers `also`, unless the triplet loss ignores it."""
+    """Whether each place is a negative of each anchor (t, b). Covers `second`, unless the triplet loss ignores it."""
     positives: int = flax.struct.field(pytree_node=False)
-    """Number of positives after each anchor."""
+    """Number of positives of each anchor. They follow the anchor in its tuple."""
     images: Any = None
     """Images (b, h, w)."""
     maps: Any = None
@@ -47,19 +42,19 @@ class Batch:
     """Number of valid points of each place (b,)."""
     classes: Any = None
     """Classes of the points (b, n)."""
-    also: Any = None
-    """Second batch, whose places follow the places of this batch."""
+    second: Any = None
+    """None, or the batch of a second dataset, such as simulated scans with labels beside real images without labels."""
 
     @property
     def places(self) -> int:
-        """Number of places, without those of `also`."""
+        """Number of places, without those of `second`."""
         return len(self.points if self.images is None else self.images)
 
 
 def read_batch(
     recordings: Sequence[Recording],
     pool: TuplePool,
-    frames: Int[np.ndarray, "t k"],
+    places: Int[np.ndarray, "t k"],
     *,
     max_points: int,
     share_negatives: bool,
@@ -67,147 +62,152 @@ def read_batch(
     image: ImageKind = "points",
     part: slice = slice(None),
 ) -> Batch:
-    """Read the frames of some tuples.
+    """Read the scans or ready-made images of training tuples.
 
     Arguments:
       recordings: Recordings of the pool.
-      pool: Pool of the frames.
-      frames: Frame numbers of the pool, one row per tuple, from `TuplePool.draw`.
-      max_points: Maximum number of points of a cloud. Larger clouds are thinned evenly.
+      pool: Pool of the places.
+      places: Place numbers of the pool, one row (anchor, positives, negatives) per tuple, from `TuplePool.draw`.
+      max_points: Maximum number of points of a scan. Larger scans are thinned evenly.
       share_negatives: Whether every place of the batch that is far enough from an anchor is its negative. Otherwise
         only the negatives of its own tuple count.
       categories: Number of classes; with 0 no labels are read.
       image: Kind of image. "density" computes density images from all points of a scan.
       part: Tuples to read. Their negatives come from the whole batch.
 
-    Raises:
-      ValueError: If the batch mixes scans and images, images differ in size, or a scan shows no place.
+    Raises ValueError if the batch mixes scans and images, images differ in size, or a scan has no usable points.
     """
-    tuples, size = frames.shape
-    negatives = pool.far_apart(frames[:, :1], frames.reshape(1, -1))
+    tuples, tuple_size = places.shape
+    negatives = pool.far_apart(places[:, :1], places.reshape(1, -1))
     if not share_negatives:
-        negatives &= np.kron(np.eye(tuples, dtype=bool), np.arange(size) > pool.config.positives)
+        is_own_tuple, is_negative = np.eye(tuples, dtype=bool), np.arange(tuple_size) > pool.config.positives
+        negatives &= np.kron(is_own_tuple, is_negative)
     has_labels = categories > 0 and any(recording.has_labels for recording in recordings)
     has_images = recordings[0].has_images
-    as_pictures = has_images or image == "density"
-    contents, classes = [], []
-    rows = frames[part].reshape(-1)
-    for row in rows:
-        recording, frame = recordings[int(pool.recording[row])], int(pool.frame[row])
+    gives_images = has_images or image == "density"
+    clouds_or_images, classes = [], []
+    read_places = places[part].reshape(-1)
+    for place in read_places:
+        recording, frame = recordings[int(pool.recording_of[place])], int(pool.frame_of[place])
         if recording.has_images != has_images:
             expected, found = ("images", "scans") if has_images else ("scans", "images")
             raise ValueError(f"expected only {expected} in a batch, found {found} in recording {recording.name}")
-        content, place_classes = _read_place(recording, frame, categories if has_labels else 0, image)
-        if as_pictures and contents and content.shape != contents[0].shape:
+        cloud_or_image, place_classes = _read_place(recording, frame, categories if has_labels else 0, image)
+        if gives_images and clouds_or_images and cloud_or_image.shape != clouds_or_images[0].shape:
+            first_recording = recordings[int(pool.recording_of[read_places[0]])]
+            expected, found = ("{} x {}".format(*array.shape) for array in (clouds_or_images[0], cloud_or_image))
             raise ValueError(
-                f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of "
-                f"{contents[0].shape[0]} x {contents[0].shape[1]} pixels, as in "
-                f"{recordings[int(pool.recording[rows[0]])].name}, found {content.shape[0]} x {content.shape[1]}"
+                f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of {expected} pixels, "
+                f"as in {first_recording.name}, found {found}"
             )
-        contents.append(content)
+        clouds_or_images.append(cloud_or_image)
         classes.append(place_classes)
-    labelled = np.array([place is not None for place in classes])
+    labelled = np.array([place_classes is not None for place_classes in classes])
     batch = Batch(labelled=labelled, negatives=negatives[part], positives=pool.config.positives)
-    if not as_pictures:
-        points, count, point_classes = _padded(contents, classes, max_points)
+    if not gives_images:
+        points, count, point_classes = _pad_clouds(clouds_or_images, classes, max_points)
         return dataclasses.replace(batch, points=points, count=count, classes=point_classes if has_labels else None)
-    maps = [np.full(contents[0].shape, UNLABELLED, np.int32) if place is None else place for place in classes]
-    return dataclasses.replace(batch, images=np.stack(contents), maps=np.stack(maps) if has_labels else None)
+    unlabelled = np.full(clouds_or_images[0].shape, UNLABELLED, np.int32)
+    maps = [unlabelled if place_classes is None else place_classes for place_classes in classes]
+    return dataclasses.replace(batch, images=np.stack(clouds_or_images), maps=np.stack(maps) if has_labels else None)
 
 
 def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
-    """Return the model input of each place, inside jit on the device.
+    """Return the model input of all places, inside jit on the device: images, and maps of classes if there are labels.
 
-    Arguments:
-      batch: Places to convert.
-      angles: Rotation angle of each place in radians, or None.
-      grid: Grid of the model.
-
-    Returns:
-      Images, and maps of classes or None if no place has labels.
+    `angles` rotate each place, in radians. The places of `batch.second` follow those of the batch itself.
     """
-    if batch.also is None and batch.images is not None:
+    if batch.second is None and batch.images is not None:
         return image_view(batch.images, batch.maps, grid, angles)
-    if batch.also is None:
+    if batch.second is None:
         return cloud_view(batch.points, batch.classes, batch.count, grid, angles)
-    first, second = (None, None) if angles is None else (angles[: batch.places], angles[batch.places :])
-    parts = [views(dataclasses.replace(batch, also=None), first, grid), views(batch.also, second, grid)]
-    images = jnp.concatenate([image for image, _ in parts])
-    if all(maps is None for _, maps in parts):
+    first_angles = None if angles is None else angles[: batch.places]
+    second_angles = None if angles is None else angles[batch.places :]
+    first = dataclasses.replace(batch, second=None)
+    both = (views(first, first_angles, grid), views(batch.second, second_angles, grid))
+    images = jnp.concatenate([view.image for view in both])
+    if all(view.classes is None for view in both):
         return View(images)
-    unlabelled = [jnp.full(image.shape, UNLABELLED) if maps is None else maps for image, maps in parts]
-    return View(images, jnp.concatenate(unlabelled))
+    maps = [jnp.full(view.image.shape, UNLABELLED) if view.classes is None else view.classes for view in both]
+    return View(images, jnp.concatenate(maps))
 
 
 def _read_place(
     recording: Recording, frame: int, categories: int, image: ImageKind
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read an image (h, w) or points (n, 3), and their classes (h, w) or (n,), or None without labels."""
+    """Read an image (h, w) or points (n, 3), and their classes (h, w) or (n,), or None without labels.
+
+    `check_cloud` raises ValueError if its points are unusable, `check_ready_made` if its image is no density image.
+    """
     scan = recording.scan(frame, labels=categories > 0)
     if scan.points is not None:
         check_cloud(scan.points, name=scan.name)
     check_ready_made(scan, image)
     classes = scan.classes(categories) if categories else None
-    return picture(scan, classes) if scan.points is None or image == "density" else (scan.upright_points, classes)
+    if scan.points is None or image == "density":
+        return picture(scan, classes)
+    return scan.upright_points, classes
 
 
-def _padded(
+def _pad_clouds(
     clouds: Sequence[np.ndarray], classes: Sequence[np.ndarray | None], max_points: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pad clouds to one size. Returns points, numbers of valid points, and classes (0 without labels)."""
+    """Pad or evenly thin clouds to `max_points`. Returns points, numbers of valid points, and classes (0: no label)."""
     points = np.zeros((len(clouds), max_points, 3), np.float32)
     point_classes = np.zeros((len(clouds), max_points), np.int32)
     count = np.zeros(len(clouds), np.int32)
-    for row, (cloud, labels) in enumerate(zip(clouds, classes, strict=True)):
-        rows = slice(None) if len(cloud) <= max_points else np.linspace(0, len(cloud) - 1, max_points).astype(int)
-        count[row] = len(cloud[rows])
-        points[row, : count[row]] = cloud[rows]
-        if labels is not None:
-            point_classes[row, : count[row]] = labels[rows]
+    for place, (cloud, cloud_classes) in enumerate(zip(clouds, classes, strict=True)):
+        kept = slice(None) if len(cloud) <= max_points else np.linspace(0, len(cloud) - 1, max_points).astype(int)
+        count[place] = len(cloud[kept])
+        points[place, : count[place]] = cloud[kept]
+        if cloud_classes is not None:
+            point_classes[place, : count[place]] = cloud_classes[kept]
     return points, count, point_classes
 
 
-def mix(main: Batch, also: Batch, *, triplets: bool, share_negatives: bool) -> Batch:
-    """Return one batch with the places of `main`, followed by those of `also`.
+def mix(first: Batch, second: Batch, *, triplets: bool, share_negatives: bool) -> Batch:
+    """Return one batch with the places of `first`, followed by those of `second`, which is from another dataset.
 
-    Arguments:
-      main: First batch.
-      also: Second batch, from another dataset.
-      triplets: Whether the triplet loss counts the tuples of both batches. Otherwise it counts only those of `main`.
-      share_negatives: With `triplets`, whether the places of each batch are negatives of the anchors in the other one.
-        The datasets must not share a place.
+    With `triplets`, the triplet loss counts the tuples of both batches, otherwise only those of `first`. With
+    `share_negatives`, too, the places of each batch are negatives of the anchors in the other one.
     """
-    negatives = main.negatives
+    negatives = first.negatives
     if triplets:
-        main_to_also = np.full((len(main.negatives), also.negatives.shape[1]), share_negatives)
-        also_to_main = np.full((len(also.negatives), main.negatives.shape[1]), share_negatives)
-        negatives = np.block([[main.negatives, main_to_also], [also_to_main, also.negatives]])
-    labelled = np.concatenate([main.labelled, also.labelled])
-    return dataclasses.replace(main, labelled=labelled, negatives=negatives, also=also)
+        first_to_second = np.full((len(first.negatives), second.negatives.shape[1]), share_negatives)
+        second_to_first = np.full((len(second.negatives), first.negatives.shape[1]), share_negatives)
+        negatives = np.block([[first.negatives, first_to_second], [second_to_first, second.negatives]])
+    labelled = np.concatenate([first.labelled, second.labelled])
+    return dataclasses.replace(first, labelled=labelled, negatives=negatives, second=second)
 
 
 def in_network_order(x: Shaped[Array, "b *_"], batch: Batch, *, every: int) -> Shaped[Array, "b *_"]:
-    """Reorder values of the places of a batch into network order. The segmentation head sees every `every`-th image."""
-    return x if batch.also is None else x[_order(batch, every)]
+    """Reorder values of the places of a batch for the network, whose segmentation head sees every `every`-th image.
+
+    Places of `batch.second`, which have labels, come to these positions, so that the head spends no time on images
+    without labels. Without a second batch, the order stays.
+    """
+    return x if batch.second is None else x[_network_order(batch, every)]
 
 
 def in_batch_order(x: Shaped[Array, "b *_"], batch: Batch, *, every: int) -> Shaped[Array, "b *_"]:
-    """Inverse of `in_network_order`."""
-    return x if batch.also is None else x[np.argsort(_order(batch, every))]
+    """Undo `in_network_order`."""
+    return x if batch.second is None else x[np.argsort(_network_order(batch, every))]
 
 
-def _order(batch: Batch, every: int) -> Int[np.ndarray, "b"]:
+def _network_order(batch: Batch, every: int) -> Int[np.ndarray, "b"]:
+    """Return the place of the batch at each position of the network. Positions 0, `every`, ... get the second batch."""
     places = len(batch.labelled)
-    segmented_slots_first = np.argsort(np.arange(places) % every, kind="stable")
+    segmented_positions_first = np.argsort(np.arange(places) % every, kind="stable")
+    second_batch_first = np.roll(np.arange(places), -batch.places)
     order = np.empty(places, int)
-    order[segmented_slots_first] = np.roll(np.arange(places), -batch.places)
+    order[segmented_positions_first] = second_batch_first
     return order
 
 
 def tuple_pool(
     recordings: Sequence[Recording], config: TrainConfig, *, frames: Sequence[Int[np.ndarray, "_"]] | None = None
 ) -> TuplePool:
-    """Collect the tuples of the recordings, or of their `frames`. Raises ValueError if there are no tuples."""
+    """Return the pool of all frames, or of the `frames` of each recording. Raises ValueError without positives."""
     return TuplePool([positions_of(recording) for recording in recordings], config.sampling, frames=frames)
 
 

@@ -1,4 +1,4 @@
-"""Hooks that run during training: the progress on stderr, and event files for TensorBoard."""
+"""Callbacks of a training: the progress on stderr, and event files for TensorBoard."""
 
 import contextlib
 import functools
@@ -12,10 +12,11 @@ from rich.console import Console
 
 from sglpr_jax.files import writing
 from sglpr_jax.progress import progress_bar
-from sglpr_jax.training.loss import TERM_NAMES
+from sglpr_jax.training.loss_terms import TERM_NAMES
 
 EVENTS = "tensorboard"
 _SHOWN = ("loss", *TERM_NAMES, "violations", "steps_per_second")
+"""Measurements that the progress bar shows."""
 
 
 class Callback:
@@ -30,7 +31,7 @@ class Callback:
     """
 
     def on_pack(self, recording: str, done: int, scans: int) -> None:
-        """Called while `train` packs a recording (`cache`): `done` of its `scans` are packed."""
+        """Called while `train` writes a recording to its `cache`: `done` of its `scans` are written."""
 
     def on_start(self, step: int, steps: int) -> None:
         """Called before the first step: `step` of `steps` steps are already done."""
@@ -61,9 +62,9 @@ class Callbacks(Callback):
 
     def close(self) -> None:
         """Close all callbacks in order, even if one of them raises an error."""
-        with contextlib.ExitStack() as closing:
+        with contextlib.ExitStack() as exit_stack:  # calls in reverse order
             for callback in reversed(self._callbacks):
-                closing.callback(callback.close)
+                exit_stack.callback(callback.close)
 
     def _call_each(self, name: str, *arguments: Any) -> None:
         for callback in self._callbacks:
@@ -77,42 +78,38 @@ class ProgressBar(Callback):
     """
 
     def __init__(self):
-        self._bars = contextlib.ExitStack()
+        self._open_bar = contextlib.ExitStack()
         self._title, self._steps = "", 0
         self._show: Callable[..., None] = lambda done, text="": None
 
     def on_pack(self, recording: str, done: int, scans: int) -> None:
-        """Show how many scans of the recording are packed."""
-        self._open(f"pack {recording}", scans)
+        self._open_once(f"pack {recording}", scans)
         self._show(done)
 
     def on_start(self, step: int, steps: int) -> None:
-        """Show the number of finished steps."""
         self._steps = steps
-        self._open("train", steps)
+        self._open_once("train", steps)
         self._show(step)
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Show the step and its measurements."""
         text = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
         self._show(step, text)
         if not Console(stderr=True).is_terminal:
             print(f"step {step} of {self._steps}: {text}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Stop the bar and leave it on the screen."""
-        self._bars.close()
+        self._open_bar.close()
         self._title = ""
 
-    def _open(self, title: str, total: int) -> None:
-        """Replace the bar, unless it has this title."""
+    def _open_once(self, title: str, total: int) -> None:
+        """Replace the bar by one with this title, unless it is open."""
         if title != self._title:
-            self._bars.close()
-            self._title, self._show = title, self._bars.enter_context(progress_bar(title, total))
+            self._open_bar.close()
+            self._title, self._show = title, self._open_bar.enter_context(progress_bar(title, total))
 
 
 class EventFiles(Callback):
-    """Writes all measurements into event files in a folder. Their first record hides later ones of interrupted runs.
+    """Writes all measurements into event files of TensorBoard in a folder.
 
     Raises ImportError if the extra is not installed. Writing raises OSError if the files cannot be written.
     """
@@ -126,14 +123,12 @@ class EventFiles(Callback):
         self._writer: Any = None
 
     def close(self) -> None:
-        """Close the file."""
         if self._writer is not None:
             with writing(self._folder):
                 self._writer.close()
             self._writer = None
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Write the measurements of a step."""
         from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - generated
         from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -144,11 +139,11 @@ class EventFiles(Callback):
             self._writer.flush()
 
     def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        """Write the scores after a step."""
         self.on_step(step, scores)
 
 
 def _new_writer(folder: Path, step: int) -> Any:
+    """Open an event file. Its START record makes TensorBoard hide records of an earlier process from `step` on."""
     # tensorboardX's SummaryWriter writes from a thread, where errors are lost.
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]

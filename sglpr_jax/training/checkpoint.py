@@ -1,6 +1,6 @@
 """Checkpoints of a training run: folders that are complete or absent, with the SHA-256 of every file.
 
-17/               state after step 17, written by Orbax, and about.json: what the run had measured, and checksums
+17/               state after step 17, written by Orbax, and about.json: measurements of the run, and checksums
 damaged-17/       renamed checkpoint whose files do not match their checksums
 
 The newest two checkpoints are kept.
@@ -26,10 +26,10 @@ from sglpr_jax.training.step import TrainState
 
 CHECKPOINTS = "checkpoints"
 """Folder of the checkpoints, in the folder of a run."""
-_KEPT = 2
+_KEPT_CHECKPOINTS = 2
 _STATE, _ABOUT = "state", "about.json"
-_MOST_OF_AN_ERROR = 500
-"""Maximum number of characters of an error of Orbax, whose reason comes last."""
+_MAX_ERROR_LENGTH = 500
+"""Maximum number of characters of an error of Orbax."""
 
 
 class Checkpoints:
@@ -38,7 +38,7 @@ class Checkpoints:
     def __init__(self, folder: Path):
         """Rename damaged checkpoints and report them on stderr. Raises ValueError if all checkpoints are damaged."""
         self._folder = folder.resolve()
-        on_all_hosts(lambda: is_first_host() and set_damaged_aside(self._folder))
+        on_all_hosts(lambda: is_first_host() and rename_damaged(self._folder))
         self.latest_step = max(checkpoint_steps(self._folder), default=None)
         """Step of the newest checkpoint, or None."""
 
@@ -53,21 +53,23 @@ class Checkpoints:
             self.latest_step = step
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        """Return the newest state, which has the arrays of `like`, in host memory, and the JSON values about it.
+        """Return the newest state, in host memory, and the JSON values about it.
 
-        Raises ValueError if there is no checkpoint, or if it belongs to another model.
+        Raises ValueError if there is no checkpoint, or if its arrays differ from those of `like` in name or shape.
         """
         if self.latest_step is None:
             raise ValueError(f"{self._folder}: expected a checkpoint to resume from, found none")
         path = self._path(self.latest_step)
-        return _read(path, like), read_json(path / _ABOUT)["about"]
+        return _read_state(path, like), read_json(path / _ABOUT)["about"]
 
     def _write(self, state: TrainState, about: Mapping[str, Any]) -> None:
-        values = {name: np.array(leaf) for name, leaf in _by_path(state).items()}
-        with replacing(self._path(int(state.step))) as temporary, _reported(temporary), _orbax() as orbax:
-            orbax.save(temporary / _STATE, args=ocp.args.StandardSave(values))
+        """Write a checkpoint, completely or not at all, and delete all but the newest two."""
+        arrays = {name: np.array(leaf) for name, leaf in _arrays_by_name(state).items()}
+        with replacing(self._path(int(state.step))) as temporary, _shortened_errors(temporary), _orbax() as orbax:
+            orbax.save(temporary / _STATE, args=ocp.args.StandardSave(arrays))
             write_json(temporary / _ABOUT, {"about": about, "sha256": _checksums(temporary, about)})
-        for step in checkpoint_steps(self._folder)[:-_KEPT]:  # a partly deleted checkpoint would seem damaged
+        for step in checkpoint_steps(self._folder)[:-_KEPT_CHECKPOINTS]:
+            # renamed first, because a partly deleted checkpoint would seem damaged
             shutil.rmtree(self._path(step).rename(self._folder / f".{step}.old"))
 
     def _path(self, step: int) -> Path:
@@ -79,43 +81,44 @@ def checkpoint_steps(folder: Path) -> list[int]:
     return sorted(int(path.name) for path in folder.glob("*") if path.name.isdecimal())
 
 
-def set_damaged_aside(folder: Path) -> None:
+def rename_damaged(folder: Path) -> None:
     """Rename the checkpoints in `folder` whose files do not match their checksums, and report them on stderr.
 
-    If all checkpoints are damaged, the function renames none and raises ValueError.
+    If all checkpoints are damaged, the function renames none and raises ValueError. It also deletes checkpoints whose
+    deletion was interrupted (`.17.old`).
     """
-    for removed in folder.glob(".*.old"):
-        shutil.rmtree(removed)
+    for half_deleted in folder.glob(".*.old"):
+        shutil.rmtree(half_deleted)
     paths = [folder / f"{step}" for step in checkpoint_steps(folder)]
-    damages = {path: damage for path in paths if (damage := _damage(path)) is not None}
+    damages = {path: damage for path in paths if (damage := _find_damage(path)) is not None}
     if damages and len(damages) == len(paths):
         raise ValueError(f"{folder}: expected a whole checkpoint, found {len(paths)} damaged: {damages[paths[-1]]}")
     for path, damage in damages.items():
-        names = (path.with_name(f"damaged-{path.name}{suffix}") for suffix in ("", *map("-{}".format, range(2, 100))))
-        aside = next(name for name in names if not name.exists())
-        path.rename(aside)
-        print(f"damaged checkpoint set aside as {aside.name}: {damage}", file=sys.stderr)
+        names = [f"damaged-{path.name}", *(f"damaged-{path.name}-{number}" for number in range(2, 100))]
+        new_path = next(folder / name for name in names if not (folder / name).exists())
+        path.rename(new_path)
+        print(f"damaged checkpoint set aside as {new_path.name}: {damage}", file=sys.stderr)
 
 
-def _damage(path: Path) -> str | None:
+def _find_damage(path: Path) -> str | None:
     """Describe the first damaged file of a checkpoint, or return None if all files match their checksums."""
     file = path / _ABOUT
     try:
         content = read_json(file)
         expected, actual = content["sha256"], _checksums(path, content["about"])
-        different = {name for name in {*expected, *actual} if expected.get(name) != actual.get(name)}
+        damaged = {name for name in {*expected, *actual} if expected.get(name) != actual.get(name)}
     except (ValueError, OSError) as error:
         return str(error)
     except (KeyError, TypeError, AttributeError):
         return f"{file}: expected a description with checksums, found another"
-    if not different:
+    if not damaged:
         return None
-    name = min(different)
+    name = min(damaged)
     return f"{path / name}: expected SHA-256 {expected.get(name)}, found {actual.get(name, 'no such file')}"
 
 
 def _checksums(path: Path, about: Mapping[str, Any]) -> dict[str, str]:
-    """Return the SHA-256 of every file of the state, and of the JSON values about it."""
+    """Return the SHA-256 of every file of the state in a checkpoint, and of the JSON values about the run."""
     contents = {
         file.relative_to(path).as_posix(): file.read_bytes()
         for file in sorted((path / _STATE).rglob("*"))
@@ -125,25 +128,32 @@ def _checksums(path: Path, about: Mapping[str, Any]) -> dict[str, str]:
     return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
 
 
-def _read(path: Path, like: TrainState) -> TrainState:
-    expected = _by_path(like)
+def _read_state(path: Path, like: TrainState) -> TrainState:
+    """Read the state of a checkpoint. `check_arrays` raises ValueError unless its arrays are like those of `like`."""
+    expected = _arrays_by_name(like)
     with _orbax() as orbax:
         stored: Any = orbax.metadata(path / _STATE).item_metadata
         check_arrays(stored.tree, expected, source=path)
         empty = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
+<<<<<<< HEAD
         values = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
     check_arrays(values, expected, source=path)
     return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in expected])
+=======
+        arrays = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
+    check_arrays(arrays, expected, source=path)
+    return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in expected])
+>>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
 
 
-def _by_path(state: TrainState) -> dict[str, Any]:
-    """Return every array by its place in the state."""
+def _arrays_by_name(state: TrainState) -> dict[str, Any]:
+    """Return every array of the state by its path in the tree, such as `params/weights/...`."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _orbax() -> ocp.Checkpointer:
-    """Orbax for this host alone: the first host writes, and all hosts read."""
+    """Return a checkpointer of Orbax that does not wait for other hosts: the first host writes, and all hosts read."""
     host = jax.process_index()
     options = ocp.options.MultiprocessingOptions(
         primary_host=host, active_processes={host}, barrier_sync_key_prefix=f"host{host}"
@@ -154,11 +164,11 @@ def _orbax() -> ocp.Checkpointer:
 
 
 @contextlib.contextmanager
-def _reported(folder: Path) -> Iterator[None]:
-    """Turn the long errors of Orbax, which repeat the folder, into one line."""
+def _shortened_errors(folder: Path) -> Iterator[None]:
+    """Turn the long errors of Orbax, which repeat the folder, into an OSError of one line."""
     try:
         yield
     except (OSError, ValueError) as error:
-        text = str(error).replace(f"{folder}", folder.name)
-        reason = getattr(error, "strerror", None) or in_short(text, most=_MOST_OF_AN_ERROR)
+        message = str(error).replace(f"{folder}", folder.name)
+        reason = getattr(error, "strerror", None) or in_short(message, most=_MAX_ERROR_LENGTH)
         raise OSError(reason) from error

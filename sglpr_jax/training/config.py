@@ -26,8 +26,8 @@ class LossConfig:
     temperature: NotNegative = 0.0
     """If above 0, use the smooth form of the lazy loss, which hard negatives cannot collapse."""
     one_threshold: Share = 0.0
-    """Fraction of the triplet loss in which every anchor has the negatives of all anchors (`losses.one_threshold`). It
-    trains for one distance threshold that all places share. 0 in the paper."""
+    """Fraction of the triplet loss in which every anchor has the negatives of all anchors. All places then share one
+    distance threshold (`losses.one_threshold`). 0 in the paper."""
     ce_weight: NotNegative = 0.4
     """Weight of the cross-entropy."""
     dice_weight: NotNegative = 0.6
@@ -51,9 +51,9 @@ class LossConfig:
 
     @property
     def segments(self) -> bool:
-        """Whether any term uses the segmentation head. A term with weight 0 is not computed (table 7).
+        """Whether any term of the loss uses the segmentation head. Terms with weight 0 are not computed (table 7).
 
-        A new term of the class logits must be added here too, because the table in `training/loss.py` needs JAX.
+        A new `SegmentationTerm` must be added here, too: this module cannot read the table, which needs JAX.
         """
         return self.ce_weight != 0 or self.dice_weight != 0
 
@@ -126,8 +126,8 @@ class TrainConfig:
     """Include the tuples of the second dataset in the triplet loss. Otherwise they are random places for the
     segmentation losses alone."""
     chunk: CountOrNone = 0
-    """Images that pass through the network at a time, on all devices together (0: all). The size changes memory and
-    speed. It changes results only through the branches that stochastic depth drops."""
+    """Images that pass through the network at a time, on all devices together; 0: all. Fewer images need less memory.
+    Results differ only by the random branches that stochastic depth drops."""
     rotate: bool = True
     """Rotate every place about z by a random angle at every step."""
     quarter_turns: Share = 0.0
@@ -179,7 +179,7 @@ class TrainConfig:
 def without_untrained_head(config: TrainConfig) -> TrainConfig:
     """Remove labels and segmentation head from a configuration if neither a loss nor the place head uses them.
 
-    Otherwise the run would save weights that no loss has trained.
+    Otherwise the run would save weights that were never trained.
     """
     if config.model.head.reads_labels or (config.model.segments and config.loss.segments):
         return config

@@ -1,7 +1,7 @@
 """Data-parallel training: the tuples of a step are split over the devices, and all devices hold the same weights.
 
-XLA derives the communication from the placement of the arrays (GSPMD). The results are those of one device, to float32
-rounding. Several hosts have one process each, which reads its own part of a batch. Only the first host writes files.
+XLA derives the communication between devices from the placement of the arrays. Results equal those of one device, to
+float32 rounding. Each of several hosts has one process, which reads its part of a batch. Only the first writes files.
 """
 
 import contextlib
@@ -28,69 +28,73 @@ Function = TypeVar("Function", bound=Callable)
 def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh:
     """Arrange the devices of a run (default: all) in one row, host after host.
 
-    Their number must divide the tuples of a step and the images of a chunk. Each host uses the largest possible number.
-    Idle devices are reported on stderr. Raises ValueError if one device per host is already too many.
+    The number of devices must divide the tuples of a step and the images of a chunk. Each host uses the largest
+    possible number. Idle devices are reported on stderr. Raises ValueError if one device per host is too many.
     """
-    by_host: dict[int, list[Any]] = {}
+    devices_by_host: dict[int, list[Any]] = {}
     for device in jax.devices() if devices is None else devices:
-        by_host.setdefault(device.process_index, []).append(device)
-    available, hosts = min(map(len, by_host.values())), len(by_host)
-    shared = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
-    divided = math.gcd(config.tuples, config.images_at_once)
-    if config.also_tuples:  # mixed batches of two datasets are never split
-        divided = 1
-    used = max((n for n in range(1, available + 1) if divided % (n * hosts) == 0), default=0)
+        devices_by_host.setdefault(device.process_index, []).append(device)
+    hosts, available = len(devices_by_host), min(map(len, devices_by_host.values()))
+    work = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
+    divisible = math.gcd(config.tuples, config.images_at_once)
+    if config.also_tuples:  # a batch of two datasets stays on one device
+        divisible = 1
+    used = max((n for n in range(1, available + 1) if divisible % (n * hosts) == 0), default=0)
     if not used:
-        raise ValueError(f"expected {shared} to be divisible by the number of hosts, found {hosts} hosts")
+        raise ValueError(f"expected {work} to be divisible by the number of hosts, found {hosts} hosts")
     if used < available and is_first_host():
-        print(f"using {used} of {available} devices of each host: their number must divide {shared}", file=sys.stderr)
-    row = [device for host in sorted(by_host) for device in by_host[host][:used]]
+        print(f"using {used} of {available} devices of each host: their number must divide {work}", file=sys.stderr)
+    row = [device for host in sorted(devices_by_host) for device in devices_by_host[host][:used]]
     return Mesh(np.array(row), (AXIS,), axis_types=(AxisType.Auto,))
 
 
-def split(batch: Tree, mesh: Mesh) -> Tree:
-    """Place this host's tuples on its devices of the mesh, as its part of the batch of all hosts."""
-    return _place(batch, NamedSharding(mesh, PartitionSpec(AXIS)))
+def split_over_devices(batch: Tree, mesh: Mesh) -> Tree:
+    """Move this host's tuples to its devices of the mesh. Together, the hosts then hold one batch."""
+    return _to_devices(batch, NamedSharding(mesh, PartitionSpec(AXIS)))
 
 
 def replicate(tree: Tree, mesh: Mesh) -> Tree:
     """Copy the arrays to every device of the mesh. All hosts must pass the same arrays."""
-    return _place(tree, NamedSharding(mesh, PartitionSpec()))
+    return _to_devices(tree, NamedSharding(mesh, PartitionSpec()))
 
 
-def own_copy(tree: Tree) -> Tree:
-    """Return this host's copy of replicated arrays, from its first device. It can be used without the other hosts."""
+def host_copy(tree: Tree) -> Tree:
+    """Return replicated arrays as they are on this host's first device. Using them does not involve other hosts."""
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
 
-def on_own_rows(function: Function) -> Function:
-    """Under jit: let each device of the mesh apply a row-wise function to its own rows.
+def per_device(function: Function) -> Function:
+    """Under jit: return a function with which each device computes only the rows of the batch that it holds.
 
-    Use it for operations for which XLA would gather all rows, such as scatters.
+    `function` must treat every row alone. Use this where XLA would gather all rows on a device, as for scatters.
     """
-    if not _several_devices():
+    if not _has_several_devices():
         return function
     return jax.shard_map(function, in_specs=PartitionSpec(AXIS), out_specs=PartitionSpec(AXIS))
 
 
-def keep_placed(tree: Tree, *, axis: int | None = None) -> Tree:
-    """Under jit on several devices: keep `axis` of the arrays split over them, or the arrays replicated on each."""
-    spec = PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, AXIS)
-    return jax.lax.with_sharding_constraint(tree, spec) if _several_devices() else tree
+def keep_sharding(tree: Tree, *, axis: int | None = None) -> Tree:
+    """Under jit: keep `axis` of the arrays split over the devices. None: keep the arrays replicated on each device."""
+    if not _has_several_devices():
+        return tree
+    unsplit_axes = [None] * (axis or 0)
+    spec = PartitionSpec() if axis is None else PartitionSpec(*unsplit_axes, AXIS)
+    return jax.lax.with_sharding_constraint(tree, spec)
 
 
-def _several_devices() -> bool:
+def _has_several_devices() -> bool:
+    """Return whether the mesh of the current `jax.set_mesh` has more than one device."""
     mesh = jax.sharding.get_abstract_mesh()
     return not mesh.empty and mesh.size > 1
 
 
-def _place(tree: Tree, sharding: NamedSharding) -> Tree:
+def _to_devices(tree: Tree, sharding: NamedSharding) -> Tree:
     return jax.make_array_from_process_local_data(sharding, jax.tree.map(np.asarray, tree))
 
 
 @contextlib.contextmanager
 def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterator[None]:
-    """Connect the processes of `hosts` hosts to one JAX cluster, before any other use of JAX. All hosts must leave it.
+    """Connect the processes of `hosts` hosts to one JAX cluster, before any other use of JAX. The end waits for all.
 
     Raises ValueError if the index or the address (HOST:PORT) is invalid, and ConnectionError if the hosts do not find
     each other, or if another host ends.
@@ -124,14 +128,15 @@ def is_first_host() -> bool:
     return jax.process_index() == 0
 
 
-def own_part(tuples: int) -> slice:
-    """Return the slice of a step's tuples that this host reads: equal parts, in the order of the hosts."""
+def host_slice(tuples: int) -> slice:
+    """Return the part of the `tuples` of a step that this host reads. Hosts read equal parts, in their order."""
     host_tuples = tuples // jax.process_count()
-    return slice(jax.process_index() * host_tuples, (jax.process_index() + 1) * host_tuples)
+    start = jax.process_index() * host_tuples
+    return slice(start, start + host_tuples)
 
 
-def on_any_host(flag: bool) -> bool:
-    """Whether `flag` is set on any host. All hosts must call this function."""
+def any_host(flag: bool) -> bool:
+    """Return whether `flag` is set on any host. All hosts must call this function."""
     return flag if jax.process_count() == 1 else bool(multihost_utils.process_allgather(np.array(flag)).any())
 
 
@@ -146,6 +151,6 @@ def on_all_hosts(work: Callable[[], T]) -> T:
         result = work()
     except Exception as raised:
         error = raised
-    if on_any_host(error is not None):
+    if any_host(error is not None):
         raise error or ConnectionError("another host ended with an error; see the message that it printed")
     return result

@@ -1,10 +1,4 @@
-"""The network of this package in a run of `bin/train`: what a step sees, its loss and its gradient.
-
-The triplet and Dice losses span the batch, so the gradient of a chunk depends on all other chunks. A step in chunks
-therefore has two passes. The first computes the inputs of the losses: descriptors and a few sums per chunk. The second
-runs each chunk forward and backward with the gradients of the losses at these inputs. Only the activations of one chunk
-are in memory at a time.
-"""
+"""Training of the network of this package: input images of a step, in chunks to save memory, loss and gradient."""
 
 import dataclasses
 import functools
@@ -23,8 +17,8 @@ from sglpr_jax.models.sglpr import forward, init
 from sglpr_jax.models.weights import freeze_descriptor_layers
 from sglpr_jax.training.batches import Batch, in_network_order, views
 from sglpr_jax.training.config import LossConfig, OcclusionConfig, TrainConfig
-from sglpr_jax.training.devices import keep_placed, on_own_rows
-from sglpr_jax.training.loss import Summary, joint_loss, segmentation_sums
+from sglpr_jax.training.devices import keep_sharding, per_device
+from sglpr_jax.training.loss_terms import Summary, joint_loss, segmentation_sums
 from sglpr_jax.training.step import Gradient, Metrics, TrainState
 
 
@@ -36,12 +30,10 @@ class ImageNetwork:
 
     @property
     def seed(self) -> int:
-        """Seed of the weights and of the random choices of a step."""
         return self.config.seed
 
     @property
     def images(self) -> int:
-        """Images per step."""
         return self.config.images
 
     @property
@@ -67,105 +59,119 @@ class ImageNetwork:
         return TrainState(jnp.zeros((), jnp.int32), weights, self.optimizer.init(weights))
 
     def gradient(self, state: TrainState, batch: Batch, key: Array) -> Gradient:
-        """Return the gradient of equation 8 for the rotated batch, and the metrics of the loss."""
+        """Return the gradient of the joint loss (equation 8) for the rotated batch, and the metrics of the loss."""
         angle_key, model_key = jax.random.split(key)
-        chunks = _chunks(batch, angle_key, model_key, self.config)
-        weights, metrics = gradients(state.params, chunks, batch, self.config.loss)
-        return Gradient(dataclasses.replace(state.params, weights=weights), {}, metrics)
+        chunks = _network_input(batch, angle_key, model_key, self.config)
+        gradient, metrics = gradients(state.params, chunks, batch, self.config.loss)
+        return Gradient(dataclasses.replace(state.params, weights=gradient), {}, metrics)
 
 
 class Chunk(NamedTuple):
-    """Images (c, h, w), their label maps (c, h, w) if there are labels, a mask of labelled images (c,), and a key
-    ()."""
+    """Images that pass through the network at a time. `key` draws the branches that stochastic depth drops."""
 
-    images: Any
-    maps: Any
-    labelled: Any
+    images: Any  # (c, h, w)
+    maps: Any  # class of every pixel (c, h, w), or None without labels
+    labelled: Any  # whether each image has labels (c,)
     key: Any
 
 
 def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -> tuple[Any, Metrics]:
-    """Return the gradient of equation 8 at `params.weights`, accumulated over the chunks, and the metrics of the loss.
+    """Return the gradient of the joint loss (equation 8) at `params.weights`, and the metrics of the loss.
 
-    Arrays of `chunks` have a leading chunk axis.
+    Arrays of `chunks` have a leading chunk axis. The triplet and Dice losses span the batch, so the gradient of a chunk
+    depends on all other chunks. The first pass computes the inputs of the loss: descriptors and a few sums per chunk.
+    The second pass runs each chunk forward and backward with the gradient of the loss at these inputs, so only the
+    activations of one chunk are in memory at a time. A single chunk needs one pass.
     """
 
-    def summary(weights, chunk: Chunk) -> Summary:
+    def summary_of(weights, chunk: Chunk) -> Summary:
         return summarize(dataclasses.replace(params, weights=weights), chunk, config)
 
-    def loss(summaries: Summary):
+    def loss_of(summaries: Summary):
         descriptors, sums = summaries
-        merged = Summary(descriptors.reshape(-1, descriptors.shape[-1]), jax.tree.map(lambda s: s.sum(0), sums))
-        return joint_loss(merged, batch, config)
+        all_sums = jax.tree.map(lambda chunk_sums: chunk_sums.sum(0), sums)
+        return joint_loss(Summary(descriptors.reshape(-1, descriptors.shape[-1]), all_sums), batch, config)
 
     if chunks.images.shape[0] == 1:
-        only = jax.tree.map(lambda x: x[0], chunks)
-        return jax.grad(lambda w: loss(jax.tree.map(lambda x: x[None], summary(w, only))), has_aux=True)(params.weights)
+        chunk = jax.tree.map(lambda x: x[0], chunks)
 
-    summaries = jax.lax.map(lambda chunk: summary(params.weights, chunk), chunks)
-    cotangents, metrics = jax.grad(loss, has_aux=True)(summaries)
+        def loss_of_weights(weights):
+            return loss_of(jax.tree.map(lambda x: x[None], summary_of(weights, chunk)))
 
-    def add(total, chunk_and_cotangent):
-        chunk, cotangent = chunk_and_cotangent
-        (gradient,) = jax.vjp(lambda w: summary(w, chunk), params.weights)[1](cotangent)
+        return jax.grad(loss_of_weights, has_aux=True)(params.weights)
+
+    summaries = jax.lax.map(lambda chunk: summary_of(params.weights, chunk), chunks)
+    summary_gradients, metrics = jax.grad(loss_of, has_aux=True)(summaries)
+
+    def add_gradient(total, chunk_and_summary_gradient):
+        chunk, summary_gradient = chunk_and_summary_gradient
+        _, backward = jax.vjp(lambda weights: summary_of(weights, chunk), params.weights)
+        (gradient,) = backward(summary_gradient)
         return jax.tree.map(jnp.add, total, gradient), None
 
     zeros = jax.tree.map(jnp.zeros_like, params.weights)
-    return jax.lax.scan(add, zeros, (chunks, cotangents))[0], metrics
+    return jax.lax.scan(add_gradient, zeros, (chunks, summary_gradients))[0], metrics
 
 
 def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
-    """Run one chunk through the network. The segmentation head runs only if there are labels, on every n-th image."""
+    """Run a chunk through the network. Returns its descriptors and, with labels, its sums for the segmentation losses.
+
+    The segmentation head runs on every `config.segment_every`-th image.
+    """
     params = freeze_descriptor_layers(params) if config.segmentation_alone else params
-    labels = chunk.maps if params.config.head.reads_labels else None
     if chunk.maps is None or not (params.config.segments and config.segments):
+        labels = chunk.maps if params.config.head.reads_labels else None
         return Summary(forward(params, chunk.images, labels, key=chunk.key, segment=0).descriptor, {})
     outputs = forward(params, chunk.images, key=chunk.key, segment=config.segment_every)
-    maps, labelled = (x[:: config.segment_every] for x in (chunk.maps, chunk.labelled))
-    counted = labelled[:, None, None] & ((maps != UNLABELLED) | (not config.ignore_unlabelled))
-    return Summary(outputs.descriptor, segmentation_sums(outputs.logits, maps, counted, config))
+    maps = chunk.maps[:: config.segment_every]
+    labelled_images = chunk.labelled[:: config.segment_every, None, None]
+    counted_pixels = labelled_images & ((maps != UNLABELLED) | (not config.ignore_unlabelled))
+    return Summary(outputs.descriptor, segmentation_sums(outputs.logits, maps, counted_pixels, config))
 
 
-def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
-    """Return the batch as the network sees it, cut into chunks along a new leading axis."""
-    angles = _angles(angle_key, config) if config.rotate else None
+def _network_input(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
+    """Rasterise, rotate and occlude the places of a batch, and cut them into chunks along a new leading axis."""
+    angles = _random_angles(angle_key, config) if config.rotate else None
     make_views = functools.partial(views, grid=config.model.grid)
-    make_views = make_views if batch.also is not None else on_own_rows(make_views)  # a mixed batch is on one device
+    if batch.second is None:  # a batch of two datasets is on one device
+        make_views = per_device(make_views)
     images, maps = make_views(batch, angles)
     visible_cells = field_of_view(config.model)
     if config.occlusion.share:
         key = jax.random.fold_in(angle_key, 1)
-        unoccluded = visible(key, config.images, config.model.grid, config.occlusion)
-        visible_cells, images = visible_cells & unoccluded, jnp.where(unoccluded, images, 0)
+        unoccluded = unoccluded_cells(key, config.images, config.model.grid, config.occlusion)
+        visible_cells = visible_cells & unoccluded
+        images = jnp.where(unoccluded, images, 0)
     maps = None if maps is None else jnp.where(visible_cells, maps, UNLABELLED)
     keys = jax.random.split(model_key, config.images // config.images_at_once)
 
-    def cut(x: Array) -> Array:
+    def cut_into_chunks(x: Array) -> Array:
         ordered = in_network_order(x, batch, every=config.loss.segment_every)
         return ordered.reshape(-1, config.images_at_once, *x.shape[1:])
 
-    chunks = jax.tree.map(cut, (images, maps, jnp.asarray(batch.labelled)))
-    return Chunk(*keep_placed(chunks, axis=1), key=keys)  # otherwise each chunk would be on one device
+    chunks = jax.tree.map(cut_into_chunks, (images, maps, jnp.asarray(batch.labelled)))
+    return Chunk(*keep_sharding(chunks, axis=1), key=keys)  # without it, each chunk would be on one device
 
 
-def _angles(key: Array, config: TrainConfig) -> Array:
-    """Return the rotation of each place, in radians."""
+def _random_angles(key: Array, config: TrainConfig) -> Array:
+    """Return a random rotation of each place in radians. A share `config.quarter_turns` are multiples of 90 degrees."""
     angles = jax.random.uniform(key, (config.images,), maxval=2 * jnp.pi)
     if not config.quarter_turns:
         return angles
-    by_quarters = jax.random.bernoulli(jax.random.fold_in(key, 3), config.quarter_turns, angles.shape)
-    return jnp.where(by_quarters, jnp.floor(angles / (jnp.pi / 2)) * (jnp.pi / 2), angles)
+    is_quarter_turn = jax.random.bernoulli(jax.random.fold_in(key, 3), config.quarter_turns, angles.shape)
+    return jnp.where(is_quarter_turn, jnp.floor(angles / (jnp.pi / 2)) * (jnp.pi / 2), angles)
 
 
-def visible(key: Array, images: int, grid: Grid, config: OcclusionConfig) -> Bool[Array, "b h w"]:
-    """Return the visible cells of each image. In a fraction of the images, a random sector is hidden.
+def unoccluded_cells(key: Array, images: int, grid: Grid, config: OcclusionConfig) -> Bool[Array, "b h w"]:
+    """Return a mask of the visible cells of each image. In a random fraction of the images, a sector is hidden.
 
-    The width of the sector is uniform between 0 and `config.widest_deg`. The bearing of a cell is that of its centre.
+    The width of the sector is uniform from 0 to `config.widest_deg`. A cell is hidden if its centre is.
     """
-    chosen_key, width_key, start_key = jax.random.split(key, 3)
-    chosen = jax.random.bernoulli(chosen_key, config.share, (images,))
-    width = jnp.where(chosen, jax.random.uniform(width_key, (images,), maxval=jnp.deg2rad(config.widest_deg)), 0.0)
-    start = jax.random.uniform(start_key, (images,), maxval=2 * jnp.pi)
+    occluded_key, width_key, start_key = jax.random.split(key, 3)
+    is_occluded = jax.random.bernoulli(occluded_key, config.share, (images,))
+    widths = jax.random.uniform(width_key, (images,), maxval=jnp.deg2rad(config.widest_deg))
+    width = jnp.where(is_occluded, widths, 0.0)[:, None, None]
+    start = jax.random.uniform(start_key, (images,), maxval=2 * jnp.pi)[:, None, None]
     x, y = jnp.meshgrid(jnp.arange(grid.height) + 0.5, jnp.arange(grid.width) + 0.5, indexing="ij")
-    bearing = jnp.arctan2(y - grid.width / 2, x - grid.height / 2)
-    return (bearing[None] - start[:, None, None]) % (2 * jnp.pi) >= width[:, None, None]
+    azimuth = jnp.arctan2(y - grid.width / 2, x - grid.height / 2)[None]
+    return (azimuth - start) % (2 * jnp.pi) >= width

@@ -19,16 +19,17 @@ class MetricsLog:
     """
 
     def __init__(self, path: Path, *, start_step: int = 0):
-        lines = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
-        write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
+        earlier_lines = read_metrics(path) if path.exists() else []
+        kept_lines = [json.dumps(line) + "\n" for line in earlier_lines if line["step"] <= start_step]
+        write_text(path, "".join(kept_lines))
         self._path = path
         self._file = path.open("ab", buffering=0)  # unbuffered, so that closing has nothing left to write
 
     def append(self, step: int, values: Mapping[str, Any]) -> None:
         """Write the measurements of one step. Values that are not finite become null."""
-        numbers = {name: float(value) for name, value in values.items()}
-        line = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-        unwritten = json.dumps({"step": step, **line}).encode() + b"\n"
+        floats = {name: float(value) for name, value in values.items()}
+        json_values = {name: value if math.isfinite(value) else None for name, value in floats.items()}
+        unwritten = json.dumps({"step": step, **json_values}).encode() + b"\n"
         with writing(self._path):
             while unwritten:  # a nearly full disk may accept only a part
                 unwritten = unwritten[self._file.write(unwritten) :]
@@ -48,20 +49,21 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
     Raises ValueError, with the file and the line, if any other line is invalid.
     """
-    *texts, last = path.read_bytes().split(b"\n")
-    lines = [_read_line(text, source=f"{path}, line {i}") for i, text in enumerate(texts, start=1)]
-    with contextlib.suppress(ValueError):
-        lines += [_read_line(last, source=path)]
-    for i, (before, line) in enumerate(itertools.pairwise(lines), start=2):
-        if line["step"] < before["step"]:
-            raise ValueError(f"{path}, line {i}: expected a step from {before['step']} on, found {line['step']}")
+    *complete_texts, last_text = path.read_bytes().split(b"\n")
+    lines = [_parse_line(text, source=f"{path}, line {i}") for i, text in enumerate(complete_texts, start=1)]
+    with contextlib.suppress(ValueError):  # cut off, or empty after the last newline
+        lines.append(_parse_line(last_text, source=path))
+    for i, (previous, line) in enumerate(itertools.pairwise(lines), start=2):
+        if line["step"] < previous["step"]:
+            raise ValueError(f"{path}, line {i}: expected a step from {previous['step']} on, found {line['step']}")
     return lines
 
 
-def _read_line(text: bytes, *, source: Path | str) -> dict[str, Any]:
+def _parse_line(text: bytes, *, source: Path | str) -> dict[str, Any]:
+    """Return a line as a dictionary. Raises ValueError unless it has an integer `step` and numbers or nulls."""
     line = parse_json(text, source=source)
-    fits = isinstance(line, dict) and type(line.get("step")) is int
-    if not fits or not all(value is None or type(value) in (int, float) for value in line.values()):
+    has_step = isinstance(line, dict) and type(line.get("step")) is int
+    if not has_step or not all(value is None or type(value) in (int, float) for value in line.values()):
         raise ValueError(f"{source}: expected a step and its measurements, found {text[:80].decode(errors='replace')}")
     return line
 
@@ -75,17 +77,16 @@ class Throughput(NamedTuple):
 
 
 def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
-    """Return the mean throughput over all lines of the log that state a speed, or None if no line states one.
+    """Return the mean throughput over the lines of a log that have `steps_per_second`, or None without such lines.
 
     The first line after a start or a resume has no speed, because the step is compiled then.
     """
-    timed = [
-        (line["step"] - before["step"], line)
-        for before, line in itertools.pairwise(lines)
-        if "steps_per_second" in line
-    ]
-    if not timed:
-        return None
-    seconds = sum(steps / line["steps_per_second"] for steps, line in timed)
-    waited = sum(line["data_wait"] * steps / line["steps_per_second"] for steps, line in timed)
-    return Throughput(sum(steps for steps, _ in timed) / seconds, waited / seconds)
+    steps, seconds, waited_s = 0, 0.0, 0.0
+    for previous, line in itertools.pairwise(lines):
+        if "steps_per_second" in line:
+            line_steps = line["step"] - previous["step"]
+            line_seconds = line_steps / line["steps_per_second"]
+            steps += line_steps
+            seconds += line_seconds
+            waited_s += line["data_wait"] * line_seconds
+    return Throughput(steps / seconds, waited_s / seconds) if steps else None

@@ -1,4 +1,4 @@
-"""Hard negatives: places with similar descriptors, which are recomputed at regular steps."""
+"""Descriptors that select hard negatives: distant places with similar descriptors. Recomputed at regular steps."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ MINING = "mining"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DescriptorCache:
-    """Descriptors of some places. `places` are frame numbers of a `TuplePool` in ascending order."""
+    """Descriptors of some places of a `TuplePool`. `places` are their numbers in ascending order."""
 
     places: Int[np.ndarray, "n"]
     descriptors: Float32[np.ndarray, "n d"]
@@ -27,18 +27,19 @@ class DescriptorCache:
     def nearest(self, anchor: int, candidates: Int[np.ndarray, "_"], size: int) -> Int[np.ndarray, "_"]:
         """Return at most `size` candidates with the descriptors nearest to the anchor's, nearest first.
 
-        Candidates that are not in the cache are skipped. If the anchor is not in the cache, the result is empty.
+        Anchor and candidates are place numbers of the pool. Candidates that are not in the cache are skipped. If the
+        anchor is not in the cache, the result is empty.
         """
         candidates = candidates[np.isin(candidates, self.places, assume_unique=True)]
         if anchor not in self.places:
             return candidates[:0]
-        rows, row = np.searchsorted(self.places, candidates), np.searchsorted(self.places, anchor)
-        # |a - b|^2 - |a|^2 needs one matrix-vector product. Differences would copy the whole cache.
-        square = self._squares - 2 * (self.descriptors @ self.descriptors[row])
-        return candidates[np.argsort(square[rows], kind="stable")[:size]]
+        anchor_row, candidate_rows = np.searchsorted(self.places, anchor), np.searchsorted(self.places, candidates)
+        # |d - a|^2 - |a|^2 = |d|^2 - 2 d a needs one matrix-vector product. Differences would copy the whole cache.
+        relative_distances = self._squared_norms - 2 * (self.descriptors @ self.descriptors[anchor_row])
+        return candidates[np.argsort(relative_distances[candidate_rows], kind="stable")[:size]]
 
     @functools.cached_property
-    def _squares(self) -> Float32[np.ndarray, "n"]:
+    def _squared_norms(self) -> Float32[np.ndarray, "n"]:
         return np.square(self.descriptors).sum(1)
 
     def save(self, path: Path) -> None:
@@ -66,32 +67,26 @@ def refresh_cache(
     *,
     seed: int,
 ) -> DescriptorCache:
-    """Load or compute the descriptors for the steps from the last multiple of `config.refresh_steps` to `step` on.
+    """Load or compute the descriptors of the last refresh, at the last multiple of `config.refresh_steps`.
 
-    The cache is stored in the folder of the run. A run that is resumed between two refreshes reads it, so its batches
-    are those of an uninterrupted run. Caches that no checkpoint needs are deleted.
+    The folder of the run stores them. A run that is resumed between two refreshes loads them, so its batches are those
+    of an uninterrupted run. Files that no checkpoint needs are deleted.
 
-    Arguments:
-      step: Next step of the run.
-      describe: Describes places, given as frame numbers of the pool, with the weights before `step`.
-      pool_size: Number of frames of the pool.
-      config: Number of described places, and steps between two refreshes.
-      run: Folder of the run.
-      seed: Seed of the selection of places.
-
-    Raises FileNotFoundError if the cache of an earlier step is needed but missing.
+    `describe` describes places, given as numbers of the pool, with the weights before `step`, the next step of the run.
+    Of the `pool_size` places, `config.mined_places` random ones are described. `DescriptorCache.load` raises
+    FileNotFoundError if the last refresh was at an earlier step and its file is missing.
     """
-    every, folder = config.refresh_steps, run / MINING
-    path = folder / f"{step - step % every}.npz"
-    if path.is_file() or step % every:
+    folder, last_refresh = run / MINING, step - step % config.refresh_steps
+    path = folder / f"{last_refresh}.npz"
+    if path.is_file() or step > last_refresh:
         return DescriptorCache.load(path)
     places = np.arange(pool_size)
     if 0 < config.mined_places < pool_size:
         places = np.sort(np.random.default_rng([seed, step]).choice(pool_size, config.mined_places, replace=False))
     cache = DescriptorCache(places, describe(places))
     cache.save(path)
-    needed = {saved - saved % every for saved in checkpoint_steps(run / CHECKPOINTS)}
-    for old in folder.glob("*.npz"):
-        if old.stem.isdecimal() and int(old.stem) not in needed and int(old.stem) < max(needed, default=0):
-            old.unlink()
+    needed = {saved - saved % config.refresh_steps for saved in checkpoint_steps(run / CHECKPOINTS)}
+    for file in folder.glob("*.npz"):
+        if file.stem.isdecimal() and int(file.stem) not in needed and int(file.stem) < max(needed, default=0):
+            file.unlink()
     return cache

@@ -1,4 +1,4 @@
-"""Inputs of the network for all scans of recordings. They are computed once and kept as memory-mapped files."""
+"""Inputs of a learned method for all scans of recordings, computed once and stored in memory-mapped files."""
 
 import hashlib
 import inspect
@@ -31,9 +31,9 @@ class TrainingInputs:
     inputs: tuple[Shaped[np.ndarray, "_n ..."], ...]
     """Inputs of each recording, one for each scan."""
 
-    def of(self, pool: TuplePool, places: Int[np.ndarray, " n"]) -> Shaped[np.ndarray, "n ..."]:
-        """Return the inputs of places, given as frame numbers of a pool over these recordings."""
-        return np.stack([self.inputs[pool.recording[place]][pool.frame[place]] for place in places])
+    def at_places(self, pool: TuplePool, places: Int[np.ndarray, " n"]) -> Shaped[np.ndarray, "n ..."]:
+        """Return the inputs of places, which are numbers of a pool over these recordings."""
+        return np.stack([self.inputs[pool.recording_of[place]][pool.frame_of[place]] for place in places])
 
 
 def prepare_inputs(
@@ -42,27 +42,24 @@ def prepare_inputs(
     """Compute the inputs of all scans, or read them from the cache.
 
     Each recording becomes one file in the folder `cache`, which is complete or does not exist. A repeated call
-    continues with the missing recordings.
-
-    Raises:
-      ValueError: If a recording has no poses or lacks what the method needs, if a scan is invalid, or if inputs differ
-        in shape or type.
-      OSError: If the cache cannot be written.
+    continues with the missing recordings. Raises ValueError if a recording has no poses or lacks what the method needs,
+    if a scan is invalid, or if inputs differ in shape or type, and OSError if the cache cannot be written.
     """
     for recording in recordings:
         require_content(method.name, method.takes, recording, every_label=True)
         positions_of(recording)
-    inputs = tuple(_inputs(method, recording, cache, progress) for recording in recordings)
-    for recording, array in zip(recordings, inputs, strict=True):
-        _require_alike(array[0], inputs[0][0], name=f"sequence {recording.name}")
+    inputs = tuple(_cached_inputs(method, recording, cache, progress) for recording in recordings)
+    for recording, recording_inputs in zip(recordings, inputs, strict=True):
+        _require_same_shape(recording_inputs[0], inputs[0][0], name=f"sequence {recording.name}")
     return TrainingInputs(tuple(recordings), inputs)
 
 
-def _inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: Progress) -> np.ndarray:
-    path = cache / f"{method.name}-{file_name(recording.name)}-{_identity(method, recording)}.npy"
+def _cached_inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: Progress) -> np.ndarray:
+    """Return the inputs of the scans of a recording from its file in the folder `cache`. Writes a missing file."""
+    path = cache / f"{method.name}-{file_name(recording.name)}-{_cache_key(method, recording)}.npy"
     if not path.is_file():
         with progress(f"prepare {recording.name}", len(recording)) as show:
-            _write(path, method, recording, show)
+            _write_inputs(path, method, recording, show)
     try:
         inputs = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, EOFError) as error:
@@ -72,8 +69,8 @@ def _inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: 
     return inputs
 
 
-def _write(path: Path, method: LearnedMethod, recording: Recording, show) -> None:
-    """Write the inputs of a recording, completely or not at all."""
+def _write_inputs(path: Path, method: LearnedMethod, recording: Recording, show) -> None:
+    """Write the inputs of a recording, completely or not at all. `show` receives the number of prepared scans."""
     check_readable(recording, len(recording))
     options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD, "on_progress": show}
     stream = scan_stream(recording, lambda row, scan: method.prepare(scan), **options)
@@ -84,12 +81,13 @@ def _write(path: Path, method: LearnedMethod, recording: Recording, show) -> Non
             if file is None:
                 shape = (len(recording), *inputs.shape)
                 file = np.lib.format.open_memmap(temporary, mode="w+", dtype=inputs.dtype, shape=shape)
-            _require_alike(inputs, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
+            _require_same_shape(inputs, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
             file[row] = inputs
-        del file  # flushes it
+        del file  # writes it to disk
 
 
-def _require_alike(inputs: np.ndarray, expected: np.ndarray, *, name: str) -> None:
+def _require_same_shape(inputs: np.ndarray, expected: np.ndarray, *, name: str) -> None:
+    """Raise ValueError if the input of a scan differs in shape or type from that of another scan."""
     if (inputs.shape, inputs.dtype) != (expected.shape, expected.dtype):
         raise ValueError(
             f"{name}: expected an input {expected.dtype} {expected.shape} as for the other scans, found "
@@ -97,15 +95,16 @@ def _require_alike(inputs: np.ndarray, expected: np.ndarray, *, name: str) -> No
         )
 
 
-def _identity(method: LearnedMethod, recording: Recording) -> str:
-    """Identify the inputs: the files of a recording, their read options, and the file that declares `prepare`."""
-    paths = [path for path in (*recording.paths, *recording.label_paths, *recording.containers) if path is not None]
-    stats = [path.stat() if path.exists() else None for path in paths]  # None for a scan inside another file
-    stamps = [None if stat is None else (stat.st_size, stat.st_mtime_ns) for stat in stats]
-    files = [(str(path.absolute()), stamp) for path, stamp in zip(paths, stamps, strict=True)]
+def _cache_key(method: LearnedMethod, recording: Recording) -> str:
+    """Return a hash of what determines the inputs: method, source file of `prepare`, scan files and read options."""
+    files: list[tuple[str, tuple[int, int] | None]] = []
+    for path in (*recording.paths, *recording.label_paths, *recording.containers):
+        if path is not None:
+            stat = path.stat() if path.exists() else None  # None for a scan inside another file
+            files.append((str(path.absolute()), None if stat is None else (stat.st_size, stat.st_mtime_ns)))
     mountings = [str(recording.mounting_of(row)) for row in range(len(recording))]
     code = hashlib.sha256(Path(inspect.getfile(method.prepare)).read_bytes()).hexdigest()
-    source = [method.name, code, recording.name, recording.read_options, files, mountings]
+    content = [method.name, code, recording.name, recording.read_options, files, mountings]
     if not recording.on_disk and recording.positions is not None:  # a simulated recording has no files
-        source.append(recording.positions.tolist())
-    return hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
+        content.append(recording.positions.tolist())
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

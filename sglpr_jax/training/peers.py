@@ -36,23 +36,23 @@ RATES_FILE = "rates.json"
 LIMITS = ("settings.seconds", "settings.images")
 """Settings that may differ when a run is resumed."""
 FIRST_SNAPSHOT = 1000
-"""Number of images at the first snapshot. Each further one has twice as many."""
+"""Number of images at the first snapshot of the weights. Each further snapshot has twice as many."""
 START_PLACES = 100
 """Number of random places from which `LearnedMethod.start` sets weights."""
 LOG_EVERY = 10
 """Number of steps between two lines of the metrics."""
 SAVE_EVERY_S, REPORT_EVERY_S = 60.0, 30.0
 """Training time between two saved states, and between two lines of progress, in seconds."""
-DESCRIBED = 256
+PLACES_IN_MEMORY = 256
 """Number of places whose inputs are in memory at a time."""
 
 ScoreFn = Callable[[Variables], dict[str, float]]
-"""Scores weights. The entry `recall_at_1` selects among them."""
+"""Scores weights. The entry `recall_at_1` selects the best ones."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RunSettings:
-    """Settings of a run, beside the recipe of its method."""
+    """Settings of a run. The recipe of its method has the others."""
 
     learning_rate: Positive
     seed: CountOrNone = 0
@@ -66,10 +66,11 @@ class RunSettings:
 
 
 class PeerBatch(NamedTuple):
-    """Tuples of one step. All their places are in one array, tuple after tuple."""
+    """Training tuples of one step: t tuples of k places, which are b = t k places in all."""
 
     inputs: Shaped[Any, "b ..."]
-    apart_m: Float[Any, "t k"]
+    """Input of each place, tuple after tuple."""
+    anchor_distance_m: Float[Any, "t k"]
     """Distance of each place from the anchor of its tuple, in metres. Infinite between recordings."""
 
 
@@ -85,7 +86,6 @@ class PeerNetwork:
 
     @property
     def images(self) -> int:
-        """Images per step."""
         sampling = self.method.recipe.sampling
         return self.method.recipe.tuples * (1 + sampling.positives + sampling.negatives)
 
@@ -107,8 +107,8 @@ class PeerNetwork:
         def loss_of(params):
             variables = {"params": params, **state.statistics}
             outputs, statistics = self.method.network.apply(variables, inputs, train=True, mutable=[*state.statistics])
-            descriptors = outputs.reshape(*batch.apart_m.shape, -1)
-            tuples = Tuples(descriptors, batch.apart_m, self.method.recipe.sampling.positives)
+            descriptors = outputs.reshape(*batch.anchor_distance_m.shape, -1)
+            tuples = Tuples(descriptors, batch.anchor_distance_m, self.method.recipe.sampling.positives)
             return self.method.loss({"params": params, **statistics}, tuples), statistics
 
         (loss, statistics), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
@@ -121,7 +121,7 @@ class PeerNetwork:
 
 
 def variables_of(state: TrainState) -> Variables:
-    """Return the variables of a learned method."""
+    """Return the parameters and statistics of a state as variables of a learned method."""
     return {"params": state.params, **state.statistics}
 
 
@@ -139,15 +139,13 @@ def train_learned(
 ) -> Trained:
     """Train a method until its time or its number of images is reached, whichever is first.
 
-    The folder gets the settings, the measurements (`metrics.jsonl`), snapshots of the weights (`weights-1000`,
+    The folder `out` gets the settings, the measurements (`metrics.jsonl`), snapshots of the weights (`weights-1000`,
     `weights-2000`, `weights-4000`, ...), the last weights (`weights`) and checkpoints for resuming. A resumed run has
     the batches and the weights of an uninterrupted one.
 
     Arguments:
       method: Method to train, from random weights.
       data: Training recordings and their inputs.
-      settings: Settings of the run.
-      out: Folder of the run.
       score: Scores each snapshot, for `scores.jsonl`.
       resume: Continue the run in the folder.
       stopped: Asked after every step. If it returns True, the state is saved and the training stops.
@@ -159,22 +157,22 @@ def train_learned(
       ValueError: The recordings give no tuples, or the run to resume has other settings.
       OSError: The folder cannot be written, has a run already, or has none to resume.
     """
-    network, chosen = PeerNetwork(method, settings.seed), dataclasses.asdict(settings)
+    network, settings_json = PeerNetwork(method, settings.seed), dataclasses.asdict(settings)
 
-    def save(run: Trained, name: str) -> None:
-        about = {"images": run.images, "seconds": round(run.seconds, 3), "settings": chosen}
+    def save_weights(run: Trained, name: str) -> None:
+        about = {"images": run.images, "seconds": round(run.seconds, 3), "settings": settings_json}
         save_variables(out / name, method, variables_of(run.state), about)
 
     recipe = dataclasses.asdict(method.recipe)
-    del recipe["learning_rates"]  # the settings have the chosen one
+    del recipe["learning_rates"]  # the settings have the learning rate of this run
     recordings = [{"name": recording.name, "scans": len(recording)} for recording in data.recordings]
-    config = {"method": method.name, "settings": chosen, "recipe": recipe, "recordings": recordings}
+    config = {"method": method.name, "settings": settings_json, "recipe": recipe, "recordings": recordings}
     lock = lock_run(out, config, seed=settings.seed, resume=resume, limits=LIMITS)
     with lock, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
         pool = TuplePool([positions_of(recording) for recording in data.recordings], method.recipe.sampling)
         trainer = Trainer(
             network,
-            _batches(network, data, pool, out),
+            _peer_batches(network, data, pool, out),
             out,
             Schedule(
                 LOG_EVERY,
@@ -185,29 +183,37 @@ def train_learned(
                 costs=True,
             ),
             mesh=Mesh(np.array(jax.devices()[:1]), (AXIS,), axis_types=(AxisType.Auto,)),
-            begin=functools.partial(_first_state, network, data, pool, settings.learning_rate),
+            first_state=functools.partial(_first_state, network, data, pool, settings.learning_rate),
             score=lambda state: {} if score is None else score(variables_of(state)),
+<<<<<<< HEAD
             save_snapshot=lambda run, images: save(run, f"{LAST_WEIGHTS}-{images}"),
+=======
+            save_snapshot=lambda run, images: save_weights(run, f"{LAST_WEIGHTS}-{images}"),
+>>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
             resume=resume,
-            callback=_Report(report, show),
+            callback=_ReportLines(report, show),
         )
         run = trainer.train(stopped)
+<<<<<<< HEAD
         save(run, LAST_WEIGHTS)
+=======
+        save_weights(run, LAST_WEIGHTS)
+>>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
         return run
 
 
-class _Report(Callback):
-    """Reports the loss every 30 s and with each score, and shows the training time."""
+class _ReportLines(Callback):
+    """Reports the loss every 30 s of training and at each checkpoint, and the scores. Shows the training time."""
 
     def __init__(self, report: Callable[[str], None], show: Callable[[int], None]):
-        self._report, self._show, self._reported_s, self._line = report, show, 0.0, ""
+        self._report, self._show, self._last_report_s, self._line = report, show, 0.0, ""
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
         seconds = values["seconds"]
         self._show(int(seconds))
         self._line = f"step {step}: {values['images']:.0f} images, {seconds:.0f} s, loss {values['loss']:.4g}"
-        if seconds > self._reported_s + REPORT_EVERY_S:
-            self._reported_s = seconds
+        if seconds > self._last_report_s + REPORT_EVERY_S:
+            self._last_report_s = seconds
             self._report(self._line)
 
     def on_score(self, step: int, scores: Mapping[str, float]) -> None:
@@ -223,20 +229,21 @@ def _first_state(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, le
     if network.method.start is None:
         return state
     places = np.random.default_rng(network.seed).permutation(len(pool))[:START_PLACES]
-    variables = network.method.start(variables_of(state), data.of(pool, places))
+    variables = network.method.start(variables_of(state), data.at_places(pool, places))
     return dataclasses.replace(state, params=variables["params"])
 
 
-def _batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, out: Path) -> TupleBatches:
-    """Return the batches of a run."""
+def _peer_batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, out: Path) -> TupleBatches:
+    """Return the batches of a run. Its folder `out` stores the descriptors that select hard negatives."""
 
-    def read(frames: Int[np.ndarray, "t k"]) -> PeerBatch:
-        return PeerBatch(data.of(pool, frames.reshape(-1)), pool.distances_from_anchors(frames))
+    def read(places: Int[np.ndarray, "t k"]) -> PeerBatch:
+        return PeerBatch(data.at_places(pool, places.reshape(-1)), pool.distances_from_anchors(places))
 
     def describe(state: TrainState, places: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
-        blocks = np.array_split(places, math.ceil(len(places) / DESCRIBED))
         variables = variables_of(state)
-        return np.concatenate([describe_inputs(network.method, variables, data.of(pool, block)) for block in blocks])
+        blocks = np.array_split(places, math.ceil(len(places) / PLACES_IN_MEMORY))
+        descriptors = [describe_inputs(network.method, variables, data.at_places(pool, block)) for block in blocks]
+        return np.concatenate(descriptors)
 
     tuples = network.method.recipe.tuples
     return TupleBatches(data.recordings, pool, read, seed=network.seed, tuples=tuples, describe=describe, run=out)
@@ -245,17 +252,15 @@ def _batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, out: P
 def held_out_score(method: LearnedMethod, held_out: TrainingInputs) -> ScoreFn:
     """Return a function that scores weights on held-out recordings.
 
-    The entries of a score are `recall_at_1`, the mean, and `recall_at_1 NAME` for each recording. Raises ValueError if
-    a recording has no revisits.
+    The entries are `recall_at_1 NAME` for each recording and the mean, `recall_at_1`. Each recording needs revisits.
     """
     require_revisits(held_out.recordings)
 
     def score(variables: Variables) -> dict[str, float]:
         distance, recalls = learned_distance(method, variables), {}
         for recording, inputs in zip(held_out.recordings, held_out.inputs, strict=True):
-            descriptors = describe_inputs(method, variables, inputs)
-            recall = recall_at_1(descriptors, positions_of(recording), recording.times, distance)
-            recalls[f"{RECALL} {recording.name}"] = recall
+            descriptors, positions = describe_inputs(method, variables, inputs), positions_of(recording)
+            recalls[f"{RECALL} {recording.name}"] = recall_at_1(descriptors, positions, recording.times, distance)
         return {RECALL: float(np.mean(list(recalls.values()))), **recalls}
 
     return score
@@ -276,16 +281,11 @@ def best_rate(
     report: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> float:
-    """Train with each of the three learning rates and return the one with the highest Recall@1.
+    """Train with each of the three learning rates of the method and return the one with the highest Recall@1.
 
-    The folder gets the trainings and `rates.json` with all scores. Finished trainings are not repeated. A rate whose
-    loss is not finite has no score. If scores are equal, the smaller rate is returned.
-
-    Each rate is trained for `seconds` with the options of `train_learned`.
-
-    Raises:
-      FloatingPointError: The loss is not finite with any rate.
-      Stopped: The search was asked to stop.
+    The folder `out` gets the trainings, of `seconds` each, and `rates.json` with all scores. Finished trainings are not
+    repeated. A rate whose loss is not finite has no score. If scores are equal, the smaller rate is returned.
+    `options` are those of `train_learned`. Raises FloatingPointError if no loss is finite, and `Stopped` after a stop.
     """
     recalls: dict[float, float | None] = {}
     for rate in method.recipe.learning_rates:

@@ -19,8 +19,8 @@ def load_preset(name: str) -> TrainConfig:
 
     Raises ValueError if the file does not exist or fails.
     """
-    candidates = [Path(name)] if name.endswith(".py") else [folder / f"{name}.py" for folder in _FOLDERS]
-    path = next((path for path in candidates if path.is_file()), None)
+    paths = [Path(name)] if name.endswith(".py") else [folder / f"{name}.py" for folder in _FOLDERS]
+    path = next((path for path in paths if path.is_file()), None)
     if path is None:
         raise ValueError(f"no preset {name!r}: expected a .py file or one of {', '.join(preset_names())}")
     try:

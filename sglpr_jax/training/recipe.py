@@ -1,4 +1,4 @@
-"""A whole training run in one call, from recordings to weights. `bin/train` adds only the final test."""
+"""A whole training in one call, from recordings to weights. `bin/train` adds only the final test."""
 
 import contextlib
 import dataclasses
@@ -17,12 +17,12 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import graft, without_whitening
 from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.training.batch_source import TupleBatches, batches_of
+from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.batches import positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.checkpoint import CHECKPOINTS, checkpoint_steps
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
-from sglpr_jax.training.devices import data_mesh, is_first_host, on_all_hosts, own_copy
+from sglpr_jax.training.devices import data_mesh, host_copy, is_first_host, on_all_hosts
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
 from sglpr_jax.training.run_folder import lock_run
@@ -33,7 +33,7 @@ from sglpr_jax.training.validation import describe_places, training_recall, vali
 
 WEIGHTS = "weights"
 LIMITS = ("config.steps",)
-"""Settings that may differ in a resumed run."""
+"""Settings that may differ when a run is resumed."""
 
 ScoreFn = Callable[[Params], dict[str, float]]
 """Scores weights."""
@@ -62,10 +62,8 @@ class TrainResult:
         lines = [f"{self.folder}: {self.steps} of {self.config.steps} steps, weights in {self.folder / WEIGHTS}"]
         if self.throughput is not None:
             steps, waiting = self.throughput.steps_per_second, self.throughput.data_wait
-            lines.append(
-                f"{steps:.3g} steps/s, {steps * self.config.tuples:.3g} tuples/s, "
-                f"{waiting:.1%} of the time waiting for data"
-            )
+            speed = f"{steps:.3g} steps/s, {steps * self.config.tuples:.3g} tuples/s"
+            lines.append(f"{speed}, {waiting:.1%} of the time waiting for data")
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -123,36 +121,37 @@ def train(
     if config.loss.segmentation_alone and weights is None and not resume:
         raise ValueError("loss.segmentation_alone trains no descriptors: expected weights to begin with, found none")
     if settings is None:
-        names = {
-            key: [recording.name for recording in group] for key, group in (("recordings", recordings), ("also", also))
+        settings = {
+            "recordings": [recording.name for recording in recordings],
+            "also": [recording.name for recording in also],
+            "test": None if test is None else test.name,
         }
-        settings = {**names, "test": None if test is None else test.name}
-    with contextlib.ExitStack() as opened:
-        follower = opened.enter_context(contextlib.closing(callback if callback and is_first_host() else Callback()))
+    with contextlib.ExitStack() as exit_stack:
+        host_callback = callback if callback and is_first_host() else Callback()
+        exit_stack.enter_context(contextlib.closing(host_callback))
         recordings, also = on_all_hosts(
-            lambda: (_packed(recordings, cache, follower, stopped), _packed(also, cache, follower, stopped))
+            lambda: [_packed(group, cache, host_callback, stopped) for group in (recordings, also)]
         )
-        source, score = _source_and_score(recordings, also, config, folder)
+        source, score = _batches_and_score(recordings, also, config, folder)
         last_step = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
-        start_from = None if weights is None or last_step else _grafted(weights, config)
+        start_from = None if weights is None or last_step else _initial_weights(weights, config)
         if config.steps < last_step:
-            raise ValueError(
-                f"{folder}: expected at least the {last_step} steps that are already done, found {config.steps}"
-            )
+            expected = f"at least the {last_step} steps that are already done"
+            raise ValueError(f"{folder}: expected {expected}, found {config.steps}")
         lock = lock_run(folder, run_settings(config, settings), seed=config.seed, resume=resume, limits=LIMITS)
-        on_all_hosts(lambda: is_first_host() and opened.enter_context(lock))
-        options = {"start_from": start_from, "resume": resume, "callback": follower, "stopped": stopped}
+        on_all_hosts(lambda: is_first_host() and exit_stack.enter_context(lock))
+        options = {"start_from": start_from, "resume": resume, "callback": host_callback, "stopped": stopped}
         state = run_network(config, source, folder, score=score, **options).state
-        steps, params, speed = int(state.step), own_copy(state.params), None
+        steps, params, speed = int(state.step), host_copy(state.params), None
         if is_first_host():
             save(params, folder / WEIGHTS)
             speed = throughput(read_metrics(folder / METRICS_FILE))
-        follower.on_end(steps)
+        host_callback.on_end(steps)
     return TrainResult(params, folder, steps, config, speed)
 
 
 def run_settings(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a run's config.json."""
+    """Return the content of config.json in the folder of a run."""
     return {**settings, "config": dataclasses.asdict(config)}
 
 
@@ -167,9 +166,9 @@ def run_network(
     callback: Callback | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Trained:
-    """Train the network of a configuration with ready-made batches.
+    """Train the network of a configuration with the batches of `source`. The other arguments are those of `Trainer`.
 
-    Raises the errors of `Trainer`, and ValueError if the devices cannot share a step (`data_mesh`).
+    `data_mesh` raises ValueError if the devices cannot share a step.
     """
     network = ImageNetwork(config)
     trainer = Trainer(
@@ -178,7 +177,7 @@ def run_network(
         folder,
         Schedule(config.log_every, config.score_every, steps=config.steps),
         mesh=data_mesh(config),
-        begin=functools.partial(network.new_state, start_from),
+        first_state=functools.partial(network.new_state, start_from),
         score=lambda state: score(state.params),
         resume=resume,
         callback=callback,
@@ -186,10 +185,10 @@ def run_network(
     return trainer.train(stopped)
 
 
-def _source_and_score(
+def _batches_and_score(
     recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
 ) -> tuple[TupleBatches, ScoreFn]:
-    """Return the batches of the training places, and the score: on held-out places, if there are any."""
+    """Return batches of the training places, and a score, on held-out places or, without them, on training places."""
     splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
     pool = tuple_pool(recordings, config, frames=[training for training, _ in splits])
 
@@ -197,21 +196,21 @@ def _source_and_score(
         return describe_places(state.params, recordings, pool, places, np.zeros(len(places)), config)
 
     if config.validation.share:
-        score = validation_score(recordings, [held_out for _, held_out in splits], config)
+        score = validation_score(recordings, [validation for _, validation in splits], config)
     else:
         score = training_recall(recordings, pool, config)
-    return batches_of(recordings, pool, config, also=also, describe=describe, run=folder), score
+    return training_batches(recordings, pool, config, also=also, describe=describe, run=folder), score
 
 
 def _require_usable(
     config: TrainConfig, recordings: Sequence[Recording], also: Sequence[Recording], test: Recording | None
 ) -> None:
+    """Raise ValueError if the recordings do not fit the configuration. `also` are those of a second dataset."""
     if not recordings:
         raise ValueError("expected recordings to train on, found none")
-    if jax.process_count() > 1 and (also or config.sampling.mining != "none"):
-        raise ValueError(
-            f"mined negatives and a second dataset work on one host only, found {jax.process_count()} hosts"
-        )
+    hosts = jax.process_count()
+    if hosts > 1 and (also or config.sampling.mining != "none"):
+        raise ValueError(f"mined negatives and a second dataset work on one host only, found {hosts} hosts")
     if bool(also) != bool(config.also_tuples):
         raise ValueError(
             "also_tuples is the number of tuples per step from the second dataset: expected both or neither, "
@@ -224,7 +223,9 @@ def _require_usable(
             "loss.segmentation_alone trains on labels alone: expected labels beside some scans, "
             f"found none in {len(recordings) + len(also)} recording(s)"
         )
-    for recording in (*recordings, *also, *filter(None, (test,))) if config.model.categories_read else ():
+    if not config.model.categories_read:
+        return
+    for recording in (*recordings, *also, *([] if test is None else [test])):
         labelled = sum(recording.labelled)
         if labelled < len(recording):
             raise ValueError(
@@ -236,19 +237,19 @@ def _require_usable(
 def _packed(
     recordings: Sequence[Recording], cache: Path | None, callback: Callback, stopped: Callable[[], bool]
 ) -> Sequence[Recording]:
-    """Return the same recordings, read from packs in the folder `cache`. Missing packs are written first."""
+    """Return the recordings, each read from one file in the folder `cache`. Missing files are written first."""
     if cache is None:
         return recordings
 
-    def show(recording: Recording, done: int) -> None:
+    def report(recording: Recording, done: int) -> None:
         callback.on_pack(recording.name, done, len(recording))
         if stopped():
             raise KeyboardInterrupt
 
-    return [packed(recording, cache, on_progress=functools.partial(show, recording)) for recording in recordings]
+    return [packed(recording, cache, on_progress=functools.partial(report, recording)) for recording in recordings]
 
 
-def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:
+def _initial_weights(weights: Params | Path | str, config: TrainConfig) -> Params:
     """Return the weights with random values for missing ones, and with a whitening layer only if the model has one."""
     params = weights if isinstance(weights, Params) else load(weights)
     if config.loss.segmentation_alone and params.config.head.whiten and not config.model.head.whiten:

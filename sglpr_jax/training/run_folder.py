@@ -21,7 +21,7 @@ CONFIG_FILE = "config.json"
 ENVIRONMENT_FILE = "environment.json"
 PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy")
 REMOVED = {"config.select": "last"}
-"""Settings of earlier versions with the only value that runs have today."""
+"""Removed settings, which older runs still have in config.json, and the value that all runs have today."""
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
@@ -29,14 +29,9 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 def lock_run(
     folder: Path, settings: Mapping[str, Any], *, seed: int, resume: bool, limits: Collection[str] = ()
 ) -> Iterator[None]:
-    """Lock a run's folder while the block runs. Writes settings and environment, removes unfinished files.
+    """Lock the folder of a run during the block. First write settings and environment, and remove unfinished files.
 
-    Arguments:
-      folder: Folder of the run.
-      settings: Content of config.json.
-      seed: Seed of the run, for environment.json.
-      resume: Continue the run in the folder.
-      limits: Settings that may differ in a resumed run, such as `config.steps`.
+    With `resume`, the folder must have a run with these settings, except for `limits` such as `config.steps`.
 
     Raises:
       FileExistsError: The folder already has a run, and `resume` is false.
@@ -66,29 +61,31 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], *, limits: 
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a run to resume, found none")
-    different = sorted(_differences(read_json(path), _as_json(settings)) - set(limits))
+    different = sorted(_different_settings(read_json(path), _as_json(settings)) - set(limits))
     if different:
         raise ValueError(f"{path}: expected the settings of the run to resume, found others: {', '.join(different)}")
 
 
 def _as_json(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings as they would be read from a JSON file: lists instead of tuples, texts instead of paths."""
     return json.loads(json.dumps(settings, default=str))
 
 
-def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
-    if not (isinstance(a, dict) and isinstance(b, dict)):
-        return set() if a == b else {prefix.removesuffix(".")}
-    return {
-        name
-        for key in a.keys() | b.keys()
-        for name in _differences(a.get(key), b.get(key, REMOVED.get(prefix + key)), f"{prefix}{key}.")
-    }
+def _different_settings(old: Any, new: Any, name: str = "") -> set[str]:
+    """Return the dotted names (`config.loss.margin`) of the settings that differ. `name` is that of the two values."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return set() if old == new else {name}
+    different: set[str] = set()
+    for key in old.keys() | new.keys():
+        key_name = f"{name}.{key}" if name else key
+        different |= _different_settings(old.get(key), new.get(key, REMOVED.get(key_name)), key_name)
+    return different
 
 
 def note_environment(folder: Path, *, seed: int) -> None:
     """Write the environment of a run into its folder. A resumed run appends its environment under `resumes`."""
     path = folder / ENVIRONMENT_FILE
-    now = {
+    environment = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": shlex.join(sys.argv),
         "git": git_commit(_CHECKOUT),
@@ -105,24 +102,24 @@ def note_environment(folder: Path, *, seed: int) -> None:
         "seed": seed,
     }
     if not path.exists():
-        write_json(path, now | {"resumes": []})
+        write_json(path, environment | {"resumes": []})
         return
-    begun = read_json(path)
-    if not isinstance(begun, dict) or not isinstance(begun.get("resumes"), list):
-        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {begun!r:.60}")
-    write_json(path, begun | {"resumes": [*begun["resumes"], now]})
+    first = read_json(path)
+    if not isinstance(first, dict) or not isinstance(first.get("resumes"), list):
+        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {first!r:.60}")
+    write_json(path, first | {"resumes": [*first["resumes"], environment]})
 
 
 def git_commit(checkout: Path) -> dict[str, Any] | None:
-    """Return the commit of a checkout and whether its files differ from it, or None without a checkout or git."""
+    """Return the commit of a Git checkout and whether its files differ (`dirty`). None without Git or a checkout."""
     if not (checkout / ".git").exists():
         return None
 
-    def git(*arguments: str) -> str:
+    def run_git(*arguments: str) -> str:
         command = ["git", "-C", str(checkout), *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout.strip()
 
     try:
-        return {"commit": git("rev-parse", "HEAD"), "dirty": bool(git("status", "--porcelain"))}
+        return {"commit": run_git("rev-parse", "HEAD"), "dirty": bool(run_git("status", "--porcelain"))}
     except (OSError, subprocess.SubprocessError):
         return None

@@ -8,7 +8,7 @@ import jax
 import optax
 from jaxtyping import Array, Float
 
-from sglpr_jax.training.devices import keep_placed
+from sglpr_jax.training.devices import keep_sharding
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -35,12 +35,12 @@ class Gradient(NamedTuple):
     statistics: Any
     """New `TrainState.statistics`."""
     metrics: Metrics
-    """The loss, and measurements beside it."""
+    """The loss and other measurements, by name."""
 
 
 @runtime_checkable
 class PlaceNetwork(Protocol):
-    """A network with its loss and its optimiser. It is hashable: a compiled step belongs to one network."""
+    """A network with its loss and its optimiser. It must be hashable: `train_step` is compiled for each network."""
 
     @property
     def seed(self) -> int:
@@ -68,11 +68,14 @@ class PlaceNetwork(Protocol):
 
 @functools.partial(jax.jit, static_argnames="network", donate_argnames="state")
 def train_step(state: TrainState, batch: Any, *, network: PlaceNetwork) -> tuple[TrainState, Metrics]:
-    """Make one step. The metrics are those of the loss, and the norms of gradient, update and weights."""
+    """Return the next state, and the metrics: those of the loss, and the norms of gradient, update and weights.
+
+    The arrays of `state` are reused for the new state, so the caller must not use them afterwards.
+    """
     key = jax.random.fold_in(jax.random.key(network.seed), state.step)
     gradient, statistics, metrics = network.gradient(state, batch, key)
     updates, optimizer = network.optimizer.update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, updates)
     norms = {"gradient_norm": gradient, "update_norm": updates, "weight_norm": params}
     metrics = metrics | {name: optax.tree.norm(tree) for name, tree in norms.items()}
-    return keep_placed(TrainState(state.step + 1, params, optimizer, statistics)), metrics
+    return keep_sharding(TrainState(state.step + 1, params, optimizer, statistics)), metrics

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from sglpr_jax.training.batch_source import TupleBatches, batches_in_order
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.checkpoint import CHECKPOINTS, Checkpoints
-from sglpr_jax.training.devices import is_first_host, on_all_hosts, on_any_host, own_copy, replicate, split
+from sglpr_jax.training.devices import any_host, host_copy, is_first_host, on_all_hosts, replicate, split_over_devices
 from sglpr_jax.training.metrics_log import MetricsLog
 from sglpr_jax.training.step import PlaceNetwork, TrainState, train_step
 
@@ -43,37 +43,34 @@ class Schedule:
     first_snapshot: int = 0
     """Number of images at the first snapshot, which is scored, too. Each further one has twice as many. 0: none."""
     save_every_s: float = math.inf
-    """Training time between two checkpoints in seconds, beside those of the scores."""
+    """Training time in seconds after which a checkpoint is written. One is also written with each score."""
     steps: int = sys.maxsize
     images: int = sys.maxsize
     seconds: float = math.inf
     """Limits of the run. The first one that is reached ends it."""
     costs: bool = False
-    """State images and seconds in every line of the metrics and of the scores, which then have a file of their own."""
+    """Write images and seconds of `Trained` in every line of metrics and scores, and scores to a file of their own."""
 
     def is_over(self, run: Trained) -> bool:
         """Whether a limit is reached."""
         return int(run.state.step) >= self.steps or run.images >= self.images or run.seconds >= self.seconds
 
-    def is_scored(self, before: Trained, run: Trained) -> bool:
-        """Whether a score and a checkpoint follow the step between two states."""
-        due = int(run.state.step) % self.score_every == 0 or any(self.snapshots(before, run))
-        return due or self.is_over(run)
+    def is_scored(self, before: Trained, after: Trained) -> bool:
+        """Whether a score and a checkpoint follow the step from `before` to `after`."""
+        is_regular = int(after.state.step) % self.score_every == 0
+        return is_regular or any(self.snapshots(before, after)) or self.is_over(after)
 
-    def snapshots(self, before: Trained, run: Trained) -> Iterator[int]:
-        """Yield the numbers of images at which snapshots became due in the step between two states."""
-        due = self.first_snapshot
-        while 0 < due <= run.images:
-            if due > before.images:
-                yield due
-            due *= 2
+    def snapshots(self, before: Trained, after: Trained) -> Iterator[int]:
+        """Yield the numbers of images of the snapshots that became due in the step from `before` to `after`."""
+        snapshot = self.first_snapshot
+        while 0 < snapshot <= after.images:
+            if snapshot > before.images:
+                yield snapshot
+            snapshot *= 2
 
 
 class Trainer:
-    """A run in progress: its state, its open files, and the measurements since the last line of the metrics.
-
-    A stop between two lines saves the measurements since then, so the lines are those of an uninterrupted run.
-    """
+    """A run in progress. A resumed run continues with the weights and the lines of the log of an uninterrupted one."""
 
     def __init__(
         self,
@@ -83,25 +80,21 @@ class Trainer:
         schedule: Schedule,
         *,
         mesh: Mesh,
-        begin: Callable[[], TrainState],
+        first_state: Callable[[], TrainState],
         score: Callable[[TrainState], Mapping[str, float]],
         save_snapshot: Callable[[Trained, int], object] = lambda run, images: None,
         resume: bool = False,
         callback: Callback | None = None,
     ):
-        """Open a run.
+        """Open a run in a folder, for metrics and checkpoints.
 
         Arguments:
-          network: Network to train.
           source: Source of this host's part of each batch.
-          folder: Folder for metrics and checkpoints.
-          schedule: Limits, and moments of measurements, scores and checkpoints.
           mesh: Devices, which share a step.
-          begin: Returns the state of a new run.
-          score: Scores the weights, on the first host.
-          save_snapshot: Saves the weights of a snapshot, whose number of images it receives.
+          first_state: Returns the state of a new run.
+          score: Scores the weights of a state. Only the first host calls it.
+          save_snapshot: `(run, images)`: saves the weights of the snapshot with this number of images.
           resume: Continue from the newest checkpoint, if there is one.
-          callback: Receives the measurements.
         """
         self._network, self._source, self._schedule, self._mesh = network, source, schedule, mesh
         self._compute_score, self._save_snapshot = score, save_snapshot
@@ -110,112 +103,120 @@ class Trainer:
         if resume and self._checkpoints.latest_step is not None:
             state, about = self._checkpoints.restore(jax.eval_shape(network.new_state))
         else:
-            state, about = begin(), {}
+            state, about = first_state(), {}
         self._run = Trained(replicate(state, mesh), about.get("images", 0), about.get("seconds", 0.0))
-        self._unlogged: list[dict[str, float]] = about.get("unlogged", [])
-        self._saved_s, self._compiled = self._run.seconds, False
-        start, self._scores_file = int(state.step), SCORES_FILE if schedule.costs else METRICS_FILE
-        names = {METRICS_FILE, self._scores_file} if is_first_host() else set()
-        self._logs = {name: MetricsLog(folder / name, start_step=start) for name in names}
+        self._unlogged_metrics: list[dict[str, float]] = about.get("unlogged", [])
+        """Metrics of each step since the last line of the log. Checkpoints store them, too."""
+        self._last_checkpoint_s = self._run.seconds
+        self._has_logged = False
+        """Whether this process has logged a line. Until then, its time includes the compilation of the step."""
+        start = int(state.step)
+        self._scores_file = SCORES_FILE if schedule.costs else METRICS_FILE
+        log_files = {METRICS_FILE, self._scores_file} if is_first_host() else set()
+        self._logs = {name: MetricsLog(folder / name, start_step=start) for name in log_files}
         self._batches = batches_in_order(
             source,
-            lambda: own_copy(self._run.state),
+            lambda: host_copy(self._run.state),
             start=start,
             stop=schedule.steps,
-            place=lambda batch: split(batch, mesh),
+            to_devices=lambda batch: split_over_devices(batch, mesh),
         )
         self._callback.on_start(start, schedule.steps)
 
     def train(self, stopped: Callable[[], bool] = lambda: False) -> Trained:
         """Train until a limit of the schedule is reached or `stopped()`, asked after every step, returns true.
 
-        Writes what is due after each step and a checkpoint at the end, and closes the files.
+        Writes measurements, scores and checkpoints by the schedule and a checkpoint at the end, and closes the files.
 
-        Raises:
-          FloatingPointError: The loss is not finite. The message names the step and the places of its batch.
-          OSError: Metrics or a checkpoint cannot be written.
+        Raises FloatingPointError, with the step and the scans of its batch, if the loss is not finite, and OSError if a
+        file cannot be written.
         """
         try:
-            self._start_clock()
-            stop = False
-            while not self._schedule.is_over(self._run) and not stop:
+            self._restart_clock()
+            is_stopped = False
+            while not self._schedule.is_over(self._run) and not is_stopped:
                 before = self._run
                 self._step()
-                stop = on_any_host(stopped())
+                is_stopped = any_host(stopped())
                 self._require_finite()
                 self._write_due(before)
-            self._save()
+            self._save_checkpoint()
         finally:
             self._batches.close()
             for log in self._logs.values():
                 log.close()
         return self._run
 
-    def _start_clock(self) -> None:
-        self._since, self._waited, self._steps = time.perf_counter(), 0.0, 0
+    def _restart_clock(self) -> None:
+        """Begin to measure the speed for the next line of the log."""
+        self._clock_start_s, self._waited_s, self._clocked_steps = time.perf_counter(), 0.0, 0
 
     def _step(self) -> None:
-        begun = time.perf_counter()
+        """Make one step and add its metrics, images and seconds. The first step of a process compiles: 0 seconds."""
+        step_start_s = time.perf_counter()
         batch = on_all_hosts(lambda: next(self._batches))
-        self._waited += time.perf_counter() - begun
+        self._waited_s += time.perf_counter() - step_start_s
         with jax.set_mesh(self._mesh):
             state, metrics = train_step(self._run.state, batch, network=self._network)
-        self._unlogged.append({name: float(value) for name, value in jax.device_get(metrics).items()})
-        spent = time.perf_counter() - begun if self._compiled or self._steps else 0.0
-        self._run = Trained(state, self._run.images + self._network.images, self._run.seconds + spent)
-        self._steps += 1
+        self._unlogged_metrics.append({name: float(value) for name, value in jax.device_get(metrics).items()})
+        is_first_step = not self._has_logged and self._clocked_steps == 0
+        step_s = 0.0 if is_first_step else time.perf_counter() - step_start_s
+        self._run = Trained(state, self._run.images + self._network.images, self._run.seconds + step_s)
+        self._clocked_steps += 1
 
     def _write_due(self, before: Trained) -> None:
         """Write the measurements, scores, snapshots and checkpoints that are due after the step since `before`."""
         schedule, step = self._schedule, int(self._run.state.step)
-        scored = schedule.is_scored(before, self._run)
-        if step % schedule.log_every == 0 or scored:
-            self._measure(step)
-        if scored:
+        is_scored = schedule.is_scored(before, self._run)
+        if step % schedule.log_every == 0 or is_scored:
+            self._log_metrics(step)
+        if is_scored:
             for images in schedule.snapshots(before, self._run):
                 self._save_snapshot(self._run, images)
             state = self._run.state
-            scores = on_all_hosts(lambda: self._compute_score(own_copy(state)) if is_first_host() else {})
+            scores = on_all_hosts(lambda: self._compute_score(host_copy(state)) if is_first_host() else {})
             if scores:
                 self._callback.on_score(step, self._log(self._scores_file, scores))
-            self._save()
+            self._save_checkpoint()
             self._callback.on_checkpoint(step)
-        elif self._run.seconds >= self._saved_s + schedule.save_every_s:
-            self._save()
-        if not self._unlogged:
-            self._start_clock()
+        elif self._run.seconds >= self._last_checkpoint_s + schedule.save_every_s:
+            self._save_checkpoint()
+        if not self._unlogged_metrics:  # a line was logged
+            self._restart_clock()
 
-    def _measure(self, step: int) -> None:
+    def _log_metrics(self, step: int) -> None:
         """Log the means since the last line. The first line of a process has no speed: its first step compiles."""
-        seconds = time.perf_counter() - self._since
-        values = {name: float(np.mean([metrics[name] for metrics in self._unlogged])) for name in self._unlogged[-1]}
-        if self._compiled:
-            values |= {"steps_per_second": self._steps / seconds, "data_wait": self._waited / seconds}
-        self._unlogged.clear()
-        self._compiled = True
+        seconds = time.perf_counter() - self._clock_start_s
+        names = self._unlogged_metrics[-1]
+        values = {name: float(np.mean([metrics[name] for metrics in self._unlogged_metrics])) for name in names}
+        if self._has_logged:
+            values |= {"steps_per_second": self._clocked_steps / seconds, "data_wait": self._waited_s / seconds}
+        self._unlogged_metrics.clear()
+        self._has_logged = True
         self._callback.on_step(step, self._log(METRICS_FILE, values))
 
-    def _log(self, name: str, values: Mapping[str, float]) -> dict[str, float]:
+    def _log(self, file: str, values: Mapping[str, float]) -> dict[str, float]:
+        """Append values, and the costs of the run if the schedule asks for them, to a log. Returns what is logged."""
         costs = {"images": float(self._run.images), "seconds": round(self._run.seconds, 3)}
-        measured = {**(costs if self._schedule.costs else {}), **values}
-        if name in self._logs:
-            self._logs[name].append(int(self._run.state.step), measured)
-        return measured
+        logged = {**costs, **values} if self._schedule.costs else dict(values)
+        if file in self._logs:  # only on the first host
+            self._logs[file].append(int(self._run.state.step), logged)
+        return logged
 
-    def _save(self) -> None:
-        """Write a checkpoint, which must not be ahead of the logs."""
+    def _save_checkpoint(self) -> None:
+        """Flush the logs to disk, because a checkpoint must not be ahead of them, and write a checkpoint."""
         for log in self._logs.values():
             log.sync()
-        about = {"unlogged": self._unlogged, "images": self._run.images, "seconds": self._run.seconds}
-        self._checkpoints.save(own_copy(self._run.state), about)
-        self._saved_s = self._run.seconds
+        about = {"unlogged": self._unlogged_metrics, "images": self._run.images, "seconds": self._run.seconds}
+        self._checkpoints.save(host_copy(self._run.state), about)
+        self._last_checkpoint_s = self._run.seconds
 
     def _require_finite(self) -> None:
+        """Raise FloatingPointError if a metric of the last step is not finite."""
         step = int(self._run.state.step)
-        broken = [name for name, value in self._unlogged[-1].items() if not math.isfinite(value)]
+        broken = [name for name, value in self._unlogged_metrics[-1].items() if not math.isfinite(value)]
         if broken:
-            places = self._source.places(step - 1)
-            batch = f" (batch: {places})" if places else ""
-            raise FloatingPointError(
-                f"step {step}: {', '.join(broken)} not finite{batch}; the last checkpoint is intact"
-            )
+            scan_names = self._source.scan_names(step - 1)
+            batch = f" (batch: {scan_names})" if scan_names else ""
+            names = ", ".join(broken)
+            raise FloatingPointError(f"step {step}: {names} not finite{batch}; the last checkpoint is intact")

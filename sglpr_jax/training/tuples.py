@@ -1,4 +1,4 @@
-"""Draws training tuples: 1 anchor, k_p positives of the same place, k_n negatives of other places; holds out places."""
+"""Training tuples: an anchor, k_p positives near it and k_n negatives far from it. Held-out parts of recordings."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,24 +15,28 @@ from sglpr_jax.training.mining import DescriptorCache
 
 @dataclasses.dataclass(frozen=True)
 class Positives:
-    """Positives of every frame of the pool, as slices of one flat array."""
+    """Positives of all places of a pool. Those of place i are `places[starts[i] : starts[i + 1]]`."""
 
-    frames: Int[np.ndarray, "pairs"]
+    places: Int[np.ndarray, "pairs"]
     starts: Int[np.ndarray, "bounds"]
 
     @property
     def anchors(self) -> Int[np.ndarray, "anchors"]:
-        """Frames with at least one positive."""
+        """Places with at least one positive."""
         return np.flatnonzero(np.diff(self.starts))
 
     def draw(self, rng: np.random.Generator, anchor: int, size: int) -> Int[np.ndarray, "size"]:
         """Draw positives of `anchor`, without repetition if there are enough."""
-        choices = self.frames[self.starts[anchor] : self.starts[anchor + 1]]
-        return rng.choice(choices, size, replace=len(choices) < size)
+        positives = self.places[self.starts[anchor] : self.starts[anchor + 1]]
+        return rng.choice(positives, size, replace=len(positives) < size)
 
 
 class TuplePool:
-    """All frames of several recordings, numbered consecutively, and the tuples that can be drawn from them."""
+    """The places of a training, and the tuples that can be drawn from them.
+
+    Every frame of several recordings is one place. Places are numbered from 0, recording after recording. Place i is
+    frame `frame_of[i]` of recording `recording_of[i]`, at `positions[i]` in metres.
+    """
 
     def __init__(
         self,
@@ -41,109 +45,114 @@ class TuplePool:
         *,
         frames: Sequence[Int[np.ndarray, "_"]] | None = None,
     ):
-        """Number the frames and find their positives.
+        """Number the places and find their positives. Raises ValueError if no place has a positive.
 
-        Arguments:
-          positions: Positions of each recording, in metres.
-          config: Configuration of the tuples.
-          frames: Frames of each recording to use, or None for all.
-
-        Raises:
-          ValueError: If no frame has a positive.
+        `positions` has those of each recording, in metres, and `frames` the frames to use of each one (default: all).
         """
         self.config = config
-        frames = [np.arange(len(p)) for p in positions] if frames is None else frames
-        self.positions = np.concatenate([places[rows] for places, rows in zip(positions, frames, strict=True)])
-        self.recording = np.repeat(np.arange(len(positions)), [len(rows) for rows in frames])
-        self.frame = np.concatenate(frames)
-        pairs = np.concatenate([self._pairs_within(d) for d in range(len(positions))])
-        same_visit = np.abs(self.frame[pairs[:, 0]] - self.frame[pairs[:, 1]]) <= config.revisit_gap
-        self.neighbours = self._group(pairs[same_visit])
-        self.revisits = self._group(pairs[~same_visit])
+        frames = [np.arange(len(recording)) for recording in positions] if frames is None else frames
+        self.positions = np.concatenate([recording[rows] for recording, rows in zip(positions, frames, strict=True)])
+        self.recording_of = np.repeat(np.arange(len(positions)), [len(rows) for rows in frames])
+        self.frame_of = np.concatenate(frames)
+        pairs = np.concatenate([self._positive_pairs(recording) for recording in range(len(positions))])
+        same_visit = np.abs(self.frame_of[pairs[:, 0]] - self.frame_of[pairs[:, 1]]) <= config.revisit_gap
+        self.neighbours = self._positives_by_anchor(pairs[same_visit])
+        self.revisits = self._positives_by_anchor(pairs[~same_visit])
         if not len(pairs):
             raise ValueError(f"expected frames within {config.positive_m} m of each other as positives, found none")
 
     def __len__(self) -> int:
-        return len(self.frame)
+        return len(self.frame_of)
 
     def draw(
         self, *, seed: int, step: int, tuples: int, cache: DescriptorCache | None = None
     ) -> Int[np.ndarray, "{tuples} k"]:
-        """Draw the frame numbers of one batch, with one row (anchor, positives, negatives) per tuple.
+        """Draw the place numbers of one batch, with one row (anchor, positives, negatives) per tuple.
 
         The result is a pure function of the arguments. With a cache, anchors are among its places, and negatives and
-        clusters are mined.
-
-        Raises:
-          ValueError: If an anchor has no negatives.
+        the anchors of a cluster have similar descriptors. Raises ValueError if an anchor has no negatives.
         """
         rng = np.random.default_rng([seed, step])
-        rows: list[list[int]] = []
+        anchors_and_positives: list[list[int]] = []
         for i in range(tuples):
-            cluster = [anchor for anchor, *_ in rows[i - i % self.config.cluster :]]
-            rows.append(self._draw_anchored(rng, cluster, cache))
-        return np.array([[*row, *self._draw_negatives(rng, row[0], cache)] for row in rows])
+            cluster_start = i - i % self.config.cluster
+            cluster = [anchor for anchor, *_ in anchors_and_positives[cluster_start:]]
+            anchors_and_positives.append(self._draw_anchor_and_positives(rng, cluster, cache))
+        return np.array([[*row, *self._draw_negatives(rng, row[0], cache)] for row in anchors_and_positives])
 
     def draw_places(self, *, seed: int, step: int, tuples: int) -> Int[np.ndarray, "{tuples} k"]:
-        """Draw the same number of frames as `draw`, but at any places, and without repetition if there are enough."""
+        """Draw random places in the shape of `draw`. They repeat only if the pool has fewer places."""
         rng = np.random.default_rng([seed, step])
         shape = tuples, 1 + self.config.positives + self.config.negatives
         return rng.choice(len(self), shape, replace=bool(np.prod(shape) > len(self)))
 
-    def _draw_anchored(self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None) -> list[int]:
-        """Draw an anchor and its positives. `cluster` contains the earlier anchors of the same cluster."""
-        other_visit = rng.random() < self.config.revisit_fraction and len(self.revisits.anchors) > 0
-        source = self.revisits if other_visit or not len(self.neighbours.anchors) else self.neighbours
+    def _draw_anchor_and_positives(
+        self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None
+    ) -> list[int]:
+        """Draw an anchor and its positives, either of other visits or of the same visit (`config.revisit_fraction`).
+
+        `cluster` contains the earlier anchors of the same cluster. The new anchor is near the first of them or, with a
+        cache of descriptors, similar to the first and far from all.
+        """
+        wants_revisit = rng.random() < self.config.revisit_fraction
+        prefers_revisits = wants_revisit and len(self.revisits.anchors) > 0
+        source = self.revisits if prefers_revisits or not len(self.neighbours.anchors) else self.neighbours
         anchors = source.anchors
         if cache is not None:
-            anchors = _unless_empty(np.intersect1d(anchors, cache.places), anchors)
+            anchors = _first_unless_empty(np.intersect1d(anchors, cache.places), anchors)
         if cluster and cache is None:
-            anchors = _unless_empty(anchors[self._within(cluster[0], anchors, self.config.cluster_m)], anchors)
-        elif cluster and cache is not None:  # similar to the first anchor and far from all
-            far = self.far_apart(np.array(cluster)[:, None], anchors[None]).all(0)
-            anchors = _unless_empty(cache.nearest(cluster[0], anchors[far], self.config.hardest), anchors)
+            near_cluster = anchors[self._are_within(cluster[0], anchors, self.config.cluster_m)]
+            anchors = _first_unless_empty(near_cluster, anchors)
+        elif cluster and cache is not None:
+            far_from_cluster = anchors[self.far_apart(np.array(cluster)[:, None], anchors[None]).all(0)]
+            similar_to_first = cache.nearest(cluster[0], far_from_cluster, self.config.hardest)
+            anchors = _first_unless_empty(similar_to_first, anchors)
         anchor = int(rng.choice(anchors))
         return [anchor, *source.draw(rng, anchor, self.config.positives).tolist()]
 
     def _draw_negatives(
         self, rng: np.random.Generator, anchor: int, cache: DescriptorCache | None
     ) -> Int[np.ndarray, "{self.config.negatives}"]:
-        choices = np.flatnonzero(self.far_apart(np.array(anchor), np.arange(len(self))))
+        """Draw places far from the anchor. With a cache, only those whose descriptors are most similar to its own."""
+        candidates = np.flatnonzero(self.far_apart(np.array(anchor), np.arange(len(self))))
         size = self.config.negatives
-        if size and not len(choices):
+        if size and not len(candidates):
             raise ValueError(f"no frame lies farther than {self.config.negative_m} m from frame {anchor} of the pool")
         if cache is not None:
-            choices = _unless_empty(cache.nearest(anchor, choices, self.config.hardest), choices)
-        return rng.choice(choices, size, replace=len(choices) < size)
+            candidates = _first_unless_empty(cache.nearest(anchor, candidates, self.config.hardest), candidates)
+        return rng.choice(candidates, size, replace=len(candidates) < size)
 
     def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
-        """Return whether two frames show different places: in different recordings, or beyond the negative distance."""
-        return ~self._within(a, b, self.config.negative_m)
+        """Return whether places a and b are in different recordings or farther apart than the negative distance."""
+        return ~self._are_within(a, b, self.config.negative_m)
 
-    def distances_from_anchors(self, frames: Int[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
-        """Return the horizontal distance of each place from the anchor of its tuple, in metres. Infinite between
-        recordings."""
-        offset = self.positions[frames, :2] - self.positions[frames[:, :1], :2]
-        same = self.recording[frames] == self.recording[frames[:, :1]]
-        return np.where(same, np.hypot(offset[..., 0], offset[..., 1]), np.inf).astype(np.float32)
+    def distances_from_anchors(self, places: Int[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
+        """Return the horizontal distance of each place from its anchor, in metres. Infinite between recordings."""
+        anchors = places[:, :1]
+        offset_m = self.positions[places, :2] - self.positions[anchors, :2]
+        same_recording = self.recording_of[places] == self.recording_of[anchors]
+        return np.where(same_recording, np.hypot(offset_m[..., 0], offset_m[..., 1]), np.inf).astype(np.float32)
 
-    def _within(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."], metres: float) -> np.ndarray:
-        """Whether two frames are in the same recording and at most this distance apart, in metres."""
-        offset = self.positions[a, :2] - self.positions[b, :2]
-        return (self.recording[a] == self.recording[b]) & (np.hypot(offset[..., 0], offset[..., 1]) <= metres)
+    def _are_within(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."], max_m: float) -> np.ndarray:
+        """Return whether places a and b are in one recording and at most this horizontal distance apart, in metres."""
+        offset_m = self.positions[a, :2] - self.positions[b, :2]
+        same_recording = self.recording_of[a] == self.recording_of[b]
+        return same_recording & (np.hypot(offset_m[..., 0], offset_m[..., 1]) <= max_m)
 
-    def _pairs_within(self, recording: int) -> Int[np.ndarray, "pairs 2"]:
-        members = np.flatnonzero(self.recording == recording)
-        pairs = close_pairs(self.positions[members, :2], closer_than_m=self.config.positive_m)
-        return members[np.concatenate([pairs, pairs[:, ::-1]])].reshape(-1, 2)
+    def _positive_pairs(self, recording: int) -> Int[np.ndarray, "pairs 2"]:
+        """Return all pairs (anchor, positive) of places of a recording. Each pair appears in both orders."""
+        places = np.flatnonzero(self.recording_of == recording)
+        pairs = close_pairs(self.positions[places, :2], closer_than_m=self.config.positive_m)
+        return places[np.concatenate([pairs, pairs[:, ::-1]])].reshape(-1, 2)
 
-    def _group(self, pairs: Int[np.ndarray, "pairs 2"]) -> Positives:
-        pairs = pairs[np.lexsort(pairs.T[::-1])]
-        return Positives(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(len(self.recording) + 1)))
+    def _positives_by_anchor(self, pairs: Int[np.ndarray, "pairs 2"]) -> Positives:
+        """Group pairs (anchor, positive) by anchor."""
+        pairs = pairs[np.lexsort(pairs.T[::-1])]  # by anchor, then by positive
+        return Positives(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(len(self) + 1)))
 
 
-def _unless_empty(wanted: Int[np.ndarray, "_"], otherwise: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
-    return wanted if len(wanted) else otherwise
+def _first_unless_empty(preferred: Int[np.ndarray, "_"], fallback: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
+    return preferred if len(preferred) else fallback
 
 
 def hold_out(
@@ -155,23 +164,24 @@ def hold_out(
     distance of all validation frames, so that no house is visible in both parts. Both distances are horizontal. The
     stretch is the first one whose fraction of the revisiting frames is nearest to its fraction of all frames.
     """
-    n = len(positions)
-    length = round(config.share * n)
-    if length == 0:
-        return np.arange(n), np.arange(0)
-    places = positions[:, :2]
-    pairs = close_pairs(places, closer_than_m=sampling.positive_m)
+    frames = np.arange(len(positions))
+    stretch_length = round(config.share * len(frames))
+    if stretch_length == 0:
+        return frames, frames[:0]
+    plane = positions[:, :2]
+    pairs = close_pairs(plane, closer_than_m=sampling.positive_m)
     revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
-    revisiting = np.isin(np.arange(n), revisits)
-    inside = np.convolve(revisiting, np.ones(length), mode="valid")
-    start = int(np.abs(inside - config.share * revisiting.sum()).argmin())
-    validation = _within(places, places[start : start + length], np.nextafter(sampling.positive_m, 0))
-    near = _within(places, places[validation], sampling.negative_m)
-    return np.flatnonzero(~near), np.flatnonzero(validation)
+    is_revisiting = np.isin(frames, revisits)
+    revisiting_by_start = np.convolve(is_revisiting, np.ones(stretch_length), mode="valid")
+    start = int(np.abs(revisiting_by_start - config.share * is_revisiting.sum()).argmin())
+    below_positive_m = np.nextafter(sampling.positive_m, 0)  # as `close_pairs`, which excludes the distance itself
+    in_validation = _is_near(plane, plane[start : start + stretch_length], below_positive_m)
+    near_validation = _is_near(plane, plane[in_validation], sampling.negative_m)
+    return np.flatnonzero(~near_validation), np.flatnonzero(in_validation)
 
 
-def _within(
-    places: Float[np.ndarray, "n 2"], centres: Float[np.ndarray, "m 2"], radius_m: float
+def _is_near(
+    positions: Float[np.ndarray, "n 2"], centres: Float[np.ndarray, "m 2"], radius_m: float
 ) -> Bool[np.ndarray, "n"]:
-    """Whether each place is at most this distance from one of the centres, in metres."""
-    return KDTree(centres).query(places)[0] <= radius_m
+    """Return whether each position is at most this distance from one of the centres, in metres."""
+    return KDTree(centres).query(positions)[0] <= radius_m

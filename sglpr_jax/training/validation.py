@@ -20,7 +20,7 @@ from sglpr_jax.training.tuples import TuplePool
 
 CHUNK = 16
 """Number of places that are described at a time."""
-PLACES = 192
+PAIRS = 192
 """Number of pairs of training places that are scored."""
 RECALL = "recall_at_1"
 """Name of the score on held-out recordings."""
@@ -36,22 +36,22 @@ def training_recall(
 ) -> Callable[[Params], dict[str, float]]:
     """Return a function that scores weights by Recall@1 among fixed places of the training recordings.
 
-    The places are pairs of an anchor and a positive, each rotated at random. A pair counts as found if the nearest of
-    all positive descriptors belongs to a place within the positive distance of the anchor. The score says little about
-    new places.
+    The places are pairs of an anchor and a positive, each rotated at random. An anchor counts as found if the most
+    similar of all positives is within the positive distance. The score says little about new places.
     """
-    frames = pool.draw(seed=_SEED, step=0, tuples=PLACES)[:, :2]
-    offset = pool.positions[frames[:, :1], :2] - pool.positions[None, frames[:, 1], :2]
-    same_recording = pool.recording[frames[:, :1]] == pool.recording[None, frames[:, 1]]
-    same_place = same_recording & (np.linalg.norm(offset, axis=-1) < pool.config.positive_m)
-    angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, frames.shape).astype(np.float32)
+    pairs = pool.draw(seed=_SEED, step=0, tuples=PAIRS)[:, :2]
+    anchors, positives = pairs[:, :1], pairs[None, :, 1]
+    offset_m = pool.positions[anchors, :2] - pool.positions[positives, :2]
+    same_recording = pool.recording_of[anchors] == pool.recording_of[positives]
+    is_match = same_recording & (np.linalg.norm(offset_m, axis=-1) < pool.config.positive_m)  # (anchor, positive)
+    angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, pairs.shape).astype(np.float32)
 
     def score(params: Params) -> dict[str, float]:
-        places, rotations = frames.reshape(-1), angles.reshape(-1) * config.rotate
+        places, rotations = pairs.reshape(-1), angles.reshape(-1) * config.rotate
         descriptors = describe_places(params, recordings, pool, places, rotations, config)
-        anchors, positives = descriptors.reshape(PLACES, 2, -1).transpose(1, 0, 2)
-        nearest = (anchors @ positives.T).argmax(1)
-        return {"score": float(same_place[np.arange(PLACES), nearest].mean())}
+        anchor_descriptors, positive_descriptors = descriptors.reshape(PAIRS, 2, -1).transpose(1, 0, 2)
+        nearest = (anchor_descriptors @ positive_descriptors.T).argmax(1)
+        return {"score": float(is_match[np.arange(PAIRS), nearest].mean())}
 
     return score
 
@@ -61,9 +61,9 @@ def validation_score(
 ) -> Callable[[Params], dict[str, float]]:
     """Return a function that scores weights by retrieval among the held-out `frames` of each recording.
 
-    Every frame is rotated at random and searches for its nearest descriptor among all others. `recall_neighbours`
-    counts any frame within the positive distance as found. If there are revisits, `recall_revisits` and `f1max` exclude
-    frames of the same visit, and "score" is their mean. Otherwise "score" is `recall_neighbours`.
+    Every frame is a query, rotated at random, and all other frames are its database. `recall_neighbours` is Recall@1
+    within the positive distance. If there are revisits, `recall_revisits` (Recall@1) and `f1max` exclude frames of the
+    same visit, and "score" is their mean. Otherwise "score" is `recall_neighbours`.
 
     Raises ValueError if no two held-out frames are within the positive distance.
     """
@@ -75,38 +75,40 @@ def validation_score(
 
     def score(params: Params) -> dict[str, float]:
         descriptors = describe_places(params, recordings, pool, np.arange(len(pool)), angles, config)
-        recall, _ = retrieval(descriptors, pool, gap=0)
+        neighbours, _ = recall_and_f1_max(descriptors, pool, gap=0)
         if not len(pool.revisits.anchors):
-            return {"score": recall, "recall_neighbours": recall}
-        revisits, f1_max = retrieval(descriptors, pool, gap=config.sampling.revisit_gap)
+            return {"score": neighbours, "recall_neighbours": neighbours}
+        revisits, f1_max = recall_and_f1_max(descriptors, pool, gap=config.sampling.revisit_gap)
         score = (revisits + f1_max) / 2
-        return {"score": score, "recall_neighbours": recall, "recall_revisits": revisits, "f1max": f1_max}
+        return {"score": score, "recall_neighbours": neighbours, "recall_revisits": revisits, "f1max": f1_max}
 
     return score
 
 
-def retrieval(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: int) -> tuple[float, float]:
-    """Return Recall@1 and top-1 F1max. Every frame searches other recordings and frames more than `gap` frames away.
+def recall_and_f1_max(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: int) -> tuple[float, float]:
+    """Return Recall@1 and top-1 F1max. Every place of the pool is a query, and `descriptors` are those of its places.
 
-    Recall@1 is the fraction found among the frames with a match. At least one frame must have a match. For F1max, the
-    nearest frame is accepted up to a threshold on the descriptor distance. It is right within the positive distance of
-    places and wrong beyond the negative one.
+    The database of a query has all places of other recordings, and those of its own more than `gap` frames away. A
+    match is in the same recording and within the positive distance. Recall@1 counts queries with a match; there must be
+    at least one. F1max accepts the nearest place up to a threshold on the descriptor distance: a match is right, a
+    place beyond the negative distance is wrong.
     """
     queries = np.arange(len(pool))
-    same_recording = pool.recording[:, None] == pool.recording[None]
-    same_visit = same_recording & (np.abs(pool.frame[:, None] - pool.frame[None]) <= gap)
+    same_recording = pool.recording_of[:, None] == pool.recording_of[None]
+    same_visit = same_recording & (np.abs(pool.frame_of[:, None] - pool.frame_of[None]) <= gap)
     distance_m = cdist(pool.positions[:, :2], pool.positions[:, :2])
-    matches = same_recording & ~same_visit & (distance_m < pool.config.positive_m)
+    is_match = same_recording & ~same_visit & (distance_m < pool.config.positive_m)  # (query, place)
     descriptor_distance = np.where(same_visit, np.inf, cdist(descriptors, descriptors))
     nearest = descriptor_distance.argmin(1)
-    is_match, has_match = matches[queries, nearest], matches.any(1)
+    nearest_is_match = is_match[queries, nearest]
+    has_match = is_match.any(1)
     curve = decision_curve(
         -descriptor_distance[queries, nearest],
-        true_if_accepted=is_match,
+        true_if_accepted=nearest_is_match,
         false_if_accepted=pool.far_apart(queries, nearest),
         missed_if_rejected=has_match,
     )
-    return float(is_match[has_match].mean()), curve.f1_max
+    return float(nearest_is_match[has_match].mean()), curve.f1_max
 
 
 def describe_places(
@@ -117,11 +119,11 @@ def describe_places(
     angles: Float[np.ndarray, "n"],
     config: TrainConfig,
 ) -> Float32[np.ndarray, "n d"]:
-    """Describe places of the training recordings, given as frame numbers of the pool, each rotated about z by its
-    angle in radians. Raises the errors of reading a scan."""
+    """Describe places of training recordings, given as numbers of the pool, after rotations about z in radians."""
     descriptors = []
     for start in range(0, len(places), CHUNK):
-        rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)  # the last batch is padded with its last place
+        # The last chunk repeats its last place, so that every chunk has one shape and compiles once.
+        rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)
         batch = read_batch(
             recordings,
             pool,
@@ -131,12 +133,12 @@ def describe_places(
             categories=config.model.categories_read,
             image=config.model.image,
         )
-        descriptors.append(np.asarray(_describe(params, batch, jnp.asarray(angles[rows], jnp.float32))))
+        descriptors.append(np.asarray(_describe_batch(params, batch, jnp.asarray(angles[rows], jnp.float32))))
     return np.concatenate(descriptors)[: len(places)].astype(np.float32)
 
 
 @jax.jit
-def _describe(params: Params, batch: Batch, angles: Float[Array, "b"]) -> Float[Array, "b d"]:
+def _describe_batch(params: Params, batch: Batch, angles: Float[Array, "b"]) -> Float[Array, "b d"]:
     return describe(params, *views(batch, angles, params.config.grid))
 
 
@@ -157,19 +159,17 @@ def recall_at_1(
 ) -> float:
     """Return the fraction of the revisits whose nearest descriptor, among frames older than 30 s, is within 5 m.
 
-    Arguments:
-      descriptors: Descriptor of each frame.
-      positions: Position of each frame in metres. Distances are horizontal.
-      times: Time of each frame in seconds. None: 290 frames replace 30 s.
-      distance: Distance between descriptors.
+    All frames are of one recording. `positions` are in metres, and distances between them are horizontal. `times` are
+    in seconds; without them, 290 frames replace 30 s (`revisits.database_end`). `distance` compares descriptors.
     """
-    places = positions[:, :2]
-    queries = np.flatnonzero(revisits(places, times=times, radius_m=FOUND_M))
-    ends = database_end(len(places), times=times)[queries]
+    plane = positions[:, :2]
+    queries = np.flatnonzero(revisits(plane, times=times, radius_m=FOUND_M))
+    database_ends = database_end(len(plane), times=times)[queries]
     hits = 0
     for start in range(0, len(queries), QUERIES):
-        rows, end = queries[start : start + QUERIES], ends[start : start + QUERIES]
-        distances = distance(descriptors[rows], descriptors[: end.max()])
-        nearest = np.where(np.arange(end.max())[None] < end[:, None], distances, np.inf).argmin(axis=1)
-        hits += int((np.linalg.norm(places[rows] - places[nearest], axis=1) <= FOUND_M).sum())
+        block, ends = queries[start : start + QUERIES], database_ends[start : start + QUERIES]
+        distances = distance(descriptors[block], descriptors[: ends.max()])
+        in_database = np.arange(ends.max())[None] < ends[:, None]  # (query, frame)
+        nearest = np.where(in_database, distances, np.inf).argmin(axis=1)
+        hits += int((np.linalg.norm(plane[block] - plane[nearest], axis=1) <= FOUND_M).sum())
     return hits / len(queries)

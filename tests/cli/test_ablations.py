@@ -1,4 +1,4 @@
-"""Settings of tables 4 to 7 and figure 9 are a few flags: they train, and their weights say what they are."""
+"""Settings of tables 4 to 7 and figure 9 are flags. Each setting trains, and its weights store the setting."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def run(town, preset, tmp_path, monkeypatch):
     return run
 
 
-def test_no_categories_are_the_triplet_alone():
+def test_without_categories_only_the_triplet_loss_remains():
     """Figure 9's 0, table 5's #1 and table 7's #1 are one network."""
     none, alone = (
         without_untrained_head(parse_command(TrainCommand, "train", flags.split()).config)

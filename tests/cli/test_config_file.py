@@ -1,4 +1,4 @@
-"""Values of flags survive a file: --dump-config prints them, --config reads them, and wrong files are one line."""
+"""--dump-config prints flag values that --config reads unchanged. Wrong files give an error of one line."""
 
 import json
 import re
@@ -121,7 +121,7 @@ def test_paths_that_are_not_utf_8_survive(tmp_path):
     assert parsed("segment", "--config", record_command(command, tmp_path)) == command
 
 
-def test_a_flag_reaches_the_backbone_of_the_preset_and_that_of_another_is_unknown():
+def test_a_flag_sets_the_backbone_of_the_preset_and_flags_of_other_backbones_are_unknown():
     swin = parsed("train", "--preset", "paper", "--model.backbone.window", "4").config.model
     assert (swin.backbone.kind, swin.backbone.window, swin.backbone.patch) == ("swin", 4, 4)
     ended = run_command("train", "--preset", "circular", "--model.backbone.window", "4")

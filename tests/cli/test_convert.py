@@ -1,4 +1,4 @@
-"""bin/convert: weights by PyTorch's names become a folder that bin/train begins with."""
+"""bin/convert turns PyTorch weights into a folder of initial weights for bin/train."""
 
 import jax
 import numpy as np
@@ -59,7 +59,7 @@ def written(path, weights):
     return path
 
 
-def test_swin_t_fills_what_it_fits_and_says_what_it_does_not(command, preset, state, tmp_path):
+def test_swin_t_fills_the_matching_layers_and_lists_the_unused_ones(command, preset, state, tmp_path):
     encoder = {name: value for name, value in state.items() if name.startswith(("patch_embed.", "layers.", "norm."))}
     file = written(tmp_path / "t.safetensors", {**encoder, "head.weight": np.zeros((10, 16), np.float32)})
     ended = command("convert", file, "--preset", preset, "--out", tmp_path / "start")

@@ -43,7 +43,7 @@ def test_a_store_gets_each_recording_once(command, scans, tmp_path):
     assert f"{name}: 12 places" in first.out and f"{name}: already there" in again.out
 
 
-def test_embedding_is_what_the_training_tested_and_twice_the_same(embed, trained, town):
+def test_embedding_repeats_the_descriptors_of_the_final_test(embed, trained, town):
     ended, first = embed("--weights", trained.folder, "--data", town, "--seq", "08")
     assert ended.status == 0, ended.error
     assert ended.out.strip() == f"{first}: 40 descriptors of 256 numbers, 0 scans skipped"
@@ -60,7 +60,7 @@ def test_embedding_is_what_the_training_tested_and_twice_the_same(embed, trained
     assert file.config["model"]["grid"]["resolution_m"] == 3.2
 
 
-def test_a_bad_scan_is_named_and_left_out_only_when_asked(embed, scans, tmp_path):
+def test_a_bad_scan_is_an_error_and_skipped_only_with_skip_bad(embed, scans, tmp_path):
     whole = load(embed("--method", "polar-fft", "--data", scans)[1])
     bad = scans / "000004.bin"
     bad.write_bytes(bad.read_bytes()[:100])

@@ -80,7 +80,7 @@ def test_every_protocol_is_printed_written_and_drawn_and_the_record_repeats_it(c
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(score, monkeypatch):
+def test_without_matplotlib_only_the_table_is_written_and_the_extra_is_named(score, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     ended, folder = score("08.npz", "--protocol", "top1-f1max")
     assert ended.status == 0 and "sglpr-jax[viz]" in ended.error

@@ -1,4 +1,4 @@
-"""bin/export writes what describes places; every tool takes its weights by name too."""
+"""bin/export writes weights that describe places, which all commands accept by name."""
 
 import dataclasses
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_exported_weights_embed_by_name_as_the_whole_ones_do(command, exported, 
     assert 0 < np.abs(found - whole).max() < 1e-2
 
 
-def test_float32_weights_with_the_head_are_those_of_before(command, weights, tmp_path):
+def test_an_export_in_float32_with_the_head_is_unchanged(command, weights, tmp_path):
     ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--keep-segmentation")
     assert ended.status == 0, ended.error
     for file in ("model.safetensors", "config.json"):
@@ -60,7 +60,7 @@ def test_a_program_is_written_in_place_of_weights(command, weights, tmp_path):
     assert files == {"describe.stablehlo", "config.json", "input.json"}
 
 
-def test_an_average_is_that_of_the_weights_named_with_and_without_the_head(command, weights, tmp_path):
+def test_average_is_the_mean_of_the_weights_with_and_without_the_head(command, weights, tmp_path):
     params = sglpr_jax.load(weights)
     doubled = dataclasses.replace(params, weights=jax.tree.map(lambda leaf: 2 * leaf, params.weights))
     other = sglpr_jax.save(doubled, tmp_path / "other")

@@ -1,4 +1,4 @@
-"""bin/live on a folder that grows: stopped in the middle, the next one goes on, and finds loops to the scans before."""
+"""bin/live on a growing folder: after a stop, the same command continues the map and finds loops to earlier scans."""
 
 import json
 import os
@@ -20,7 +20,7 @@ HALF, BEGIN, TIMEOUT_S = SCANS // 2, 1_700_000_000.25, 120
 
 
 @pytest.mark.slow
-def test_a_stopped_node_goes_on_with_its_map(town, tmp_path):
+def test_a_stopped_node_continues_its_map(town, tmp_path):
     recording, scans, lines = open_recording(town, "08"), tmp_path / "scans", tmp_path / "lines.txt"
     times = BEGIN + recording.times
     write_tum(tmp_path / "poses.tum", read_odometry(town / "sequences/08/poses.txt", format="kitti"), times)

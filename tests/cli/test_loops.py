@@ -23,7 +23,7 @@ def odometry(town) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_files_and_page_are_those_of_the_library(command, walk, tmp_path, monkeypatch):
+def test_bin_loops_writes_the_files_and_page_of_the_library(command, walk, tmp_path, monkeypatch):
     found, find_loops = [], search.find_loops
     monkeypatch.setattr(
         search, "find_loops", lambda *given, **options: found.append(find_loops(*given, **options)) or found[0]
@@ -56,7 +56,7 @@ def test_files_and_page_are_those_of_the_library(command, walk, tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, town, tmp_path, monkeypatch):
+def test_ctrl_c_writes_the_loops_found_until_then_without_odometry(command, town, tmp_path, monkeypatch):
     find_loops = search.find_loops
 
     def stopped(recording, params, *, should_stop, on_progress, **options):
@@ -106,7 +106,7 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
     assert [row["reason"] for row in rows] == ["repeats", "degenerate"]
 
 
-def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_path):
+def test_input_that_the_run_would_overwrite_is_refused(command, town, odometry, tmp_path):
     path = tmp_path / "found" / "trajectory-optimized.tum"
     write_tum(path, odometry, np.arange(float(SCANS)))
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry", path)
@@ -122,7 +122,7 @@ def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_
         ("images", True, [], False, "because they are ready-made images"),
     ],
 )
-def test_scans_are_registered_if_they_can_be(
+def test_scans_are_registered_if_possible(
     command, town, images, tmp_path, monkeypatch, layout, installed, flags, registered, said
 ):
     asked = []

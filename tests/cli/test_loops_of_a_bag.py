@@ -1,4 +1,4 @@
-"""The whole way of a new user: an mcap and odometry in, a graph out that is right and that other programs read."""
+"""From an mcap and odometry to a correct pose graph that other programs read."""
 
 from pathlib import Path
 

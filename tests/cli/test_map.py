@@ -76,9 +76,7 @@ def test_a_scan_of_the_map_finds_itself_in_it(command, scans, poses, run, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_stopped_map_of_a_name_that_is_taken_goes_on_and_ends_as_if_not_stopped(
-    command, poses, run, tmp_path, monkeypatch
-):
+def test_a_stopped_map_over_an_existing_file_continues_to_the_same_map(command, poses, run, tmp_path, monkeypatch):
     def stopped(recording, params, given, *, should_stop, on_progress, **options):
         def show(done):
             on_progress(done)
@@ -151,7 +149,7 @@ def test_wrong_queries_and_maps_are_one_clear_error(command, scans, places_file,
     assert not (tmp_path / "pose.json").exists()
 
 
-def test_a_frame_of_a_recording_is_asked_in_the_map(command, town, places_file, monkeypatch):
+def test_relocalize_reads_a_frame_of_a_recording(command, town, places_file, monkeypatch):
     """The scan, the mounting and the name are those of the recording."""
     asked = []
     monkeypatch.setattr(PlaceMap, "relocate", lambda self, params, scan, **options: asked.append(scan) or [])

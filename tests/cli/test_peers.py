@@ -50,7 +50,7 @@ def test_a_run_writes_its_settings_its_measurements_and_snapshots(run):
     assert about["method"] == "rinet" and about["images"] == 3072
 
 
-def test_a_finished_run_resumes_to_nothing_and_a_new_one_is_refused(run):
+def test_a_finished_run_resumes_without_steps_and_is_not_overwritten(run):
     before = read_metrics(run / "metrics.jsonl")
     again = ("peers", "train", "rinet", run.with_name("data"), "--out", run, "--images", 4000, "--learning-rate", 0.002)
     assert_one_line_error(run_command(*again), run, "there is a run already")

@@ -1,4 +1,4 @@
-"""Poses of other times or of more scans serve bin/embed and bin/evaluate as they do bin/loops and bin/map."""
+"""bin/embed and bin/evaluate accept poses at other times or of more scans, as bin/loops and bin/map do."""
 
 import json
 import shutil

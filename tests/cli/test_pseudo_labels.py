@@ -1,4 +1,4 @@
-"""Semantics from images: their own label images, those of a second dataset, and those that a model made."""
+"""Semantics from images: their own label images, those of a second dataset, and predicted ones."""
 
 import json
 
@@ -36,7 +36,7 @@ def steps_of(folder) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_maps_that_a_model_made_teach_beside_those_of_a_second_dataset(
+def test_pseudo_labels_and_labels_of_a_second_dataset_are_both_trained_on(
     command, images, labelled_images, trained, preset, tmp_path, labelled_places
 ):
     pseudo, out = tmp_path / "pseudo", tmp_path / "run"

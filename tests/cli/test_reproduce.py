@@ -38,7 +38,7 @@ def reproduced(town, preset, sessions, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_is_missing_is_trained_and_what_is_there_is_used_again(reproduced, command):
+def test_missing_runs_are_trained_and_finished_runs_are_reused(reproduced, command):
     folder, ended, options = reproduced
     assert "2 leave-one-out runs of 4 steps, 0 of them already trained" in ended.error
     assert "s a step" in ended.error and "run 2 of 2" in ended.error
@@ -51,7 +51,7 @@ def test_what_is_missing_is_trained_and_what_is_there_is_used_again(reproduced, 
 
 
 @pytest.mark.slow
-def test_tables_have_ours_and_the_papers_rows(reproduced):
+def test_tables_have_rows_of_this_package_and_of_the_paper(reproduced):
     folder, ended, _ = reproduced
     table = json.loads((folder / "table5.json").read_text())
     assert [(row["method"], row["source"]) for row in table] == [
@@ -70,7 +70,7 @@ def test_tables_have_ours_and_the_papers_rows(reproduced):
 
 
 @pytest.mark.slow
-def test_table_3_asks_the_later_sessions_and_leaves_out_what_needs_labels(reproduced):
+def test_table_3_queries_the_later_sessions_and_skips_methods_that_need_labels(reproduced):
     folder, _, _ = reproduced
     table = json.loads((folder / "table3.json").read_text())
     assert [row["method"] for row in table if row["source"] == OURS] == ["SG-LPR", "polar-fft"]
@@ -79,7 +79,7 @@ def test_table_3_asks_the_later_sessions_and_leaves_out_what_needs_labels(reprod
 
 
 @pytest.mark.slow
-def test_other_settings_are_refused_and_more_steps_go_on(reproduced, command):
+def test_other_settings_are_refused_and_more_steps_continue_a_run(reproduced, command):
     folder, _, options = reproduced
     other = command("reproduce", "table5", *options, "--optimizer.learning-rate", "0.5")
     assert_one_line_error(other, "no-segmentation", "config.optimizer.learning_rate")
@@ -102,7 +102,7 @@ def test_a_mean_needs_every_column():
     assert "| part | here | 0.500 | no revisits | - |" in table.markdown()
 
 
-def test_the_plan_tells_the_recordings_that_never_come_back(town, images, preset, tmp_path):
+def test_the_plan_lists_the_recordings_without_revisits(town, images, preset, tmp_path):
     def plan(data, names, *seqs):
         return make_plan(Reproduction(tmp_path, data, str(preset), load_preset(str(preset)), seqs), names)
 

@@ -1,4 +1,4 @@
-"""Commands are called as whoever started one knows them; what is a path stays one."""
+"""Names of commands in messages, bounds of flags, and one-line errors of all commands."""
 
 import dataclasses
 import os
@@ -10,7 +10,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.cli import runtime
-from sglpr_jax.cli.runtime import own_names, parse_command
+from sglpr_jax.cli.runtime import parse_command, with_installed_names
 from sglpr_jax.fields import NotNegative, Size
 
 
@@ -32,9 +32,9 @@ class Example:
         ("bin/test", "bin/test"),
     ],
 )
-def test_commands_have_the_names_that_are_installed_and_paths_stay(text, expected, monkeypatch):
+def test_names_of_commands_are_those_of_the_installation_and_paths_are_unchanged(text, expected, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/home/me/.local/bin/sglpr-evaluate", "08.npz"])
-    assert own_names(text) == expected
+    assert with_installed_names(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_commands_have_the_names_that_are_installed_and_paths_stay(text, expecte
         (("--spacing-m", "nan"), "--spacing-m: expected a finite number, found nan"),
     ],
 )
-def test_numbers_that_no_flag_can_have_are_told(flags, error):
+def test_numbers_outside_the_bounds_of_a_flag_are_errors(flags, error):
     with pytest.raises(ValueError) as raised:
         parse_command(Example, "example", list(flags))
     assert str(raised.value) == error

@@ -55,7 +55,7 @@ def test_images_get_label_maps_that_lie_on_them(segment, trained, labelled_image
     assert {name for name, share in scores["shares"].items() if share} == {"car", "building"}
 
 
-def test_what_the_network_is_not_sure_of_is_left_out(segment, trained, images):
+def test_cells_below_the_minimum_confidence_are_unlabelled(segment, trained, images):
     options = ("--weights", trained.folder, "--data", images, "--seq", "06")
     _, maps = segment(*options)
     every = np.stack([pixels(path) for path in sorted(maps.glob("*.png"))])

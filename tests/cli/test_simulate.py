@@ -8,7 +8,7 @@ THIN = ("--scans", 3, "--azimuth-steps", 40, "--seed", 5)
 
 
 @pytest.mark.slow
-def test_drives_are_written_completed_and_kept(command, tmp_path):
+def test_drives_are_written_and_an_interrupted_dataset_is_completed(command, tmp_path):
     out = tmp_path / "town"
     first = command("simulate", "--out", out, *THIN, "--seq", "08")
     assert first.status == 0 and "08" in first.out

@@ -1,4 +1,4 @@
-"""Commands describe submaps in place of scans, and scaled scans; they compare only equals."""
+"""Commands describe submaps and scaled scans, and compare only descriptors of one scale."""
 
 import json
 
@@ -52,7 +52,7 @@ def test_embed_describes_submaps_and_keeps_the_scale(command, drive, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_scan_is_located_in_a_map_of_its_kind(command, drive, tmp_path):
+def test_a_scan_is_located_only_in_a_map_of_the_same_scale(command, drive, tmp_path):
     (folder, poses), out, found = drive, tmp_path / "town.safetensors", tmp_path / "found"
     flags = ("--scale", "2", "--submap-m", "6")
     ended = command("map", folder, "--poses", poses, "--out", out, *flags, *HEIGHT)

@@ -20,7 +20,7 @@ def parse(*arguments):
     return parse_command(TrainCommand, "train", list(arguments))
 
 
-def test_a_run_leaves_everything_that_it_printed(trained, town):
+def test_a_run_stores_everything_that_it_printed(trained, town):
     folder, ended = trained
     assert f"run: {folder}" in ended.out and "training on 00, 05; testing on 08" in ended.error
     report = json.loads((folder / "test" / "results.json").read_text())
@@ -41,7 +41,7 @@ def test_a_run_leaves_everything_that_it_printed(trained, town):
             assert min(picture.size) > 200
 
 
-def test_a_run_can_be_loaded_and_says_what_it_was(trained, preset, town):
+def test_a_run_can_be_loaded_and_stores_its_settings(trained, preset, town):
     folder = trained.folder
     params = sglpr_jax.load(folder)
     assert params.config == load_preset(str(preset)).model
@@ -80,7 +80,7 @@ def test_a_run_is_resumed_with_its_own_settings_only(command, trained, town, pre
 
 
 @pytest.mark.slow
-def test_a_run_starts_with_the_weights_it_is_given(command, trained, images, preset, tmp_path):
+def test_a_run_starts_with_the_weights_of_the_flag(command, trained, images, preset, tmp_path):
     options = ("--data", images, "--preset", preset, "--seq", "06", "--steps", 1, "--method")
     options = (*options, "--optimizer.learning-rate", "0", "--optimizer.weight-decay", "0")
     begun = command("train", *options, "--weights", trained.folder, "--out", tmp_path / "run")

@@ -1,4 +1,4 @@
-"""Two processes on loopback, through the real command line, make the run of one."""
+"""Two processes on one computer, with the real command line, train the run of a single process."""
 
 import os
 import socket

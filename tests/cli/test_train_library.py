@@ -1,4 +1,4 @@
-"""What bin/train does is one call of the library."""
+"""bin/train is one call of the library."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""bin/train on scans of one's own: their format and mounting can be said, and bad ones left out."""
+"""bin/train on scans of the user: flags for format and mounting, and skipped bad scans."""
 
 import json
 import shutil
@@ -9,7 +9,7 @@ import pytest
 from sglpr_jax.cli.train import SETTINGS, TrainCommand, settings
 
 
-def test_flags_that_older_runs_do_not_know_are_noted_only_where_they_are_set():
+def test_newer_flags_are_stored_only_if_they_differ_from_their_defaults():
     assert tuple(settings(TrainCommand())) == SETTINGS
     said = settings(TrainCommand(sensor_height=0.6, skip_bad=True, format="float32x4"))
     assert {name: said[name] for name in said if name not in SETTINGS} == {
@@ -30,7 +30,7 @@ def damaged(town, tmp_path):
 
 
 @pytest.mark.slow
-def test_bad_scans_are_left_out_before_the_training(damaged, preset, command, tmp_path):
+def test_bad_scans_are_skipped_before_the_training(damaged, preset, command, tmp_path):
     options = ("--seq", "08", "--data", damaged, "--preset", preset, "--method", "polar-fft")
     options += ("--out", tmp_path / "run", "--cache", tmp_path / "cache")
     ended = command("train", *options, "--skip-bad", "--sensor-height", "1.73")

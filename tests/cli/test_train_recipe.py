@@ -1,4 +1,4 @@
-"""Mining, validation, bfloat16 and a second source, together through the real command line."""
+"""Mining, validation, bfloat16 and a second dataset together, with the real command line."""
 
 import json
 import os
@@ -43,7 +43,7 @@ def mixed(town, images, preset, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_run_of_two_sources_learns_places_and_semantics(mixed, town):
+def test_a_run_on_two_datasets_learns_places_and_semantics(mixed, town):
     out, _, ended = mixed
     assert "training on 00; testing on 06" in ended.error and f"also training on 00, 05, 08 of {town}" in ended.error
     lines = read_metrics(out / "metrics.jsonl")
@@ -60,7 +60,7 @@ def test_a_run_of_two_sources_learns_places_and_semantics(mixed, town):
 
 
 @pytest.mark.slow
-def test_a_stopped_run_of_the_recipe_goes_on_to_the_same_weights(mixed, command, tmp_path, monkeypatch):
+def test_a_stopped_run_on_two_datasets_continues_to_the_same_weights(mixed, command, tmp_path, monkeypatch):
     whole, options, _ = mixed
     out = tmp_path / "run"
     options = (*options[:-1], out, *RECIPE, *LABELLED)

@@ -28,8 +28,8 @@ FAST_STEP = jax.jit(
 class Made(TupleBatches):
     """Batches that a function of the step makes."""
 
-    def __init__(self, make: Callable[[int], Batch], *, places: Callable[[int], str] = lambda step: ""):
-        self._make, self.places = make, places
+    def __init__(self, make: Callable[[int], Batch], *, scan_names: Callable[[int], str] = lambda step: ""):
+        self._make, self.scan_names = make, scan_names
 
     def batch(self, step: int) -> Batch:
         return self._make(step)

@@ -1,4 +1,4 @@
-"""Tests for eight devices, which `test_devices.py` runs in a process that has them."""
+"""Tests on eight devices. `test_devices.py` runs them in a process that has them."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.training import recipe, trainer
-from sglpr_jax.training.devices import data_mesh, own_copy, replicate, split
+from sglpr_jax.training.devices import data_mesh, host_copy, replicate, split_over_devices
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.recipe import run_network
@@ -36,12 +36,12 @@ def make_steps(config, params, batches, devices):
     for batch in batches:
         before = state
         with jax.set_mesh(mesh):
-            state, metrics = FAST_STEP(before, split(batch, mesh), network=network)
+            state, metrics = FAST_STEP(before, split_over_devices(batch, mesh), network=network)
         measured.append(jax.device_get(metrics))
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before.params))
     for leaf in jax.tree.leaves(state):
         assert leaf.sharding.is_fully_replicated and len(leaf.sharding.device_set) == len(devices)
-    return jax.device_get(own_copy(state.params.weights)), measured
+    return jax.device_get(host_copy(state.params.weights)), measured
 
 
 def assert_same_weights(found, expected):
@@ -91,7 +91,7 @@ def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, mo
             np.testing.assert_allclose(found[name], expected[name], rtol=1e-4)
 
 
-def test_as_many_devices_as_divide_the_step(config, capsys):
+def test_the_mesh_has_the_largest_number_of_devices_that_divides_the_step(config, capsys):
     assert data_mesh(config).size == 8 and capsys.readouterr().err == ""
     for tuples, chunk, size in ((6, 0, 6), (20, 0, 5), (8, 4, 4), (1, 0, 1)):
         assert data_mesh(dataclasses.replace(config, tuples=tuples, chunk=chunk)).size == size

@@ -1,4 +1,4 @@
-"""Batches are read ahead in their order, but not past a refresh; errors come at their turn, and no thread is left."""
+"""Batches are read ahead in order, but not past a refresh. Errors are raised when due, and no thread remains."""
 
 import threading
 
@@ -25,11 +25,11 @@ def no_thread_is_left():
 
 
 @pytest.mark.parametrize("depth", [1, 5])
-def test_items_come_in_order(depth):
+def test_values_are_yielded_in_order(depth):
     assert list(read_ahead(lambda step: step * step, start=3, stop=20, depth=depth)) == [i * i for i in range(3, 20)]
 
 
-def test_an_error_is_raised_at_its_turn():
+def test_an_error_is_raised_when_its_value_is_due():
     def make(step):
         if step == 3:
             raise OSError("scan 3 is broken")

@@ -1,4 +1,4 @@
-"""A batch holds what the files say, and its views are what equation 1 makes of the turned points."""
+"""A batch has the content of the files, and its views are the rasterised rotated points (equation 1)."""
 
 import dataclasses
 from pathlib import Path
@@ -17,7 +17,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.recipe import TupleConfig
-from sglpr_jax.training.batch_source import batches_of
+from sglpr_jax.training.batch_source import training_batches
 from sglpr_jax.training.batches import Batch, mix, read_batch, tuple_pool, views
 from sglpr_jax.training.tuples import TuplePool
 
@@ -73,7 +73,7 @@ def read(recordings, pool, frames=FRAMES, *, max_points=9, share_negatives=False
     return read_batch(recordings, pool, frames, max_points=max_points, share_negatives=share_negatives)
 
 
-def test_clouds_are_padded_and_say_how_many_points_count(recordings, pool):
+def test_clouds_are_padded_and_the_valid_points_counted(recordings, pool):
     batch = read(recordings, pool, max_points=12)
     every = clouds(0) + clouds(1)
     assert batch.points.shape == (8, 12, 3) and batch.images is None
@@ -153,7 +153,7 @@ def image_drive(folder: Path, *, labelled: range) -> Recording:
 
 
 @pytest.mark.parametrize(("categories", "moving_car"), [(20, 1), (25, 25)])
-def test_images_come_with_the_maps_that_there_are(pool, tmp_path, categories, moving_car):
+def test_a_batch_of_images_has_the_label_maps_of_labelled_ones(pool, tmp_path, categories, moving_car):
     recordings = [image_drive(tmp_path / "06", labelled=range(3)), image_drive(tmp_path / "07", labelled=range(0))]
     options = {"max_points": 9, "share_negatives": False}
     batch = read_batch(recordings, pool, FRAMES, **options, categories=categories)
@@ -196,7 +196,7 @@ def test_scans_become_density_images_of_all_their_points(recordings, pool):
     np.testing.assert_allclose(views(batch, jnp.zeros(4), GRID)[0], middle, atol=1e-4)
     labelled = read_batch(recordings, pool, FRAMES, max_points=9, share_negatives=False, image="density")
     for row, frame in enumerate(FRAMES.reshape(-1)):
-        recording, number = recordings[int(pool.recording[frame])], int(pool.frame[frame])
+        recording, number = recordings[int(pool.recording_of[frame])], int(pool.frame_of[frame])
         assert labelled.labelled[row] == (recording.labels(number) is not None)
         if labelled.labelled[row]:
             classes = to_classes(recording.labels(number))
@@ -227,7 +227,7 @@ SCANS = Batch(
 )
 
 
-def test_the_views_are_those_of_each_source_one_after_the_other():
+def test_views_of_a_mixed_batch_are_those_of_the_first_and_then_the_second():
     mixed = mix(SCANS, IMAGES, triplets=False, share_negatives=True)
     angles = jnp.asarray(RNG.uniform(0, 6, SCANS.places + IMAGES.places).astype(np.float32))
     images, maps = views(mixed, angles, GRID)
@@ -240,7 +240,7 @@ def test_the_views_are_those_of_each_source_one_after_the_other():
 
 
 @pytest.mark.parametrize("share_negatives", [False, True])
-def test_the_tuples_of_both_sources_lend_each_other_negatives_where_tuples_do(share_negatives):
+def test_tuples_of_both_datasets_share_negatives_only_if_asked(share_negatives):
     alone = mix(IMAGES, SCANS, triplets=False, share_negatives=share_negatives)
     np.testing.assert_array_equal(alone.negatives, IMAGES.negatives)  # places for the segmentation are no negatives
     negatives = mix(IMAGES, SCANS, triplets=True, share_negatives=share_negatives).negatives
@@ -257,14 +257,14 @@ def straight(name: str) -> Recording:
 
 
 @pytest.mark.parametrize("triplets", [False, True])
-def test_the_places_of_both_datasets_are_named(config, triplets):
+def test_scan_names_are_those_of_both_datasets(config, triplets):
     config = dataclasses.replace(config, also_tuples=1, also_triplets=triplets)
     main, also = [straight("00")], [straight("town")]
-    batches = batches_of(main, tuple_pool(main, config), config, also=also)
+    batches = training_batches(main, tuple_pool(main, config), config, also=also)
     pool = tuple_pool(also, config)
     draw = pool.draw if triplets else pool.draw_places
     for step in range(3):
-        first, second = batches.places(step).split("; ")
+        first, second = batches.scan_names(step).split("; ")
         assert first.startswith("recording 00 frames 00-")
         frames = np.unique(draw(seed=config.seed, step=step, tuples=1))
         assert second == f"recording town frames {' '.join(f'town-{frame}' for frame in frames)}"

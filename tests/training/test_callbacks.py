@@ -41,7 +41,7 @@ def terminal(monkeypatch):
 
 
 @pytest.mark.usefixtures("terminal")
-def test_a_bar_serves_a_second_training(capsys):
+def test_a_progress_bar_can_be_used_for_a_second_training(capsys):
     bar = ProgressBar()
     for steps in (4, 7):
         bar.on_start(0, steps)
@@ -50,7 +50,7 @@ def test_a_bar_serves_a_second_training(capsys):
         assert f"3/{steps}" in capsys.readouterr().err
 
 
-def test_without_a_terminal_there_is_a_line_a_call(capsys):
+def test_without_a_terminal_each_call_prints_a_line(capsys):
     bar = ProgressBar()
     bar.on_start(0, 4)
     assert capsys.readouterr().err == ""
@@ -70,7 +70,7 @@ def read_events(path: Path) -> list[Event]:
     return events
 
 
-def test_events_are_what_was_measured(tmp_path):
+def test_event_files_contain_the_measurements(tmp_path):
     events = EventFiles(tmp_path / "run" / "tensorboard")
     events.on_step(3, {"loss": 0.25, "triplet": 0.5})
     (path,) = (tmp_path / "run" / "tensorboard").iterdir()

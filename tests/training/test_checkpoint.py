@@ -1,4 +1,4 @@
-"""Checkpoints come back bit by bit, the newest stay, and damaged or foreign ones are refused."""
+"""Checkpoints are read bit by bit, the newest two are kept, and damaged or foreign ones are refused."""
 
 import gc
 
@@ -86,7 +86,7 @@ def damage(path, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["cut off", "about", "values"])
-def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_used(state, tmp_path, capfd, how):
+def test_a_damaged_checkpoint_is_renamed_and_the_previous_one_used(state, tmp_path, capfd, how):
     saved(tmp_path, state, 2, 4)
     damage(tmp_path / "4", how)
     found, about = Checkpoints(tmp_path).restore(state)

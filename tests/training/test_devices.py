@@ -1,4 +1,4 @@
-"""Several devices and hosts share a step. Eight devices are tested in a process of their own."""
+"""Several devices and hosts share a step. Tests on eight devices run in a separate process."""
 
 import os
 import subprocess
@@ -29,6 +29,6 @@ def test_hosts_that_do_not_divide_a_step_are_refused(config):
 
 
 def test_an_error_of_another_host_ends_this_one(monkeypatch):
-    monkeypatch.setattr(devices, "on_any_host", lambda failed: True)
+    monkeypatch.setattr(devices, "any_host", lambda failed: True)
     with pytest.raises(ConnectionError, match="another host ended with an error"):
         on_all_hosts(lambda: 1)

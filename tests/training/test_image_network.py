@@ -1,4 +1,4 @@
-"""What a step sees, and its gradient: a step in chunks is the step of the whole batch, and it learns."""
+"""Input and gradient of a step: a step in chunks equals a step of the whole batch, and the loss falls."""
 
 import dataclasses
 import functools
@@ -15,8 +15,15 @@ from sglpr_jax.models.sglpr import forward
 from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
 from sglpr_jax.training.config import LossConfig, OcclusionConfig
-from sglpr_jax.training.image_network import ImageNetwork, _angles, _chunks, gradients, summarize, visible
-from sglpr_jax.training.loss import Summary, joint_loss
+from sglpr_jax.training.image_network import (
+    ImageNetwork,
+    _network_input,
+    _random_angles,
+    gradients,
+    summarize,
+    unoccluded_cells,
+)
+from sglpr_jax.training.loss_terms import Summary, joint_loss
 from sglpr_jax.training.step import train_step
 
 from .conftest import FAST_COMPILE, SWIN
@@ -28,7 +35,7 @@ def gradients_of(params, batch, config):
 
 
 def chunks_of(batch, config):
-    return _chunks(batch, *jax.random.split(jax.random.key(0)), config)
+    return _network_input(batch, *jax.random.split(jax.random.key(0)), config)
 
 
 def assert_same(found, expected):
@@ -104,7 +111,7 @@ def test_segmenting_every_second_image_is_as_if_the_others_had_no_labels(config,
 
 
 @pytest.mark.slow
-def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(config, random_params, make_batch):
+def test_training_the_segmentation_alone_keeps_the_descriptors(config, random_params, make_batch):
     head = dataclasses.replace(config.model.head, tap="pixels")
     loss = dataclasses.replace(config.loss, segmentation_alone=True)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head, detail=4), loss=loss)
@@ -120,7 +127,7 @@ def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(con
     assert {"segmentation_head/kernel", "narrow/kernel"} <= set(by_name(found)) - set(described)
 
 
-def test_a_segmentation_that_learns_alone_needs_a_loss_of_its_own_and_moves_nothing_else(config):
+def test_segmentation_alone_needs_a_segmentation_loss_and_no_weight_decay(config):
     with pytest.raises(ValueError, match="leaves no loss: expected ce_weight or dice_weight above 0"):
         LossConfig(segmentation_alone=True, ce_weight=0.0, dice_weight=0.0)
     loss = dataclasses.replace(config.loss, segmentation_alone=True)
@@ -181,10 +188,10 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     assert run(steps=1, start=1)[1][0]["loss"] != losses[0]  # each step has its own rotations
 
 
-def test_of_a_share_of_the_places_the_rotation_is_a_quarter_turn_or_more(config, make_batch):
+def test_a_fraction_of_the_rotations_are_quarter_turns(config, make_batch):
     config = dataclasses.replace(config, quarter_turns=0.5)
     keys = jax.random.split(jax.random.key(0), 60)
-    quarters = np.stack([_angles(key, config) for key in keys]) / (np.pi / 2)
+    quarters = np.stack([_random_angles(key, config) for key in keys]) / (np.pi / 2)
     whole = np.abs(quarters - np.round(quarters)) < 1e-5
     assert 0.4 < whole.mean() < 0.6
     assert np.bincount(np.round(quarters[whole]).astype(int), minlength=4).min() > whole.sum() / 6
@@ -195,8 +202,8 @@ GRID = Grid(resolution_m=1.0, height=64, width=48)
 IMAGES = 400
 
 
-def test_a_sector_of_each_chosen_image_is_hidden():
-    shown = np.asarray(visible(jax.random.key(3), IMAGES, GRID, OcclusionConfig(share=0.5, widest_deg=180.0)))
+def test_occluded_images_have_one_hidden_sector():
+    shown = np.asarray(unoccluded_cells(jax.random.key(3), IMAGES, GRID, OcclusionConfig(share=0.5, widest_deg=180.0)))
     x, y = np.mgrid[: GRID.height, : GRID.width] + 0.5
     bearing = np.angle((x - GRID.height / 2) + 1j * (y - GRID.width / 2))
     of_bearing = ~shown[:, *np.unravel_index(np.argsort(bearing, axis=None), bearing.shape)]  # around the sensor
@@ -208,7 +215,7 @@ def test_a_sector_of_each_chosen_image_is_hidden():
     assert np.ptp([part.mean() for part in np.split(of_bearing[chosen], 4, axis=1)]) < 0.06  # each bearing as often
 
 
-def test_what_is_hidden_has_neither_counts_nor_labels(config, make_batch):
+def test_hidden_cells_have_neither_counts_nor_labels(config, make_batch):
     batch = make_batch(0, images=True)
     batch = batch.replace(
         images=batch.images + 1, maps=np.ones(batch.images.shape, np.int32), labelled=np.ones(config.images, bool)
@@ -217,7 +224,7 @@ def test_what_is_hidden_has_neither_counts_nor_labels(config, make_batch):
     angle_key, model_key = jax.random.split(jax.random.key(0))
 
     def chunk(occlusion):
-        chunks = _chunks(batch, angle_key, model_key, dataclasses.replace(config, occlusion=occlusion))
+        chunks = _network_input(batch, angle_key, model_key, dataclasses.replace(config, occlusion=occlusion))
         return np.asarray(chunks.images[0]), np.asarray(chunks.maps[0])
 
     whole, labels = chunk(OcclusionConfig())
@@ -247,11 +254,11 @@ def mixed(make_batch):
 
 
 @pytest.mark.parametrize("every", [1, 2, 4])
-def test_labelled_places_come_where_the_segmentation_head_looks_and_go_back(mixed, every):
+def test_labelled_places_are_moved_to_segmented_positions_and_back(mixed, every):
     places = jnp.arange(8)
     order = in_network_order(places, mixed, every=every)
     np.testing.assert_array_equal(in_batch_order(order, mixed, every=every), places)
     seen = np.asarray(order)[::every]
     assert (seen >= 4).sum() == min(len(seen), 4)
-    alone = mixed.replace(also=None)
+    alone = mixed.replace(second=None)
     np.testing.assert_array_equal(in_network_order(places, alone, every=every), places)

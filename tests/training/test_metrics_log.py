@@ -1,4 +1,4 @@
-"""Measurements survive interruptions: nothing is lost, nothing is there twice. Their lines tell the speed of a run."""
+"""Measurements survive interruptions without lost or repeated lines, and give the speed of a run."""
 
 import json
 
@@ -15,7 +15,7 @@ def write(path, steps, *, start_step=0):
     return log
 
 
-def test_lines_come_back(tmp_path):
+def test_lines_are_read_as_they_were_written(tmp_path):
     path = tmp_path / "metrics.jsonl"
     log = MetricsLog(path)
     log.append(1, {"loss": np.float32(0.5), "score": 1})
@@ -28,14 +28,14 @@ def test_lines_come_back(tmp_path):
     assert all(json.loads(line) for line in path.read_text().splitlines())
 
 
-def test_a_resumed_run_drops_the_steps_it_makes_again(tmp_path):
+def test_a_resumed_run_removes_the_lines_of_repeated_steps(tmp_path):
     path = tmp_path / "metrics.jsonl"
     write(path, [1, 2, 3, 4]).close()
     write(path, [3, 4, 5], start_step=2).close()
     assert [line["step"] for line in read_metrics(path)] == [1, 2, 3, 4, 5]
 
 
-def test_a_line_cut_short_is_left_out_and_does_not_spoil_the_next(tmp_path):
+def test_an_incomplete_last_line_is_ignored_and_replaced(tmp_path):
     path = tmp_path / "metrics.jsonl"
     write(path, [1, 2]).close()
     whole = path.read_text()
@@ -45,7 +45,7 @@ def test_a_line_cut_short_is_left_out_and_does_not_spoil_the_next(tmp_path):
     assert path.read_text() == whole
 
 
-def test_a_full_disk_is_an_error_that_names_the_file_and_what_was_cut_short_is_repaired(tmp_path, small_files):
+def test_a_full_disk_is_an_error_with_the_file_and_the_incomplete_line_is_removed_later(tmp_path, small_files):
     path = tmp_path / "metrics.jsonl"
     log = write(path, [1, 2])
     whole = path.read_bytes()
@@ -62,7 +62,7 @@ def test_a_full_disk_is_an_error_that_names_the_file_and_what_was_cut_short_is_r
     "line",
     ['{"step": 2, "lo', "[2]", '{"step": true}', '{"step": 2, "loss": "x"}', '{"step": 0}'],
 )
-def test_a_damaged_line_is_named_and_nothing_is_dropped_for_it(tmp_path, line):
+def test_a_damaged_line_is_an_error_with_its_number_and_the_file_is_unchanged(tmp_path, line):
     path = tmp_path / "metrics.jsonl"
     write(path, [1, 2, 3]).close()
     first, _, third = path.read_text().splitlines()
@@ -74,7 +74,7 @@ def test_a_damaged_line_is_named_and_nothing_is_dropped_for_it(tmp_path, line):
     assert path.read_text() == damaged
 
 
-def test_steps_and_waits_are_added_up():
+def test_throughput_is_the_mean_over_all_lines():
     lines = [
         {"step": 10, "loss": 1.0},
         {"step": 10, "score": 0.5},

@@ -1,4 +1,4 @@
-"""A descriptor cache is computed when it is due, kept while a checkpoint needs it, and read back to the bit."""
+"""A descriptor cache is computed at refresh steps, kept while a checkpoint needs it, and read bit by bit."""
 
 import functools
 
@@ -57,7 +57,7 @@ def cache_of(places: np.ndarray, seed: int = 0) -> DescriptorCache:
 
 @settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 10**6), size=st.integers(1, 12))
-def test_the_nearest_are_those_of_brute_force(seed, size):
+def test_nearest_equals_brute_force(seed, size):
     rng = np.random.default_rng(seed)
     cache = cache_of(np.sort(rng.choice(100, 40, replace=False)), seed)
     candidates = np.sort(rng.choice(100, 30, replace=False))
@@ -72,7 +72,7 @@ def test_a_place_that_was_not_described_has_no_nearest_place():
     assert cache_of(np.array([1, 4, 6])).nearest(5, np.array([1, 4]), 2).tolist() == []
 
 
-def test_a_file_comes_back_whole_or_is_refused(tmp_path):
+def test_a_cache_file_is_read_completely_or_refused(tmp_path):
     cache, path = cache_of(np.array([2, 3, 9])), tmp_path / "40.npz"
     cache.save(path)
     found = DescriptorCache.load(path)

@@ -1,4 +1,4 @@
-"""A run's folder says with what, where and by which command it was made, each time it was started."""
+"""The folder of a run records settings, environment and command of each start."""
 
 import contextlib
 import json
@@ -33,7 +33,7 @@ def test_environment_and_command_line_are_noted_at_each_start(tmp_path, monkeypa
     assert all(start["packages"] == noted["packages"] for start in noted["resumes"])
 
 
-def test_a_checkout_has_a_commit_and_may_differ_from_it(tmp_path):
+def test_git_commit_returns_the_commit_and_whether_files_differ(tmp_path):
     assert git_commit(tmp_path) is None
     git(tmp_path, "init")
     assert git_commit(tmp_path) is None  # no commit yet
@@ -46,7 +46,7 @@ def test_a_checkout_has_a_commit_and_may_differ_from_it(tmp_path):
     assert git_commit(tmp_path) == {"commit": commit, "dirty": True}
 
 
-def test_a_setting_that_every_run_has_today_may_be_stored(tmp_path):
+def test_a_removed_setting_may_be_stored_with_the_value_of_today(tmp_path):
     for stored, fits in (("last", True), ("best", False)):
         (tmp_path / "config.json").write_text(json.dumps({"config": {"select": stored, "steps": 3}}))
         with contextlib.nullcontext() if fits else pytest.raises(ValueError, match=r"others: config\.select"):

@@ -1,4 +1,4 @@
-"""A run that was stopped and resumed ends where an uninterrupted one ends, to the bit."""
+"""A resumed run ends with the weights and the logs of an uninterrupted one, bit by bit."""
 
 import dataclasses
 from collections.abc import Callable
@@ -75,7 +75,7 @@ def fake_step(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("fast_step")
-def test_stopped_and_resumed_is_uninterrupted_even_past_a_damaged_checkpoint(run, config, tmp_path, capfd):
+def test_a_resumed_run_equals_an_uninterrupted_one_even_after_a_damaged_checkpoint(run, config, tmp_path, capfd):
     folders = [tmp_path / name for name in ("whole", "resumed")]
     whole, stopped = run(folders[0]), run(folders[1], stopped=after(5))
     assert (whole.step, stopped.step) == (config.steps, 5)
@@ -93,7 +93,7 @@ def test_stopped_and_resumed_is_uninterrupted_even_past_a_damaged_checkpoint(run
 
 
 @pytest.mark.usefixtures("fake_step")
-def test_a_stop_between_two_lines_of_the_log_leaves_no_trace_in_it(run, tmp_path):
+def test_a_stop_between_two_lines_does_not_change_the_log(run, tmp_path):
     change = {"steps": 12, "log_every": 5, "score_every": 8}
     folders = [tmp_path / name for name in ("whole", "resumed")]
     run(folders[0], change=change)
@@ -112,7 +112,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_at_its_step(run, config, make_ba
     fake_step(broken=3)
     words = r"^step 3: loss not finite \(batch: the one read for 2\); the last checkpoint is intact$"
     with pytest.raises(FloatingPointError, match=words):
-        run(make=Made(make_batch, places="the one read for {}".format))
+        run(make=Made(make_batch, scan_names="the one read for {}".format))
     assert [line["step"] for line in logged(tmp_path)] == [1, 2, 2]
     like = jax.eval_shape(ImageNetwork(config).new_state)
     found, _ = Checkpoints(tmp_path / CHECKPOINTS).restore(like)
@@ -121,7 +121,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_at_its_step(run, config, make_ba
 
 
 @pytest.mark.usefixtures("fake_step")
-def test_a_callback_gets_all_that_is_measured(run, tmp_path):
+def test_a_callback_receives_all_measurements(run, tmp_path):
     told = []
 
     class Told(Callback):

@@ -1,4 +1,4 @@
-"""Every tuple is what its configuration says, and a pure function of seed and step; held-out places are apart."""
+"""Tuples follow their configuration and are a pure function of seed and step. Held-out places are far apart."""
 
 import numpy as np
 import pytest
@@ -44,10 +44,10 @@ def test_positives_are_near_and_negatives_far(seed, step, positives, negatives, 
     assert rows.shape == (6, 1 + positives + negatives)
     anchors, near, far = columns(rows, config)
     assert (horizontal(pool, anchors, near) < 3).all()
-    assert (pool.recording[anchors] == pool.recording[near]).all()
+    assert (pool.recording_of[anchors] == pool.recording_of[near]).all()
     assert (anchors != near).all()
-    assert ((horizontal(pool, anchors, far) > 20) | (pool.recording[anchors] != pool.recording[far])).all()
-    gap = np.abs(pool.frame[anchors] - pool.frame[near])
+    assert ((horizontal(pool, anchors, far) > 20) | (pool.recording_of[anchors] != pool.recording_of[far])).all()
+    gap = np.abs(pool.frame_of[anchors] - pool.frame_of[near])
     if revisit_fraction == 1:
         assert (gap > config.revisit_gap).all()
     if revisit_fraction == 0:
@@ -59,10 +59,10 @@ def test_all_pairs_within_three_metres_are_found_and_no_other():
     recordings = [circuit(3), circuit(2, seed=1)]
     pool = TuplePool(recordings, config)
     for anchor in range(5 * LAP):
-        recording, frame = pool.recording[anchor], pool.frame[anchor]
+        recording, frame = pool.recording_of[anchor], pool.frame_of[anchor]
         near = np.flatnonzero(np.linalg.norm((recordings[recording] - recordings[recording][frame])[:, :2], axis=1) < 3)
         found = [
-            np.sort(group.frames[group.starts[anchor] : group.starts[anchor + 1]]) - (0 if recording == 0 else 3 * LAP)
+            np.sort(group.places[group.starts[anchor] : group.starts[anchor + 1]]) - (0 if recording == 0 else 3 * LAP)
             for group in (pool.neighbours, pool.revisits)
         ]
         same_visit = np.abs(near - frame) <= config.revisit_gap
@@ -74,7 +74,7 @@ def test_three_metres_are_too_far_for_a_positive_and_twenty_too_near_for_a_negat
     recording = np.zeros((5, 3))
     recording[:, 0] = [0, 3, 20, np.nextafter(3, 0), np.nextafter(20, 21)]
     pool = TuplePool([recording], TupleConfig())
-    np.testing.assert_array_equal(pool.neighbours.frames[: pool.neighbours.starts[1]], [3])
+    np.testing.assert_array_equal(pool.neighbours.places[: pool.neighbours.starts[1]], [3])
     np.testing.assert_array_equal(pool.far_apart(np.array(0), np.arange(5)), [False, False, False, False, True])
 
 
@@ -87,7 +87,7 @@ def test_a_batch_is_a_pure_function_of_seed_and_step():
         assert (pool.draw(seed=other[0], step=other[1], tuples=4) != rows).any()
 
 
-def test_without_a_revisit_the_positives_are_neighbours_and_the_other_way_round():
+def test_positives_are_neighbours_without_revisits_and_revisits_without_neighbours():
     config = TupleConfig(revisit_fraction=1.0)
     once = TuplePool([circuit(1)], config)
     assert len(once.draw(seed=0, step=0, tuples=5)) == 5
@@ -111,10 +111,10 @@ def test_the_anchors_of_a_cluster_lie_near_each_other_and_the_others_anywhere():
     pool = TuplePool([street, street], config)
     anchors = pool.draw(seed=0, step=0, tuples=40)[:, 0].reshape(10, 4)
     assert (horizontal(pool, anchors[:, :1], anchors) <= 60).all()
-    assert (pool.recording[anchors[:, :1]] == pool.recording[anchors]).all()
-    assert np.ptp(pool.frame[anchors[:, 0]]) > 1000
+    assert (pool.recording_of[anchors[:, :1]] == pool.recording_of[anchors]).all()
+    assert np.ptp(pool.frame_of[anchors[:, 0]]) > 1000
     single = TuplePool([street, street], TupleConfig(negatives=0)).draw(seed=0, step=0, tuples=40)[:, 0]
-    assert (np.abs(np.diff(pool.frame[single])) > 40).mean() > 0.8
+    assert (np.abs(np.diff(pool.frame_of[single])) > 40).mean() > 0.8
 
 
 def described(pool: TuplePool, places: np.ndarray | None = None) -> DescriptorCache:
@@ -129,7 +129,7 @@ def test_mined_negatives_are_the_nearest_far_frames_of_brute_force():
     anchors, near, far = columns(pool.draw(seed=0, step=0, tuples=20, cache=cache), config)
     assert (horizontal(pool, anchors, near) < 3).all()
     for anchor, row in zip(anchors[:, 0], far, strict=True):
-        apart = (pool.recording != pool.recording[anchor]) | (
+        apart = (pool.recording_of != pool.recording_of[anchor]) | (
             horizontal(pool, np.array(anchor), np.arange(len(pool))) > 20
         )
         distance = np.linalg.norm(cache.descriptors - cache.descriptors[anchor], axis=1)
@@ -137,13 +137,13 @@ def test_mined_negatives_are_the_nearest_far_frames_of_brute_force():
         assert set(row.tolist()) == set(expected.tolist())
 
 
-def test_mined_clusters_look_alike_and_lie_far_apart():
+def test_mined_clusters_have_similar_descriptors_and_are_far_apart():
     config = TupleConfig(negatives=0, cluster=4, mining="hardest", hardest=5, revisit_gap=LAP // 2)
     pool = TuplePool([circuit(3), circuit(2, seed=1)], config)
     cache = described(pool)
     for row in pool.draw(seed=0, step=0, tuples=40, cache=cache)[:, 0].reshape(10, 4):
         apart = horizontal(pool, row[:, None], row[None]) + 100 * (
-            pool.recording[row][:, None] != pool.recording[row][None]
+            pool.recording_of[row][:, None] != pool.recording_of[row][None]
         )
         assert (apart[~np.eye(4, dtype=bool)] > 20).all()
         distance = np.linalg.norm(cache.descriptors - cache.descriptors[row[0]], axis=1)
@@ -151,7 +151,7 @@ def test_mined_clusters_look_alike_and_lie_far_apart():
         assert (np.argsort(np.argsort(distance))[row[1:]] < 60).all()
 
 
-def test_where_only_some_places_are_described_the_anchors_and_negatives_are_among_them():
+def test_anchors_and_negatives_are_among_the_described_places():
     config = TupleConfig(negatives=2, mining="hardest", revisit_gap=LAP // 2)
     pool = TuplePool([circuit(3)], config)
     some = np.arange(0, 3 * LAP, 4)
@@ -159,18 +159,18 @@ def test_where_only_some_places_are_described_the_anchors_and_negatives_are_amon
     assert np.isin(rows[:, [0, 2, 3]], some).all() and not np.isin(rows[:, 1], some).all()
 
 
-def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
+def test_excluded_frames_are_in_no_tuple_and_the_others_keep_their_numbers():
     kept = np.r_[0:40, 100:180]
     config = TupleConfig(negatives=2, revisit_gap=LAP // 2)
     recordings = [circuit(3), circuit(1, seed=1)]
     pool = TuplePool(recordings, config, frames=[kept, np.arange(LAP)])
-    np.testing.assert_array_equal(pool.frame, np.r_[kept, 0:LAP])
+    np.testing.assert_array_equal(pool.frame_of, np.r_[kept, 0:LAP])
     np.testing.assert_array_equal(pool.positions, np.concatenate([recordings[0][kept], recordings[1]]))
     rows = pool.draw(seed=0, step=0, tuples=200)
     assert rows.max() < len(pool)
     for group, other_visit in ((pool.neighbours, False), (pool.revisits, True)):
         anchors = np.repeat(np.arange(len(pool)), np.diff(group.starts))
-        assert ((np.abs(pool.frame[anchors] - pool.frame[group.frames]) > LAP // 2) == other_visit).all()
+        assert ((np.abs(pool.frame_of[anchors] - pool.frame_of[group.places]) > LAP // 2) == other_visit).all()
 
 
 SAMPLING = TupleConfig(revisit_gap=20)
@@ -202,7 +202,7 @@ def test_no_training_frame_lies_within_the_negative_distance_of_a_validation_fra
         assert apart(positions[left_out], positions[validation]).min(1).max() <= SAMPLING.negative_m
 
 
-def test_the_stretch_comes_with_its_revisits_and_its_fair_share_of_them():
+def test_the_held_out_stretch_contains_its_revisits_and_a_proportional_share_of_them():
     out_and_back = np.r_[np.arange(0, 600, 2.0), np.arange(600, 300, -2.0)]  # the second half of the way out comes back
     positions = np.column_stack([out_and_back, np.zeros((len(out_and_back), 2))])
     training, validation = hold_out(positions, ValidationConfig(share=0.1), SAMPLING)
@@ -213,7 +213,7 @@ def test_the_stretch_comes_with_its_revisits_and_its_fair_share_of_them():
     assert (positions[rows, 0] > 300).sum() > 60  # most of what is revisited is still trained on
 
 
-def test_a_drive_without_revisits_gives_its_first_frames_and_share_0_nothing():
+def test_without_revisits_the_first_frames_are_held_out_and_with_share_0_none():
     positions = np.column_stack([np.arange(0, 400, 2.0), np.zeros((200, 2))])
     training, validation = hold_out(positions, ValidationConfig(share=0.25), SAMPLING)
     np.testing.assert_array_equal(validation, np.arange(51))  # and the one frame less than 3 m further on

@@ -1,4 +1,4 @@
-"""The score on held-out places is that of a search by hand."""
+"""The scores of weights equal those of a search by hand."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.training import validation
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.tuples import TuplePool
-from sglpr_jax.training.validation import recall_at_1, retrieval, validation_score
+from sglpr_jax.training.validation import recall_and_f1_max, recall_at_1, validation_score
 
 PARAMS = Params({}, ModelConfig())
 
@@ -36,8 +36,8 @@ def by_hand(descriptors: np.ndarray, pool: TuplePool, gap: int) -> tuple[float, 
     """Recall@1, and the best F1 over all thresholds, query by query."""
     answers = []
     for i in range(len(pool)):
-        same = pool.recording == pool.recording[i]
-        open_ = ~(same & (np.abs(pool.frame - pool.frame[i]) <= gap))
+        same = pool.recording_of == pool.recording_of[i]
+        open_ = ~(same & (np.abs(pool.frame_of - pool.frame_of[i]) <= gap))
         apart = np.where(same, np.linalg.norm((pool.positions - pool.positions[i])[:, :2], axis=1), np.inf)
         distance = np.where(open_, np.linalg.norm(descriptors - descriptors[i], axis=1), np.inf)
         best = int(distance.argmin())
@@ -54,10 +54,12 @@ def by_hand(descriptors: np.ndarray, pool: TuplePool, gap: int) -> tuple[float, 
 
 @pytest.mark.parametrize("gap", [0, 20])
 @pytest.mark.parametrize("noise", [0.05, 3.0, 30.0])
-def test_recall_and_f1max_are_those_by_hand(pool, gap, noise):
-    places = pool.positions[:, :2] + 300 * pool.recording[:, None]
+def test_recall_and_f1_max_equal_a_search_by_hand(pool, gap, noise):
+    places = pool.positions[:, :2] + 300 * pool.recording_of[:, None]
     descriptors = (places + np.random.default_rng(5).normal(scale=noise, size=places.shape)).astype(np.float32)
-    np.testing.assert_allclose(retrieval(descriptors, pool, gap=gap), by_hand(descriptors, pool, gap), atol=1e-12)
+    np.testing.assert_allclose(
+        recall_and_f1_max(descriptors, pool, gap=gap), by_hand(descriptors, pool, gap), atol=1e-12
+    )
 
 
 def sequence(positions: np.ndarray) -> Recording:
@@ -66,7 +68,7 @@ def sequence(positions: np.ndarray) -> Recording:
     return of_images(dict.fromkeys(paths, np.zeros((4, 4))), name="00", positions=positions)
 
 
-def test_revisits_count_where_there_are_any_and_neighbours_elsewhere(monkeypatch):
+def test_the_score_uses_revisits_if_there_are_any_and_neighbours_otherwise(monkeypatch):
     def positions_with_noise(params, recordings, pool, places, angles, config):
         assert len(places) == len(angles) == len(pool) and np.ptp(angles) > 3
         return pool.positions[places].astype(np.float32)
@@ -84,13 +86,13 @@ def test_revisits_count_where_there_are_any_and_neighbours_elsewhere(monkeypatch
     assert set(validation_score([sequence(street)], [np.arange(40)], config)(PARAMS)) == {"score", "recall_neighbours"}
 
 
-def test_a_part_without_two_frames_of_one_place_is_refused():
+def test_a_held_out_part_without_two_frames_of_one_place_is_refused():
     street = np.column_stack([np.arange(60.0) * 10, np.zeros((60, 2))])
     with pytest.raises(ValueError, match=r"validation\.share is too small: expected frames within 3\.0 m"):
         validation_score([sequence(street)], [np.arange(5)], TrainConfig())
 
 
-def test_recall_is_counted_by_hand():
+def test_recall_at_1_equals_a_count_by_hand():
     rng = np.random.default_rng(0)
     positions, descriptors = rng.uniform(0, 20, (120, 3)), rng.normal(size=(120, 4)).astype(np.float32)
     times = np.arange(120) * 1.0

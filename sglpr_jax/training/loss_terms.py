@@ -1,7 +1,4 @@
-"""The training loss: a table of terms with their weights.
-
-A new term needs an entry in the table, its functions, and a field for its weight.
-"""
+"""Terms of the training loss and their weights, in two tables. `losses.py` has the functions that the terms use."""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,7 +24,7 @@ class DescriptorTerm:
 
 @dataclasses.dataclass(frozen=True)
 class SegmentationTerm:
-    """Term of the loss that depends on class logits. Images come in chunks, and the sums of the chunks are added."""
+    """Term of the loss that depends on class logits: `value` of the sums over all chunks of images of a batch."""
 
     weight: Callable[[LossConfig], float]
     sums: Callable[[Float[Array, "c h w k"], Int[Array, "c h w"], Bool[Array, "c h w"], LossConfig], Array]
@@ -37,29 +34,32 @@ class SegmentationTerm:
 
 
 class Summary(NamedTuple):
-    """Input of the loss from the images of a chunk or of a whole batch."""
+    """What the loss needs of the images of a chunk or of a whole batch."""
 
     descriptors: Any
-    """Descriptors (c, d)."""
+    """Descriptors (images, d)."""
     sums: dict[str, Any]
     """Sums of each segmentation term, by its name. Empty without labels."""
 
 
 def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
-    """Equation 5, averaged over the tuples of `batch.negatives`."""
-    distances = _tuple_distances(descriptors, batch, config)
-    options: dict[str, Any] = _options(batch, config) | {"temperature": config.temperature}
-    loss = losses.lazy_triplet(*distances, **options).mean()
+    """Return the triplet loss (equation 5), averaged over the tuples that the rows of `batch.negatives` stand for.
+
+    The fraction `config.one_threshold` of it is the loss in which every anchor has the negatives of all anchors.
+    """
+    to_positives, to_places = _anchor_distances(descriptors, batch, config)
+    options: dict[str, Any] = _triplet_options(batch, config) | {"temperature": config.temperature}
+    own_negatives = losses.lazy_triplet(to_positives, to_places, **options).mean()
     if not config.one_threshold:
-        return loss
-    shared_threshold = losses.one_threshold(*distances, **options).mean()
-    return (1 - config.one_threshold) * loss + config.one_threshold * shared_threshold
+        return own_negatives
+    all_negatives = losses.one_threshold(to_positives, to_places, **options).mean()
+    return (1 - config.one_threshold) * own_negatives + config.one_threshold * all_negatives
 
 
 def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
-    """Return the fraction of tuples that violate the margin."""
-    lazy = losses.lazy_triplet(*_tuple_distances(descriptors, batch, config), **_options(batch, config))
-    return (lazy > 0).mean()  # without a temperature, because the smooth loss is never zero
+    """Return the fraction of tuples that violate the margin: those whose loss without a temperature is above 0."""
+    to_positives, to_places = _anchor_distances(descriptors, batch, config)
+    return (losses.lazy_triplet(to_positives, to_places, **_triplet_options(batch, config)) > 0).mean()
 
 
 DESCRIPTOR_TERMS = {"triplet": DescriptorTerm(lambda config: 0.0 if config.segmentation_alone else 1.0, triplet)}
@@ -90,42 +90,41 @@ def segmentation_sums(
 
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
-    """Compute equation 8 for a whole batch.
+    """Return the joint loss (equation 8), and the metrics by name: its terms, `violations` and the loss itself.
 
-    Returns:
-      The loss, and the metrics by name: its terms, the fraction of `violations` and the loss itself.
+    `summary` has the images in network order, in which the head saw the first of every `config.segment_every`.
     """
     descriptors = in_batch_order(summary.descriptors, batch, every=config.segment_every)
     labelled = in_network_order(jnp.asarray(batch.labelled), batch, every=config.segment_every)
-    images = labelled[:: config.segment_every].sum()
+    segmented_images = labelled[:: config.segment_every].sum()
     descriptor_terms = _weighted(DESCRIPTOR_TERMS, config)
     segmentation_terms = {name: SEGMENTATION_TERMS[name] for name in summary.sums}
     values = {name: term.value(descriptors, batch, config) for name, term in descriptor_terms.items()}
-    values |= {name: term.value(summary.sums[name], images) for name, term in segmentation_terms.items()}
+    values |= {name: term.value(summary.sums[name], segmented_images) for name, term in segmentation_terms.items()}
     weights = {name: term.weight(config) for name, term in (descriptor_terms | segmentation_terms).items()}
     total = losses.joint(values, weights)
     return total, values | {"violations": violations(descriptors, batch, config), "loss": total}
 
 
 def _weighted(terms: dict[str, Any], config: LossConfig) -> dict[str, Any]:
+    """Return the terms with a nonzero weight."""
     return {name: term for name, term in terms.items() if term.weight(config)}
 
 
-def _tuple_distances(
+def _anchor_distances(
     descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig
 ) -> tuple[Float[Array, "t p"], Float[Array, "t places"]]:
-    """Return the distances of each anchor to its positives, and to all places of the tuples."""
+    """Return the distances of each anchor to its positives, and to all places of the columns of `batch.negatives`."""
     tuples, places = batch.negatives.shape
-    descriptors = descriptors[:places]
-    grouped = descriptors.reshape(tuples, -1, descriptors.shape[-1])
-    anchors = grouped[:, :1]
-    positives = grouped[:, 1 : 1 + batch.positives]
+    descriptors = descriptors[:places]  # without those of a second batch that the triplet loss ignores
+    by_tuple = descriptors.reshape(tuples, -1, descriptors.shape[-1])
+    anchors, positives = by_tuple[:, :1], by_tuple[:, 1 : 1 + batch.positives]
     to_positives = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, positives), squared=config.squared)
-    to_all = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, descriptors[None]), squared=config.squared)
-    return to_positives, to_all
+    to_places = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, descriptors[None]), squared=config.squared)
+    return to_positives, to_places
 
 
-def _options(batch: Batch, config: LossConfig) -> dict[str, Any]:
+def _triplet_options(batch: Batch, config: LossConfig) -> dict[str, Any]:
     return {
         "margin": config.margin,
         "closest_positive": config.closest_positive,

@@ -1,4 +1,4 @@
-"""The loss is a table: an entry is a term of it, a metric and a curve, and costs nothing without a weight."""
+"""A table entry is a term of the loss and a metric. Without a weight it is not computed."""
 
 import dataclasses
 
@@ -6,19 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.training import loss
+from sglpr_jax.training import loss_terms
 from sglpr_jax.training.config import LossConfig
-from sglpr_jax.training.loss import SegmentationTerm, Summary, joint_loss, segmentation_sums
+from sglpr_jax.training.loss_terms import SegmentationTerm, Summary, joint_loss, segmentation_sums
 
 UNIT = np.eye(8, dtype=np.float32)
 
 
-def test_an_entry_of_classes_is_summed_over_chunks_and_left_out_without_weight(make_batch, monkeypatch):
+def test_a_segmentation_term_is_summed_over_chunks_and_skipped_without_weight(make_batch, monkeypatch):
     def count(logits, classes, counted, config):
         return counted.sum()
 
     term = SegmentationTerm(lambda config: config.margin, count, lambda total, images: total / images)
-    monkeypatch.setitem(loss.SEGMENTATION_TERMS, "pixels", term)
+    monkeypatch.setitem(loss_terms.SEGMENTATION_TERMS, "pixels", term)
     rng, config = np.random.default_rng(0), LossConfig(margin=2.0)
     logits = jnp.asarray(rng.normal(size=(8, 4, 4, 20)), jnp.float32)
     classes, counted = jnp.asarray(rng.integers(0, 20, (8, 4, 4))), jnp.asarray(rng.random((8, 4, 4)) < 0.5)
