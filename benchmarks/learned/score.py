@@ -101,13 +101,8 @@ def _training_effort(folder: Path) -> tuple[int, float]:
     if "images" in config:
         return config["images"], config["seconds"]
     lines = [json.loads(line) for line in (folder.parent / SCORES_FILE).read_text().splitlines()]
-<<<<<<< HEAD
     snapshot = folder.name.removeprefix(f"{LAST_WEIGHTS}-")  # number of images, or the last weights
     line = next((line for line in lines if str(line["images"]) == snapshot), lines[-1])
-=======
-    named = folder.name.removeprefix(f"{LAST_WEIGHTS}-")
-    line = next((one for one in lines if str(one["images"]) == named), lines[-1])
->>>>>>> 405c4155d7afc1ffed24f94f0ba4f1533760072e
     return line["images"], line["seconds"]
 
 

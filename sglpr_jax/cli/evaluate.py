@@ -113,13 +113,9 @@ def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures
     console().print(evaluation)
     if not figures.can_draw():
         print("no drawings: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
-<<<<<<< HEAD
-    return found, None if recording is None else take_pictures(recording, params, source, found.worst_false_positives)
-=======
     if recording is None:
         return evaluation, None
     return evaluation, take_pictures(recording, params, first_method, evaluation.worst_false_positives)
->>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
 
 
 def _check_options(command: EvaluateCommand) -> None:

@@ -151,16 +151,10 @@ def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> De
             raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
         return file
     positions, times = trajectory.positions, trajectory.times
-<<<<<<< HEAD
-    is_described = file.is_described
-    if len(positions) == len(is_described) != len(file):
-        positions, times = positions[is_described], None if times is None else times[is_described]
-=======
     in_file = file.is_described
     if len(positions) == len(in_file) != len(file):  # poses of all scans, but some scans are not in the file
         positions = positions[in_file]
         times = None if times is None else times[in_file]
->>>>>>> 9b76abc14a4c2c9fcf8b6d5035ae1334720f7aab
     with naming(path):
         scan_poses = poses_at_scans(
             trajectory.source,

@@ -54,9 +54,11 @@ class Transport(Protocol):
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
         """Return a function that publishes encoded messages (CDR) of one type. With `latched`, later subscribers
         receive the last `depth` messages."""
+        ...
 
     def published(self) -> dict[str, set[str]]:
         """Return the types of each topic that has a publisher."""
+        ...
 
     def close(self) -> None: ...
 

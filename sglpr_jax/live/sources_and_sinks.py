@@ -29,10 +29,12 @@ class Source(Protocol):
     def frames(self) -> Iterator[LiveFrame | None]:
         """Yield scans as they arrive, and None after `WAIT_S` seconds without a scan, so that the node can react to
         signals. Ends if no more scans can come."""
+        ...
 
     @property
     def dropped(self) -> int:
         """Number of scans that were replaced by newer ones before they were taken."""
+        ...
 
     def close(self) -> None: ...
 

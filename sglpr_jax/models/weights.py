@@ -58,7 +58,7 @@ def graft(source: Params, target: Params) -> Params:
             if added_inputs <= 0 or np.count_nonzero(added) > 1:
                 found = f"{name} has shape {value.shape}"
                 raise ValueError(f"cannot start from these weights: {found}, expected {expected}")
-            value = np.pad(np.asarray(value), [(0, length) for length in added])
+            value = np.pad(np.asarray(value), [(0, int(length)) for length in added])
         weights[name] = value
     return dataclasses.replace(target, weights=as_tree(weights))
 

@@ -135,15 +135,9 @@ def _read_state(path: Path, like: TrainState) -> TrainState:
         stored: Any = orbax.metadata(path / _STATE).item_metadata
         check_arrays(stored.tree, expected, source=path)
         empty = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in expected.items()}
-<<<<<<< HEAD
-        values = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
-    check_arrays(values, expected, source=path)
-    return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in expected])
-=======
         arrays = orbax.restore(path / _STATE, args=ocp.args.StandardRestore(empty))
     check_arrays(arrays, expected, source=path)
     return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in expected])
->>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
 
 
 def _arrays_by_name(state: TrainState) -> dict[str, Any]:

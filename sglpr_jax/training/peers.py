@@ -185,20 +185,12 @@ def train_learned(
             mesh=Mesh(np.array(jax.devices()[:1]), (AXIS,), axis_types=(AxisType.Auto,)),
             first_state=functools.partial(_first_state, network, data, pool, settings.learning_rate),
             score=lambda state: {} if score is None else score(variables_of(state)),
-<<<<<<< HEAD
-            save_snapshot=lambda run, images: save(run, f"{LAST_WEIGHTS}-{images}"),
-=======
             save_snapshot=lambda run, images: save_weights(run, f"{LAST_WEIGHTS}-{images}"),
->>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
             resume=resume,
             callback=_ReportLines(report, show),
         )
         run = trainer.train(stopped)
-<<<<<<< HEAD
-        save(run, LAST_WEIGHTS)
-=======
         save_weights(run, LAST_WEIGHTS)
->>>>>>> d547dc376a45225fd5bf35135eb7d88eb2e68025
         return run
 
 

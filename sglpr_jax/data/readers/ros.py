@@ -139,7 +139,7 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     used = _pose_topic(shares, topic, bag.paths[0])
     unused = [f"{name} (poses for {share:.0%} of the scans)" for name, share in shares.items() if name != used]
     if unused:
-        recording = recording.noting(f"poses not used: {', '.join(unused)}")
+        recording = recording.with_note(f"poses not used: {', '.join(unused)}")
     if not used:
         return recording
     track, rows = tracks[used], np.flatnonzero(has_pose[used])
