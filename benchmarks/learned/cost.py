@@ -17,9 +17,8 @@ from benchmarks.learned.score import Entry, entry
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.files import write_json
-from sglpr_jax.methods.learned.describe import apply_network
 from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.learned.weights_file import example_inputs, random_variables
+from sglpr_jax.methods.learned.trained import apply_network, example_inputs, random_variables
 from sglpr_jax.models.sglpr import describe
 
 TOWN = "town-601"

@@ -14,7 +14,7 @@ from benchmarks.learned import tables
 from benchmarks.learned.train import stages
 from sglpr_jax.cli.peers import RATES
 from sglpr_jax.files import replacing, write_json, write_text
-from sglpr_jax.methods.learned.weights_file import RANDOM
+from sglpr_jax.methods.learned.trained import RANDOM
 from sglpr_jax.training.peers import RATES_FILE
 from sglpr_jax.training.trainer import SCORES_FILE
 

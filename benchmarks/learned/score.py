@@ -30,7 +30,7 @@ from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.learned.weights_file import RANDOM
+from sglpr_jax.methods.learned.trained import RANDOM
 from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
 from sglpr_jax.models.config import model_preset

@@ -18,8 +18,8 @@ from sglpr_jax.evaluation.figures import overlaid
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.registration.bev_alignment import refine
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_spectra import within_reach
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import transform, travelled
 
 VERIFICATION = VerificationConfig()

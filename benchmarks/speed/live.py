@@ -22,9 +22,9 @@ import numpy as np
 
 from benchmarks.table import Table
 from benchmarks.timing import resident_mb
-from sglpr_jax.live.node_messages import Reports
-from sglpr_jax.live.ros import Transport, domain_of
+from sglpr_jax.live.data_types import Reports
 from sglpr_jax.live.ros_encoding import CLOUD, TRANSFORMS, encode, header, transform_message
+from sglpr_jax.live.ros_topics import Transport, domain_of
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.se3 import quaternions
 from sglpr_jax.sim.recording import simulate_recording

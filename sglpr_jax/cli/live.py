@@ -17,8 +17,8 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:
+    from sglpr_jax.live.data_types import Report
     from sglpr_jax.live.live_map import LiveMap
-    from sglpr_jax.live.node_messages import Report
     from sglpr_jax.live.sources_and_sinks import Sink, Source
 
 
@@ -56,7 +56,7 @@ class LiveCommand(LiveOptions, DetectorFlags):
 
 def live(command: LiveCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.live.node_messages import Reports
+    from sglpr_jax.live.data_types import Reports
     from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 
     _check_endpoints(command)

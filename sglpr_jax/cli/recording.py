@@ -20,7 +20,7 @@ from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorCon
 from sglpr_jax.odometry.config import OdometryFormat
 from sglpr_jax.odometry.drift_model import DRIFT_DEG_PER_100M, DRIFT_PERCENT, DriftModel
 from sglpr_jax.progress import progress_bar
-from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.stop_request import stop_on_signal
 
 if TYPE_CHECKING:

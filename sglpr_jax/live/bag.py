@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.live.node_messages import WAIT_S, LatestScan, LiveFrame, Report
+from sglpr_jax.live.data_types import WAIT_S, LatestScan, LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import Taken
 

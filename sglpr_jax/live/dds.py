@@ -22,9 +22,9 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.node_messages import Report
-from sglpr_jax.live.ros import Receive, domain_of, ros_type, wire_type
+from sglpr_jax.live.data_types import Report
 from sglpr_jax.live.ros_encoding import Received, typestore
+from sglpr_jax.live.ros_topics import Receive, domain_of, ros_type, wire_type
 
 TOPIC_PREFIX = "rt"
 """Beginning of the names of ROS 2 topics on the wire. Services have others."""

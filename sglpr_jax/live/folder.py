@@ -16,7 +16,7 @@ from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.times import EPOCH, PER_SECOND
-from sglpr_jax.live.node_messages import LiveFrame, Report
+from sglpr_jax.live.data_types import LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import Taken
 

@@ -8,7 +8,7 @@ from typing import IO, Any
 import numpy as np
 
 from sglpr_jax.files import writing
-from sglpr_jax.live.node_messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.data_types import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 

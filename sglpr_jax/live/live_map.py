@@ -15,7 +15,7 @@ from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.files import parse_json, read_json, write_json, writing
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.live.node_messages import LiveFrame, LoopEdge, Report
+from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
 from sglpr_jax.live.odometry_input import FixedMounting, OdometryContinuity, ScanClock
 from sglpr_jax.loops.arguments import as_pose
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame

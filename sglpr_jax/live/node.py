@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from sglpr_jax.files import in_short
+from sglpr_jax.live.data_types import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.live.node_messages import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.sources_and_sinks import Sink, Source
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32
 
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.mounting import Mounting, common_mounting, estimate_mounting
-from sglpr_jax.live.node_messages import Report
+from sglpr_jax.live.data_types import Report
 from sglpr_jax.se3 import inverse
 
 JUMP_S = 60.0

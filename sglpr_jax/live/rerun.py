@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import check_writable, writing
-from sglpr_jax.live.node_messages import FrameStatus, LoopEdge, Report
+from sglpr_jax.live.data_types import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 os.environ.setdefault("RUST_LOG", "off")  # read by the import; the node has its own line for a lost viewer

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, Header, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short
-from sglpr_jax.live.node_messages import LoopEdge
+from sglpr_jax.live.data_types import LoopEdge
 from sglpr_jax.se3 import quaternions
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

@@ -17,7 +17,7 @@ from sglpr_jax.data.formats.ros_messages import (
     tracks_of_transforms,
 )
 from sglpr_jax.data.poses import pose_at
-from sglpr_jax.live.node_messages import Report
+from sglpr_jax.live.data_types import Report
 from sglpr_jax.live.ros_encoding import TRANSFORMS, Received
 
 ODOMETRY_TYPES = (*POSES, TRANSFORMS)

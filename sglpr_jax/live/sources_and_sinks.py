@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
-from sglpr_jax.live.node_messages import FrameStatus, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.data_types import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
@@ -62,7 +62,7 @@ def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken
     module = _import_module(name, SOURCES[name])
     if name not in TRANSPORTS:
         return module.open_source(where, options, report, taken)
-    from sglpr_jax.live.ros import RosSource  # needs the same extra
+    from sglpr_jax.live.ros_topics import RosSource  # needs the same extra
 
     return RosSource(module.open_transport(where, report), options, report)
 
@@ -73,7 +73,7 @@ def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
     module = _import_module(name, SINKS[name])
     if name not in TRANSPORTS:
         return module.open_sink(where, options, report)
-    from sglpr_jax.live.ros import RosSink  # needs the same extra
+    from sglpr_jax.live.ros_topics import RosSink  # needs the same extra
 
     return RosSink(module.open_transport(where, report), options)
 

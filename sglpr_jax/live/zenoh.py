@@ -29,9 +29,9 @@ from zenoh.ext import (
 )
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.node_messages import Report
-from sglpr_jax.live.ros import Receive, domain_of, ros_type, wire_type
+from sglpr_jax.live.data_types import Report
 from sglpr_jax.live.ros_encoding import Received, typestore
+from sglpr_jax.live.ros_topics import Receive, domain_of, ros_type, wire_type
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
 """Endpoint of rmw_zenoh's router."""

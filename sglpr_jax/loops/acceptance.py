@@ -13,8 +13,8 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import warn
 from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, LoopClosure, Reason, RejectedClosure, frames_of
 from sglpr_jax.loops.consistency import are_consistent, largest_consistent_set
-from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.frame_alignment import logarithm
+from sglpr_jax.loops.odometry_deviation import deviations
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.registration.gicp import register

@@ -15,6 +15,7 @@ import numpy as np
 import safetensors.numpy
 from jaxtyping import Float
 
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
@@ -27,7 +28,6 @@ from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.odometry.drift_model import MOTION_DRIFT
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
-from sglpr_jax.retrieval.descriptor_cache import fingerprint
 from sglpr_jax.schema import Column, check_about, check_columns
 
 FORMAT = "sglpr-jax unfinished loops 7"

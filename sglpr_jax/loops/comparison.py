@@ -14,15 +14,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int, UInt8
 
 from sglpr_jax.loops.config import CandidateConfig
-from sglpr_jax.loops.drift import planar_covariance, planar_deviations
 from sglpr_jax.loops.keyframes import EVERY, Keyframes
+from sglpr_jax.loops.odometry_deviation import planar_covariance, planar_deviations
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, search
 from sglpr_jax.registration.bev_spectra import query_spectra
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar
 
 BATCH, COARSE_BATCH = 8, 32

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from sglpr_jax.fields import Bounds, Count, NotNegative, Positive, Share, check_fields
 from sglpr_jax.odometry.drift_model import DriftModel
-from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.registration.bev_config import VerificationConfig
 
 Degenerate = Literal["keep", "drop"]
 """Whether degenerate loops are kept or rejected. Their position has a standard deviation of more than 1 m in one

@@ -19,8 +19,8 @@ from sglpr_jax.growing import GrowingArray
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.odometry.bev_odometry import BevOdometry
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_spectra import match_spectra
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
 
 

@@ -15,9 +15,8 @@ from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
-from sglpr_jax.methods.learned.describe import apply_network, name_of_distance
 from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.learned.weights_file import load_variables, method_of, variables_hash
+from sglpr_jax.methods.learned.trained import apply_network, load_variables, method_of, name_of_distance, variables_hash
 from sglpr_jax.methods.method import LABELLED, HandcraftedMethod, Method
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.models.config import model_preset

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.deskew import has_point_times, poses_at
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan import Scan
@@ -21,7 +22,6 @@ from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.files import warn
 from sglpr_jax.frame_log import RunLog
 from sglpr_jax.odometry.config import OdometryConfig
-from sglpr_jax.retrieval.descriptor_cache import fingerprint
 from sglpr_jax.se3 import inverse, transformed
 
 MIN_POINTS = 100

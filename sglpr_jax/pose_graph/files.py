@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
-from sglpr_jax.loops.drift import step_deviations
+from sglpr_jax.loops.odometry_deviation import step_deviations
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import are_rotations, from_quaternions, inverse, quaternions
 

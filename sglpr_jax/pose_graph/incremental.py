@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.drift import step_deviations
+from sglpr_jax.loops.odometry_deviation import step_deviations
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.factor_graph import FactorGraph, gtsam_library, rotation_first
 from sglpr_jax.se3 import inverse

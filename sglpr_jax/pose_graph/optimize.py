@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax.data.mounting import is_tilted
 from sglpr_jax.files import warn
 from sglpr_jax.loops.closure import LoopClosure, frames_of, to_upright
-from sglpr_jax.loops.drift import deviations, step_deviations
+from sglpr_jax.loops.odometry_deviation import deviations, step_deviations
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Num
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_search import CorrelationPeak, search
 from sglpr_jax.registration.bev_spectra import (
     DEFAULT,
@@ -24,7 +25,6 @@ from sglpr_jax.registration.bev_spectra import (
     rotate,
     spectrum,
 )
-from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.se3 import wrap_angle
 
 NOISE, NOISE_CELLS, NOISE_RANGE_M = 0.8, 300.0, 10.0

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_spectra import DEFAULT, AnyArray, cell_count, correlations, lower_half, quarters
-from sglpr_jax.registration.config import VerificationConfig
 
 SECOND_M, SECOND_DEG = 3.0, 15.0
 """Minimum distance of the second peak from the best one, in metres or in degrees."""

@@ -11,7 +11,7 @@ from scipy.fft import next_fast_len
 
 from sglpr_jax.bev import centre_crop, rotate_image
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
-from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.registration.bev_config import VerificationConfig
 
 DEFAULT = VerificationConfig()
 AnyArray = Array | np.ndarray

@@ -15,7 +15,7 @@ from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.files import file_name, read_json, write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
-from sglpr_jax.methods.learned.weights_file import method_of
+from sglpr_jax.methods.learned.trained import method_of
 from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.params import Params

@@ -45,7 +45,7 @@ def distance_function(name: str) -> DistanceFn:
     method = name.partition(":")[0]
     if method in LEARNED_NAMES:
         from sglpr_jax.methods.learned import LEARNED  # slow import: the networks
-        from sglpr_jax.methods.learned.describe import distance_named
+        from sglpr_jax.methods.learned.trained import distance_named
 
         return distance_named(LEARNED[method], name)
     if name not in DISTANCES:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scale_of
 from sglpr_jax.fields import Size
@@ -19,7 +20,6 @@ from sglpr_jax.files import file_name, in_short, naming, parse_json, replacing
 from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.params import Params
-from sglpr_jax.retrieval.descriptor_cache import fingerprint
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.schema import check_about

@@ -22,10 +22,9 @@ import orbax.checkpoint as ocp
 from sglpr_jax.files import in_short, read_json, replacing, write_json
 from sglpr_jax.models.weights_file import check_arrays
 from sglpr_jax.training.devices import is_first_host, on_all_hosts
+from sglpr_jax.training.run_folder import checkpoint_steps
 from sglpr_jax.training.step import TrainState
 
-CHECKPOINTS = "checkpoints"
-"""Folder of the checkpoints, in the folder of a run."""
 _KEPT_CHECKPOINTS = 2
 _STATE, _ABOUT = "state", "about.json"
 _MAX_ERROR_LENGTH = 500
@@ -74,11 +73,6 @@ class Checkpoints:
 
     def _path(self, step: int) -> Path:
         return self._folder / f"{step}"
-
-
-def checkpoint_steps(folder: Path) -> list[int]:
-    """Return the steps of all checkpoints in `folder`, in order."""
-    return sorted(int(path.name) for path in folder.glob("*") if path.name.isdecimal())
 
 
 def rename_damaged(folder: Path) -> None:

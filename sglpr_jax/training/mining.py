@@ -11,7 +11,7 @@ from jaxtyping import Float32, Int
 from sglpr_jax.files import replacing
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.numpy_files import read_arrays
-from sglpr_jax.training.checkpoint import CHECKPOINTS, checkpoint_steps
+from sglpr_jax.training.run_folder import CHECKPOINTS, checkpoint_steps
 
 MINING = "mining"
 """Folder of the descriptor caches, in the folder of a run."""

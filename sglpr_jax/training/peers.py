@@ -16,9 +16,8 @@ from jaxtyping import Array, Float, Float32, Int, Shaped
 
 from sglpr_jax.fields import CountOrNone, NotNegative, Positive, check_fields
 from sglpr_jax.files import read_json, write_json
-from sglpr_jax.methods.learned.describe import describe_inputs, learned_distance
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
-from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
+from sglpr_jax.methods.learned.trained import describe_inputs, learned_distance, random_variables, save_variables
 from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.training.batch_source import TupleBatches

@@ -20,12 +20,11 @@ from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.batches import positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.checkpoint import CHECKPOINTS, checkpoint_steps
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.devices import data_mesh, host_copy, is_first_host, on_all_hosts
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
-from sglpr_jax.training.run_folder import lock_run
+from sglpr_jax.training.run_folder import CHECKPOINTS, checkpoint_steps, lock_run
 from sglpr_jax.training.step import TrainState
 from sglpr_jax.training.trainer import METRICS_FILE, Schedule, Trained, Trainer
 from sglpr_jax.training.tuples import hold_out

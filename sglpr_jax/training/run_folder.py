@@ -19,6 +19,7 @@ from sglpr_jax.files import exclusive_lock, read_json, remove_half_written, writ
 
 CONFIG_FILE = "config.json"
 ENVIRONMENT_FILE = "environment.json"
+CHECKPOINTS = "checkpoints"
 PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy")
 REMOVED = {"config.select": "last"}
 """Removed settings, which older runs still have in config.json, and the value that all runs have today."""
@@ -108,6 +109,11 @@ def note_environment(folder: Path, *, seed: int) -> None:
     if not isinstance(first, dict) or not isinstance(first.get("resumes"), list):
         raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {first!r:.60}")
     write_json(path, first | {"resumes": [*first["resumes"], environment]})
+
+
+def checkpoint_steps(folder: Path) -> list[int]:
+    """Return the steps of all checkpoints in `folder`, in order."""
+    return sorted(int(path.name) for path in folder.glob("*") if path.name.isdecimal())
 
 
 def git_commit(checkout: Path) -> dict[str, Any] | None:

@@ -14,9 +14,10 @@ from jax.sharding import Mesh
 
 from sglpr_jax.training.batch_source import TupleBatches, batches_in_order
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.checkpoint import CHECKPOINTS, Checkpoints
+from sglpr_jax.training.checkpoint import Checkpoints
 from sglpr_jax.training.devices import any_host, host_copy, is_first_host, on_all_hosts, replicate, split_over_devices
 from sglpr_jax.training.metrics_log import MetricsLog
+from sglpr_jax.training.run_folder import CHECKPOINTS
 from sglpr_jax.training.step import PlaceNetwork, TrainState, train_step
 
 METRICS_FILE, SCORES_FILE = "metrics.jsonl", "scores.jsonl"

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from sglpr_jax.methods.learned.disco import DISCO
-from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
+from sglpr_jax.methods.learned.trained import random_variables, save_variables
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
 from sglpr_jax.reproduce.plan import make_plan
 from sglpr_jax.reproduce.reproduction import Reproduction

@@ -27,11 +27,11 @@ from dataset_trees import (
 )
 from PIL import Image
 
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.formats.pose_files import read_timed_rows
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.readers import kitti_raw, mulran_helipr_boreas_nclt, open_recording, recording_names
-from sglpr_jax.retrieval.descriptor_cache import fingerprint
 
 
 class Layout(NamedTuple):

@@ -6,7 +6,7 @@ import pytest
 from drives import PASS, street
 
 import sglpr_jax
-from sglpr_jax.live.node_messages import LiveFrame
+from sglpr_jax.live.data_types import LiveFrame
 
 SCANS = 2 * PASS
 BEGIN = 1_700_000_000.25

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.scan import Scan
+from sglpr_jax.live.data_types import AGAIN_S, FrameStatus, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.node import Node
-from sglpr_jax.live.node_messages import AGAIN_S, FrameStatus, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import open_sink
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.live.node_messages import FrameStatus, LoopEdge
+from sglpr_jax.live.data_types import FrameStatus, LoopEdge
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.rerun import RerunSink
 from sglpr_jax.live.sources_and_sinks import open_sink

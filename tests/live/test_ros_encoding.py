@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.live.node_messages import LoopEdge
+from sglpr_jax.live.data_types import LoopEdge
 from sglpr_jax.live.ros_encoding import (
     CLOUD,
     EDGE,

@@ -13,7 +13,7 @@ from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import acceptance
 from sglpr_jax.loops.acceptance import accept_loops, check_odometry, count_revisit_segments
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.drift import deviations
+from sglpr_jax.loops.odometry_deviation import deviations
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.pose_graph.optimize import solve_pose_graph

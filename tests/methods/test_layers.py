@@ -20,7 +20,7 @@ from sglpr_jax.methods.learned.bevplace import (
     rotation_taps,
 )
 from sglpr_jax.methods.learned.layers import FEATURES, LOCAL, NetVLAD, fit_clusters
-from sglpr_jax.methods.learned.weights_file import random_variables
+from sglpr_jax.methods.learned.trained import random_variables
 from sglpr_jax.models.layers import l2_normalize
 
 from . import learned_reference as reference

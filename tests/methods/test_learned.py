@@ -14,10 +14,9 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.labels import to_raw
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.bevplace import grey_image
-from sglpr_jax.methods.learned.describe import describe_inputs, learned_distance
 from sglpr_jax.methods.learned.method import Tuples
 from sglpr_jax.methods.learned.sgpr import cluster_of_points
-from sglpr_jax.methods.learned.weights_file import random_variables
+from sglpr_jax.methods.learned.trained import describe_inputs, learned_distance, random_variables
 from sglpr_jax.methods.names import LEARNED_NAMES
 
 from . import learned_reference as reference

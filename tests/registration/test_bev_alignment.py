@@ -11,7 +11,7 @@ from scipy import ndimage, signal
 
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.registration.bev_alignment import align
-from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.se3 import inverse, yaw_of
 
 SMALL = VerificationConfig(reach_m=12.8, max_shift_m=4.0)

@@ -7,6 +7,7 @@ import pytest
 from scenes import place, relative, seen_from
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
+from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_search import SECOND_DEG, SECOND_M, coarse_correlations, search, search_near
 from sglpr_jax.registration.bev_spectra import (
     cell_count,
@@ -18,7 +19,6 @@ from sglpr_jax.registration.bev_spectra import (
     rotate,
     spectrum,
 )
-from sglpr_jax.registration.config import VerificationConfig
 
 SMALL = VerificationConfig(reach_m=12.8, max_shift_m=4.0)
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from recordings import of_scans
 
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.retrieval.descriptor_cache import fingerprint
 
 
 def test_another_format_mounting_or_position_is_another_recording(tmp_path):

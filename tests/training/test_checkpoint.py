@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from sglpr_jax.training.checkpoint import Checkpoints, checkpoint_steps
+from sglpr_jax.training.checkpoint import Checkpoints
 from sglpr_jax.training.image_network import ImageNetwork
+from sglpr_jax.training.run_folder import checkpoint_steps
 from sglpr_jax.training.step import TrainState
 
 pytestmark = [

@@ -14,7 +14,7 @@ from flax import linen as nn
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.methods.learned.method import LearnedMethod, triplet
-from sglpr_jax.methods.learned.weights_file import load_variables, random_variables, save_variables
+from sglpr_jax.methods.learned.trained import load_variables, random_variables, save_variables
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.peer_inputs import prepare_inputs

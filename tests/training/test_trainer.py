@@ -12,10 +12,11 @@ import pytest
 
 from sglpr_jax.training import trainer
 from sglpr_jax.training.callbacks import Callback, Callbacks
-from sglpr_jax.training.checkpoint import CHECKPOINTS, Checkpoints
+from sglpr_jax.training.checkpoint import Checkpoints
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.recipe import run_network
+from sglpr_jax.training.run_folder import CHECKPOINTS
 from sglpr_jax.training.step import TrainState
 from sglpr_jax.training.trainer import METRICS_FILE, Schedule, Trained
 

@@ -9,8 +9,8 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from sglpr_jax.cli.live import LiveCommand, run_node
-from sglpr_jax.live.node_messages import Report, Reports
-from sglpr_jax.live.ros import RosSink, RosSource, Transport
+from sglpr_jax.live.data_types import Report, Reports
+from sglpr_jax.live.ros_topics import RosSink, RosSource, Transport
 from sglpr_ros.parameters import command_of, defaults
 from sglpr_ros.transport import RclpyTransport
 

@@ -9,14 +9,16 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rosidl_runtime_py.utilities import get_message
 
 from sglpr_jax.files import in_short
-from sglpr_jax.live.node_messages import Report
-from sglpr_jax.live.ros import Receive
+from sglpr_jax.live.data_types import Report
 from sglpr_jax.live.ros_encoding import Received
+from sglpr_jax.live.ros_topics import Receive
 
 
 class RclpyTransport:
-    """Subscriptions and publishers of a node. See `sglpr_jax.live.ros.Transport` for the methods. rclpy does not tell
-    which publisher sent a message."""
+    """Subscriptions and publishers of a node. See `sglpr_jax.live.ros_topics.Transport` for the methods.
+
+    rclpy does not tell which publisher sent a message.
+    """
 
     def __init__(self, node: Any, report: Report):
         """Use a node, which another thread spins."""

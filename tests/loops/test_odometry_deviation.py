@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.drift import deviations, planar_deviations, step_deviations
+from sglpr_jax.loops.odometry_deviation import deviations, planar_deviations, step_deviations
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o

@@ -6,10 +6,10 @@ import time as clock
 import numpy as np
 import pytest
 
-from sglpr_jax.live.node_messages import FrameStatus, LoopEdge
+from sglpr_jax.live.data_types import FrameStatus, LoopEdge
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros import TAKEOVER_S, RosSink, RosSource, domain_of
 from sglpr_jax.live.ros_encoding import CLOUD, MARKERS, TRANSFORMS
+from sglpr_jax.live.ros_topics import TAKEOVER_S, RosSink, RosSource, domain_of
 from tests.live.messages import LIVOX, ODOMETRY, POINTS, cloud, decoded, odometry, received
 
 
@@ -40,7 +40,7 @@ def transport() -> Memory:
 
 @pytest.fixture
 def source(transport, said, monkeypatch) -> RosSource:
-    monkeypatch.setattr("sglpr_jax.live.ros.MISSING_S", 0.0)
+    monkeypatch.setattr("sglpr_jax.live.ros_topics.MISSING_S", 0.0)
     return RosSource(transport, LiveOptions(topic="points", odometry_topic="/odom"), said)
 
 

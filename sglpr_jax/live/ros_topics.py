@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sglpr_jax.live.node_messages import WAIT_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
+from sglpr_jax.live.data_types import WAIT_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_encoding import (
     CLOUD_TYPES,
