@@ -47,7 +47,7 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
     """
     temporary = _hidden_path(path)
     try:
-        with writing(path, temporary, *path.parents):
+        with raising_write_error(path, temporary, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
             _rename(temporary, path, keep=keep)
@@ -92,7 +92,7 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not existing.is_dir():
         raise NotADirectoryError(f"{existing}: expected a folder to write into, found a file")
-    with writing(folder, *folder.parents):
+    with raising_write_error(folder, *folder.parents):
         folder.mkdir(parents=True, exist_ok=True)
     digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
     try:
@@ -175,7 +175,7 @@ def _shortened(text: str, *, most: int) -> str:
 
 
 @contextlib.contextmanager
-def writing(path: Path, *replaced: Path) -> Iterator[None]:
+def raising_write_error(path: Path, *replaced: Path) -> Iterator[None]:
     """Context manager that raises WriteError with `path` for an OSError that names no file, as of a full disk.
 
     An error that names one of the paths `replaced` is converted, too. Other errors are unchanged.
@@ -199,7 +199,7 @@ def check_writable(path: Path) -> None:
     existing = next(folder for folder in path.absolute().parents if folder.exists())
     trial = _hidden_path(existing / path.name)
     try:
-        with writing(path, trial, *trial.parents):
+        with raising_write_error(path, trial, *trial.parents):
             trial.touch()
     finally:
         _remove(trial)

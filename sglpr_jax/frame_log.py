@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.files import parse_json, warn, writing
+from sglpr_jax.files import parse_json, raising_write_error, warn
 
 HEAD = struct.Struct("<4sIII")
 """Bytes before a record: `MARK`, number of the record, its length, and the CRC-32 of number and record."""
@@ -22,7 +22,7 @@ MARK = b"\x93FR1"
 
 
 class FrameLog:
-    """Append-only file of numbered records.
+    """Append-only file with a numbered record for each frame.
 
     Example:
       log = FrameLog(path)
@@ -35,7 +35,7 @@ class FrameLog:
         self.path = path
         self.removed_bytes = 0
         """Number of bytes that `records` removed from the end."""
-        with writing(path, path):
+        with raising_write_error(path, path):
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
         self._size = os.fstat(self._file).st_size
 
@@ -67,7 +67,7 @@ class FrameLog:
         Raises WriteError if the record cannot be written, for instance on a full disk. The file then stays as it was.
         """
         content = memoryview(HEAD.pack(MARK, number, len(record), _checksum(number, record)) + record)
-        with writing(self.path):
+        with raising_write_error(self.path):
             os.lseek(self._file, self._size, os.SEEK_SET)
             try:
                 written = 0
@@ -80,7 +80,7 @@ class FrameLog:
 
     def sync(self) -> None:
         """Wait until the disk has all records."""
-        with writing(self.path):
+        with raising_write_error(self.path):
             os.fsync(self._file)
 
     def close(self) -> None:
@@ -92,7 +92,7 @@ class FrameLog:
 
     def truncate(self, size: int) -> None:
         """Remove everything after the first `size` bytes."""
-        with writing(self.path):
+        with raising_write_error(self.path):
             os.ftruncate(self._file, size)
         self._size = size
 
@@ -119,7 +119,7 @@ class RunLog:
         self.path, self._log = path, None
         if path is None:
             return
-        with writing(path, *path.parents):
+        with raising_write_error(path, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
         self._log = FrameLog(path)
         records: list[bytes] = []

@@ -18,12 +18,12 @@ from sglpr_jax.files import (
     json_in_short,
     path_inside,
     printable,
+    raising_write_error,
     read_json,
     remove_half_written,
     replacing,
     write_all,
     write_json,
-    writing,
 )
 
 HOSTILE = ("../../escaped", "/etc/passwd", "a/b", "a\\b", "", ".", "..", "a\0b", "a\nb")
@@ -101,7 +101,12 @@ def test_a_locked_folder_is_refused_until_it_is_unlocked(tmp_path):
 
 def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files):
     path = tmp_path / "a.bin"
-    with small_files(10), pytest.raises(WriteError) as raised, writing(tmp_path), replacing(path) as temporary:
+    with (
+        small_files(10),
+        pytest.raises(WriteError) as raised,
+        raising_write_error(tmp_path),
+        replacing(path) as temporary,
+    ):
         temporary.write_bytes(bytes(100))
     assert str(raised.value) == f"{path}: cannot be written: File too large"
     assert names(tmp_path) == []

@@ -104,10 +104,8 @@ def embed_recording(command: EmbedCommand) -> None:
 
 
 def _load_weights(command: EmbedCommand) -> "tuple[Method | None, Params | None]":
-    """Load --weights: a learned method, or weights of this package's network. Returns None twice without --weights.
-
-    Raises ValueError if --weights do not fit --method.
-    """
+    """Load --weights. Returns (method, None) for a learned method, (None, parameters) for the network of this package,
+    and (None, None) without --weights. Raises ValueError if --weights do not fit --method."""
     from sglpr_jax.methods.learned import LEARNED
     from sglpr_jax.methods.registry import trained_method
     from sglpr_jax.models.weights_file import load

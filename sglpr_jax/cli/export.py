@@ -12,7 +12,7 @@ from sglpr_jax.progress import progress_bar
 
 @dataclasses.dataclass(frozen=True)
 class ExportCommand:
-    """Write weights that describe places, without the segmentation head, or a program that contains them.
+    """Write the weights that descriptors need, without the segmentation head, or a program that contains them.
 
     Example:
       bin/export --weights runs/sglpr-08 --out mine --half
@@ -26,8 +26,8 @@ class ExportCommand:
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     average: tuple[str, ...] = ()
-    """Further weights of the same model. Every parameter becomes the mean over all of them, without a whitening layer.
-    One of the trainings must have started from the weights of the other."""
+    """Further weights of the same model. Each parameter is averaged over all models, and the whitening layer is
+    removed. All trainings must descend from one training."""
     shares: tuple[NotNegative, ...] = ()
     """Weight of each model in the mean, --weights first. If omitted, all are equal."""
     format: Literal["weights", "stablehlo", "onnx"] = "weights"

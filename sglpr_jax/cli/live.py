@@ -63,7 +63,7 @@ def live(command: LiveCommand) -> int:
     report = Reports()
 
     def open_source_of(live_map: "LiveMap") -> "Source":
-        return open_source(command.source, command, report, taken=live_map.names.__contains__)
+        return open_source(command.source, command, report, is_in_map=live_map.names.__contains__)
 
     def open_sinks() -> Iterator["Sink"]:
         return (open_sink(sink, command, report) for sink in command.sinks)

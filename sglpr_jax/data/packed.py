@@ -16,7 +16,7 @@ import numpy as np
 from sglpr_jax.data.formats.png import image_scan
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.files import file_name, in_short, read_json, replacing, writing
+from sglpr_jax.files import file_name, in_short, raising_write_error, read_json, replacing
 
 FORMAT = "sglpr-jax packed recording 1"
 ABOUT_FILE = "pack.json"
@@ -135,7 +135,7 @@ def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int
                         f"of shape {layout['row']}, like the first array of the pack, found {array.dtype} {row_shape}"
                     )
                 array = np.ascontiguousarray(array)
-                with writing(path):
+                with raising_write_error(path):
                     if name not in streams:
                         streams[name] = path.open("xb")
                         opened.callback(_close, streams[name])
@@ -144,7 +144,7 @@ def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int
                 layout["offsets"].append(layout["offsets"][-1] + len(array))
             on_progress(i + 1)
         for name, stream in streams.items():
-            with writing(folder / f"{name}.bin"):
+            with raising_write_error(folder / f"{name}.bin"):
                 _sync(stream)
     return layouts
 

@@ -104,7 +104,7 @@ def draw(evaluation: Evaluation) -> "dict[str, matplotlib.figure.Figure]":
     """Return the figures by file name: precision-recall curves, and the decisions along the trajectory.
 
     One method gets a plot with a line for each protocol. Several methods get a plot for each protocol, with a line for
-    each method. The decisions are those of the first protocol that has decisions.
+    each method. The decisions are those of the first method, by its first protocol that has decisions.
     """
     plots = {}
     if len(evaluation.methods) == 1:

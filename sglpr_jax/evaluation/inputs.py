@@ -104,7 +104,8 @@ def recording_trajectory(recording: Recording) -> Trajectory | None:
 def recording_rows(recording: Recording, source: Input) -> Mapping[int, int]:
     """Return the row in the recording of each frame number of `source`.
 
-    Frames are matched by id. Without matching ids, row i is frame i; ValueError is raised if their numbers differ.
+    Frames are matched by id. Without matching ids, frame i is row i. Raises ValueError if `source` and the recording
+    then have different numbers of frames.
     """
     row_of_id = {frame_id: row for row, frame_id in enumerate(recording.ids)}
     if isinstance(source, DescriptorFile) and set(source.ids) <= set(row_of_id):

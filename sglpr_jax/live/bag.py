@@ -10,17 +10,17 @@ from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.live.data_types import WAIT_S, LatestScan, LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.sources_and_sinks import Taken
+from sglpr_jax.live.sources_and_sinks import IsInMap
 
 
 class BagSource:
     """Scans of a bag at the times of their headers, `rate` times as fast. With `rate=0`, as fast as they are taken."""
 
-    def __init__(self, root: Path, recording: Recording, options: LiveOptions, report: Report, taken: Taken):
-        """Begin after the last scan for which `taken` is true."""
+    def __init__(self, root: Path, recording: Recording, options: LiveOptions, report: Report, is_in_map: IsInMap):
+        """Begin after the last scan for which `is_in_map` is true."""
         self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
         self._poses = None if options.odometry_topic is None else recording.world_from_lidar
-        last_taken = max((row for row in range(len(recording)) if taken(self._scan_name(row))), default=-1)
+        last_taken = max((row for row in range(len(recording)) if is_in_map(self._scan_name(row))), default=-1)
         self._rows = range(last_taken + 1, len(recording))
         self._latest: LatestScan[LiveFrame] = LatestScan()
         self._stopped, self._ended = threading.Event(), threading.Event()
@@ -73,7 +73,7 @@ class BagSource:
         return f"{self._root}, scan {self._recording.ids[row]}"
 
 
-def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> BagSource:
+def open_source(where: str, options: LiveOptions, report: Report, is_in_map: IsInMap) -> BagSource:
     """Open the bag `where`.
 
     Raises:
@@ -91,4 +91,4 @@ def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) 
     )
     if options.odometry_topic is not None and recording.world_from_lidar is None:
         raise ValueError(f"{root}: expected poses with rotations on {options.odometry_topic}, found none")
-    return BagSource(root, recording, options, report, taken)
+    return BagSource(root, recording, options, report, is_in_map)

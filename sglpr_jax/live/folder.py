@@ -18,7 +18,7 @@ from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.live.data_types import LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.sources_and_sinks import Taken
+from sglpr_jax.live.sources_and_sinks import IsInMap
 
 POLL_S = 0.05
 """Time between two looks at the folder, in seconds."""
@@ -36,8 +36,8 @@ class FolderSource:
     dropped = 0
     """Scans are never dropped: their files stay until they are read."""
 
-    def __init__(self, root: Path, options: LiveOptions, report: Report, taken: Taken):
-        """Begin after the last scan for which `taken` is true. Raises ValueError if the poses are in a csv file."""
+    def __init__(self, root: Path, options: LiveOptions, report: Report, is_in_map: IsInMap):
+        """Begin after the last scan for which `is_in_map` is true. Raises ValueError if the poses are in a csv file."""
         self._root, self._options, self._report = root, options, report
         self._bin_layout: RecordFormat | None = None
         """Format of .bin files whose names do not state it, detected in the content of the first one."""
@@ -46,7 +46,7 @@ class FolderSource:
         self._listed_change_ns = 0  # modification time of the folder when it was listed last, in nanoseconds
         self._closed = False
         paths = self._list()
-        last_taken = max((row for row, path in enumerate(paths) if taken(_scan_name(path))), default=-1)
+        last_taken = max((row for row, path in enumerate(paths) if is_in_map(_scan_name(path))), default=-1)
         self._taken = set(paths[: last_taken + 1])
         self._poses = None
         if options.poses is not None:
@@ -207,9 +207,9 @@ class GrowingPoses:
         self._poses[-1] = pose
 
 
-def open_source(where: str, options: LiveOptions, report: Report, taken: Taken) -> FolderSource:
+def open_source(where: str, options: LiveOptions, report: Report, is_in_map: IsInMap) -> FolderSource:
     """Open the folder `where`. Raises FileNotFoundError if it does not exist."""
     root = Path(where)
     if not where or not root.is_dir():
         raise FileNotFoundError(f"folder:{where}: expected a folder, into which scans are written, found none")
-    return FolderSource(root, options, report, taken)
+    return FolderSource(root, options, report, is_in_map)

@@ -7,7 +7,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from sglpr_jax.files import writing
+from sglpr_jax.files import raising_write_error
 from sglpr_jax.live.data_types import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
@@ -46,5 +46,5 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> JsonLines:
     """Open standard output, or the file `where` for appending. Raises WriteError if the file cannot be written."""
     if not where:
         return JsonLines(sys.stdout)
-    with writing(Path(where)):
+    with raising_write_error(Path(where)):
         return JsonLines(Path(where).open("a", encoding="utf-8"))

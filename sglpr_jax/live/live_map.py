@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
-from sglpr_jax.files import parse_json, read_json, write_json, writing
+from sglpr_jax.files import parse_json, raising_write_error, read_json, write_json
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
@@ -166,7 +166,7 @@ class LiveMap:
         if missed and written:
             self._report("log", f"{path}: {len(missed)} loops were added that the last process missed")
         write_loops_jsonl(path, loops)
-        with writing(path):
+        with raising_write_error(path):
             self._loops_file = os.open(path, os.O_WRONLY | os.O_APPEND)
         return missed
 
@@ -223,7 +223,7 @@ class LiveMap:
         try:
             about = {name: getattr(scan, name) for name in ABOUT}
             self._log.append(len(self) - 1, frame_bytes(scan.keyframe, compared, pose=scan.pose, **about))
-            with writing(self._loops_path):
+            with raising_write_error(self._loops_path):
                 os.write(self._loops_file, loop_lines(loops).encode())
             if time.monotonic() - self._synced_at > SYNC_S:
                 self._log.sync()

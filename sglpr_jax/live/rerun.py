@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.files import check_writable, writing
+from sglpr_jax.files import check_writable, raising_write_error
 from sglpr_jax.live.data_types import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
@@ -87,7 +87,7 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> RerunSink:
     """
     if where.endswith(".rrd"):
         check_writable(Path(where))
-        with writing(Path(where)):
+        with raising_write_error(Path(where)):
             Path(where).parent.mkdir(parents=True, exist_ok=True)
         stream = rerun.RecordingStream("sglpr-jax")
         stream.save(where, default_blueprint=_layout())

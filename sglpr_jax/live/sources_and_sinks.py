@@ -1,6 +1,6 @@
 """Sources of scans and sinks of loops for the live node: what each must implement, and how one is opened by name.
 
-The module `live/NAME.py` is imported when it is used. It has `open_source(where, options, report, taken)`,
+The module `live/NAME.py` is imported when it is used. It has `open_source(where, options, report, is_in_map)`,
 `open_sink(where, options, report)` or, for a connection to ROS, `open_transport(where, report)`. To support another
 source or sink, add a module and its name.
 """
@@ -18,7 +18,7 @@ SINKS = {"json": None, "dds": "live", "zenoh": "live", "rerun": "view"}
 """Names of sources and sinks, with the extra of the package that each needs."""
 TRANSPORTS = ("dds", "zenoh")
 """Connections to ROS, each a source and a sink."""
-Taken = Callable[[str], bool]
+IsInMap = Callable[[str], bool]
 """Function that says whether a scan with this `Scan.name` is in the map already."""
 
 
@@ -52,16 +52,16 @@ class Sink(Protocol):
     def close(self) -> None: ...
 
 
-def open_source(text: str, options: LiveOptions, report: Report, *, taken: Taken = lambda name: False) -> Source:
+def open_source(text: str, options: LiveOptions, report: Report, *, is_in_map: IsInMap = lambda name: False) -> Source:
     """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
 
-    `report` receives errors of single scans and messages. Scans of files for which `taken` is true are skipped. Raises
-    ValueError if no source has this name, and ImportError if its extra is not installed.
+    `report` receives errors of single scans and messages. Scans of files for which `is_in_map` is true are skipped.
+    Raises ValueError if no source has this name, and ImportError if its extra is not installed.
     """
     name, where = split_known_name(text, SOURCES, kind="sources")
     module = _import_module(name, SOURCES[name])
     if name not in TRANSPORTS:
-        return module.open_source(where, options, report, taken)
+        return module.open_source(where, options, report, is_in_map)
     from sglpr_jax.live.ros_topics import RosSource  # needs the same extra
 
     return RosSource(module.open_transport(where, report), options, report)

@@ -92,7 +92,7 @@ def read_frame(
     except Exception as error:  # another program may have written it
         raise ValueError(f"{source}: expected frame {frame}, found another content ({in_short(error)})") from error
     x, y, yaw, correlation, second, along_m = link
-    covariance = np.diag([along_m, along_m, 0.0]) ** 2  # of the stored one, only `along_m` is used
+    covariance = np.diag([along_m, along_m, 0.0]) ** 2  # the log keeps only the deviation along the uncertain direction
     registration = None if np.isnan(link).all() else BevRegistration(x, y, yaw, covariance, correlation, second)
     fits = Fits(frames, CorrelationPeak(*arrays["fits"].T), registration)
     return keyframe, fits, arrays.get("pose"), {name: values[name] for name in annotations}

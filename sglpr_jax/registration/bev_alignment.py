@@ -222,11 +222,13 @@ def _refine_peak(
     centre = [jnp.clip(index, 1, n - 2) for index, n in zip(peak, volume.shape, strict=True)]
     block = jax.lax.dynamic_slice(volume, [index - 1 for index in centre], (3, 3, 3))
     value, gradient, hessian = _parabola(block)  # per step
-    offset = jnp.clip(jnp.linalg.solve(hessian - 1e-6 * jnp.eye(3), -gradient), -1, 1)
+    definite = hessian - 1e-6 * jnp.eye(3)  # negative definite, also for a flat peak
+    offset = jnp.clip(jnp.linalg.solve(definite, -gradient), -1, 1)
     steps = jnp.array([cell_m / 2, cell_m / 2, yaw_step])
     pose = jnp.stack([xs[centre[0]], ys[centre[1]], yaws[centre[2]]]) + offset * steps
     correlation = value + gradient @ offset + offset @ hessian @ offset / 2
     curvature = -hessian / (steps[:, None] * steps[None])
+    # Between plain walls the peak is a ridge. Its covariance follows from the correlations at a few yaws.
     nearest_turn = centre[2][None] + jnp.round(offset[2]).astype(int)
     turns = jnp.concatenate([nearest_turn, np.array(RIDGE_TURNS)])
     ridge = _ridge_covariance(product[turns], pose, yaws[turns], curvature, config)

@@ -95,7 +95,8 @@ def spectrum(images: Float[Array, "t m m"], cell_m: float, config: VerificationC
 def lower_half(spectra: Complex[Array, "*k s f"], config: VerificationConfig) -> Complex[Array, "*k r g"]:
     """Spectra of the same images on cells twice as large and with blurs twice as wide.
 
-    They are the lower half of the frequencies, with the band-pass of the input replaced by one of twice the width.
+    They are the lower half of the frequencies, with the band-pass of the input replaced by one whose blurs are twice as
+    wide in metres. Frequencies are in cycles per output cell, which are twice those per input cell.
     """
     size, cell_m = spectra.shape[-2] // 2, DENSITY_RESOLUTION_M * config.coarse
     rows, columns = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]

@@ -92,7 +92,7 @@ def footprint_distance(
 
 
 def distances(shapes: Shapes, line: Float[np.ndarray, "p 2"], *, reach_m: float) -> Float[np.ndarray, " n"]:
-    """Horizontal distance of each shape from the nearest point of a line, in metres, or inf if above `reach_m`."""
+    """Horizontal distance of each shape from the nearest point of a line, in metres. It may be inf above `reach_m`."""
     search_radius = np.hypot(shapes.half[:, 0], shapes.half[:, 1]) + reach_m
     near_points = KDTree(line).query_ball_point(np.asarray(shapes.centre)[:, :2], search_radius)
     # One row for each pair of a shape and a point near it.

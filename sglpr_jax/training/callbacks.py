@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from sglpr_jax.files import writing
+from sglpr_jax.files import raising_write_error
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.training.loss_terms import TERM_NAMES
 
@@ -124,7 +124,7 @@ class EventFiles(Callback):
 
     def close(self) -> None:
         if self._writer is not None:
-            with writing(self._folder):
+            with raising_write_error(self._folder):
                 self._writer.close()
             self._writer = None
 
@@ -133,7 +133,7 @@ class EventFiles(Callback):
         from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
         scalars = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
-        with writing(self._folder):
+        with raising_write_error(self._folder):
             self._writer = self._writer or _new_writer(self._folder, step)
             self._writer.write_event(Event(wall_time=time.time(), step=step, summary=Summary(value=scalars)))
             self._writer.flush()

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sglpr_jax.files import parse_json, write_text, writing
+from sglpr_jax.files import parse_json, raising_write_error, write_text
 
 
 class MetricsLog:
@@ -30,13 +30,13 @@ class MetricsLog:
         floats = {name: float(value) for name, value in values.items()}
         json_values = {name: value if math.isfinite(value) else None for name, value in floats.items()}
         unwritten = json.dumps({"step": step, **json_values}).encode() + b"\n"
-        with writing(self._path):
+        with raising_write_error(self._path):
             while unwritten:  # a nearly full disk may accept only a part
                 unwritten = unwritten[self._file.write(unwritten) :]
 
     def sync(self) -> None:
         """Flush the lines to disk. Called before a checkpoint, which must not be ahead of the log."""
-        with writing(self._path):
+        with raising_write_error(self._path):
             os.fsync(self._file.fileno())
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ def test_a_bag_is_replayed_as_fast_as_possible(bag, said):
     assert [frame.odometry[0, 3] for frame in frames] == pytest.approx(range(10), abs=1e-6)
     assert frames[3].scan.mounting.height_m == 1.5 and frames[3].scan.name.endswith("scan 000003")
     known = {frames[3].scan.name, frames[6].scan.name}
-    rest = open_source(f"bag:{bag}", LiveOptions(rate=0.0), said, taken=known.__contains__)
+    rest = open_source(f"bag:{bag}", LiveOptions(rate=0.0), said, is_in_map=known.__contains__)
     assert [frame.time for frame in rest.frames()] == [frame.time for frame in frames[7:]]
 
 

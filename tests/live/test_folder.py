@@ -66,7 +66,7 @@ def test_scans_of_a_folder_come_in_order_once_they_are_complete(incoming, said):
 def test_a_folder_is_continued_after_the_last_scan_of_the_map(incoming, said):
     paths = [scan(incoming / f"{i}.bin") for i in range(4)]
     known = {str(paths[1].resolve())}
-    source = open_source(f"folder:{incoming}", LiveOptions(), said, taken=known.__contains__)
+    source = open_source(f"folder:{incoming}", LiveOptions(), said, is_in_map=known.__contains__)
     assert [Path(frame.scan.name).name for frame in looked(source, 0.5)] == ["2.bin", "3.bin"]
 
 

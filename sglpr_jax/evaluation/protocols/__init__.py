@@ -68,9 +68,9 @@ def chosen_protocols(kind: Kind, names: Sequence[str]) -> list[str]:
         return list(fitting)
     for name in names:
         if name not in fitting:
-            words = {"top-k list": "a top-k list without scores", "scored top-k list": "a top-k list"}
-            available = f"{words.get(kind, kind)}, which are {', '.join(fitting)}"
-            raise ValueError(f"expected protocols for {available}; found {name}")
+            input_names = {"top-k list": "a top-k list without scores", "scored top-k list": "a top-k list"}
+            input_name = input_names.get(kind, kind)
+            raise ValueError(f"expected protocols for {input_name}, which are {', '.join(fitting)}; found {name}")
     return list(dict.fromkeys(names))
 
 

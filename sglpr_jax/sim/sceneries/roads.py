@@ -94,8 +94,8 @@ def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]
     """Vehicles on the outer lane of one direction, one every few seconds. `direction` is 1 along the line, or -1."""
     lane = shifted(line, -1.5 * LANE_M)[:-1] if direction > 0 else shifted(line, 1.5 * LANE_M)[::-1][:-1]
     length_m = len(lane) * STEP_M
-    spots, start_s = [], -length_m / 18
-    while start_s < length_m / 6:  # the vehicle is faster than 12 m/s, and may return
+    spots, start_s = [], -length_m / 18  # the slowest vehicle of these is at the end of the line when the drive starts
+    while start_s < length_m / 6:  # the sensor drives at 12 m/s or faster, at most to the end and back
         thing = moving((car, car, van, truck)[rng.integers(4)](rng))
         speed = rng.uniform(20, 32) if direction > 0 else rng.uniform(18, 28)
         spots += _drive(thing, lane, start_s, speed)

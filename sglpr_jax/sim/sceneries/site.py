@@ -147,7 +147,7 @@ def build(site: Site, driven: Line, *, clearance_m: float) -> World:
 
 
 class Rows(NamedTuple):
-    """Path through parallel rows along x. Row k is at y = k * pitch, from x = 0 to `run_m`."""
+    """Driven line through `count` parallel rows along x, each from x = 0 to `run_m` metres, at equal distances in y."""
 
     line: Line
     count: int
