@@ -138,8 +138,8 @@ class SglprConfig(_SwinStages):
 
     kind: Literal["sglpr"] = "sglpr"
     stem: CircularConfig = CircularConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
-    """Circular CNN that makes the tokens. Its last map has one pixel for each token. `fine` are the widths of the
-    layers at full resolution, and `means` the factors of average pooling before each block."""
+    """Circular CNN that makes the tokens. Its last map has one pixel for each token. `fine` are the widths of
+    additional blocks at full resolution, and `means` the numbers of sectors averaged into one after each block."""
     embed_dim: Size = 64
     depths: Depths = (2, 2)
     """Number of blocks of each stage."""
