@@ -1,4 +1,4 @@
-"""Deviation of loops from the odometry between their two frames, in standard deviations of its drift."""
+"""Deviation of loops from the odometry, in standard deviations of its drift. `DriftModel.max_deviation` is the limit."""
 
 from collections.abc import Sequence
 
