@@ -100,7 +100,12 @@ class LoopDetector:
         fits: Fits | None = None,
         continues: bool = True,
     ) -> list[LoopClosure]:
-        """Add a described frame, with the arguments of `CandidateSearch.add_keyframe`. Returns loops as `add` does."""
+        """Find candidates of a described frame, and return the loops that are now probable.
+
+        Candidates wait as pairs, because later frames on the next `WINDOW_M` metres may confirm them. Older pairs that
+        were not returned are rejected. The arguments are those of `CandidateSearch.add_keyframe`: `keyframe` is None
+        for a scan that cannot be read, and `continues` is False if the motion since the last frame is unknown.
+        """
         finder = self.finder
         candidates = finder.add_keyframe(keyframe, time=time, odometry=odometry, fits=fits, continues=continues)
         self.candidates += candidates
@@ -110,10 +115,10 @@ class LoopDetector:
             pair = pair_of(candidate, self.model, finder.motion, finder.mountings, knows_height=finder.knows_height)
             self._waiting.append(pair)
         oldest_m = finder.motion.travelled[len(self) - 1] - WINDOW_M
-        decided = sum(pair.travelled_m < oldest_m for pair in self._waiting)
-        decided = max(decided, len(self._waiting) - MAX_WAITING)
-        self.rejected += self._reject(self._waiting[:decided])
-        self._waiting = self._waiting[decided:]
+        expired = sum(pair.travelled_m < oldest_m for pair in self._waiting)
+        expired = max(expired, len(self._waiting) - MAX_WAITING)
+        self.rejected += self._reject(self._waiting[:expired])
+        self._waiting = self._waiting[expired:]
         if not candidates:
             return []
         allowed = [pair for pair in self._waiting if self._is_allowed(pair)]

@@ -1,4 +1,4 @@
-"""Deviation of loops from the odometry, in standard deviations of its drift. `DriftModel.max_deviation` is the limit."""
+"""Deviation of loops from the odometry, in standard deviations of its drift (limit: `DriftModel.max_deviation`)."""
 
 from collections.abc import Sequence
 

@@ -29,7 +29,11 @@ class Background:
         self._root = root if self._root is None else self._root + (root - self._root) / min(self.added, FRAMES)
 
     def without(self, image: UInt8[np.ndarray, "n n"]) -> UInt8[np.ndarray, "n n"]:
-        """Return an image without its background: the average or, if it is more, the median of each cell's ring."""
+        """Return an image less its background, with a lower limit of 0, computed on square roots of the cells.
+
+        The background of a cell is the median of its ring in this image or, if it is larger, the running average of the
+        cell over the added images (from `MIN_FRAMES` images on).
+        """
         if not image.size:
             return image
         root = np.sqrt(image, dtype=np.float32)

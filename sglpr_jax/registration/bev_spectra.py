@@ -147,12 +147,12 @@ def _rotate_by_90_degrees(spectra: Complex[Array, "t s f"]) -> Complex[Array, "t
 
 @functools.cache
 def _rotated_indices(size: int) -> tuple[Int[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """Source of each element of a half spectrum that is rotated by 90 degrees: row r, column c is row c, column -r.
+    """Source of each element of a half spectrum that is rotated by 90 degrees.
 
-    Columns below 0 are not stored, because they are conjugates of the opposite frequencies. Row size / 2 is stored as
-    row -size / 2, which changes the sign, because the centre of an even number of cells lies between two of them.
-    Returns the index into the flattened half spectrum, the factor of the imaginary part (-1 for conjugates), and the
-    sign.
+    Row r and column c of the result are row c and column -r of the source. A half spectrum has no columns below 0, so
+    these are read as conjugates of the opposite frequency. The frequencies size / 2 and -size / 2 share one row, but
+    differ in sign, because the image is rotated about its centre, half a cell from the nearest cells. Returns the index
+    into the flattened source, the factor of the imaginary part (-1 for conjugates), and the sign.
     """
     rows = np.rint(np.fft.fftfreq(size) * size).astype(int)[:, None]
     columns = np.arange(size // 2 + 1)[None]
@@ -250,8 +250,9 @@ def _waves(reach: int, size: int) -> tuple[Float32[np.ndarray, "_ _"], ...]:
     """Cosines and sines of an inverse Fourier transform at shifts from 0 to `reach` cells.
 
     Returns cosines and sines by row shift and row frequency, then cosines and sines by column frequency and column
-    shift. Row sines omit the frequencies without a negative partner (0 and size / 2). Column waves are scaled for the
-    inverse transform of a half spectrum.
+    shift. Row frequencies are 0 to size / 2: the caller adds (cosines) or subtracts (sines) the values at the opposite
+    frequencies first. Sines omit 0 and size / 2, which have no opposite. Column waves are scaled for the inverse
+    transform of a half spectrum.
     """
     shifts, frequencies = np.arange(reach + 1), np.arange(size // 2 + 1)
     row_phases = 2 * np.pi / size * np.outer(shifts, frequencies)

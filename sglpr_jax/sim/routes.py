@@ -37,7 +37,7 @@ class Role:
     again: float = 0.0  # fraction of the streets that are driven a second time
     opposite: bool = False  # whether the second visit is in the opposite direction
     loops: int = 1
-    """Maximum number of loops. A route with one loop ends with its second visit."""
+    """Maximum number of times that the route returns to streets driven before. With 1, it ends after this return."""
     straight: float = 0.5  # probability of driving straight ahead at a crossing
     block_m: float = 60.0  # distance between neighbouring crossings of the lattice, in metres
     winding: float = 0.2

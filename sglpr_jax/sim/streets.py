@@ -39,7 +39,7 @@ class Stretch(NamedTuple):
 
 
 class Street(NamedTuple):
-    """Line with one point per metre, and its stretches."""
+    """Middle line of a street with one point per metre, and the stretches of one width and style that divide it."""
 
     middle: np.ndarray  # (n, 2) metres
     heading: np.ndarray  # (n,) radians, unwrapped

@@ -53,10 +53,11 @@ def sinogram(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "60 120"
 def ring_distance(
     queries: Float32[np.ndarray, "q 3660"], database: Float32[np.ndarray, "n 3660"]
 ) -> Float32[np.ndarray, "q n"]:
-    """Return 1 - (the highest correlation coefficient of the magnitudes over all shifts of the angles), from 0 to 2.
+    """Return 1 minus the highest correlation coefficient of two descriptors over all shifts of the angles, from 0 to 2.
 
-    A descriptor without points has the distance 1 from every other. The published distance is 1 - m / (0.15 sqrt(120)),
-    where m sums the absolute values of the correlations of the frequencies. This function sums the correlations.
+    A descriptor has the magnitudes of the sinogram's spectrum by angle and frequency. One without points has the
+    distance 1 from every other. The published distance is 1 - m / (0.15 sqrt(120)), where m sums the absolute value of
+    each frequency's correlation over the frequencies. This function sums the correlations with their signs.
     """
 
     def compare(queries, database):
