@@ -122,7 +122,7 @@ def draw(evaluation: Evaluation) -> "dict[str, matplotlib.figure.Figure]":
 
 
 def _draw_curves(curves: Mapping[str, PrecisionRecallCurve | None], *, title: str) -> "matplotlib.figure.Figure | None":
-    """Draw the curves that are not None, or return None if there is none."""
+    """Draw the curves that are not None, or return None without such curves."""
     drawable = {name: curve for name, curve in curves.items() if curve is not None}
     return figures.precision_recall(drawable, title=title) if drawable else None
 

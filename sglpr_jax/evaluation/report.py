@@ -62,7 +62,7 @@ class TextTable:
 
 
 def _plain(text: str, *, style: str = "") -> Text:
-    """Return text that rich prints as it is. From a str, rich would interpret names in brackets as styles."""
+    """Return text that rich prints unchanged. From a str, rich would interpret names in brackets as styles."""
     return Text("\n".join(printable(line, most=MOST_IN_CELL) for line in text.split("\n")), style=style)
 
 

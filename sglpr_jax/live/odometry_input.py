@@ -162,8 +162,11 @@ class FixedMounting:
         self._mounting = mounting or self._mounting
 
     def add(self, points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
-        """Return the mounting at the next scan, or None if the scans so far do not show the ground."""
-        is_known = self._mounting is not None and not self._estimates  # stated or resumed
+        """Return the mounting for this scan: the given one, or the common one of at most `MOUNTING_SCANS` scans.
+
+        None if none of these scans shows the ground.
+        """
+        is_known = self._mounting is not None and not self._estimates  # given by the user, or by an earlier process
         if not is_known and len(self._estimates) < MOUNTING_SCANS:
             self._estimates.append(estimate_mounting(points))
             self._mounting = common_mounting(self._estimates)

@@ -31,7 +31,7 @@ LOOP_M = 10.0
 NEAR_M = (2.0, 10.0)
 """Minimum and maximum distance of the two scans of a positive pair for calibration, in metres."""
 SAME_PASS_M = 50.0
-"""Maximum travelled distance between the frames of such a pair, in metres."""
+"""Maximum travelled distance between the two frames of these pairs, in metres."""
 
 
 class Bin(NamedTuple):

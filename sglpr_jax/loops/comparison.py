@@ -80,7 +80,7 @@ class Query:
     """Frame number in the motion."""
     descriptor: Float32[np.ndarray, " d"]
     image: UInt8[np.ndarray, "m m"]
-    """Density image, of which only the part `within_reach` is compared."""
+    """Density image. Only its part `within_reach` is compared."""
     verification: VerificationConfig = VerificationConfig()
 
     @functools.cached_property

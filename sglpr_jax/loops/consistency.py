@@ -19,7 +19,7 @@ from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar, planar_pos
 BLOCK = 64
 """Number of loops compared with all others at a time, to limit memory."""
 STARTS = 20
-"""Number of loops from each of which a consistent set is grown. The largest set counts."""
+"""Number of loops from which consistent sets are grown, one from each. The largest set counts."""
 CYCLE_M, CYCLE_DEG = 0.5, 1.5
 """Standard deviations of a cycle in addition to the covariances of its loops, in metres and degrees."""
 CYCLE_DEVIATIONS = 3.0

@@ -118,7 +118,7 @@ class StoredScans(Keyframes):
         keyframe_m: float = 0.0,
         max_places: int | None = None,
     ):
-        """Start with an index without places. The limits are those of `DetectorConfig`."""
+        """Start with an index without places. `keyframe_m` and `max_places` limit the scans, as in `DetectorConfig`."""
         self.index, self.verification, self.keyframe_m, self.max_places = index, verification, keyframe_m, max_places
         self._first_frame = 0
         self._frames = GrowingArray(np.empty(0, np.int64))
@@ -126,6 +126,7 @@ class StoredScans(Keyframes):
         """Whether each scan has a loop to a newer stored scan."""
         self._compressed: list[bytes] = []
         self._shape = 0, 0
+        """Compressed image of each scan, and the shape of all of them."""
         self._spectra: OrderedDict[int, Complex64[np.ndarray, "s f"]] = OrderedDict()
         """Spectra by frame, the last used one at the end."""
 

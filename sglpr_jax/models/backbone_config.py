@@ -1,12 +1,11 @@
 """Configurations of the backbones: Swin-Unet, circular CNN, and a Swin-Unet on the tokens of the circular CNN.
 
-Besides its fields, each has the following properties:
-
-    token        rows and columns of the image that one feature represents
-    width        channels of the features
-    multiple     required divisors of the image's rows and columns: the size of one feature of the coarsest map
-    needs_polar  whether the backbone requires a polar image, because its columns wrap around
-    pictures     maps to draw as heat maps: from the title of each picture to a name in `Outputs.intermediates`
+Each has these properties:
+* `token`: rows and columns of the image that one feature represents.
+* `width`: channels of the features.
+* `multiple`: the rows and columns of the image must be multiples of it, the size of one feature of the coarsest map.
+* `needs_polar`: whether the backbone requires a polar image, because its columns wrap around.
+* `pictures`: maps to draw as heat maps, from the title of each picture to a name in `Outputs.maps`.
 """
 
 import dataclasses

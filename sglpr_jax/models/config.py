@@ -263,7 +263,7 @@ MODELS: dict[str, ModelConfig] = {
 
 
 def model_preset(name: str) -> ModelConfig:
-    """Return the model configuration with this name. Raises ValueError if there is none."""
+    """Return the model configuration with this name. Raises ValueError for an unknown name."""
     if name not in MODELS:
         raise ValueError(f"expected a model preset ({', '.join(MODELS)}), found {name!r}")
     return MODELS[name]

@@ -30,12 +30,12 @@ class OdometryCheck:
 
     def __init__(self):
         self._last_pose: Float[np.ndarray, "4 4"] | None = None
-        """Pose by odometry of the last compared scan. None if the motion since then is unknown."""
+        """Pose by odometry of the last scan that was registered for this check. None if the motion since is unknown."""
         self._frames = 0
-        """Number of scans since the last compared one."""
+        """Number of scans since then."""
         self._start_window()
         self._errors: list[tuple[float, float]] = []
-        """For each window, the error of its length, and of its angle in degrees, per metre."""
+        """For each window, the motion by odometry minus that by images: length, and angle in degrees, per metre."""
 
     def _start_window(self) -> None:
         """Forget the motion by odometry and by images since the start of the window."""
@@ -78,7 +78,10 @@ class OdometryCheck:
 
     @property
     def errors(self) -> tuple[float, float]:
-        """Root mean square errors of length and angle (degrees) per metre. Each is 0 if images alone explain it."""
+        """Root mean square errors of length and angle (degrees) per metre of all windows.
+
+        An error that does not exceed the noise of the registration counts as 0, and so do those of few windows.
+        """
         if len(self._errors) < MIN_WINDOWS:
             return 0.0, 0.0
         length, degrees = np.sqrt(np.square(self._errors).mean(axis=0)).tolist()

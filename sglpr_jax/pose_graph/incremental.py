@@ -127,7 +127,7 @@ class IncrementalTrajectory:
                 self._add_loop(loop)
 
     def _add_loop(self, loop: LoopClosure) -> None:
-        """Connect the nodes before query and match of a loop, of which at least one is in the graph. If the other node
+        """Connect the nodes before query and match of a loop. At least one of them is in the graph. If the other node
         is not, its segment enters the graph. A loop that adds no information is ignored. The covariance stays that of
         the loop, because the nodes are near its frames."""
         query, match = self._node_before(loop.query), self._node_before(loop.match)

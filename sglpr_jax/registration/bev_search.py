@@ -22,7 +22,7 @@ SECOND_M, SECOND_DEG = 3.0, 15.0
 PRIOR_M, PRIOR_DEG = 2.0, 10.0
 """Maximum distance from an expected pose of a pose near it, in metres and degrees."""
 NO_PRIOR = np.full(3, np.nan)
-"""Expected pose (x, y, yaw) if there is none: NaN allows every pose."""
+"""Value of an expected pose (x, y, yaw) that is unknown: NaN allows every pose."""
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -49,7 +49,7 @@ def coarse_correlations(
 
 
 class CorrelationPeak(NamedTuple):
-    """Pose with the highest correlation of a query in the frame of a match, or an array of such poses."""
+    """Pose with the highest correlation of a query in the frame of a match, or an array of these poses."""
 
     x: Float[AnyArray, "*b"]
     y: Float[AnyArray, "*b"]

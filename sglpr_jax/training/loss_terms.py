@@ -114,7 +114,10 @@ def _weighted(terms: dict[str, Any], config: LossConfig) -> dict[str, Any]:
 def _anchor_distances(
     descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig
 ) -> tuple[Float[Array, "t p"], Float[Array, "t places"]]:
-    """Return the distances of each anchor to its positives, and to all places of the columns of `batch.negatives`."""
+    """Return the distances of each anchor to its positives, and to each descriptor of the batch.
+
+    `batch.negatives` has the same shape as the second result, and tells which of these descriptors are negatives.
+    """
     tuples, places = batch.negatives.shape
     descriptors = descriptors[:places]  # without those of a second batch that the triplet loss ignores
     by_tuple = descriptors.reshape(tuples, -1, descriptors.shape[-1])

@@ -250,7 +250,7 @@ def test_scores_do_not_depend_on_block_sizes(make_file, monkeypatch):
     whole = [protocol(file) for protocol in DESCRIPTORS.values()]
     for block in ("protocol.BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
         monkeypatch.setattr(f"sglpr_jax.evaluation.protocols.{block}", 7)
-    monkeypatch.setattr("sglpr_jax.revisits.BLOCK", 7)
+    monkeypatch.setattr("sglpr_jax.revisits.BLOCK_QUERIES", 7)
     for one, other in zip(whole, [protocol(file) for protocol in DESCRIPTORS.values()], strict=True):
         assert one.score == pytest.approx(other.score, nan_ok=True)
         assert one.counts == other.counts

@@ -91,7 +91,7 @@ def _read(
 
 
 def bag_files(root: Path) -> tuple[Path, ...]:
-    """Return the bags at `root` (a file, a folder with metadata, or a folder of files), or () if there are none."""
+    """Return the bags at `root` (a file, a folder with metadata, or a folder of files), or () without bags."""
     endings = (*ENDINGS, *COMPRESSED)
     if root.is_file():
         return (root,) if root.name.endswith(endings) else ()

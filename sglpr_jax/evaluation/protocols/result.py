@@ -55,7 +55,7 @@ class Result:
     decisions: Int8[np.ndarray, " n"] | None = None
     """`Decision` of each frame. None for pairs and across sessions."""
     answers: Int64[np.ndarray, " n"] | None = None
-    """Retrieved frame of each frame as a query, -1 if there is none. None if the protocol applies no threshold."""
+    """Retrieved frame of each frame as a query, -1 without one. None if the protocol applies no threshold."""
     answer_distances: Float64[np.ndarray, " n"] | None = None
     """Descriptor distance of each answer, infinite for frames without an answer."""
 
