@@ -5,7 +5,7 @@ Each has these properties:
 * `width`: channels of the features.
 * `multiple`: the rows and columns of the image must be multiples of it, the size of one feature of the coarsest map.
 * `needs_polar`: whether the backbone requires a polar image, because its columns wrap around.
-* `pictures`: maps to draw as heat maps, from the title of each picture to a name in `Outputs.maps`.
+* `pictures`: maps to draw as heat maps, from the title of each picture to a name in `Outputs.intermediates`.
 """
 
 import dataclasses

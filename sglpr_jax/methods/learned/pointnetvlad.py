@@ -1,9 +1,9 @@
 """PointNetVLAD (Uy and Lee, 2018): features of points, pooled by NetVLAD, as in its authors' TensorFlow code.
 
 Published recipe: Adam 5e-5, times 0.9 every 5 epochs, at least 1e-5; lazy quadruplet with margins 0.5 and 0.2 on
-squared L2. Batches of 2 tuples with 2 positives within 10 m, 18 negatives beyond 50 m and 1 other negative; 20 epochs; hard
-negatives from epoch 6; no rotations. Differences: a constant learning rate, 8 negatives, because a step of 22 scans
-needs 4 GB, no mining, rotated scans, and one scan instead of a submap of 20 m.
+squared L2. Batches of 2 tuples with 2 positives within 10 m, 18 negatives beyond 50 m and 1 other negative; 20
+epochs; hard negatives from epoch 6; no rotations. Differences: a constant learning rate, 8 negatives, because a step
+of 22 scans needs 4 GB, no mining, rotated scans, and one scan instead of a submap of 20 m.
 """
 
 import functools
