@@ -22,7 +22,7 @@ from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe, describe_scan
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.se3 import travelled
 from sglpr_jax.sim.recording import SimulatedRecording
 

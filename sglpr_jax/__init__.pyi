@@ -38,7 +38,6 @@ from .models.config import HeadConfig as HeadConfig
 from .models.config import ModelConfig as ModelConfig
 from .models.config import model_preset as model_preset
 from .models.export import save_program as save_program
-from .models.params import Params as Params
 from .models.sglpr import Outputs as Outputs
 from .models.sglpr import describe as describe
 from .models.sglpr import forward as forward
@@ -46,6 +45,7 @@ from .models.sglpr import init as init
 from .models.sglpr import is_describable as is_describable
 from .models.sglpr import segment as segment
 from .models.shipped import shipped_weights as shipped_weights
+from .models.weights import Params as Params
 from .models.weights import average as average
 from .models.weights import for_places as for_places
 from .models.weights_file import load as load

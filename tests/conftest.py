@@ -15,8 +15,8 @@ import pytest
 from filelock import FileLock
 
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
+from sglpr_jax.models.weights import Params
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

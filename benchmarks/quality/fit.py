@@ -31,7 +31,7 @@ from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.consistency import are_consistent
 from sglpr_jax.loops.probability import DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.sequence import neighbour_weights
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.se3 import transform
 
 PAIRS = 300.0

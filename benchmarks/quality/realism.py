@@ -20,7 +20,7 @@ from sglpr_jax.evaluation.segmentation import confusion_matrix, score_confusion
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
 from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_classes, to_raw
 from sglpr_jax.models.config import model_preset
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.retrieval.image_maps import semantic_map
 
 GRID = model_preset("sglpr").grid

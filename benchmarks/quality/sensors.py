@@ -21,8 +21,8 @@ from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import view
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.models.weights import Params
 from sglpr_jax.se3 import distances, inverse, transformed
 from sglpr_jax.sim.drive import TimedPoses, plan_path, poses_on
 from sglpr_jax.sim.recording import SimulatedRecording

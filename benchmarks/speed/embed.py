@@ -13,7 +13,7 @@ import numpy as np
 import sglpr_jax
 from benchmarks.timing import clocked, in_turn, warn_if_busy
 from sglpr_jax.data.views import view
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 
 BATCH = 8
 

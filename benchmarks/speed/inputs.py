@@ -7,8 +7,8 @@ import numpy as np
 
 from sglpr_jax.grid import DENSITY_SIZE, Grid, ImageKind
 from sglpr_jax.models.config import ModelConfig, model_preset
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
+from sglpr_jax.models.weights import Params
 from sglpr_jax.training.batches import Batch
 from sglpr_jax.training.config import TrainConfig
 

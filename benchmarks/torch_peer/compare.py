@@ -13,8 +13,8 @@ from benchmarks.speed.inputs import comparable_model, random_batch, random_image
 from benchmarks.timing import Contender, Job, check_equal, in_turn, report, warn_if_busy
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe as describe_images
+from sglpr_jax.models.weights import Params
 from sglpr_jax.training.batches import Batch, views
 from sglpr_jax.training.config import LossConfig, TrainConfig
 from sglpr_jax.training.image_network import ImageNetwork

@@ -17,7 +17,7 @@ from benchmarks.torch_peer.torch_swin import SwinUnet
 from sglpr_jax.losses import DICE_EPSILON
 from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.training.config import LossConfig, TrainConfig
 
 HEADS = ("place_head", "segmentation_head", "narrow", "detail")

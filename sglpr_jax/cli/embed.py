@@ -14,7 +14,7 @@ from sglpr_jax.progress import progress_bar
 
 if TYPE_CHECKING:
     from sglpr_jax.methods.method import Method
-    from sglpr_jax.models.params import Params
+    from sglpr_jax.models.weights import Params
 
 
 @dataclasses.dataclass(frozen=True)

@@ -52,8 +52,7 @@ def export(command: ExportCommand) -> None:
     """Run the command. Raises FileExistsError if the output folder exists."""
     from sglpr_jax.data.readers import open_recording, recording_names
     from sglpr_jax.models.export import save_program
-    from sglpr_jax.models.params import Params
-    from sglpr_jax.models.weights import average, for_places
+    from sglpr_jax.models.weights import Params, average, for_places
     from sglpr_jax.models.weights_file import load, save
     from sglpr_jax.retrieval.embed import whiten
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from sglpr_jax.maps.place_map import PlaceMap
-    from sglpr_jax.models.params import Params
+    from sglpr_jax.models.weights import Params
 
 UNFINISHED = ".unfinished"
 """Suffix of the folder of a running command's checkpoint, beside the map."""

@@ -24,5 +24,7 @@ TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 ignores row numbers (0, 1, 2, ...)."""
 Scale = Literal[1, 2, 4]
 """Factor for all lengths of a recording before images are computed. Rooms fill an image only with a factor above 1."""
+SCALE = "scale"
+"""Name of the read option that states the scale of a recording."""
 ScaleChoice = Literal["auto", 1, 2, 4]
 """Scale, or "auto", which chooses it from the ranges of the scans."""

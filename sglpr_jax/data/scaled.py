@@ -9,15 +9,13 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.choices import SCALE, Scale
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import sampled_points
 from sglpr_jax.fields import check_value
 
-SCALE = "scale"
-"""Name of the read option that states the scale of a recording."""
 SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0

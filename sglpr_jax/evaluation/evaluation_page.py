@@ -21,7 +21,7 @@ from sglpr_jax.evaluation.segmentation import draw_map
 from sglpr_jax.files import file_name, json_text, text_bytes, write_all
 from sglpr_jax.metrics import PrecisionRecallCurve
 from sglpr_jax.models.config import model_preset
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.retrieval.image_maps import heat_maps, semantic_map
 
 if TYPE_CHECKING:

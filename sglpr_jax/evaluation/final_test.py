@@ -15,7 +15,7 @@ from sglpr_jax.evaluation.segmentation import SegmentationScore, segment_recordi
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.names import BESIDE, NETWORK
 from sglpr_jax.methods.registry import method_beside, network
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.embed import embed
 

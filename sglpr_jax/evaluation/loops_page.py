@@ -15,7 +15,6 @@ from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import LoopSearchResult, diagnose_no_loops
 from sglpr_jax.odometry.path import level_odometry
-from sglpr_jax.pose_graph.folder import unique_names
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements, trajectory_error
 from sglpr_jax.same_place import NEGATIVE_M
 from sglpr_jax.se3 import yaw_of
@@ -33,7 +32,7 @@ def loops_page(result: LoopSearchResult, *, optimized: OptimizedTrajectory | Non
     if len(result.sessions) == 1:
         title = f"Loops of {result.sessions[0].recording.name}"
         return render(title, _summary(result), _recording_sections(result, optimized))
-    names = unique_names(result)
+    names = result.unique_names
     sections = [_transform_section(result, names), *_common_frame_sections(result, names, optimized)]
     for match, query in result.pairs:
         between = result.between(match, query)

@@ -14,7 +14,7 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.report import PrintsItself, TextTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.image_maps import SemanticMap, semantic_map
 

@@ -14,7 +14,7 @@ from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.sources_and_sinks import Sink, Source
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.se3 import transform
 
 PROGRESS_S = 10.0

@@ -17,7 +17,7 @@ from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import level_odometry

@@ -14,8 +14,7 @@ from sglpr_jax.loops.closure import LoopClosure, to_lidar, to_upright
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan, image_spectrum
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.models.weights import Params, weights_hash
 from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, BevOdometry
 from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.odometry.drift_model import MOTION_DRIFT, DriftModel

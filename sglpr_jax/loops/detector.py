@@ -16,7 +16,7 @@ from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.loops.sequence import WINDOW_M, Pair, pair_of, probable_loops, rejection_reason
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 
 MAX_WAITING = 240
 """Maximum number of pairs that wait for their neighbours. It limits the computation per frame if the sensor is slow."""

@@ -16,8 +16,8 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.grid import DENSITY_MAX_COUNT
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.weights import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_spectra import match_spectra

@@ -70,6 +70,17 @@ class LoopSearchResult:
         return np.split(poses, np.cumsum([session.frames for session in self.sessions])[:-1])
 
     @property
+    def unique_names(self) -> list[str]:
+        """Name of each session's recording. A repeated name gets the suffix ~2, ~3 and so on."""
+        names: list[str] = []
+        for session in self.sessions:
+            name, number = session.recording.name, 2
+            while name in names:
+                name, number = f"{session.recording.name}~{number}", number + 1
+            names.append(name)
+        return names
+
+    @property
     def pairs(self) -> list[tuple[int, int]]:
         """All pairs of sessions, by number: first the session of the matches, then that of the queries."""
         return list(itertools.combinations(range(len(self.sessions)), 2))

@@ -35,7 +35,7 @@ from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.result import LoopSearchResult, Session, ordered_rejections
 from sglpr_jax.loops.sequence import pair_of, probable_loops, rejection_reason
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.gicp import check_installed, is_installed

@@ -21,7 +21,7 @@ from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.maps.place_map import PlaceMap, place_names
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.retrieval.index import Index
 
 

@@ -26,7 +26,7 @@ from sglpr_jax.loops.comparison import KeyframeComparison, Query
 from sglpr_jax.loops.config import CANDIDATES, MIN_CELLS, CandidateConfig, PlaceCount
 from sglpr_jax.loops.keyframes import Keyframe, Keyframes
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_spectra import within_reach

@@ -21,10 +21,9 @@ from sglpr_jax.methods.method import LABELLED, HandcraftedMethod, Method
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.models.weights import Params, weights_hash
 from sglpr_jax.models.weights_file import load
 
 

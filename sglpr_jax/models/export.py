@@ -19,9 +19,8 @@ from sglpr_jax.fields import check_value
 from sglpr_jax.files import check_holds_only, replacing, write_json
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, Grid
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
-from sglpr_jax.models.weights import for_places
+from sglpr_jax.models.weights import Params, for_places
 from sglpr_jax.models.weights_file import CONFIG_FILE, load, save
 
 ProgramFormat = Literal["stablehlo", "onnx"]

@@ -1,5 +1,6 @@
 """The network, and the calls that users make: `describe`, `segment`, `forward`, `is_describable` and `init`."""
 
+import functools
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -13,11 +14,11 @@ from sglpr_jax.models.circular import CircularDecoder, CircularNet
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import PlaceHead, input_without_backbone
 from sglpr_jax.models.segmentation_head import segmentation_head
 from sglpr_jax.models.swin import PatchExpand
 from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
+from sglpr_jax.models.weights import Params, by_name
 
 
 def _encode(
@@ -200,3 +201,9 @@ def init(key: Array, *, preset: str = "sglpr", config: ModelConfig | None = None
     traced = jax.eval_shape(SGLPR(config).init, key, image, labels)
     distributions, shapes = traced["initial"], traced["params"]
     return Params(draw_all(key, distributions, shapes), config)
+
+
+@functools.cache
+def weight_shapes(config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shape and type of every weight of a configuration, without computing the weights."""
+    return by_name(jax.eval_shape(lambda: init(jax.random.key(0), config=config)).weights)

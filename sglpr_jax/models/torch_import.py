@@ -13,8 +13,8 @@ import safetensors.numpy
 from sglpr_jax.files import in_short, naming
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.weights import as_tree, by_name, weight_shapes
+from sglpr_jax.models.sglpr import weight_shapes
+from sglpr_jax.models.weights import Params, as_tree, by_name
 
 _NAME_REPLACEMENTS = (
     (r"^backbone/", ""),

@@ -1,11 +1,11 @@
-"""Operations on weights: names, parts, partial restore, checksums, averages, and the fit of the whitening layer."""
+"""Parameters of a model: names, parts, partial restore, checksums, averages, and the fit of the whitening layer."""
 
 import dataclasses
-import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import flax.struct
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,21 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.models.config import WHITENING_POWER, ModelConfig
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import init
 
 SEGMENTATION_LAYERS = ("segmentation_head", "narrow", "detail")
 PIXEL_LAYERS = ("expand", "decoder")
 """Layers for the segmentation head, and for a place head with `head.tap="pixels"`."""
 SMALLEST_SPREAD = 1e-3
 """Minimum spread of a direction, as a fraction of the largest spread. Smaller spreads are replaced by it."""
+
+
+@flax.struct.dataclass
+class Params:
+    """Parameters of a model: a pytree of weights whose static part is `config`."""
+
+    weights: Any
+    """Nested dictionaries of arrays, with the names of the model's layers as keys."""
+    config: ModelConfig = flax.struct.field(pytree_node=False)
 
 
 def by_name(weights: Any) -> dict[str, Any]:
@@ -31,12 +38,6 @@ def by_name(weights: Any) -> dict[str, Any]:
 def as_tree(named: dict[str, Any]) -> Any:
     """Rebuild the nested dictionaries from the output of `by_name`."""
     return flax.traverse_util.unflatten_dict(named, sep="/")
-
-
-@functools.cache
-def weight_shapes(config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return the shape and type of every weight of a configuration, without computing the weights."""
-    return by_name(jax.eval_shape(lambda: init(jax.random.key(0), config=config)).weights)
 
 
 def graft(source: Params, target: Params) -> Params:

@@ -57,7 +57,7 @@ def write_loop_folder(
 
     Raises WriteError if a file cannot be written. All files of an earlier run then stay as they were.
     """
-    folder, names, numbers, placed = Path(folder), unique_names(result), vertex_numbers(result), placements(result)
+    folder, names, numbers, placed = Path(folder), result.unique_names, vertex_numbers(result), placements(result)
     ids, recordings = dict[int, str](), dict[int, str]()  # by vertex number
     chains = []  # vertex numbers and poses of each session with odometry
     for name, vertices, (_, group_from_session), session in zip(names, numbers, placed, result.sessions, strict=True):
@@ -101,17 +101,6 @@ def graph_files(
         LOOPS_CSV: partial(write_loops_csv, loops=loops, recordings=recordings),
         REJECTED: partial(write_loops_jsonl, loops=rejected, ids=ids, recordings=recordings),
     }
-
-
-def unique_names(result: LoopSearchResult) -> list[str]:
-    """Return the name of each session's recording. A repeated name gets the suffix ~2, ~3 and so on."""
-    names: list[str] = []
-    for session in result.sessions:
-        name, number = session.recording.name, 2
-        while name in names:
-            name, number = f"{session.recording.name}~{number}", number + 1
-        names.append(name)
-    return names
 
 
 def vertex_numbers(result: LoopSearchResult) -> list[Int[np.ndarray, " _"]]:

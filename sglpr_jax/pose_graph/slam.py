@@ -14,8 +14,8 @@ from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.loops.search import find_loops
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.models.weights import Params
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.odometry import kiss_icp
 from sglpr_jax.odometry.config import OdometryConfig

@@ -18,7 +18,7 @@ from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.trained import method_of
 from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1, VARIANTS, variant_config

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.scaled import SCALE
+from sglpr_jax.data.choices import SCALE, Scale
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import json_in_short, naming, parse_json, replacing
 from sglpr_jax.numpy_files import read_arrays

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32
 
+from sglpr_jax.data.choices import SCALE
 from sglpr_jax.data.deskew import DESKEWED
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scaled import SCALE, scale_of
+from sglpr_jax.data.scaled import scale_of
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, require_content, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
@@ -21,8 +22,7 @@ from sglpr_jax.methods.method import LABELLED, Method, check_descriptors
 from sglpr_jax.methods.registry import checked_view, network
 from sglpr_jax.models.config import WHITENING_POWER, ModelConfig
 from sglpr_jax.models.input_image import field_of_view
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.weights import with_whitening, without_whitening
+from sglpr_jax.models.weights import Params, with_whitening, without_whitening
 from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
 
 SCANS_AHEAD = 8

@@ -17,8 +17,8 @@ from sglpr_jax.data.views import view
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import UNLABELLED, to_raw
 from sglpr_jax.models.input_image import field_of_view, from_polar
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward, segment
+from sglpr_jax.models.weights import Params
 
 
 class SemanticMap(NamedTuple):

@@ -19,7 +19,7 @@ from sglpr_jax.fields import Size
 from sglpr_jax.files import file_name, in_short, naming, parse_json, replacing
 from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import network
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.schema import check_about

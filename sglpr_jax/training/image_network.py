@@ -12,9 +12,8 @@ from jaxtyping import Array, Bool
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward, init
-from sglpr_jax.models.weights import freeze_descriptor_layers
+from sglpr_jax.models.weights import Params, freeze_descriptor_layers
 from sglpr_jax.training.batches import Batch, in_network_order, views
 from sglpr_jax.training.config import LossConfig, OcclusionConfig, TrainConfig
 from sglpr_jax.training.devices import keep_sharding, per_device

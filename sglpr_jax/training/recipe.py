@@ -13,9 +13,8 @@ from jaxtyping import Float32, Int
 
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights import graft, without_whitening
+from sglpr_jax.models.weights import Params, graft, without_whitening
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.batches import positions_of, tuple_pool

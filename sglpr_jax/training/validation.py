@@ -11,8 +11,8 @@ from scipy.spatial.distance import cdist
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.methods.method import DistanceFn
 from sglpr_jax.metrics import decision_curve
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.weights import Params
 from sglpr_jax.revisits import database_end, revisits
 from sglpr_jax.training.batches import Batch, positions_of, read_batch, tuple_pool, views
 from sglpr_jax.training.config import TrainConfig

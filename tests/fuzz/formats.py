@@ -28,7 +28,8 @@ from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, config_from_dict
-from sglpr_jax.models.weights import hash_of, weight_shapes
+from sglpr_jax.models.sglpr import weight_shapes
+from sglpr_jax.models.weights import hash_of
 from sglpr_jax.models.weights_file import CONFIG_FILE, VALUES_HASH, WEIGHTS_FILE, load
 from sglpr_jax.pose_graph import files as loop_files
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile

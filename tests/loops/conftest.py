@@ -11,7 +11,7 @@ from sglpr_jax.loops.comparison import Candidate, KeyframeComparison
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe, describe_scan
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import yaw_of
 

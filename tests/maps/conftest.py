@@ -7,7 +7,7 @@ from drives import PASS, drive, part_of_drive  # noqa: F401
 import sglpr_jax
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.sim.recording import SimulatedRecording
 
 

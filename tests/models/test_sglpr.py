@@ -12,8 +12,8 @@ import pytest
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.input_image import prepare
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe, forward, init, segment
+from sglpr_jax.models.weights import Params
 
 # One stage instead of two, so that a program compiles in a second.
 CONFIG = dataclasses.replace(

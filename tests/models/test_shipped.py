@@ -12,10 +12,9 @@ from sglpr_jax.grid import Grid
 from sglpr_jax.models import shipped
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, model_preset
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.shipped import shipped_weights, weights_folder
-from sglpr_jax.models.weights import for_places
+from sglpr_jax.models.weights import Params, for_places
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 FILES = ["README.md", CONFIG_FILE, WEIGHTS_FILE]

@@ -10,9 +10,9 @@ import pytest
 import safetensors.numpy
 
 from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.torch_import import from_torch_names, import_swin_t, import_swin_unet, torch_name
+from sglpr_jax.models.weights import Params
 
 
 @pytest.fixture

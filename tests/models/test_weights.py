@@ -12,9 +12,9 @@ import pytest
 import sglpr_jax
 from sglpr_jax.models.backbone_config import CircularConfig
 from sglpr_jax.models.config import HeadConfig, model_preset
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import describe, init
+from sglpr_jax.models.sglpr import describe, init, weight_shapes
 from sglpr_jax.models.weights import (
+    Params,
     as_tree,
     average,
     by_name,
@@ -22,7 +22,6 @@ from sglpr_jax.models.weights import (
     fit_whitening,
     for_places,
     graft,
-    weight_shapes,
     weights_hash,
     with_whitening,
     without_whitening,

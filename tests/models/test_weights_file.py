@@ -12,8 +12,7 @@ import safetensors.numpy
 
 from sglpr_jax.models import weights_file
 from sglpr_jax.models.config import model_preset
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.weights import hash_of, weights_hash
+from sglpr_jax.models.weights import Params, hash_of, weights_hash
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 

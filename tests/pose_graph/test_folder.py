@@ -14,7 +14,7 @@ from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl
-from sglpr_jax.pose_graph.folder import FIRST_VERTEX, unique_names, vertex_numbers, write_loop_folder
+from sglpr_jax.pose_graph.folder import FIRST_VERTEX, vertex_numbers, write_loop_folder
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import inverse, transform
 
@@ -125,7 +125,7 @@ def test_without_a_common_place_each_trajectory_stays_in_its_frame(pair, tmp_pat
 
 def test_names_and_vertices_of_sessions_do_not_collide(pair):
     same = dataclasses.replace(pair, sessions=(pair.sessions[0],) * 3)
-    assert unique_names(same) == ["monday", "monday~2", "monday~3"]
+    assert same.unique_names == ["monday", "monday~2", "monday~3"]
     assert [int(rows[0]) for rows in vertex_numbers(same)] == [0, FIRST_VERTEX, 2 * FIRST_VERTEX]
     recording = pair.sessions[0].recording
     recording = dataclasses.replace(recording, rows=np.arange(len(recording)) + FIRST_VERTEX)

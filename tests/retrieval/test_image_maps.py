@@ -19,8 +19,8 @@ from sglpr_jax.labels import to_raw
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import MODELS, HeadConfig, model_preset
 from sglpr_jax.models.input_image import field_of_view
-from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward, init, segment
+from sglpr_jax.models.weights import Params
 from sglpr_jax.retrieval.image_maps import heat_maps, semantic_map
 
 HEAD = HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)

@@ -11,7 +11,7 @@ from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.backbone_config import CircularConfig, SwinConfig
 from sglpr_jax.models.config import HeadConfig, model_preset
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.training.batch_source import TupleBatches
 from sglpr_jax.training.batches import Batch
 from sglpr_jax.training.config import OptimizerConfig, TrainConfig

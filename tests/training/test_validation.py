@@ -9,7 +9,7 @@ from recordings import of_images
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import Params
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.training import validation
 from sglpr_jax.training.config import TrainConfig
