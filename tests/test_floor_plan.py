@@ -22,6 +22,7 @@ FLOORS = (
     ("cli",),
 )
 """From the ground up. Only the files of the ground import others on their own floor."""
+MOST_FILES_IN_A_CHAIN = 14
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 FILES = {
     ".".join(("sglpr_jax", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): path
@@ -31,10 +32,13 @@ FILES = {
 
 
 @functools.cache
-def imported(path: Path) -> tuple[str, ...]:
-    """The modules that a file imports; of `from a import b` the file b of the package a where there is one."""
-    found = []
-    for node in ast.walk(ast.parse(path.read_text())):
+def imported(path: Path, *, when_loaded: bool = False) -> tuple[str, ...]:
+    """The modules that a file imports, perhaps only those when it is loaded, not in its functions.
+
+    Of `from a import b`, this is the file b of the package a where there is one.
+    """
+    found, tree = [], ast.parse(path.read_text())
+    for node in tree.body if when_loaded else ast.walk(tree):
         if isinstance(node, ast.Import):
             found += [name.name for name in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -63,6 +67,16 @@ def test_every_room_has_a_floor():
 def test_no_two_files_import_each_other():
     graph = {module: {other for other in imported(path) if other in FILES} for module, path in FILES.items()}
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+def test_chains_of_imports_are_short():
+    @functools.cache
+    def chain(module: str) -> tuple[str, ...]:
+        below = (chain(other) for other in imported(FILES[module], when_loaded=True) if other in FILES)
+        return (module, *max(below, key=len, default=()))
+
+    longest = max((chain(module) for module in FILES), key=len)
+    assert len(longest) <= MOST_FILES_IN_A_CHAIN, " -> ".join(longest)
 
 
 def test_flax_modules_are_in_the_models_and_learned_methods_alone():

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from tests.live.test_ros import Memory
 
 from sglpr_jax.cli.live import LiveCommand
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_encoding import CLOUD, EDGE, TRANSFORMS
 from sglpr_jax.live.ros_topics import RosSource, Transport
 from tests.live.messages import ODOMETRY, POINTS, cloud, odometry, received
+from tests.live.test_ros_topics import Memory
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "ros2" / "sglpr_ros"
