@@ -56,6 +56,8 @@ class Recall(Protocol):
     """
 
     takes: tuple[Kind, ...] = ("descriptors", "top-k list", "scored top-k list")
+    metres: str = "5 m"
+    """Distance of right answers, as stated in results."""
     near: Near = lambda metres: metres < 5
     """Whether an answer at this distance in metres is right."""
     split: Callable[[Source, Float[np.ndarray, "n _"]], Split]
@@ -77,7 +79,7 @@ class Recall(Protocol):
         first_answer = np.where(right[:, 0], Decision.TRUE_POSITIVE, Decision.FALSE_NEGATIVE)
         decisions[queries] = np.where(counted, first_answer, Decision.UNCOUNTED)
         counts = {"queries": len(queries), "revisits": int(revisited.sum())}
-        result = replace(self.new_result(f"5 m, {split}", source), counts=counts, decisions=decisions)
+        result = replace(self.new_result(f"{self.metres}, {split}", source), counts=counts, decisions=decisions)
         if not counted.any():
             return result
         n = self.numbers[0]
