@@ -35,7 +35,7 @@ LOG = "checkpoint.log"
 OLD = "settings.json"
 """File of checkpoints of earlier versions, which are not read."""
 FRAME_FORMAT = "sglpr-jax live 4"
-LINK = ("x", "y", "yaw", "correlation", "second", "along_m")
+LINK = ("x", "y", "yaw", "correlation", "peak_ratio", "along_m")
 """Stored fields of the registration that shows the motion (`Fits.link`)."""
 COLUMNS = {
     "descriptor": Column("float32", ("d",), optional=True),
@@ -52,10 +52,11 @@ def frame_bytes(
     keyframe: Keyframe | None, fits: Fits, *, pose: Float[np.ndarray, "4 4"] | None = None, **values: Any
 ) -> bytes:
     """Serialise a frame for `read_frame`: description, comparisons, pose by odometry, and further JSON values."""
+    link = [np.nan] * len(LINK) if fits.link is None else [float(getattr(fits.link, name)) for name in LINK]
     arrays = {
         "fitted": np.asarray(fits.frames, np.int64),
         "fits": np.stack(fits.peaks, axis=1).astype(np.float64),
-        "links": np.array([[float(getattr(fits.link, name, np.nan)) for name in LINK]]),  # NaN without a link
+        "links": np.array([link]),
     }
     if keyframe is not None:
         arrays |= {"descriptor": keyframe.descriptor, "image": keyframe.image}
@@ -91,9 +92,9 @@ def read_frame(
             keyframe = Keyframe(arrays["descriptor"], arrays["image"], mounting)
     except Exception as error:  # another program may have written it
         raise ValueError(f"{source}: expected frame {frame}, found another content ({in_short(error)})") from error
-    x, y, yaw, correlation, second, along_m = link
+    x, y, yaw, correlation, peak_ratio, along_m = link
     covariance = np.diag([along_m, along_m, 0.0]) ** 2  # the log keeps only the deviation along the uncertain direction
-    registration = None if np.isnan(link).all() else BevRegistration(x, y, yaw, covariance, correlation, second)
+    registration = None if np.isnan(link).all() else BevRegistration(x, y, yaw, covariance, correlation, peak_ratio)
     fits = Fits(frames, CorrelationPeak(*arrays["fits"].T), registration)
     return keyframe, fits, arrays.get("pose"), {name: values[name] for name in annotations}
 

@@ -8,6 +8,7 @@ Each has these properties:
 * `pictures`: maps to draw as heat maps, from the title of each picture to a name in `Outputs.intermediates`.
 """
 
+import abc
 import dataclasses
 import math
 from typing import Literal
@@ -24,7 +25,7 @@ def check_lengths(owner: str, **lists: tuple[int, ...]) -> None:
         raise ValueError(f"expected equal numbers of {', '.join(names)} and {last_name} of {owner}, found {found}")
 
 
-class _SwinStages:
+class _SwinStages(abc.ABC):
     """Properties and checks of `SwinConfig` and `SglprConfig`. Stage i has `embed_dim` * 2**i channels."""
 
     embed_dim: int
@@ -42,8 +43,9 @@ class _SwinStages:
                 raise ValueError(f"heads: expected a divisor of the {channels} channels of stage {i}, found {heads}")
 
     @property
+    @abc.abstractmethod
     def token(self) -> tuple[int, int]:
-        raise NotImplementedError
+        """Rows and columns of the image that one token represents."""
 
     @property
     def width(self) -> int:

@@ -190,7 +190,7 @@ class BevOdometry:
             limit = MAX_SECOND_OF_JUMP
         elif apart_m <= EXPECTED_M and link.angle_to(prior[2]) <= np.radians(EXPECTED_DEG):
             limit = MAX_SECOND_EXPECTED
-        return bool(link.correlation >= MIN_CORRELATION and link.second <= limit) and not self.is_ridge(link)
+        return bool(link.correlation >= MIN_CORRELATION and link.peak_ratio <= limit) and not self.is_ridge(link)
 
     def is_ridge(self, link: BevRegistration) -> bool:
         """Whether the registered images show the position in one direction only, as between walls."""

@@ -63,7 +63,7 @@ class OdometryCheck:
         """
         step = None if self._last_pose is None else inverse(self._last_pose) @ pose
         self._last_pose, self._frames = pose, 0
-        is_clear = link is not None and link.second <= MAX_SECOND and link.along_m <= MAX_ALONG_M
+        is_clear = link is not None and link.peak_ratio <= MAX_SECOND and link.along_m <= MAX_ALONG_M
         if step is None or link is None or not is_clear or np.linalg.norm(step[:3, 3]) > MAX_STEP_M:
             self._start_window()
             return

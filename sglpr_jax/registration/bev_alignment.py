@@ -146,8 +146,8 @@ class BevRegistration(NamedTuple):
     """Covariance of x, y (metres) and yaw (radians), in the match's frame, if this peak is the correct one."""
     correlation: Float[AnyArray, "*b"]
     """Correlation at the peak: 1 for equal images, about 0 for unrelated ones."""
-    second: Float[AnyArray, "*b"]
-    """Second-peak ratio: correlation at the best other pose divided by that at this pose. It is near 1 if both fit."""
+    peak_ratio: Float[AnyArray, "*b"]
+    """Correlation at the best other pose divided by that at this pose. It is near 1 if both fit."""
 
     @property
     def along_m(self) -> float:
@@ -195,11 +195,11 @@ def refine(
     config: VerificationConfig = DEFAULT,
 ) -> BevRegistration:
     """Register two images near a peak of `search`, to a fraction of a cell. The images and errors are as in `align`."""
-    second_ratio = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
+    peak_ratio = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
     query, match = prepare_image(query, config), prepare_image(match, config)
     pose, correlation, covariance = _refine_peak(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
     yaw = jnp.mod(pose[2] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return BevRegistration(pose[0], pose[1], yaw, covariance, correlation, second_ratio)
+    return BevRegistration(pose[0], pose[1], yaw, covariance, correlation, peak_ratio)
 
 
 def _refine_peak(

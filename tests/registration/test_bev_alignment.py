@@ -32,7 +32,7 @@ def test_the_pose_of_the_images_is_found(yaw, x, y, seed):
     found = align(*images, config=SMALL)
     error = difference(pose_of(found), relative(match, query))
     assert np.hypot(*error[:2]) < 0.15 and abs(np.degrees(error[2])) < 1, error
-    assert found.correlation > 0.4 and found.second < 0.8 and -np.pi <= found.yaw <= np.pi
+    assert found.correlation > 0.4 and found.peak_ratio < 0.8 and -np.pi <= found.yaw <= np.pi
 
 
 def test_the_peak_is_that_of_a_brute_force_search():
@@ -98,7 +98,7 @@ def test_other_places_correlate_less_and_another_pose_fits_as_well():
     assert same.correlation == pytest.approx(1, abs=0.02)
     for other in images[1:]:
         found = align(images[0], other, config=SMALL)
-        assert found.correlation < 0.5 < found.second
+        assert found.correlation < 0.5 < found.peak_ratio
 
 
 def test_wrong_sizes_are_refused():
@@ -112,4 +112,4 @@ def test_empty_images_fit_nothing_and_nothing_is_nan():
     for query, match in ((empty, empty), (empty, seen_from(place(0), (0.0,) * 3))):
         found = align(query, match, config=SMALL)
         assert all(np.isfinite(value).all() for value in found) and abs(found.correlation) < 1e-3
-        assert found.second == 1
+        assert found.peak_ratio == 1
