@@ -42,6 +42,7 @@ PROGRAMS = {
     "speed loops": Program("speed.loops", "loops", "memory and time of the loop detector on a long drive"),
     "speed live": Program("speed.live", "live", "latency, dropped scans and memory of bin/live"),
     "speed start-up": Program("speed.start_up", "start_up", "time until a command starts"),
+    "speed trees": Program("speed.trees", "trees", "commands of this checkout and of another one in turn"),
     "speed training": Program("speed.training", "training", "training steps, and their share of the device's peak"),
     "speed profile": Program("speed.profile_step", "profile", "parts of a training step"),
     "torch describe": Program("torch_peer.compare", "describe", "descriptors beside the same network in PyTorch"),

@@ -98,11 +98,16 @@ def replay(
     *,
     breaks: bool = False,
 ) -> Iterator[list[Any]]:
-    """Adds the scans of a drive to a search, one by one, and yields the results of `add_keyframe`.
+    """Adds the keyframes of a drive to a search, one by one, and yields the results of `add_keyframe`.
 
     With `breaks`, the motion to the scan in the middle of the drive is unknown.
     """
+    finder = search.finder if isinstance(search, LoopDetector) else search
     for i, keyframe in enumerate(drive.keyframes):
         pose = None if odometry is None else odometry[i]
         continues = not (breaks and i == len(drive.keyframes) // 2)
-        yield search.add_keyframe(keyframe, time=float(drive.times[i]), odometry=pose, continues=continues)
+        when = {"time": float(drive.times[i]), "odometry": pose, "continues": continues}
+        if finder.is_due(**when):
+            yield search.add_keyframe(keyframe, **when)
+        else:
+            finder.skip()

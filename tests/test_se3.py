@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.se3 import (
+    adjoint,
     are_rotations,
     distances,
     from_quaternions,
@@ -44,6 +45,17 @@ def test_quaternions_go_there_and_back():
     found = quaternions(poses())
     assert (found[:, 3] >= 0).all()
     np.testing.assert_allclose(from_quaternions(poses()[:, :3, 3], found), poses(), atol=1e-12)
+
+
+def test_the_adjoint_moves_small_motions_to_another_frame():
+    motion = 1e-6 * np.random.default_rng(2).normal(size=6)
+    moved = np.eye(4)
+    moved[:3, :3], moved[:3, 3] = Rotation.from_rotvec(motion[3:]).as_matrix(), motion[:3]
+    in_other_frame = poses() @ moved @ np.linalg.inv(poses())
+    expected = np.concatenate(
+        [in_other_frame[:, :3, 3], Rotation.from_matrix(in_other_frame[:, :3, :3]).as_rotvec()], axis=1
+    )
+    np.testing.assert_allclose(adjoint(poses()) @ motion, expected, atol=1e-10)
 
 
 def test_travelled_distance_is_the_sum_of_steps():

@@ -26,6 +26,7 @@ from benchmarks.quality.scoring import (
     count_loops,
     describe_errors,
     pose_errors,
+    represented,
     rule_of,
     town_rule,
 )
@@ -39,6 +40,7 @@ from sglpr_jax.evaluation.protocols.protocol import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.loops.acceptance import accept_loops
 from sglpr_jax.loops.calibration import reliability_of
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import StoredScans
 from sglpr_jax.loops.probability import Evidence
@@ -66,6 +68,12 @@ class Task(NamedTuple):
     params: sglpr_jax.Params
     weights: str
     environment: Path
+    keyframe_m: float
+
+    @property
+    def detector(self) -> LoopDetector:
+        """A detector without scans."""
+        return LoopDetector(self.params, config=DetectorConfig(keyframe_m=self.keyframe_m))
 
     @property
     def folder(self) -> Path:
@@ -112,7 +120,7 @@ class _ScanContextStore(StoredScans):
 
 def _search_by_scan_context(task: Task) -> Answer:
     """Scan Context chooses the candidates. The loop detector does the rest."""
-    detector, recording = LoopDetector(task.params), task.simulate()
+    detector, recording = task.detector, task.simulate()
     index = Index.empty(NUMBERS, weights_hash=detector.finder.index.weights_hash)
     detector.finder.stored = _ScanContextStore(index)
     keyframes = [
@@ -145,7 +153,7 @@ def _search_by_local_maps(task: Task, *, method: str) -> Answer:
 
 
 METHODS: dict[str, Callable[[Task], Answer]] = {
-    "sglpr": lambda task: _search_with(LoopDetector(task.params), task),
+    "sglpr": lambda task: _search_with(task.detector, task),
     "scan-context": _search_by_scan_context,
     "bin-loops": _search_by_bin_loops,
     "kiss-slam": functools.partial(_search_by_local_maps, method="kiss-slam"),
@@ -169,6 +177,7 @@ def loops(
     odometry: Odometry = "none",
     scale: Scale = 1,
     weights: str = "sglpr",
+    keyframe_m: float = DetectorConfig.keyframe_m,
     environment: Path = Path("build/peers"),
     out: Path = Path("build/loops"),
 ) -> None:
@@ -183,8 +192,8 @@ def loops(
     within 3 m of a scan 30 m of path before that have a loop with a right pose.
 
     Described scans are kept in `out`, so that a further search does not render them. The error of a trajectory is the
-    root mean square of positions after rigid alignment. kiss-slam, map-closures and bin-loops run in separate
-    processes, read files, and their seconds include imports and compilation.
+    root mean square of positions after rigid alignment. A loop counts for all scans within 3 m of path. kiss-slam,
+    map-closures and bin-loops run in separate processes, read files, and their seconds include imports and compilation.
 
     Args:
         drives: drives to search.
@@ -192,6 +201,7 @@ def loops(
         odometry: poses that sglpr and scan-context are given.
         scale: factor for all lengths before a scan is described; another scale needs another folder.
         weights: model that describes the scans.
+        keyframe_m: distance between keyframes in metres, of sglpr and scan-context.
         environment: folder of the environment of kiss-slam and MapClosures, made if it does not exist.
         out: folder of the drives.
     """
@@ -203,7 +213,7 @@ def loops(
         if not path.exists():
             described.store(path, simulate(), params, scale=scale, **drive._asdict())
         stored = described.read(path)
-        task = Task(stored, simulate, stored.odometry(odometry, drive.seed), params, weights, environment)
+        task = Task(stored, simulate, stored.odometry(odometry, drive.seed), params, weights, environment, keyframe_m)
         poses = scaled_poses(stored.world_from_lidar, 1 / stored.scale)
         rule = rule_of(drive, poses, stored.times)
         for name in method:
@@ -250,6 +260,7 @@ def _pose_counts(drive: DescribedDrive, loops: Sequence[Any]) -> list[int]:
     poses = np.array([loop.match_from_query for loop in loops])
     errors = pose_errors([(loop.query, loop.match) for loop in loops], poses, drive.world_from_lidar)
     right_queries = {loop.query for loop, is_right in zip(loops, errors.right, strict=True) if is_right}
+    right_queries = represented(right_queries, scaled_poses(drive.world_from_lidar, 1 / drive.scale)[:, :3, 3])
     revisits = set(np.flatnonzero(drive.revisits).tolist())
     wrong_on_storey = errors.wrong & (errors.storey_m <= STOREY_M)
     return [int(errors.wrong.sum()), int(wrong_on_storey.sum()), len(right_queries & revisits), len(revisits)]

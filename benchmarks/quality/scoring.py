@@ -1,6 +1,6 @@
 """Scores of loops: right and wrong ones, recall of revisits, errors of poses, and calibration."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +24,8 @@ STOREY_M, SLOPE = 1.6, 0.3
 """Difference in height of scans on different storeys, in metres, and steepest slope between scans of one place."""
 ALIAS_M, ALIAS_DEG = 3.0, 10.0
 """Errors above which a pose belongs to another peak of the correlation, in metres and degrees."""
+KEYFRAME_M = 3.0
+"""Path length around a keyframe whose scans it represents, in metres, because they are not searched."""
 SUCCESS_M, SUCCESS_DEG = 2.0, 5.0  # largest errors of a successful registration
 
 
@@ -83,7 +85,15 @@ def count_loops(closures: Sequence[Closure], positions: Float[np.ndarray, "n 3"]
         wrong += int(distance.min() > rule.wrong_m)
         found_scans |= set(newer[distance <= rule.right_m].tolist())
     revisits = set(np.flatnonzero(rule.revisits).tolist())
-    return Counts(len(closures), right, wrong, len(revisits & found_scans), len(revisits))
+    return Counts(len(closures), right, wrong, len(revisits & represented(found_scans, positions)), len(revisits))
+
+
+def represented(scans: Iterable[int], positions: Float[np.ndarray, "n 3"]) -> set[int]:
+    """The scans, and those within `KEYFRAME_M` of path of one of them."""
+    travelled_m = np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
+    found_m = travelled_m[sorted(scans)]
+    is_near = (np.abs(travelled_m[:, None] - found_m[None]) <= KEYFRAME_M).any(axis=1)
+    return set(np.flatnonzero(is_near).tolist())
 
 
 def closures_of(loops: Sequence[Any]) -> list[Closure]:

@@ -133,7 +133,13 @@ MUTATIONS = (
         "expit(self.log_odds(evidence))",
         "expit(-self.log_odds(evidence))",
     ),
-    Mutation("os.replace(", "os.link(", ("test_files.py",)),
+    Mutation(
+        "os.replace(new, path)",
+        "os.replace(new, new)",
+        ("test_files.py",),
+        "os.replace(source, target)",
+        "os.replace(source, source)",
+    ),
 )
 
 

@@ -157,7 +157,7 @@ class DetectorFlags:
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a loop."""
     keyframe_m: float = DetectorConfig.keyframe_m
-    """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
+    """Distance between the keyframes, in metres. Only these scans are searched and stored. 0 searches every scan."""
     max_places: int | None = DetectorConfig.max_places
     """Maximum number of stored scans, to limit memory. By default all are stored."""
     candidates: CandidateConfig = DetectorConfig.candidates

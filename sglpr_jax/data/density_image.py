@@ -20,7 +20,7 @@ within 32 bits."""
 MAX_VOXELS = 6000
 """Maximum number of voxels of a scan."""
 MOST_SPREAD = 2**25
-"""Maximum range of voxel numbers for counting them in an array instead of sorting them. A usual range is 2**24. A point
+"""Maximum range of voxel numbers for marking them in an array instead of sorting them. A usual range is 2**24. A point
 30 m above the sensor increases it to 10**8."""
 SAMPLE_POINTS, SAMPLE_VOXELS = 18_000, 2**16
 """Number of points in the sample for a lower bound of the number of voxels, and the modulus of its voxel numbers."""
@@ -96,47 +96,46 @@ def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
     """Return x and y of the mean point of each voxel, in metres, for the smallest edge with at most `MAX_VOXELS`."""
-    voxels = _voxels_at_smallest_edge(points)
-    if not len(voxels):
+    voxels, distinct = _voxels_at_smallest_edge(points)
+    if not len(distinct):
         return np.zeros((2, 0))
-    is_occupied = _occupancy(voxels)
-    if is_occupied is None:
-        voxel = np.unique(voxels, return_inverse=True)[1]
+    least, spread = distinct[0], int(distinct[-1]) - int(distinct[0]) + 1
+    if spread > MOST_SPREAD:
+        voxel = np.searchsorted(distinct, voxels)
     else:
-        voxel = (np.cumsum(is_occupied) - 1)[voxels - voxels.min()]  # numbers without gaps, in the same order
+        rank = np.empty(spread, np.int32)  # of each voxel among the distinct ones; only these elements are written
+        rank[distinct - least] = np.arange(len(distinct))
+        voxel = rank[voxels - least]
     return np.stack([np.bincount(voxel, weights=axis) for axis in points[:2]]) / np.bincount(voxel)
 
 
-def _voxels_at_smallest_edge(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"]:
-    """Return the voxel number of each point, for the smallest edge with at most `MAX_VOXELS` voxels."""
+def _voxels_at_smallest_edge(
+    points: Float32[np.ndarray, "3 n"],
+) -> tuple[Int32[np.ndarray, " n"], Int[np.ndarray, " v"]]:
+    """Return the voxel number of each point for the smallest edge with at most `MAX_VOXELS` voxels, and `_distinct`."""
     sample = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SAMPLE_POINTS)])
     edge_m = FIRST_EDGE_M
     while True:
         # The count of a sample, with numbers modulo 2**16, is quick and never above the count of all points.
-        if not _are_too_many(_voxel_of_point(sample, edge_m) & (SAMPLE_VOXELS - 1)):
+        if len(_distinct(_voxel_of_point(sample, edge_m) & (SAMPLE_VOXELS - 1))) <= MAX_VOXELS:
             voxels = _voxel_of_point(points, edge_m)
-            if not _are_too_many(voxels):
-                return voxels
+            distinct = _distinct(voxels)
+            if len(distinct) <= MAX_VOXELS:
+                return voxels, distinct
         edge_m += EDGE_STEP_M
 
 
-def _are_too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
-    """Whether more than `MAX_VOXELS` different voxel numbers occur."""
-    is_occupied = _occupancy(voxels)
-    return int(len(np.unique(voxels)) if is_occupied is None else np.count_nonzero(is_occupied)) > MAX_VOXELS
-
-
-def _occupancy(voxels: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
-    """Whether each number from the smallest to the largest voxel occurs, or None beyond `MOST_SPREAD` numbers."""
+def _distinct(voxels: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " v"]:
+    """Return the different voxel numbers in ascending order."""
     if not len(voxels):
-        return np.zeros(0, bool)
+        return voxels
     least = int(voxels.min())
     spread = int(voxels.max()) - least + 1
     if spread > MOST_SPREAD:
-        return None
+        return np.unique(voxels)
     is_occupied = np.zeros(spread, bool)
     is_occupied[voxels - least] = True
-    return is_occupied
+    return np.flatnonzero(is_occupied) + least
 
 
 def _voxel_of_point(points: Float32[np.ndarray, "3 n"], edge_m: float) -> Int32[np.ndarray, " n"]:

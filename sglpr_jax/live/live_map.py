@@ -20,7 +20,7 @@ from sglpr_jax.live.odometry_input import FixedMounting, OdometryContinuity, Sca
 from sglpr_jax.loops.arguments import as_pose
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.comparison import Fits
+from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
@@ -33,7 +33,7 @@ SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""
 MAX_PAUSE_S = 1e8
 """Maximum time between two processes, in seconds. If clocks state a longer one, this value is used."""
-ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int}
+ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int, "is_keyframe": bool}
 """Fields of `LiveScan` that are JSON values of each scan in the log."""
 
 
@@ -41,13 +41,15 @@ class LiveScan(NamedTuple):
     """A scan of a live map, as the log stores it."""
 
     keyframe: Keyframe | None
-    """Descriptor and image. None for a scan that is damaged in the log."""
+    """Descriptor and image. None for a scan that is not a keyframe, and for one that is damaged in the log."""
     compared: Fits | None
     """Comparisons with earlier scans. None if they must be computed."""
     pose: Float[np.ndarray, "4 4"] | None
     """Pose of the LiDAR by odometry."""
     part: int
     """Number of the scan's part of the drive. A new part begins where the motion since the last scan is unknown."""
+    is_keyframe: bool
+    """Whether the scan is searched for loops (`CandidateSearch.is_due`)."""
     name: str
     """`Scan.name` of the scan."""
     stamp: float
@@ -142,7 +144,7 @@ class LiveMap:
             scan = LiveScan(keyframe, compared, pose, **about)
             motion_is_known = scan.part == self._part
             for _ in range(len(self), frame):  # frames that are missing in the log
-                self._add(scan._replace(keyframe=None, compared=None, name=""))
+                self._add(scan._replace(keyframe=None, is_keyframe=True, compared=None, name=""))
                 damaged += 1
             self._add(scan._replace(compared=None) if damaged else scan)
         if damaged:
@@ -150,11 +152,10 @@ class LiveMap:
         if self._log.removed_bytes:
             self._report("cut", f"{self._log.path}: {self._log.removed_bytes} bytes of an unfinished scan were removed")
         if scan is not None:
-            assert scan.keyframe is not None
             pause_s = min(max(time.time() - scan.wall, 0.0), MAX_PAUSE_S)
             self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - pause_s)
             self._continuity.resume(scan.pose, scan.time, known=motion_is_known)
-            self._mounting.resume(scan.keyframe.mounting)
+            self._mounting.resume(self.detector.finder.mountings[-1])
             self._report("recall", f"the map continues after {len(self)} scans and {len(self.detector.loops)} loops")
         return [self._loop_edge(loop, time.monotonic()) for loop in self._rewrite_loops()]
 
@@ -178,13 +179,15 @@ class LiveMap:
             raise ValueError(f"{scan.name or 'scan'}: expected points, found none")
         if scan.mounting is None:
             scan = dataclasses.replace(scan, mounting=self._mounting.add(scan.points))
-        keyframe = self.detector.finder.keyframe(scan)  # first, because an invalid scan must not change the clock
+        finder = self.detector.finder
         scan_time = self._clock.time(frame.time, frame.received)
         state = self._continuity.add(pose, scan_time)
         if state is None:
             return None
+        is_keyframe = finder.is_due(time=scan_time, odometry=state.pose, continues=state.continues)
         described = LiveScan(
-            keyframe=keyframe,
+            keyframe=finder.keyframe(scan) if is_keyframe else None,
+            is_keyframe=is_keyframe,
             compared=None,
             pose=state.pose,
             part=self._part if state.continues else self._part + 1,
@@ -194,16 +197,20 @@ class LiveMap:
             wall=time.time(),
         )
         loops = self._add(described)
-        if self.detector.finder.empty[-1]:
+        if is_keyframe and finder.empty[-1]:
             self._report("empty", f"{scan.name or f'scan {len(self) - 1}'}: expected a place, found almost no points")
-        self._log_scan(described, self.detector.finder.fits, loops)
+        self._log_scan(described, finder.fits if is_keyframe else NO_FITS, loops)
         return [self._loop_edge(loop, frame.received) for loop in loops]
 
     def _add(self, scan: LiveScan) -> list[LoopClosure]:
         """Add a scan to the detector and the trajectory, and return the loops that it closes."""
-        options = {"fits": scan.compared, "continues": scan.part == self._part}
-        loops = self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **options)
-        self.detector.candidates.clear()  # to save memory: `fits`, from which they are chosen, are in the log
+        loops, finder = list[LoopClosure](), self.detector.finder
+        if scan.is_keyframe:
+            options = {"fits": scan.compared, "continues": scan.part == self._part}
+            loops = self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **options)
+            self.detector.candidates.clear()  # to save memory: `fits`, from which they are chosen, are in the log
+        else:
+            finder.skip()
         self._part = scan.part
         self._stamps.append(scan.stamp)
         if scan.name:
@@ -211,7 +218,7 @@ class LiveMap:
         if scan.pose is not None:
             self._poses.append(scan.pose)
             if self.trajectory is not None:
-                segments = self.detector.finder.motion.segments[-2:]  # of this and the last scan
+                segments = finder.segments_of(np.arange(max(len(self) - 2, 0), len(self)))  # of this and the last scan
                 ordered = sorted(loops, key=lambda loop: loop.query)
                 self.trajectory.add(scan.pose, ordered, continues=bool(segments[0] == segments[-1]))
         return loops
@@ -245,8 +252,9 @@ class LiveMap:
     def _loop_edge(self, loop: LoopClosure, received: float) -> LoopEdge:
         """Return a loop with the times and the odometry of its scans. Odometry is given only for scans in the odometry
         frame of the latest scan. `received` is the time at which the latest scan arrived."""
-        frames, segments = np.array([loop.query, loop.match]), self.detector.finder.motion.segments
-        in_latest_frame = (segments[frames] == segments[-1]) & (len(self.odometry) > 0)
+        frames = np.array([loop.query, loop.match])
+        *segments, latest = self.detector.finder.segments_of(np.append(frames, len(self) - 1))
+        in_latest_frame = (np.array(segments) == latest) & (len(self.odometry) > 0)
         pairs = zip(frames, in_latest_frame, strict=True)
         query_pose, match_pose = (self.odometry[frame].copy() if known else None for frame, known in pairs)
         return LoopEdge(

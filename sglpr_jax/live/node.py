@@ -20,7 +20,7 @@ from sglpr_jax.se3 import transform
 PROGRESS_S = 10.0
 """Time between two lines about the progress, in seconds."""
 TIMED_SCANS = 100
-"""Number of latest scans whose median time is printed."""
+"""Number of latest scans whose mean time is printed."""
 WARM_UP_SCANS = 12
 """Number of scans after which every compiled program of the search was used."""
 
@@ -57,7 +57,7 @@ class Node:
             self._send_to_sinks("loop", edge)
 
     def __str__(self) -> str:
-        rate = f", {1000 * float(np.median(self._scan_seconds)):.0f} ms a scan" if self._scan_seconds else ""
+        rate = f", {1000 * float(np.mean(self._scan_seconds)):.0f} ms a scan" if self._scan_seconds else ""
         memory = f"{self._live.detector.nbytes / 1e6:.0f} MB"
         return (
             f"{self.scans} scans{rate}, {self.dropped} dropped, {self.left_out} left out, {self.loops} loops; "
@@ -106,7 +106,8 @@ def warm_up(params: Params, config: DetectorConfig, *, odometry: bool) -> None:
     # Thresholds with which all scans are compared, coarsely and exactly.
     accept_all = {"recent_m": 1e-9, "good_correlation": 2.0, "min_coarse_correlation": -1.0, "min_correlation": -1.0}
     candidates = dataclasses.replace(config.candidates, **accept_all)
-    detector = LoopDetector(params, config=dataclasses.replace(config, candidates=candidates, max_places=None))
+    config = dataclasses.replace(config, candidates=candidates, max_places=None, keyframe_m=0.0)
+    detector = LoopDetector(params, config=config)
     rng = np.random.default_rng(0)
     for i in range(WARM_UP_SCANS):
         points = rng.uniform((-20, -20, -1), (20, 20, 3), (4000, 3)).astype(np.float32)

@@ -23,8 +23,9 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
     detector, odometry = live.detector, live.odometry
     chains = []
     if len(odometry):
-        segment_starts = np.flatnonzero(np.diff(detector.finder.motion.segments)) + 1  # where the motion is unknown
-        segments = np.split(np.arange(len(odometry)), segment_starts)
+        scans = np.arange(len(odometry))
+        segment_starts = np.flatnonzero(np.diff(detector.finder.segments_of(scans))) + 1  # where the motion is unknown
+        segments = np.split(scans, segment_starts)
         chains = [(frames, odometry[frames]) for frames in segments]
     files = graph_files(detector.loops, detector.rejected, chains, drift=detector.config.drift)
     if len(odometry):

@@ -1,10 +1,11 @@
 """Candidate matches of the scans of a stream: each scan is described, compared with earlier scans, and stored."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.data.scan import Scan
@@ -25,6 +26,8 @@ from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
+KEYFRAME_DEG = 20.0
+"""Rotation from the last frame at which a scan is the next frame at any distance, in degrees."""
 FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
 AGREE_M, AGREE_DEG = 0.8, 6.0
@@ -42,7 +45,9 @@ class Reference(NamedTuple):
 class CandidateSearch:
     """Finds candidates in a stream of scans, and stores descriptor and compressed image of the scans.
 
-    Almost empty scans, and scans close to the last stored one, are not stored. Each frame takes a constant number of
+    Only keyframes are added, which are some metres apart (`is_due`). The scans between them are skipped. Frames are
+    numbered in the order in which they are added, and loops that leave the search get the numbers of their scans.
+    Almost empty frames, and frames close to the last stored one, are not stored. Each frame takes a constant number of
     image comparisons, and a matrix product for the nearest descriptors.
     """
 
@@ -52,10 +57,12 @@ class CandidateSearch:
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
         self.params, self.config, self.verification = params, config.candidates, config.verification
-        self.drift = config.drift
+        self.drift, self.keyframe_m = config.drift, config.keyframe_m
+        self.scans = 0
+        """Number of scans so far: the added frames and the skipped scans."""
+        self._rows = GrowingArray(np.empty(0, np.int64))
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
-        limits = {"keyframe_m": config.keyframe_m, "max_places": config.max_places}
-        self.stored = StoredScans(index, verification=config.verification, **limits)
+        self.stored = StoredScans(index, verification=config.verification, max_places=config.max_places)
         """Descriptors, and central parts of the images without the background, of the stored scans."""
         self.fits = NO_FITS
         """Comparisons of the last frame."""
@@ -84,6 +91,15 @@ class CandidateSearch:
     def __len__(self) -> int:
         """Number of added frames."""
         return len(self._empty)
+
+    @property
+    def rows(self) -> Int[np.ndarray, " n"]:
+        """Number of the scan of each frame, counted from 0 with the skipped scans."""
+        return self._rows.rows
+
+    def segments_of(self, scans: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+        """Number of the segment of the motion of each scan. A skipped scan is in the segment of the frame before it."""
+        return self.motion.segments[np.searchsorted(self.rows, scans, side="right") - 1]
 
     @property
     def index(self) -> Index:
@@ -115,17 +131,54 @@ class CandidateSearch:
         return describe_scan(self.params, scan)
 
     def to_upright(self, loop: LoopClosure) -> LoopClosure:
-        """Convert a loop of two frames, from the LiDAR frames to the gravity-aligned frames."""
-        return to_upright(loop, query=self.mountings[loop.query], match=self.mountings[loop.match])
+        """Convert a loop of two scans, between their LiDAR frames, to one of two frames, gravity-aligned."""
+        query, match = np.searchsorted(self.rows, [loop.query, loop.match]).tolist()
+        loop = dataclasses.replace(loop, query=query, match=match)
+        return to_upright(loop, query=self.mountings[query], match=self.mountings[match])
 
     def to_lidar(self, loop: LoopClosure) -> LoopClosure:
-        """Convert a loop of two frames, from the gravity-aligned frames to the LiDAR frames."""
-        return to_lidar(loop, query=self.mountings[loop.query], match=self.mountings[loop.match])
+        """Convert a loop of two frames, gravity-aligned, to one of two scans, between their LiDAR frames."""
+        loop = to_lidar(loop, query=self.mountings[loop.query], match=self.mountings[loop.match])
+        return dataclasses.replace(loop, query=int(self.rows[loop.query]), match=int(self.rows[loop.match]))
 
     def close_loop(self, query: int, match: int) -> None:
         """Store an accepted loop between two frames."""
         self.loops.append((query, match))
         self.stored.close_loop(query, match)
+
+    def is_due(
+        self,
+        *,
+        time: float | None = None,
+        odometry: Float[np.ndarray, "4 4"] | None = None,
+        continues: bool = True,
+    ) -> bool:
+        """Whether the next scan should be a frame: the sensor moved `keyframe_m` or turned since the last one.
+
+        Without odometry, the motion since the last frame is extrapolated, so a standing sensor may move off unnoticed.
+        A scan is therefore also due if the sensor, at its highest speed so far, could have moved too far to be found.
+        Raises the ValueError of `add_keyframe`.
+        """
+        self._check_order(time, odometry)
+        if not len(self) or not self.keyframe_m or not continues:
+            return True
+        if odometry is not None:
+            pose = np.asarray(odometry, np.float64) @ inverse(upright_from_lidar(self.mountings[-1]))
+        else:
+            time = self._time_of_scan(time)
+            pose = self.motion.extrapolated(time)
+            if pose is None or self.motion.most_moved_m(time) >= self.verification.max_shift_m / 2:
+                return True
+        moved_m, rotation = self.motion.moved(len(self) - 1, pose)
+        return bool(moved_m >= self.keyframe_m or rotation >= np.radians(KEYFRAME_DEG))
+
+    def skip(self) -> None:
+        """Count a scan that is not a frame."""
+        self.scans += 1
+
+    def _time_of_scan(self, time: float | None) -> float:
+        """Time of the next scan in seconds or, without times, its number."""
+        return float(self.scans) if time is None else time
 
     def add_keyframe(
         self,
@@ -140,7 +193,7 @@ class CandidateSearch:
 
         Arguments:
           keyframe: Descriptor and image, or None for a scan that cannot be read.
-          time: Time of the scan, in seconds.
+          time: Time of the scan, in seconds. By default, scans are one second apart.
           odometry: Pose of the LiDAR in any fixed frame.
           fits: Comparisons of an earlier run (`loops.checkpoint`), which are then not repeated.
           continues: See `LoopDetector.add`.
@@ -172,11 +225,25 @@ class CandidateSearch:
         self._last = None if is_empty else Reference(frame, foreground)
         if self.motion.keyframe == frame:
             self._keyframe = self._last
-        if not is_empty and self.stored.is_new_place(frame, self.motion):
+        if not is_empty and self._is_new_place(frame):
             self.stored.add(frame, keyframe.descriptor, foreground)
         self._empty.append(is_empty)
+        self._rows.append(self.scans)
+        self.scans += 1
         self._time, self.fits = time, fits
         return candidates
+
+    def _is_new_place(self, frame: int) -> bool:
+        """Whether a frame is far enough from the last stored one, or its motion from there is unknown.
+
+        It is if they are half of `keyframe_m` apart, because a keyframe may come early.
+        """
+        if not self.keyframe_m or not len(self.stored):
+            return True
+        last_frame = int(self.stored.frames[-1])
+        moved_m, rotation = self.motion.moved(last_frame, self.motion.poses[frame])
+        is_near = moved_m < self.keyframe_m / 2 and rotation < np.radians(KEYFRAME_DEG / 2)
+        return not (is_near and self.motion.segments[frame] == self.motion.segments[last_frame])
 
     def _check_order(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         """Raise ValueError if some frames have a time or odometry and others have none, or if times decrease."""
@@ -209,7 +276,7 @@ class CandidateSearch:
         link = None if fits is None else fits.link
         to_upright = upright_from_lidar(mounting)
         pose = None if odometry is None else np.asarray(odometry, np.float64) @ inverse(to_upright)
-        time = float(len(self)) if time is None else time
+        time = self._time_of_scan(time)
         self.has_odometry = pose is not None
         if not continues:
             self.odometry_check.restart()

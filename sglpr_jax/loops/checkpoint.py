@@ -30,11 +30,11 @@ from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT = "sglpr-jax unfinished loops 7"
+FORMAT = "sglpr-jax unfinished loops 8"
 LOG = "checkpoint.log"
 OLD = "settings.json"
 """File of checkpoints of earlier versions, which are not read."""
-FRAME_FORMAT = "sglpr-jax live 4"
+FRAME_FORMAT = "sglpr-jax live 5"
 LINK = ("x", "y", "yaw", "correlation", "peak_ratio", "along_m")
 """Stored fields of the registration that shows the motion (`Fits.link`)."""
 COLUMNS = {
@@ -45,7 +45,8 @@ COLUMNS = {
     "fits": Column("float64", ("fits", len(CorrelationPeak._fields))),
     "links": Column("float64", (1, len(LINK)), finite=False),
 }
-"""Arrays of a frame. A scan that cannot be read has no descriptor and image. A missing link is stored as NaN."""
+"""Arrays of a frame. A scan that cannot be read or is not a keyframe has no descriptor and image. A missing link is
+stored as NaN."""
 
 
 def frame_bytes(

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -198,7 +198,9 @@ def covariance_in_metres(covariance: Float[np.ndarray, "6 6"], scale: Scale) -> 
     return covariance * np.outer(factors, factors)
 
 
-def renumbered(loop: LoopClosure, new_frames: Sequence[Int[np.ndarray, " _"]]) -> LoopClosure:
+def renumbered(
+    loop: LoopClosure, new_frames: Sequence[Int[np.ndarray, " _"]] | Mapping[int, Int[np.ndarray, " _"]]
+) -> LoopClosure:
     """Replace the frame numbers of a loop. `new_frames` has for each session the new number of each frame."""
     query, match = new_frames[loop.query_session][loop.query], new_frames[loop.match_session][loop.match]
     return dataclasses.replace(loop, query=int(query), match=int(match))

@@ -118,15 +118,27 @@ class KeyframeComparison:
             is_other_pass = self.travelled_between(frames, query.frame) >= config.recent_m
             possible = is_other_pass & ~self.are_elsewhere(frames, query.frame)
         rows, coarse = self._most_similar(query, searched, config.further, possible)
-        rows = rows[coarse >= config.min_coarse_correlation]
-        first, second = np.split(rows[: 2 * config.candidates], [config.candidates])
-        fits = self._compare_exactly(query, searched, first)
-        best = self._best_consistent_with_motion(query.frame, fits, EVERY)
-        if best is None or fits.peaks.correlation[best] < config.good_correlation:
-            fits = Fits.joined(fits, self._compare_exactly(query, searched, second))
-            best = self._best(query.frame, fits, EVERY) if best is None else best
-        match = query.frame if best is None else int(fits.frames[best])
-        return Fits.joined(fits, *(self._compare_distractors(query, match, scans) for scans in (searched, *others)))
+        fits, best = NO_FITS, None
+        first, second, third, _ = np.split(np.arange(len(rows)), [1, config.candidates, 2 * config.candidates])
+        for group in (first, second, third):
+            is_clear = best is not None and fits.peaks.correlation[best] >= config.good_correlation
+            if group is third and is_clear:
+                break
+            matters = group[coarse[group] >= self._least_that_matters(fits, best)]
+            fits = Fits.joined(fits, self._compare_exactly(query, searched, rows[matters]))
+            best = self._best_consistent_with_motion(query.frame, fits, EVERY)
+        best = self._best(query.frame, fits, EVERY) if best is None else best
+        for scans in (searched, *others):
+            fits = Fits.joined(fits, self._compare_distractors(query, fits, best, scans))
+        return fits
+
+    def _least_that_matters(self, fits: Fits, best: int | None) -> float:
+        """Least coarse correlation of a further scan that is compared exactly, given the best fit so far (a row).
+
+        Coarse correlations are rarely below exact ones. A scan below the second peak of the best fit could not make its
+        ambiguity ratio worse.
+        """
+        return self.config.min_coarse_correlation if best is None else float(fits.peaks.second[best])
 
     def candidates(
         self, query: Query, fits: Fits, searched: Keyframes, *, possible: Bool[np.ndarray, "*k"] = EVERY
@@ -198,21 +210,32 @@ class KeyframeComparison:
         max_shift_m = np.sqrt(2) * self.verification.max_shift_m  # along x and y at once
         return apart_m > max_shift_m + self.drift.max_deviation * drift_m
 
-    def _compare_distractors(self, query: Query, match: int, scans: Keyframes) -> Fits:
-        """Compare a query with the distractors most like it, of two kinds.
+    def _compare_distractors(self, query: Query, fits: Fits, best: int | None, scans: Keyframes) -> Fits:
+        """Compare a query with the distractors most like it, of two kinds, given its fits and the best of them (a row).
 
         One kind shows another place than the query or the match. The other is less than two `recent_m` of travel from
-        one of them: its fit may contradict the motion.
+        one of them: its fit may contradict the motion. Without a match, only a few of the first kind are compared. They
+        may show that the motion is wrong.
         """
         config, frames = self.config, scans.frames
+        match = query.frame if best is None else int(fits.frames[best])
         travelled_m = np.stack([self.travelled_between(frames, frame) for frame in (query.frame, match)])
         distracts = (travelled_m >= DISTRACTOR_M).all(axis=0)
         elsewhere = self.are_elsewhere(frames, query.frame) | self.are_elsewhere(frames, match)
         near = (travelled_m < 2 * config.recent_m).any(axis=0) & ~elsewhere
-        far_rows, _ = self._most_similar(query, scans, config.cohort, elsewhere & distracts)
-        near_rows, _ = self._most_similar(query, scans, config.near_cohort, near & distracts)
-        far_fits = self._compare_exactly(query, scans, far_rows[:EXACT_COHORT])
-        return Fits.joined(far_fits, self._compare_exactly(query, scans, near_rows[:EXACT_NEAR_COHORT]))
+        if best is None:
+            cohort, near_cohort = config.candidates, 0
+        else:
+            cohort, near_cohort = config.cohort, config.near_cohort
+        least, compared = self._least_that_matters(fits, best), NO_FITS
+        for flags, count, most in (
+            (elsewhere, cohort, EXACT_COHORT),
+            (near, near_cohort, EXACT_NEAR_COHORT),
+        ):
+            rows, coarse = self._most_similar(query, scans, count, flags & distracts)
+            rows = rows[:most][coarse[:most] >= least]
+            compared = Fits.joined(compared, self._compare_exactly(query, scans, rows))
+        return compared
 
     def _most_similar(
         self, query: Query, scans: Keyframes, count: int, among: Bool[np.ndarray, " n"]

@@ -58,9 +58,9 @@ class DetectorConfig:
 
     min_probability: Share = MIN_PROBABILITY
     """Minimum probability of a returned loop, given its neighbours."""
-    keyframe_m: NotNegative = 0.5
-    """Minimum distance of a stored scan from the previous one, in metres. Nearer scans that are turned by less than 20
-    degrees are searched for loops, but not stored. 0 stores every scan."""
+    keyframe_m: NotNegative = 2.5
+    """Distance between keyframes, in metres, divided by the scale of the search. Only keyframes are described, searched
+    for loops and stored. A scan that is turned by 20 degrees is one, too. 0 makes every scan a keyframe."""
     max_places: Count | None = None
     """Maximum number of stored scans. Beyond it, scans with a loop to a newer stored scan are forgotten first, then the
     oldest. None stores all."""
@@ -75,4 +75,4 @@ class DetectorConfig:
 
     def at_scale(self, scale: float) -> "DetectorConfig":
         """The settings for scans with all lengths multiplied by `scale`. Settings of the images do not change."""
-        return dataclasses.replace(self, keyframe_m=self.keyframe_m * scale, drift=self.drift.at_scale(scale))
+        return dataclasses.replace(self, drift=self.drift.at_scale(scale))

@@ -50,13 +50,13 @@ class LoopDetector:
         self._waiting: list[Pair] = []
         """Pairs whose later neighbours may still be added."""
         self._returned: set[int] = set()
-        """Queries of the returned loops."""
+        """Frames of the queries of the returned loops."""
         self._contradicting: set[int] = set()
-        """Queries of the probable loops that contradict the motion."""
+        """The same for the probable loops that contradict the motion."""
 
     def __len__(self) -> int:
-        """Number of added frames."""
-        return len(self.finder)
+        """Number of added scans."""
+        return self.finder.scans
 
     @property
     def nbytes(self) -> int:
@@ -74,7 +74,10 @@ class LoopDetector:
         odometry: ArrayLike | None = None,
         continues: bool = True,
     ) -> list[LoopClosure]:
-        """Add the next frame. Returns the loops that it closes or confirms, of this and of the last few frames.
+        """Add the next scan. Returns the loops that it closes or confirms, of this and of the last few keyframes.
+
+        A scan that is nearer to the last keyframe than `DetectorConfig.keyframe_m` is not searched, but counts in the
+        numbers of scans.
 
         Arguments:
           scan: A `Scan` (with the mounting of its sensor), points (n, 3) in metres, or an image (h, w) from
@@ -88,8 +91,11 @@ class LoopDetector:
           ValueError: If a value has another shape, if times decrease, or if only some frames have a time or odometry.
           TypeError: If a value is not an array of numbers, for instance a path.
         """
-        keyframe, pose = self.finder.keyframe(as_scan(scan)), as_pose(odometry)
-        return self.add_keyframe(keyframe, time=as_seconds(time), odometry=pose, continues=continues)
+        scan, when = as_scan(scan), {"time": as_seconds(time), "odometry": as_pose(odometry), "continues": continues}
+        if not self.finder.is_due(**when):
+            self.finder.skip()
+            return []
+        return self.add_keyframe(self.finder.keyframe(scan), **when)
 
     def add_keyframe(
         self,
@@ -100,7 +106,7 @@ class LoopDetector:
         fits: Fits | None = None,
         continues: bool = True,
     ) -> list[LoopClosure]:
-        """Find candidates of a described frame, and return the loops that are now probable.
+        """Find candidates of a described keyframe, and return the loops that are now probable.
 
         Candidates wait as pairs, because later frames on the next `WINDOW_M` metres may confirm them. Older pairs that
         were not returned are rejected. The arguments are those of `CandidateSearch.add_keyframe`: `keyframe` is None
@@ -108,13 +114,16 @@ class LoopDetector:
         """
         finder = self.finder
         candidates = finder.add_keyframe(keyframe, time=time, odometry=odometry, fits=fits, continues=continues)
-        self.candidates += candidates
+        rows = finder.rows
+        self.candidates += [
+            pair._replace(query=int(rows[pair.query]), match=int(rows[pair.match])) for pair in candidates
+        ]
         if self.config.max_places is not None:
             del self.candidates[: -self.config.max_places]
         for candidate in candidates:
             pair = pair_of(candidate, self.model, finder.motion, finder.mountings, knows_height=finder.knows_height)
             self._waiting.append(pair)
-        oldest_m = finder.motion.travelled[len(self) - 1] - WINDOW_M
+        oldest_m = finder.motion.travelled[-1] - WINDOW_M
         expired = sum(pair.travelled_m < oldest_m for pair in self._waiting)
         expired = max(expired, len(self._waiting) - MAX_WAITING)
         self.rejected += self._reject(self._waiting[:expired])
@@ -124,11 +133,13 @@ class LoopDetector:
         allowed = [pair for pair in self._waiting if self._is_allowed(pair)]
         excluded = [pair for pair in self._waiting if not self._is_allowed(pair)]
         reason: Reason = "contradicts the odometry" if finder.has_odometry else "contradicts the motion"
-        self.rejected += [RejectedClosure(loop, reason) for loop in self._new_loops(excluded, self._contradicting)]
-        loops = self._new_loops(allowed, self._returned)
-        self.loops += loops
-        for loop in loops:
+        contradicting = self._new_loops(excluded, self._contradicting)
+        self.rejected += [RejectedClosure(finder.to_lidar(loop), reason) for loop in contradicting]
+        upright_loops = self._new_loops(allowed, self._returned)
+        for loop in upright_loops:
             finder.close_loop(loop.query, loop.match)
+        loops = list(map(finder.to_lidar, upright_loops))
+        self.loops += loops
         return loops
 
     def undecided(self) -> list[RejectedClosure]:
@@ -139,7 +150,7 @@ class LoopDetector:
         """Probable loops, given their neighbours, whose queries are new. Adds their queries to `known_queries`."""
         finder = self.finder
         loops = probable_loops(pairs, self.model, finder.motion.path, drift=finder.present_drift, config=self.config)
-        new_loops = [finder.to_lidar(loop) for loop in loops if loop is not None and loop.query not in known_queries]
+        new_loops = [loop for loop in loops if loop is not None and loop.query not in known_queries]
         known_queries |= {loop.query for loop in new_loops}
         return new_loops
 

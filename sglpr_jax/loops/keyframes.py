@@ -6,7 +6,6 @@ import zlib
 from collections import OrderedDict
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex64, Float32, Int, Num, UInt8
 
@@ -18,7 +17,6 @@ from sglpr_jax.grid import DENSITY_MAX_COUNT
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import Params
-from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_spectra import match_spectra
 from sglpr_jax.retrieval.index import Index
@@ -56,16 +54,14 @@ def square_image(scan: Scan) -> UInt8[np.ndarray, "n n"]:
 
 def _square_8_bit(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
     """Central square of an image, with an even number of cells per side. 255 means `DENSITY_MAX_COUNT` or more."""
-    even_image = even_cells(jnp.asarray(image, jnp.float32))
+    even_image = even_cells(np.asarray(image, np.float32))
     size = min(even_image.shape)
-    grey = np.asarray(centre_crop(even_image, height=size, width=size)) * (255 / DENSITY_MAX_COUNT)
+    grey = centre_crop(even_image, height=size, width=size) * np.float32(255 / DENSITY_MAX_COUNT)
     return np.round(grey).clip(0, 255).astype(np.uint8)
 
 
 LEVEL = 1
 """Compression level of zlib, the fastest one. Most cells of an image are empty, so higher levels save little."""
-KEYFRAME_DEG = 20.0
-"""Minimum rotation from the last stored scan at which a scan is stored at any distance, in degrees."""
 SPECTRA = 512
 """Number of spectra that are kept for the next queries. Consecutive queries are compared with the same scans."""
 PARTS = 16
@@ -115,11 +111,10 @@ class StoredScans(Keyframes):
         index: Index,
         *,
         verification: VerificationConfig = VerificationConfig(),
-        keyframe_m: float = 0.0,
         max_places: int | None = None,
     ):
-        """Start with an index without places. `keyframe_m` and `max_places` limit the scans, as in `DetectorConfig`."""
-        self.index, self.verification, self.keyframe_m, self.max_places = index, verification, keyframe_m, max_places
+        """Start with an index without places. `max_places` limits the scans, as in `DetectorConfig`."""
+        self.index, self.verification, self.max_places = index, verification, max_places
         self._first_frame = 0
         self._frames = GrowingArray(np.empty(0, np.int64))
         self._superseded = GrowingArray(np.empty(0, bool))
@@ -152,15 +147,6 @@ class StoredScans(Keyframes):
         """Number of bytes of descriptors and compressed images, without the kept spectra."""
         arrays = self.index.nbytes + self._frames.nbytes + self._superseded.nbytes
         return arrays + sum(map(len, self._compressed))
-
-    def is_new_place(self, frame: int, motion: BevOdometry) -> bool:
-        """Whether a frame is far enough from the last stored scan, or its motion from there is unknown."""
-        if not self.keyframe_m or not len(self):
-            return True
-        last_frame = int(self.frames[-1])
-        moved_m, rotation = motion.moved(last_frame, motion.poses[frame])
-        is_near = moved_m < self.keyframe_m and rotation < np.radians(KEYFRAME_DEG)
-        return not (is_near and motion.segments[frame] == motion.segments[last_frame])
 
     def check(self, frame: int, image: UInt8[np.ndarray, "m m"]) -> None:
         """Raise ValueError if the image of a frame has another shape than the stored images."""

@@ -30,8 +30,10 @@ class Session:
     """Drift of the odometry, estimated from the drive."""
     skipped: tuple[str, ...] = ()
     """Ids of scans that cannot be read."""
+    keyframes: int = 0
+    """Number of searched scans that were read and compared. The others are near one of these."""
     empty: int = 0
-    """Number of searched scans that are almost empty."""
+    """Number of keyframes that are almost empty."""
     unregistered: int = 0
     """Number of loops within the session that were not registered because the search was stopped."""
     candidates: tuple[Candidate, ...] = ()
@@ -129,7 +131,8 @@ class LoopSearchResult:
         session = self.sessions[0]
         degenerate = sum(loop.is_degenerate for loop in self.loops)
         loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
-        text = f"{loops} in {session.frames} of {len(session.recording)} frames of {session.recording.name}"
+        scans = f"{session.frames} of {len(session.recording)} frames of {session.recording.name}"
+        text = f"{loops} in {scans}{f' ({session.keyframes} keyframes)' if session.keyframes < session.frames else ''}"
         skipped = f", {len(session.skipped)} scans skipped" if session.skipped else ""
         unregistered = f", {session.unregistered} not registered" if session.unregistered else ""
         scale = f", scale {self.scale}" if self.scale != 1 else ""
@@ -179,13 +182,13 @@ def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
     reasons, scans = [], len(session.recording)
     if session.frames < scans:
         reasons.append(f"The search was stopped after {session.frames} of {scans} frames.")
-    if 2 * session.empty > session.frames:
+    if 2 * session.empty > session.keyframes:
         reasons.append(
-            f"{session.empty} of {session.frames} scans are almost empty (fewer than {MIN_CELLS} occupied cells of the "
-            "image): check the format and the range of the points, and whether the sensor was covered."
+            f"{session.empty} of {session.keyframes} scans are almost empty (fewer than {MIN_CELLS} occupied cells of "
+            "the image): check the format and the range of the points, and whether the sensor was covered."
         )
-    if 2 * len(session.skipped) > session.frames:
-        reasons.append(f"{len(session.skipped)} of {session.frames} scans cannot be read.")
+    if 2 * len(session.skipped) > session.keyframes:
+        reasons.append(f"{len(session.skipped)} of {session.keyframes} scans cannot be read.")
     if result.rejected:
         reason, count = next(iter(count_reasons(result.rejected).items()))  # the most frequent one
         return [*reasons, f"{len(result.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]

@@ -1,7 +1,8 @@
 """Search for the loops within and between sessions: a detector over the scans of each one, then joint acceptance.
 
-For loops between two sessions, each stored scan of the later session is compared with the stored scans of the earlier
-one. Probability and sequential test are the same as within a session. Scans of both sessions are distractors.
+Only keyframes are read and searched. For loops between two sessions, each stored scan of the later session is compared
+with the stored scans of the earlier one. Probability and sequential test are the same as within a session. Scans of
+both sessions are distractors.
 """
 
 import dataclasses
@@ -25,7 +26,7 @@ from sglpr_jax.loops.acceptance import AXES, accept_loops, check_odometry, regis
 from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
-from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, in_metres, to_lidar
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, in_metres, renumbered, to_lidar
 from sglpr_jax.loops.comparison import Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import accept_between
@@ -86,7 +87,7 @@ def find_loops(
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap are rejected.
         None does so if all recordings have scans, not images, and small-gicp is installed.
       scale: Factor for all lengths during the search, 1, 2 or 4, for places that are small in an image, such as rooms.
-        Results, `config.keyframe_m` and `config.drift` are in metres, the other settings those of scaled scans.
+        Results and `config.drift` are in metres, the other settings those of scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
       kept_in: Checkpoint directory, from which a search of the same input resumes. It is not removed. With several
@@ -197,10 +198,11 @@ def _session_in_metres(
     finder = searched.detector.finder
     return Session(
         recording,
-        len(finder),
+        finder.scans,
+        keyframes=len(finder),
         odometry=None if searched.odometry is None else odometry,
         drift=searched.drift.at_scale(1 / scale),
-        skipped=tuple(recording.ids[row] for row in finder.missing),
+        skipped=tuple(recording.ids[row] for row in finder.rows[finder.missing]),
         empty=int(finder.empty.sum()) - len(finder.missing),
         unregistered=sum(loop.overlap is None for loop in searched.loops) if registered else 0,
         candidates=tuple(searched.detector.candidates),
@@ -226,11 +228,22 @@ def _search_session(
     config, finder = detector.config, detector.finder
     stream = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
 
-    def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
-        row = len(detector)
+    def at(row: int) -> dict[str, Any]:
+        """Time and odometry of a scan."""
         time = None if recording.times is None else float(recording.times[row])
-        pose = None if odometry is None else odometry[row]
-        detector.add_keyframe(keyframe, time=time, odometry=pose, fits=fits)
+        return {"time": time, "odometry": None if odometry is None else odometry[row]}
+
+    def next_keyframe() -> int | None:
+        """Row of the next keyframe, or None at the end. Skips the scans before it."""
+        while finder.scans < len(recording):
+            if finder.is_due(**at(finder.scans)):
+                return finder.scans
+            finder.skip()
+        return None
+
+    def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
+        next_keyframe()  # a checkpoint has only keyframes
+        detector.add_keyframe(keyframe, fits=fits, **at(finder.scans))
 
     # With a limit of places, loops decide which scans are stored. A checkpoint then depends on settings and model, too.
     acceptance = None
@@ -240,6 +253,7 @@ def _search_session(
         recording,
         finder,
         add,
+        rows=iter(next_keyframe, None),
         kept_in=kept_in,
         odometry=odometry,
         keyframe_m=config.keyframe_m,
@@ -247,10 +261,12 @@ def _search_session(
         acceptance=acceptance,
         **stream,
     )
-    check_readable(recording, len(recording) - len(finder.missing))
-    if finder.empty.all() and len(finder) == len(recording):
+    if finder.scans > (finder.rows[-1] + 1 if len(finder) else 0):
+        on_progress(finder.scans)  # with the scans after the last keyframe
+    check_readable(recording, len(finder) - len(finder.missing) if finder.scans == len(recording) else 1)
+    if finder.empty.all() and finder.scans == len(recording):
         raise ValueError(
-            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
+            f"{recording.name}: expected at least one scan that is not empty, found {len(finder)} empty ones"
         )
     if odometry is not None and finder.odometry_check.is_unusable:
         warn(
@@ -288,7 +304,8 @@ def _search_pair(
 ) -> tuple[list[LoopClosure], list[RejectedClosure], list[SegmentAlignment]]:
     """Loops, rejected pairs and transforms between two of the searched sessions, given by their numbers.
 
-    Frames of the queries are counted from the end of the matches' session, until `between_sessions` converts them.
+    Frames of the queries are counted from the end of the matches' session, until `between_sessions` converts them to
+    numbers of scans.
     """
     sessions = searched[match], searched[query]
     match_finder, query_finder = (session.detector.finder for session in sessions)
@@ -309,10 +326,11 @@ def _search_pair(
     consistent_sets, contradicting = accept_between(likely, motion, drift=drift)
 
     def between_sessions(loop: LoopClosure) -> LoopClosure:
-        """Convert a loop between gravity-aligned frames of the joined motion to LiDAR frames of the two sessions."""
+        """Convert a loop between gravity-aligned frames of the joined motion to LiDAR frames of scans."""
         loop = to_lidar(loop, query=mountings[loop.query], match=mountings[loop.match])
-        query_frame = loop.query - len(match_finder)
-        return dataclasses.replace(loop, query=query_frame, match_session=match, query_session=query)
+        query_row, match_row = query_finder.rows[loop.query - len(match_finder)], match_finder.rows[loop.match]
+        rows = {"query": int(query_row), "match": int(match_row)}
+        return dataclasses.replace(loop, **rows, match_session=match, query_session=query)
 
     rejected = convert_rejected([*improbable, *contradicting], between_sessions)
     loops, transforms = list[LoopClosure](), list[SegmentAlignment]()
@@ -356,7 +374,7 @@ def _candidates_between(
         query = Query(frame, query_scans.index.descriptors[row], query_scans.image(row), matches.verification)
         fits = comparer.compare(query, matches.stored, query_scans)
         candidates += comparer.candidates(query, fits, matches.stored, possible=fits.frames < query_offset)
-        on_progress(row + 1)
+        on_progress(int(queries.rows[frame - query_offset]) + 1)
     return candidates
 
 
@@ -368,17 +386,22 @@ def _align_segments(
     `sessions` are those of the matches and the queries, `motion` is their joined motion, and `drift` that of both.
     """
     segments, poses = [], []
+    frames_of_scans = {}  # frame of each scan, by session
     for node, searched in zip(loops[0].nodes, sessions, strict=True):
         finder, odometry = searched.detector.finder, searched.odometry
-        frames = np.flatnonzero(finder.motion.segments == finder.motion.segments[node.frame])
-        segments.append(TrajectorySegment(node.session, int(frames[0]), int(frames[-1]), odometry is not None))
+        frames_of_scans[node.session] = np.searchsorted(finder.rows, np.arange(finder.scans))
+        segment = finder.motion.segments[frames_of_scans[node.session][node.frame]]
+        frames = np.flatnonzero(finder.motion.segments == segment)
+        first, last = finder.rows[frames[[0, -1]]].tolist()
+        segments.append(TrajectorySegment(node.session, first, last, odometry is not None))
         if odometry is None:
-            lidar_poses = finder.motion.poses @ searched.recording.uprights[: len(finder)]
+            lidar_poses = finder.motion.poses @ searched.recording.uprights[finder.rows]
             poses.append(inverse(lidar_poses[frames[0]]) @ lidar_poses)
         else:
-            poses.append(odometry[: len(finder)])
+            poses.append(odometry[finder.rows])
     match_poses, query_poses = poses
     match_m, query_m = np.split(motion.travelled, [len(match_poses)])
     distances = {"match_travelled_m": match_m, "query_travelled_m": query_m}
+    loops = [renumbered(loop, frames_of_scans) for loop in loops]
     transform, covariance = align_frames(loops, match_poses, query_poses, drift=drift, **distances)
     return SegmentAlignment(segments[0], segments[1], transform, covariance, len(loops))

@@ -73,6 +73,8 @@ class BevOdometry:
         """Number of extrapolated frames since the last registered one."""
         self._m_per_s: float | None = None
         """Last known forward speed, in metres per second. None while it was never known."""
+        self._top_m_per_s = 0.0
+        """Highest speed between two registered frames, in metres per second."""
 
     def __len__(self) -> int:
         return len(self.path)
@@ -154,7 +156,7 @@ class BevOdometry:
             along_m = float(link.along_m) if self.is_ridge(link) else math.inf
             pose = self.poses[self.keyframe] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < MAX_COASTING:
-            pose, extrapolates = self._extrapolated(time), True
+            pose, extrapolates = self.extrapolated(time), True
         self._coasted = self._coasted + 1 if extrapolates else 0
         if not len(self):
             self._append(time, np.eye(4) if pose is None else pose, segment=0, travelled=0.0, guessed_m=0.0)
@@ -168,6 +170,9 @@ class BevOdometry:
                 after_guess_m = self._guessed_m_after(time, share=1.0 if extrapolates else AMBIGUOUS_SHARE)
                 guessed_m = min(after_guess_m, self.guessed_m[-1] + M_PER_UNCERTAIN_M * along_m)
             travelled_m, segment = self.travelled[self.keyframe] + moved_m, int(self.segments[self.keyframe])
+            seconds, step_m = time - self._times[-1], float(np.linalg.norm((pose - self.poses[-1])[:3, 3]))
+            if not is_guess and seconds > 0:
+                self._top_m_per_s = max(self._top_m_per_s, step_m / seconds)
             self._append(time, pose, segment=segment, travelled=travelled_m, guessed_m=guessed_m)
             is_near_keyframe = moved_m <= KEYFRAME_M and rotation <= np.radians(KEYFRAME_DEG)
             if is_near_keyframe and not is_guess:
@@ -176,8 +181,21 @@ class BevOdometry:
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
         """Expected x, y (metres) and yaw (radians) in an earlier frame, at constant velocity. `NO_PRIOR` if unknown."""
-        expected = self._extrapolated(time)
+        expected = self.extrapolated(time)
         return NO_PRIOR if expected is None else planar_pose(inverse(self.poses[frame]) @ expected)
+
+    def extrapolated(self, time: float) -> Float[np.ndarray, "4 4"] | None:
+        """Pose at `time` at constant velocity, or None if the velocity is unknown or the last frame is too old."""
+        frames, steps = self._last_known_step, self._steps(time)
+        if frames is None or not 0 < steps <= MOST_STEPS:
+            return None
+        start, end = frames
+        step = inverse(self.poses[start]) @ self.poses[end]
+        return self.poses[-1] @ transform(steps * step[0, 3], steps * step[1, 3], steps * float(yaw_of(step)))
+
+    def most_moved_m(self, time: float) -> float:
+        """Distance from the last frame that the sensor could have at `time`, at its highest speed so far, in metres."""
+        return self._top_m_per_s * (time - self._times[-1])
 
     def is_trusted(self, link: BevRegistration, prior: Float[np.ndarray, " 3"]) -> bool:
         """Whether a registration shows how the sensor moved: no other pose fits about as well.
@@ -259,15 +277,6 @@ class BevOdometry:
             return 1.0
         start, end = frames
         return float((time - self._times[-1]) / (self._times[end] - self._times[start]))
-
-    def _extrapolated(self, time: float) -> Float[np.ndarray, "4 4"] | None:
-        """Pose at `time` at constant velocity, or None if the velocity is unknown or the last frame is too old."""
-        frames, steps = self._last_known_step, self._steps(time)
-        if frames is None or not 0 < steps <= MOST_STEPS:
-            return None
-        start, end = frames
-        step = inverse(self.poses[start]) @ self.poses[end]
-        return self.poses[-1] @ transform(steps * step[0, 3], steps * step[1, 3], steps * float(yaw_of(step)))
 
     def _guessed_m_after(self, time: float, *, share: float = 1.0) -> float:
         """Value of `guessed_m` for the next frame, if this share of the motion since the last frame is a guess."""

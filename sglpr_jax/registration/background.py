@@ -37,26 +37,24 @@ class Background:
         if not image.size:
             return image
         root = np.sqrt(image, dtype=np.float32)
-        background = ring_medians(root)  # square roots, because the comparison of images uses them, too
+        background = ring_medians(image)  # square roots, because the comparison of images uses them, too
         if self._root is not None and self.added >= MIN_FRAMES:
             background = np.maximum(self._root, background)
         return np.round(np.maximum(root - background, 0) ** 2).astype(np.uint8)
 
 
-def ring_medians(image: Float32[np.ndarray, "n n"]) -> Float32[np.ndarray, "n n"]:
-    """Replace each cell by the median of its ring around the sensor. Flat floors and ceilings fill whole rings."""
-    order, starts, ring_of_cell = _rings(len(image))
-    medians = [np.median(cells) for cells in np.split(image.reshape(-1)[order], starts)]
-    return np.array(medians, np.float32)[ring_of_cell]
+def ring_medians(image: UInt8[np.ndarray, "n n"]) -> Float32[np.ndarray, "n n"]:
+    """Median of the square roots of each cell's ring around the sensor. Flat floors and ceilings fill whole rings."""
+    ring = _ring_of_cell(len(image))
+    values = 256 * ring + image  # distinguishes the values of all rings, so that one count serves all medians
+    at_most = np.bincount(values.reshape(-1), minlength=256 * (ring.max() + 1)).reshape(-1, 256).cumsum(axis=1)
+    cells = at_most[:, -1:]
+    middle_values = [(at_most <= before).sum(axis=1) for before in ((cells - 1) // 2, cells // 2)]
+    return np.sqrt(middle_values, dtype=np.float32).mean(axis=0)[ring]
 
 
 @functools.cache
-def _rings(size: int) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " r"], Int[np.ndarray, "n n"]]:
-    """Rings of one cell's width around the centre of a square image of `size` x `size` cells.
-
-    Returns the flat indices of the cells in the order of their rings, the start of each ring but the first in this
-    order, and the ring of each cell.
-    """
+def _ring_of_cell(size: int) -> Int[np.ndarray, "n n"]:
+    """Number of the ring of each cell of a square image of `size` x `size` cells. Rings are one cell wide."""
     axis = np.arange(size) - (size - 1) / 2
-    ring = np.hypot(axis[:, None], axis[None]).astype(int)
-    return np.argsort(ring, axis=None, kind="stable"), np.cumsum(np.bincount(ring.reshape(-1)))[:-1], ring
+    return np.hypot(axis[:, None], axis[None]).astype(int)

@@ -76,7 +76,8 @@ def match_spectra(matches: Num[AnyArray, "k h w"], *, config: VerificationConfig
 
 def rotate(image: Float[Array, "m m"], angles: Float[Array, " t"]) -> Float[Array, "t m m"]:
     """Rotate an image by each angle, in radians."""
-    return rotate_image(jnp.broadcast_to(image, (len(angles), *image.shape)), angles)
+    # One by one: XLA would compile all at once into the padding of the next transform, which takes four times as long.
+    return jax.lax.map(lambda angle: rotate_image(image, angle), angles)
 
 
 def spectrum(images: Float[Array, "t m m"], cell_m: float, config: VerificationConfig) -> Complex[Array, "t s f"]:

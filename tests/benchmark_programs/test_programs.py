@@ -56,6 +56,7 @@ PARSED = (
     "speed embed --scans 65",
     "speed live --rates 5",
     "speed start-up --repeats 1",
+    "speed trees elsewhere --repeats 1",
     "torch describe --preset circular --compiled",
     "torch step --no-labels",
     "fleet embed recordings/* --out places",

@@ -84,7 +84,7 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
 
     def some(recordings, params, **options):
         return search.LoopSearchResult(
-            (search.Session(recordings[0], SCANS),), (unsure,), (RejectedClosure(unsure, "repeats"),)
+            (search.Session(recordings[0], SCANS, keyframes=SCANS),), (unsure,), (RejectedClosure(unsure, "repeats"),)
         )
 
     monkeypatch.setattr(search, "find_loops", some)

@@ -71,6 +71,13 @@ def test_interpolation_equals_the_matrix_logarithm(numbers, share):
     np.testing.assert_allclose(found[0], expected, atol=1e-6)
 
 
+def test_interpolation_uses_the_poses_before_and_after_each_time():
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = [0, 1, 5, 6]
+    found = poses_at(np.array([-0.5, 0.5, 1.0, 1.5, 2.0, 2.5, 3.5]), np.arange(4.0), poses)
+    np.testing.assert_allclose(found[:, 0, 3], [-0.5, 0.5, 1, 3, 5, 5.5, 6.5])
+
+
 def test_a_recording_is_deskewed_and_a_scan_without_a_neighbour_stays():
     times, poses, clouds = drive(twist([0, 0, 3], [2, 0, 0]))
     times[3] = 60.0

@@ -17,6 +17,7 @@ from sglpr_jax.se3 import inverse, transform
 
 NOW = CandidateConfig(recent_m=1e-9)
 CELLS, CELL_M = 152, 0.4
+AXIS_M = (np.arange(CELLS) - (CELLS - 1) / 2) * CELL_M
 BLANK = np.ones((CELLS, CELLS), np.uint8)
 
 
@@ -27,6 +28,13 @@ def finder_of(params, candidates: CandidateConfig = CandidateConfig(), **limits)
 def seen_by(finder: CandidateSearch, image: np.ndarray) -> Keyframe:
     """An image with a descriptor of zeros."""
     return Keyframe(np.zeros(finder.index.width, np.float32), image, None)
+
+
+def posts_from(x: float) -> np.ndarray:
+    """Image of posts from a position on the x axis."""
+    posts = np.random.default_rng(0).uniform(-60, 60, (200, 2))
+    apart = np.hypot(AXIS_M[:, None, None] - (posts[:, 0] - x), AXIS_M[None, :, None] - posts[:, 1]).min(axis=-1)
+    return np.where(apart < 0.5, 160, 0).astype(np.uint8)
 
 
 def test_images_and_scans_are_the_same_to_it(drive, params, revisit):
@@ -119,13 +127,10 @@ def test_rings_on_the_floor_do_not_hold_the_motion(params, monkeypatch):
     """Without the average of earlier images, only the medians of rings are subtracted."""
     monkeypatch.setattr(background.Background, "add", lambda *_: None)
     finder = finder_of(params)
-    posts = np.random.default_rng(0).uniform(-60, 60, (200, 2))
-    axis = (np.arange(CELLS) - (CELLS - 1) / 2) * CELL_M
-    radius = np.hypot(axis[:, None], axis[None])
+    radius = np.hypot(AXIS_M[:, None], AXIS_M[None])
     floor = np.where((np.abs(radius[..., None] - (4.0, 6.0, 9.0, 13.0)) < 0.2).any(axis=-1), 80, 0)
     for k in range(20):
-        apart = np.hypot(axis[:, None, None] - (posts[:, 0] - k), axis[None, :, None] - posts[:, 1]).min(axis=-1)
-        finder.add_keyframe(seen_by(finder, np.where(apart < 0.5, 160, floor).astype(np.uint8)), time=0.1 * k)
+        finder.add_keyframe(seen_by(finder, np.maximum(posts_from(k), floor.astype(np.uint8))), time=0.1 * k)
     moved = np.linalg.norm(finder.motion.poses[-1][:3, 3])
     assert moved == pytest.approx(19, abs=1)
 
@@ -140,10 +145,41 @@ def driven(params, step_m: float, turn_deg: float = 0.0, *, frames: int = 41, **
 
 
 def test_a_scan_near_the_last_stored_one_is_not_stored_unless_the_sensor_turned(params):
-    assert driven(params, 0.25, keyframe_m=1.0).stored.frames.tolist() == list(range(0, 41, 4))
-    assert driven(params, 0.0, 5.01, keyframe_m=1.0).stored.frames.tolist() == list(range(0, 41, 4))
+    assert driven(params, 0.25, keyframe_m=2.0).stored.frames.tolist() == list(range(0, 41, 4))
+    assert driven(params, 0.0, 2.51, keyframe_m=2.0).stored.frames.tolist() == list(range(0, 41, 4))
     whole = driven(params, 0.25)
     assert whole.stored.frames.tolist() == list(range(41)) and len(whole) == 41
+
+
+@pytest.mark.parametrize(("step_m", "turn_deg", "apart"), [(0.5, 0.0, 5), (0.0, 5.01, 4), (0.5, 7.0, 3), (4.0, 0.0, 1)])
+def test_with_odometry_keyframes_are_some_metres_apart_or_turned(params, step_m, turn_deg, apart):
+    finder = finder_of(params, keyframe_m=2.5)
+    for scan in range(21):
+        pose = transform(step_m * scan, 0.0, np.radians(turn_deg * scan))
+        if finder.is_due(odometry=pose):
+            finder.add_keyframe(seen_by(finder, BLANK), odometry=pose, fits=NO_FITS)
+        else:
+            finder.skip()
+    assert finder.rows.tolist() == list(range(0, 21, apart)) and finder.scans == 21
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [None, 0.1, 40.0])
+def test_without_odometry_keyframes_follow_the_motion_and_a_standing_sensor_is_looked_at_again(params, times):
+    """The sensor moves by 1 m a scan, stands for 20 scans, and moves on."""
+    finder = finder_of(params, keyframe_m=2.5)
+    positions = np.concatenate([np.arange(12.0), np.full(20, 11.0), np.arange(11.0, 24.0)])
+    for scan, x in enumerate(positions):
+        when = {"time": None if times is None else times * scan}
+        if finder.is_due(**when):
+            finder.add_keyframe(seen_by(finder, posts_from(x)), **when)
+        else:
+            finder.skip()
+    apart = np.diff(finder.rows)
+    moving = np.diff(positions[finder.rows]) > 0.5
+    assert np.diff(positions[finder.rows]).max() <= 6 and apart[~moving].max() <= 6
+    assert np.median(apart[moving]) == 3 and len(finder) < 24
+    np.testing.assert_allclose(np.linalg.norm(finder.motion.poses[:, :3, 3], axis=1), positions[finder.rows], atol=0.2)
 
 
 def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):

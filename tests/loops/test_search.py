@@ -122,7 +122,7 @@ LOOP = LoopClosure(5, 0, np.eye(4), np.eye(6), 0.995)
 def found_in(frames: int, **about) -> LoopSearchResult:
     """No loops in a recording of this many frames."""
     images = {Path(f"{i:06d}.png"): np.eye(8, dtype=np.float32) for i in range(frames)}
-    return LoopSearchResult((Session(of_images(images), frames, **about),))
+    return LoopSearchResult((Session(of_images(images), frames, keyframes=frames, **about),))
 
 
 def test_what_is_missing_explains_why_there_are_no_loops():
@@ -162,7 +162,7 @@ def test_one_street_on_two_days_has_a_transform_with_and_without_odometry(params
     frames, steps = [one.poses.world_from_lidar[0] for one in both], []
     odometry = [inverse(frame) @ one.poses.world_from_lidar for frame, one in zip(frames, both, strict=True)]
     found = find_loops(both, params, odometry=odometry, on_progress=steps.append)
-    assert found.whole and steps == list(range(1, 3 * PASS + 1))
+    assert found.whole and steps == sorted(set(steps)) and steps[0] == 1 and steps[-1] == 3 * PASS
     assert len(found.between(0, 1).loops) >= 5 and found.transforms[0].match.is_odometry
     error = inverse(inverse(frames[0]) @ frames[1]) @ found.transforms[0].match_from_query
     assert np.linalg.norm(error[:2, 3]) < 0.3 and abs(np.degrees(yaw_of(error))) < 0.5

@@ -55,6 +55,25 @@ def test_wrong_loops_do_not_bend_it(two_laps, two_laps_odometry, second_lap_loop
     )
 
 
+def test_loops_at_which_a_solution_bends_are_dropped(two_laps_odometry, second_lap_loops, monkeypatch):
+    solved_loops = []
+
+    def solve(odometry, loops, sessions, drift):
+        """Keeps all loops at first, and puts the query of one of them 20 m aside."""
+        poses = odometry.copy()
+        if not solved_loops:
+            poses[bent.query] = poses[bent.query] @ transform(0.0, 20.0, 0.0)
+        solved_loops.append([loop.query for loop in loops])
+        return poses, np.ones(len(loops), bool)
+
+    monkeypatch.setattr("sglpr_jax.pose_graph.optimize._solve_with_gtsam", solve)
+    bent, loops = second_lap_loops[6], second_lap_loops[::3]
+    found = optimized(two_laps_odometry, loops)
+    assert bent.query in solved_loops[0] and bent.query not in solved_loops[1] and solved_loops[1]
+    queries = [loop.query for loop, is_inlier in zip(loops, found.inliers, strict=True) if is_inlier]
+    assert queries == solved_loops[-1]
+
+
 def test_of_a_recording_the_searched_frames_are_corrected(two_laps_odometry, second_lap_loops, tmp_path, monkeypatch):
     images = {tmp_path / f"{i:06d}.png": np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
     early = tuple(loop for loop in second_lap_loops if loop.query < 90)

@@ -48,6 +48,9 @@ def test_a_first_guess_is_refined_and_errors_are_as_large_as_the_covariance_says
     error = np.concatenate([apart[:3, 3], Rotation.from_matrix(apart[:3, :3]).as_rotvec()])
     assert 0.3 < error @ np.linalg.inv(found.covariance) @ error < 16.8  # 99 % of a chi-square of 6 degrees of freedom
     assert np.linalg.eigvalsh(found.covariance[:2, :2]).max() < 0.05**2
+    # Points metres away fix the rotation to far less than their own errors.
+    deviations = np.sqrt(np.diag(found.covariance))
+    assert deviations[3:].max() < deviations[:3].min()
 
 
 def test_between_plain_walls_the_first_guess_stays_unknown_along_them():
@@ -80,6 +83,8 @@ def test_the_overlap_of_a_scan_with_itself_is_whole_and_counts_voxels():
     grid = np.stack(np.meshgrid(*[np.arange(-5, 5) + 0.5] * 3), -1).reshape(-1, 3)
     assert overlap(grid, grid, transform(2.0, 0.0, 0.0)) == pytest.approx(0.8)
     assert overlap(grid, grid + np.array([200, 0, 0]), np.eye(4)) == 0
+    half = grid[grid[:, 0] > 0]
+    assert overlap(half, grid, np.eye(4)) == overlap(grid, half, np.eye(4)) == 1
 
 
 def test_scans_of_next_to_no_points_are_refused():
