@@ -14,7 +14,7 @@ from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.closure import LoopClosure, to_lidar, to_upright
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
-from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan, image_spectrum
+from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan, image_spectra
 from sglpr_jax.models.weights import Params, weights_hash
 from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, BevOdometry
 from sglpr_jax.odometry.drift_check import OdometryCheck
@@ -337,7 +337,7 @@ class CandidateSearch:
         self, query: Query, reference: Reference, prior: Float[np.ndarray, " 3"]
     ) -> tuple[BevRegistration, BevRegistration]:
         """Best pose of a query in the frame of a reference, and best pose near `prior`. Equal with `NO_PRIOR`."""
-        spectrum = image_spectrum(reference.image, self.verification)
+        spectrum = image_spectra(reference.image, self.verification).exact
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
         best = self._refine(query, reference, peaks.at(0))
         if np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1]:

@@ -21,7 +21,7 @@ from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_config import VerificationConfig
-from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, search
+from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, coarse_query, search
 from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar
 
@@ -87,6 +87,11 @@ class Query:
     def spectra(self) -> Complex[Array, "2 s t f"]:
         """Result of `query_spectra`, computed at the first comparison."""
         return query_spectra(self.image, config=self.verification)
+
+    @functools.cached_property
+    def coarse_spectra(self) -> Complex[Array, "2 r u g"]:
+        """Result of `coarse_query`, computed at the first comparison."""
+        return coarse_query(self.spectra, config=self.verification)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -247,8 +252,8 @@ class KeyframeComparison:
         rows = scans.nearest(query.descriptor, count, among)
         if not len(rows):
             return rows, np.zeros(0)
-        matches = _batched(scans.spectra(rows), COARSE_BATCH)
-        correlations = coarse_correlations(query.spectra, matches, len(rows), config=self.verification)
+        matches = _batched([spectra.coarse for spectra in scans.spectra(rows)], COARSE_BATCH)
+        correlations = coarse_correlations(query.coarse_spectra, matches, len(rows), config=self.verification)
         coarse = np.asarray(correlations)[: len(rows)]
         order = np.argsort(-coarse, kind="stable")
         return rows[order], coarse[order]
@@ -257,7 +262,7 @@ class KeyframeComparison:
         """Compare the images of a query and of stored scans at all rotations and shifts."""
         if not len(rows):
             return NO_FITS
-        matches = _batched(scans.spectra(rows), BATCH)
+        matches = _batched([spectra.exact for spectra in scans.spectra(rows)], BATCH)
         peaks = jax.device_get(search(query.spectra, matches, len(rows), config=self.verification))
         return Fits(scans.frames[rows], peaks.at(slice(len(rows))))
 

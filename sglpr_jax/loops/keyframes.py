@@ -2,12 +2,14 @@
 
 import abc
 import copy
+import functools
 import zlib
 from collections import OrderedDict
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Complex64, Float32, Int, Num, UInt8
+from jaxtyping import Array, Bool, Complex64, Float32, Int, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
 from sglpr_jax.data.mounting import Mounting
@@ -18,7 +20,7 @@ from sglpr_jax.growing import GrowingArray
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import Params
 from sglpr_jax.registration.bev_config import VerificationConfig
-from sglpr_jax.registration.bev_spectra import match_spectra
+from sglpr_jax.registration.bev_spectra import lower_half, match_spectra
 from sglpr_jax.retrieval.index import Index
 
 
@@ -63,11 +65,20 @@ def _square_8_bit(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
 LEVEL = 1
 """Compression level of zlib, the fastest one. Most cells of an image are empty, so higher levels save little."""
 SPECTRA = 512
-"""Number of spectra that are kept for the next queries. Consecutive queries are compared with the same scans."""
+"""Number of images whose spectra are kept. Consecutive queries are compared with the same scans."""
 PARTS = 16
 """With `max_places`, 1 / `PARTS` of the scans are removed at once, because each removal moves all rows that follow."""
 EVERY = np.array(True)
 """Flag that broadcasts to all scans."""
+
+
+class ImageSpectra(NamedTuple):
+    """Spectra of an image for the comparison with queries."""
+
+    exact: Complex64[np.ndarray, "s f"]
+    """Row of `match_spectra`."""
+    coarse: Complex64[np.ndarray, "r g"]
+    """The same on larger cells (`lower_half`)."""
 
 
 class Keyframes(abc.ABC):
@@ -98,9 +109,9 @@ class Keyframes(abc.ABC):
         rows = self.index.query(descriptor, k, exclude=~(among & self.searchable)).rows
         return rows[rows >= 0]  # the index pads with -1
 
-    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        """Spectrum of the image of each row (`match_spectra`)."""
-        return [image_spectrum(self.image(row), self.verification) for row in rows.tolist()]
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[ImageSpectra]:
+        """Spectra of the image of each row."""
+        return [image_spectra(self.image(row), self.verification) for row in rows.tolist()]
 
 
 class StoredScans(Keyframes):
@@ -122,7 +133,7 @@ class StoredScans(Keyframes):
         self._compressed: list[bytes] = []
         self._shape = 0, 0
         """Compressed image of each scan, and the shape of all of them."""
-        self._spectra: OrderedDict[int, Complex64[np.ndarray, "s f"]] = OrderedDict()
+        self._spectra: OrderedDict[int, ImageSpectra] = OrderedDict()
         """Spectra by frame, the last used one at the end."""
 
     def __len__(self) -> int:
@@ -182,12 +193,12 @@ class StoredScans(Keyframes):
         """Image of a scan, decompressed."""
         return np.frombuffer(zlib.decompress(self._compressed[row]), np.uint8).reshape(self._shape)
 
-    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
-        """Spectrum of the image of each row (`match_spectra`). The `SPECTRA` last used ones stay in memory."""
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[ImageSpectra]:
+        """Spectra of the image of each row. Those of the `SPECTRA` last used images stay in memory."""
         spectra = []
         for row, frame in zip(rows.tolist(), self._frames.rows[rows].tolist(), strict=True):
             if frame not in self._spectra:
-                self._spectra[frame] = image_spectrum(self.image(row), self.verification)
+                self._spectra[frame] = image_spectra(self.image(row), self.verification)
             self._spectra.move_to_end(frame)  # the order of last use
             spectra.append(self._spectra[frame])
         while len(self._spectra) > SPECTRA:
@@ -195,6 +206,12 @@ class StoredScans(Keyframes):
         return spectra
 
 
-def image_spectrum(image: UInt8[np.ndarray, "m m"], config: VerificationConfig) -> Complex64[np.ndarray, "s f"]:
-    """Spectrum of one image (`match_spectra`)."""
-    return np.asarray(match_spectra(image[None], config=config))[0]
+def image_spectra(image: UInt8[np.ndarray, "m m"], config: VerificationConfig) -> ImageSpectra:
+    """Spectra of one image."""
+    return ImageSpectra(*jax.device_get(_image_spectra(image, config)))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _image_spectra(image: UInt8[Array, "m m"], config: VerificationConfig) -> tuple[Array, Array]:
+    exact = match_spectra(image[None], config=config)
+    return exact[0], lower_half(exact, config)[0]

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import minimize
 from scipy.special import expit
 
 DEFAULT = Path(__file__).with_name("probability.json")
@@ -176,6 +175,8 @@ def fit(
     `values` has the value of each argument (a name of `KNOTS`) at each pair. Raises ValueError if all pairs are loops,
     or no pair is.
     """
+    from scipy.optimize import minimize  # imported here because the import is slow
+
     if is_loop.all() or not is_loop.any():
         raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
     weights = np.ones(len(is_loop)) if weights is None else weights

@@ -14,7 +14,6 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float32
-from scipy.special import ndtr, ndtri
 
 Draw = Callable[[np.random.Generator, tuple[int, ...]], Float32[np.ndarray, "*shape"]]
 TRUNCATED_AT = 2.0
@@ -78,11 +77,13 @@ def normal(deviation: float) -> Initial:
 
 def truncated_normal(scale: float) -> Initial:
     """Normal distribution, truncated at 2 standard deviations, of variance `scale` / (number of inputs) after that."""
-    lowest_probability = ndtr(-TRUNCATED_AT)
+    lowest_probability = math.erfc(TRUNCATED_AT / math.sqrt(2)) / 2
     density = math.exp(-(TRUNCATED_AT**2) / 2) / math.sqrt(2 * math.pi)
     narrowing = math.sqrt(1 - 2 * TRUNCATED_AT * density / (1 - 2 * lowest_probability))
 
     def draw(rng: np.random.Generator, shape: tuple[int, ...]) -> Float32[np.ndarray, "*shape"]:
+        from scipy.special import ndtri  # imported here because the import is slow
+
         deviation = math.sqrt(scale / math.prod(shape[:-1])) / narrowing
         probability = rng.uniform(lowest_probability, 1 - lowest_probability, shape)
         return np.float32(deviation) * ndtri(probability).astype(np.float32)

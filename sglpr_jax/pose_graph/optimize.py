@@ -26,6 +26,10 @@ MAX_HEIGHT_CHANGE_M = 2.0
 """Maximum correction of a height without a warning, in metres."""
 UNKNOWN_MOTION_SIGMA = 1e2
 """Standard deviation of the unknown motion between two sessions, in metres and radians."""
+OUTLIER_COST = 50.0
+"""Half of the squared error, in standard deviations, at which a loop is an outlier. 8.4 would be its own 99 % quantile
+(6 degrees of freedom), but the odometry that the loop bends costs as much as the loop, and more if its noise is larger
+than stated. Loops are wrong by metres, so they cost hundreds."""
 ROUNDS = 5
 """Maximum number of solutions. Loops that bend a solution beyond the drift are dropped before the next one."""
 
@@ -234,6 +238,7 @@ def _solve_with_gtsam(
     options = gtsam.GncLMParams()
     options.setKnownInliers(list(range(odometry_factors)))
     solver = gtsam.GncLMOptimizer(graph.factors, graph.estimates, options)
+    solver.setInlierCostThresholds(OUTLIER_COST)
     solution = solver.optimize()
     poses = np.stack([solution.atPose3(frame).matrix() for frame in range(len(odometry))])
     loop_weights = np.asarray(solver.getWeights())[odometry_factors:]  # near 0 or 1

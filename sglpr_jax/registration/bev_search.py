@@ -27,25 +27,33 @@ NO_PRIOR = np.full(3, np.nan)
 
 @functools.partial(jax.jit, static_argnames="config")
 def coarse_correlations(
-    query: Complex[AnyArray, "2 s t f"],
-    matches: Complex[AnyArray, "k s f"],
+    query: Complex[AnyArray, "2 r u g"],
+    matches: Complex[AnyArray, "k r g"],
     count: Int[AnyArray, ""] | int | None = None,
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Float[Array, " k"]:
     """Highest correlation of a query with each of k matches at any pose, on cells twice as large as in `search`.
 
-    The arguments are those of `search`. Matches beyond the first `count` get -1.
+    The arguments are the results of `coarse_query` and, for the spectra of `match_spectra`, of `lower_half`. Matches
+    beyond the first `count` get -1.
     """
-    every_other_turn = jnp.asarray(query)[:, :, ::2].swapaxes(1, 2)  # `lower_half` halves the last two axes
-    rotated = quarters(lower_half(every_other_turn, config).swapaxes(1, 2))
-    matches = lower_half(jnp.asarray(matches), config)
+    rotated, matches = quarters(jnp.asarray(query)), jnp.asarray(matches)
     max_shift = cell_count(config.max_shift_m, 2 * DENSITY_RESOLUTION_M * config.coarse)
 
     def compare(row: Int[Array, ""], highest: Float[Array, " k"]) -> Float[Array, " k"]:
         return highest.at[row].set(correlations(rotated, matches[row], max_shift).max((0, 2)).max())
 
     return jax.lax.fori_loop(0, len(matches) if count is None else count, compare, jnp.full(len(matches), -1.0))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def coarse_query(
+    query: Complex[AnyArray, "2 s t f"], *, config: VerificationConfig = DEFAULT
+) -> Complex[Array, "2 r u g"]:
+    """Convert the result of `query_spectra` for `coarse_correlations`: every other rotation, on larger cells."""
+    every_other_turn = jnp.asarray(query)[:, :, ::2].swapaxes(1, 2)  # `lower_half` halves the last two axes
+    return lower_half(every_other_turn, config).swapaxes(1, 2)
 
 
 class CorrelationPeak(NamedTuple):

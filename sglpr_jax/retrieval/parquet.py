@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
@@ -72,6 +71,7 @@ def place_rows(
     Raises ValueError if another distance compares the descriptors.
     """
     import pyarrow
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     if file.distance != "l2":
         raise ValueError(f"expected descriptors compared by l2, found {file.distance}")

@@ -8,7 +8,14 @@ from scenes import place, relative, seen_from
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.registration.bev_config import VerificationConfig
-from sglpr_jax.registration.bev_search import SECOND_DEG, SECOND_M, coarse_correlations, search, search_near
+from sglpr_jax.registration.bev_search import (
+    SECOND_DEG,
+    SECOND_M,
+    coarse_correlations,
+    coarse_query,
+    search,
+    search_near,
+)
 from sglpr_jax.registration.bev_spectra import (
     cell_count,
     lower_half,
@@ -103,8 +110,12 @@ PLACES, TRUE = 12, 7
 def test_the_true_place_has_the_highest_coarse_correlation():
     images = np.stack([seen_from(place(seed), (0.0, 0.0, 0.0)).astype(np.uint8) for seed in range(PLACES)])
     query = query_spectra(seen_from(place(TRUE), (1.2, -0.8, 2.5)).astype(np.uint8))
-    found = np.asarray(coarse_correlations(query, match_spectra(images)))
+    found = np.asarray(
+        coarse_correlations(coarse_query(query), lower_half(match_spectra(images), VerificationConfig()))
+    )
     assert found.argmax() == TRUE and np.delete(found, TRUE).max() < 0.5 < found[TRUE]
-    some = np.asarray(coarse_correlations(query, match_spectra(images), TRUE))
+    some = np.asarray(
+        coarse_correlations(coarse_query(query), lower_half(match_spectra(images), VerificationConfig()), TRUE)
+    )
     np.testing.assert_allclose(some[:TRUE], found[:TRUE], atol=1e-6)
     assert (some[TRUE:] == -1).all()

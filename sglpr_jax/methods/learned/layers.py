@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Shaped
-from scipy.cluster.vq import kmeans2
 
 from sglpr_jax.methods.learned.method import Variables
 from sglpr_jax.models import convolution
@@ -63,6 +62,7 @@ def fit_clusters(network: nn.Module, variables: Variables, inputs: Shaped[np.nda
     The centres are those of k-means (Arandjelović et al., 2016). The logit of a cluster is a * x · centre / |centre|,
     with the factor a for which the second-nearest cluster gets `SECOND_WEIGHT` times the weight of the nearest one.
     """
+    from scipy.cluster.vq import kmeans2  # imported here because the import is slow
 
     @jax.jit
     def local_features(images: Any) -> Any:

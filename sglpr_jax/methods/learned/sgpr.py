@@ -10,9 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.data.views import classes_of
@@ -82,6 +79,11 @@ def semantic_graph(scan: Scan) -> Float32[np.ndarray, "100 15"]:
 
 def cluster_of_points(points: Float[np.ndarray, "n 3"], gap_m: float) -> Int[np.ndarray, " n"]:
     """Return the index of each point's cluster. Neighbouring voxel means in a cluster are at most `gap_m` apart."""
+    # imported here because the imports are slow
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
     if len(points) == 0:
         return np.zeros(0, np.int64)
     voxel, counts = group_by_voxel(points, gap_m / VOXELS_PER_GAP)
