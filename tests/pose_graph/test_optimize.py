@@ -55,6 +55,20 @@ def test_wrong_loops_do_not_bend_it(two_laps, two_laps_odometry, second_lap_loop
     )
 
 
+def test_exact_loops_are_used_although_they_bend_odometry_that_jitters(two_laps):
+    """They are far more exact than the odometry between them, whose directions have errors of 0.3 degrees."""
+    rng = np.random.default_rng(0)
+    jitter = np.tile(np.eye(4), (LAPS_FRAMES, 1, 1))
+    jitter[:, :3, :3] = Rotation.from_rotvec(np.radians(0.3) * rng.normal(size=(LAPS_FRAMES, 3))).as_matrix()
+    covariance = np.diag([0.01, 0.01, 0.003, *np.radians([0.05, 0.03, 0.02])]) ** 2
+    loops = []
+    for query in range(64, LAPS_FRAMES, 2):
+        match = int(np.linalg.norm(two_laps[:50, :3, 3] - two_laps[query, :3, 3], axis=1).argmin())
+        pose = inverse(two_laps[match]) @ two_laps[query]
+        loops.append(LoopClosure(query, match, pose, covariance, 0.99))
+    assert optimized(two_laps @ jitter, loops).inliers.all()
+
+
 def test_loops_at_which_a_solution_bends_are_dropped(two_laps_odometry, second_lap_loops, monkeypatch):
     solved_loops = []
 
