@@ -267,9 +267,17 @@ def _pose_counts(drive: DescribedDrive, loops: Sequence[Any]) -> list[int]:
 
 
 def images(
-    *, data: Path, seqs: tuple[str, ...] = ("06",), weights: str = "sglpr", odometry: bool = False, seed: int = 0
+    *,
+    data: Path,
+    seqs: tuple[str, ...] = ("06",),
+    weights: str = "sglpr",
+    odometry: bool = False,
+    seed: int = 0,
+    keyframe_m: float = DetectorConfig.keyframe_m,
 ) -> None:
     """Search ready-made images. Prints loops, calibration, and top-1 F1max (3 m / 20 m) after verification.
+
+    F1max needs a match of every scan, so it is printed if all are keyframes (`--keyframe-m 0`).
 
     Args:
         data: folder in the layout NN/imgs/*.png with NN/pose.txt.
@@ -277,14 +285,15 @@ def images(
         weights: model that describes the images.
         odometry: use drifting odometry made from the poses.
         seed: seed of the drift.
+        keyframe_m: distance between keyframes in metres.
     """
-    params = sglpr_jax.load(weights)
+    params, config = sglpr_jax.load(weights), DetectorConfig(keyframe_m=keyframe_m)
     for name in seqs:
         recording = sglpr_jax.open_recording(data, name)
         poses = np.tile(np.eye(4), (len(recording), 1, 1))
         poses[:, :3] = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
         given = odometry_of("drifting" if odometry else "none", poses, seed=seed)
-        found = sglpr_jax.find_loops(recording, params, odometry=given, registered=False)
+        found = sglpr_jax.find_loops(recording, params, odometry=given, registered=False, config=config)
         counts = count_loops(closures_of(found.loops), poses[:, :3, 3], town_rule(poses[:, :3, 3], recording.times))
         errors = describe_errors(found.loops, poses)
         print(f"{name}: {counts.loops} loops, {counts.wrong} wrong, recall {counts.recall}; {errors}")
@@ -292,7 +301,8 @@ def images(
         for one in reliability_of(found.sessions[0].candidates, found.model, poses[:, :3, 3]):
             share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.probability:.4f} said"
             print(f"  probability {one.low:g} to {one.high:g}: {share}")
-        _report_top1(found, poses, sglpr_jax.embed(params, recording).descriptors)
+        if not keyframe_m:
+            _report_top1(found, poses, sglpr_jax.embed(params, recording).descriptors)
 
 
 def _report_top1(

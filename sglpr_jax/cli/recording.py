@@ -157,7 +157,8 @@ class DetectorFlags:
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a loop."""
     keyframe_m: float = DetectorConfig.keyframe_m
-    """Distance between the keyframes, in metres. Only these scans are searched and stored. 0 searches every scan."""
+    """Distance between the keyframes, in metres, and a fifth of it where places look alike. Only these scans are
+    searched and stored. 0 searches every scan."""
     max_places: int | None = DetectorConfig.max_places
     """Maximum number of stored scans, to limit memory. By default all are stored."""
     candidates: CandidateConfig = DetectorConfig.candidates

@@ -28,6 +28,8 @@ from sglpr_jax.se3 import inverse, transform, yaw_of
 
 KEYFRAME_DEG = 20.0
 """Rotation from the last frame at which a scan is the next frame at any distance, in degrees."""
+DISTINCT = 0.4
+"""Coarse correlation with scans of other places below which a place is distinct. In towns, nine of ten places are."""
 FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
 AGREE_M, AGREE_DEG = 0.8, 6.0
@@ -57,7 +59,7 @@ class CandidateSearch:
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
         self.params, self.config, self.verification = params, config.candidates, config.verification
-        self.drift, self.keyframe_m = config.drift, config.keyframe_m
+        self.drift, self._keyframe_m = config.drift, config.keyframe_m
         self.scans = 0
         """Number of scans so far: the added frames and the skipped scans."""
         self._rows = GrowingArray(np.empty(0, np.int64))
@@ -146,6 +148,14 @@ class CandidateSearch:
         self.loops.append((query, match))
         self.stored.close_loop(query, match)
 
+    @property
+    def spacing_m(self) -> float:
+        """Distance between frames in metres: `keyframe_m`, or a fifth of it where places look alike, or may.
+
+        There, images of one place, taken apart, differ as much as those of two places, and many frames are needed.
+        """
+        return self._keyframe_m if self.fits.lookalike < DISTINCT else self._keyframe_m / 5
+
     def is_due(
         self,
         *,
@@ -153,14 +163,14 @@ class CandidateSearch:
         odometry: Float[np.ndarray, "4 4"] | None = None,
         continues: bool = True,
     ) -> bool:
-        """Whether the next scan should be a frame: the sensor moved `keyframe_m` or turned since the last one.
+        """Whether the next scan should be a frame: the sensor moved `spacing_m` or turned since the last one.
 
         Without odometry, the motion since the last frame is extrapolated, so a standing sensor may move off unnoticed.
         A scan is therefore also due if the sensor, at its highest speed so far, could have moved too far to be found.
         Raises the ValueError of `add_keyframe`.
         """
         self._check_order(time, odometry)
-        if not len(self) or not self.keyframe_m or not continues:
+        if not len(self) or not self.spacing_m or not continues:
             return True
         if odometry is not None:
             pose = np.asarray(odometry, np.float64) @ inverse(upright_from_lidar(self.mountings[-1]))
@@ -170,7 +180,7 @@ class CandidateSearch:
             if pose is None or self.motion.most_moved_m(time) >= self.verification.max_shift_m / 2:
                 return True
         moved_m, rotation = self.motion.moved(len(self) - 1, pose)
-        return bool(moved_m >= self.keyframe_m or rotation >= np.radians(KEYFRAME_DEG))
+        return bool(moved_m >= self.spacing_m or rotation >= np.radians(KEYFRAME_DEG))
 
     def skip(self) -> None:
         """Count a scan that is not a frame."""
@@ -236,13 +246,13 @@ class CandidateSearch:
     def _is_new_place(self, frame: int) -> bool:
         """Whether a frame is far enough from the last stored one, or its motion from there is unknown.
 
-        It is if they are half of `keyframe_m` apart, because a keyframe may come early.
+        It is if they are half of `spacing_m` apart, because a frame may come early.
         """
-        if not self.keyframe_m or not len(self.stored):
+        if not self.spacing_m or not len(self.stored):
             return True
         last_frame = int(self.stored.frames[-1])
         moved_m, rotation = self.motion.moved(last_frame, self.motion.poses[frame])
-        is_near = moved_m < self.keyframe_m / 2 and rotation < np.radians(KEYFRAME_DEG / 2)
+        is_near = moved_m < self.spacing_m / 2 and rotation < np.radians(KEYFRAME_DEG / 2)
         return not (is_near and self.motion.segments[frame] == self.motion.segments[last_frame])
 
     def _check_order(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:

@@ -44,6 +44,7 @@ COLUMNS = {
     "fitted": Column("int64", ("fits",)),
     "fits": Column("float64", ("fits", len(CorrelationPeak._fields))),
     "links": Column("float64", (1, len(LINK)), finite=False),
+    "lookalike": Column("float64", (1,), finite=False),
 }
 """Arrays of a frame. A scan that cannot be read or is not a keyframe has no descriptor and image. A missing link is
 stored as NaN."""
@@ -58,6 +59,7 @@ def frame_bytes(
         "fitted": np.asarray(fits.frames, np.int64),
         "fits": np.stack(fits.peaks, axis=1).astype(np.float64),
         "links": np.array([link]),
+        "lookalike": np.array([fits.lookalike]),
     }
     if keyframe is not None:
         arrays |= {"descriptor": keyframe.descriptor, "image": keyframe.image}
@@ -96,7 +98,7 @@ def read_frame(
     x, y, yaw, correlation, peak_ratio, along_m = link
     covariance = np.diag([along_m, along_m, 0.0]) ** 2  # the log keeps only the deviation along the uncertain direction
     registration = None if np.isnan(link).all() else BevRegistration(x, y, yaw, covariance, correlation, peak_ratio)
-    fits = Fits(frames, CorrelationPeak(*arrays["fits"].T), registration)
+    fits = Fits(frames, CorrelationPeak(*arrays["fits"].T), registration, float(arrays["lookalike"][0]))
     return keyframe, fits, arrays.get("pose"), {name: values[name] for name in annotations}
 
 

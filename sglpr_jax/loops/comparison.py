@@ -6,6 +6,7 @@ about as well as the match, the fit proves little. Only travelled distances coun
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -56,6 +57,8 @@ class Fits(NamedTuple):
     """Poses of the query in the frames of the other scans, and correlations."""
     link: BevRegistration | None = None
     """Pose of the query in the frame of the motion's keyframe, from which the motion without odometry is computed."""
+    lookalike: float = math.nan
+    """Highest coarse correlation with a scan that certainly shows another place. NaN if there is no such scan."""
 
     @property
     def poses(self) -> PlanarPose:
@@ -64,7 +67,7 @@ class Fits(NamedTuple):
 
     @classmethod
     def joined(cls, *parts: "Fits") -> "Fits":
-        """Concatenate comparisons of one query, without their links."""
+        """Concatenate comparisons of one query, without their links and lookalikes."""
         fields = zip(*(fits.peaks for fits in parts), strict=True)
         return cls(np.concatenate([fits.frames for fits in parts]), CorrelationPeak(*map(np.concatenate, fields)))
 
@@ -133,9 +136,11 @@ class KeyframeComparison:
             fits = Fits.joined(fits, self._compare_exactly(query, searched, rows[matters]))
             best = self._best_consistent_with_motion(query.frame, fits, EVERY)
         best = self._best(query.frame, fits, EVERY) if best is None else best
+        lookalike = math.nan
         for scans in (searched, *others):
-            fits = Fits.joined(fits, self._compare_distractors(query, fits, best, scans))
-        return fits
+            distractors = self._compare_distractors(query, fits, best, scans)
+            fits, lookalike = Fits.joined(fits, distractors), np.fmax(lookalike, distractors.lookalike)
+        return fits._replace(lookalike=float(lookalike))
 
     def _least_that_matters(self, fits: Fits, best: int | None) -> float:
         """Least coarse correlation of a further scan that is compared exactly, given the best fit so far (a row).
@@ -232,15 +237,16 @@ class KeyframeComparison:
             cohort, near_cohort = config.candidates, 0
         else:
             cohort, near_cohort = config.cohort, config.near_cohort
-        least, compared = self._least_that_matters(fits, best), NO_FITS
+        least, compared, lookalikes = self._least_that_matters(fits, best), NO_FITS, list[float]()
         for flags, count, most in (
             (elsewhere, cohort, EXACT_COHORT),
             (near, near_cohort, EXACT_NEAR_COHORT),
         ):
             rows, coarse = self._most_similar(query, scans, count, flags & distracts)
+            lookalikes.append(float(coarse[0]) if len(coarse) else math.nan)
             rows = rows[:most][coarse[:most] >= least]
             compared = Fits.joined(compared, self._compare_exactly(query, scans, rows))
-        return compared
+        return compared._replace(lookalike=lookalikes[0])
 
     def _most_similar(
         self, query: Query, scans: Keyframes, count: int, among: Bool[np.ndarray, " n"]

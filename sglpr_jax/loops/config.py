@@ -32,7 +32,7 @@ class CandidateConfig:
     further: PlaceCount = 32
     """Number of possible matches, those with the nearest descriptors, whose images are compared coarsely."""
     candidates: PlaceCount = 4
-    """Number of possible matches, the best by the coarse comparison, whose images are compared exactly."""
+    """Maximum number of possible matches, the best by the coarse comparison, whose images are compared exactly."""
     good_correlation: float = 0.6
     """If no compared image has this correlation, the next `candidates` are compared exactly, too."""
     min_coarse_correlation: float = 0.3
@@ -40,7 +40,8 @@ class CandidateConfig:
     min_correlation: float = 0.25
     """Minimum correlation of a candidate. Pairs below it are not loops."""
     cohort: PlaceCountOrNone = 24
-    """Number of scans of other places than query and match, those with the nearest descriptors, that are compared."""
+    """Number of scans of other places than query and match, those with the nearest descriptors, that are compared.
+    Queries without a match are compared with `candidates` of them."""
     near_cohort: PlaceCountOrNone = 8
     """Number of scans of the same passes, those with the nearest descriptors, that are compared. Their fits may
     contradict the motion."""
@@ -60,7 +61,8 @@ class DetectorConfig:
     """Minimum probability of a returned loop, given its neighbours."""
     keyframe_m: NotNegative = 2.5
     """Distance between keyframes, in metres, divided by the scale of the search. Only keyframes are described, searched
-    for loops and stored. A scan that is turned by 20 degrees is one, too. 0 makes every scan a keyframe."""
+    for loops and stored. Where places look alike, the distance is a fifth of it. A scan that is turned by 20 degrees is
+    a keyframe, too. 0 makes every scan a keyframe."""
     max_places: Count | None = None
     """Maximum number of stored scans. Beyond it, scans with a loop to a newer stored scan are forgotten first, then the
     oldest. None stores all."""

@@ -68,6 +68,20 @@ def test_a_lookalike_whose_fit_the_motion_excludes_makes_a_match_ambiguous(x):
     assert found.match == TRUE and found.evidence.ambiguity_ratio > 0.9
 
 
+def test_the_best_fit_of_another_place_is_told_and_of_no_other_place_nothing():
+    poses, images = street()
+    elsewhere = image(TRUE, THERE, noise=1)
+    for shown, least, most in ((image(99), 0.0, 0.5), (elsewhere, 0.5, 1.0)):
+        stored = StoredScans(Index.empty(2))
+        for frame, one in enumerate(images):
+            stored.add(frame, np.ones(2, np.float32), one)
+        at_new_place = [*poses, transform(60.0 * PLACES, 0.0, 0.0)]
+        query = Query(len(images), np.ones(2, np.float32), shown)
+        assert least < comparer_along(at_new_place).compare(query, stored).lookalike < most
+    alone = comparer_along(poses[:1]).compare(Query(0, np.ones(2, np.float32), images[0]), StoredScans(Index.empty(2)))
+    assert np.isnan(alone.lookalike)
+
+
 def test_a_near_scan_that_shows_the_same_place_is_no_lookalike():
     poses, images = street(further=(60.0 * 2 + 11, image(TRUE, (11.0, 0.0, 0.0))))
     (found,) = compared([*poses, transform(*LAST)], images)
