@@ -215,6 +215,8 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
 
     Gain and shift have maximum likelihood, with a penalty on gains other than 1. `made_with` describes the result.
     """
+    from scipy.optimize import minimize  # imported here because the import is slow
+
     log_odds, sign = model.log_odds(evidence), np.where(is_loop, 1.0, -1.0)
 
     def cost(gain_and_shift: Float[np.ndarray, " 2"]) -> float:
