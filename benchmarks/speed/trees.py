@@ -13,7 +13,7 @@ from benchmarks.table import Table
 from benchmarks.timing import run_command
 
 ROOT = Path(__file__).parents[2]
-SIMULATE = "simulate --out towns --sensor vlp16 --azimuth-steps 900"
+SIMULATE = "simulate --out towns --sensor hdl64e --azimuth-steps 900 --rate-hz 10"
 LINES = (
     "loops --help",
     "embed --data one --out NEW.npz",
