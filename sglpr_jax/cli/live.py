@@ -115,13 +115,13 @@ def run_node(
 
 
 def _check_endpoints(command: LiveCommand) -> None:
-    """Raise ValueError before any work if --poses would be overwritten. `split_known_name` for unknown names."""
+    """Raise ValueError before any work if --poses would be overwritten, and the errors of `named_module`."""
     from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
-    from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, split_known_name
+    from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, named_module
 
-    split_known_name(command.source, SOURCES, kind="sources")
+    named_module(command.source, SOURCES, kind="sources")
     for sink in command.sinks:
-        split_known_name(sink, SINKS, kind="sinks")
+        named_module(sink, SINKS, kind="sinks")
     output_files = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
     if command.poses is not None and command.poses.resolve() in output_files:
         raise ValueError(

@@ -58,8 +58,7 @@ def open_source(text: str, options: LiveOptions, report: Report, *, is_in_map: I
     `report` receives errors of single scans and messages. Scans of files for which `is_in_map` is true are skipped.
     Raises ValueError if no source has this name, and ImportError if its extra is not installed.
     """
-    name, where = split_known_name(text, SOURCES, kind="sources")
-    module = _import_module(name, SOURCES[name])
+    name, where, module = named_module(text, SOURCES, kind="sources")
     if name not in TRANSPORTS:
         return module.open_source(where, options, report, is_in_map)
     from sglpr_jax.live.ros_topics import RosSource  # needs the same extra
@@ -69,8 +68,7 @@ def open_source(text: str, options: LiveOptions, report: Report, *, is_in_map: I
 
 def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
     """Open the sink that a text names, such as `json:loops.jsonl`, as `open_source` does."""
-    name, where = split_known_name(text, SINKS, kind="sinks")
-    module = _import_module(name, SINKS[name])
+    name, where, module = named_module(text, SINKS, kind="sinks")
     if name not in TRANSPORTS:
         return module.open_sink(where, options, report)
     from sglpr_jax.live.ros_topics import RosSink  # needs the same extra
@@ -78,21 +76,19 @@ def open_sink(text: str, options: LiveOptions, report: Report) -> Sink:
     return RosSink(module.open_transport(where, report), options)
 
 
-def split_known_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str]:
-    """Split `NAME:WHERE`. Raises ValueError if the name is not known. `kind` is "sources" or "sinks"."""
+def named_module(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str, ModuleType]:
+    """Split `NAME:WHERE`, and import the module of this name. `kind` is "sources" or "sinks".
+
+    Raises ValueError if the name is not known, and ImportError, which names the extra, if a package is missing.
+    """
     name, _, where = text.partition(":")
     if name not in known:
         raise ValueError(f"{text}: expected one of the {kind} {', '.join(known)}, found {name or 'nothing'}")
-    return name, where
-
-
-def _import_module(name: str, extra: str | None) -> ModuleType:
-    """Import the module of a source or sink. Raises ImportError, which names the extra, if a package is missing."""
     try:
-        return importlib.import_module(f"sglpr_jax.live.{name}")
+        return name, where, importlib.import_module(f"sglpr_jax.live.{name}")
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.startswith("sglpr_jax"):
             raise
         raise ImportError(
-            f"{name}: expected the package {error.name}, found none; pip install 'sglpr-jax[{extra}]'"
+            f"{name}: expected the package {error.name}, found none; pip install 'sglpr-jax[{known[name]}]'"
         ) from error

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 
@@ -52,3 +53,12 @@ def test_a_stopped_node_continues_its_map(town, tmp_path):
     out = tmp_path / "map"
     assert len(read_loops_jsonl(out / "loops.jsonl")) == sum(one["type"] == "loop" for one in found())
     assert len(read_g2o(out / "loops.g2o").poses) == SCANS and not half_written(out)
+
+
+def test_a_missing_package_is_told_before_anything_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.delitem(sys.modules, "sglpr_jax.live.rerun", raising=False)
+    monkeypatch.setattr("sglpr_jax.models.weights_file.load", lambda *_: pytest.fail("weights were loaded"))
+    ended = run_command("live", f"folder:{tmp_path}", "--sinks", "rerun", "--out", tmp_path / "map")
+    assert ended.status == 1 and "pip install 'sglpr-jax[view]'" in ended.error
+    assert not (tmp_path / "map").exists()
