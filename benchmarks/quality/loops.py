@@ -36,6 +36,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.scaled import scaled_poses
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.evaluation.protocols.protocol import TopK
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.loops.acceptance import accept_loops
@@ -53,6 +54,8 @@ from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import SimulatedRecording
 
 PEERS = Path(__file__).resolve().parent / "peers"
+WARM_UP = 200
+"""Scans of a first search, which does not count."""
 KEPT, NO_LOOP = 1000.0, -100.0
 """Log odds that are added to returned loops, so that they have the highest scores, and log odds of missing pairs."""
 COLUMNS = ("scans", "loops", "right", "wrong", "recall", "wrong poses", "of these in the plane", "recall by poses")
@@ -275,7 +278,9 @@ def images(
     seed: int = 0,
     keyframe_m: float = DetectorConfig.keyframe_m,
 ) -> None:
-    """Search ready-made images. Prints loops, calibration, and top-1 F1max (3 m / 20 m) after verification.
+    """Search ready-made images. Prints loops, time, calibration, and top-1 F1max (3 m / 20 m) after verification.
+
+    The processor milliseconds are those of the search of a whole drive, divided by its scans: under `taskset -c 0`.
 
     F1max needs a match of every scan, so it is printed if all are keyframes (`--keyframe-m 0`).
 
@@ -293,10 +298,15 @@ def images(
         poses = np.tile(np.eye(4), (len(recording), 1, 1))
         poses[:, :3] = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
         given = odometry_of("drifting" if odometry else "none", poses, seed=seed)
-        found = sglpr_jax.find_loops(recording, params, odometry=given, registered=False, config=config)
+        options = {"registered": False, "config": config}
+        sglpr_jax.find_loops(only(recording, range(WARM_UP)), params, **options)  # compiles
+        start = time.process_time()
+        found = sglpr_jax.find_loops(recording, params, odometry=given, **options)
+        milliseconds = 1e3 * (time.process_time() - start) / len(recording)
         counts = count_loops(closures_of(found.loops), poses[:, :3, 3], town_rule(poses[:, :3, 3], recording.times))
         errors = describe_errors(found.loops, poses)
         print(f"{name}: {counts.loops} loops, {counts.wrong} wrong, recall {counts.recall}; {errors}")
+        print(f"  {milliseconds:.1f} ms a scan, {found.sessions[0].keyframes} keyframes of {len(recording)} scans")
         assert found.model is not None
         for one in reliability_of(found.sessions[0].candidates, found.model, poses[:, :3, 3]):
             share = f"{one.pairs} pairs, {one.share:.4f} are loops, {one.probability:.4f} said"

@@ -60,9 +60,9 @@ class LoopDetector:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of all frames, without results and without the kept spectra (13 MB at most).
+        """Number of bytes of all frames, without results and without the kept spectra (17 MB at most).
 
-        With `max_places`, only the motion grows: by 297 bytes a frame, and up to as much in spare capacity.
+        With `max_places`, only the motion grows: by 305 bytes a keyframe, and up to as much in spare capacity.
         """
         return self.finder.nbytes
 
