@@ -136,6 +136,8 @@ class KeyframeComparison:
             fits = Fits.joined(fits, self._compare_exactly(query, searched, rows[matters]))
             best = self._best_consistent_with_motion(query.frame, fits, EVERY)
         best = self._best(query.frame, fits, EVERY) if best is None else best
+        if best is not None and fits.peaks.correlation[best] < config.min_correlation:
+            best = None  # no candidate
         lookalike = math.nan
         for scans in (searched, *others):
             distractors = self._compare_distractors(query, fits, best, scans)
@@ -224,8 +226,8 @@ class KeyframeComparison:
         """Compare a query with the distractors most like it, of two kinds, given its fits and the best of them (a row).
 
         One kind shows another place than the query or the match. The other is less than two `recent_m` of travel from
-        one of them: its fit may contradict the motion. Without a match, only a few of the first kind are compared. They
-        may show that the motion is wrong.
+        one of them: its fit may contradict the motion. Without a match, a few of the first kind are compared, exactly
+        only if they are very similar, because they may show that the motion is wrong.
         """
         config, frames = self.config, scans.frames
         match = query.frame if best is None else int(fits.frames[best])
@@ -234,10 +236,10 @@ class KeyframeComparison:
         elsewhere = self.are_elsewhere(frames, query.frame) | self.are_elsewhere(frames, match)
         near = (travelled_m < 2 * config.recent_m).any(axis=0) & ~elsewhere
         if best is None:
-            cohort, near_cohort = config.candidates, 0
+            cohort, near_cohort, least = config.candidates, 0, config.good_correlation
         else:
-            cohort, near_cohort = config.cohort, config.near_cohort
-        least, compared, lookalikes = self._least_that_matters(fits, best), NO_FITS, list[float]()
+            cohort, near_cohort, least = config.cohort, config.near_cohort, self._least_that_matters(fits, best)
+        compared, lookalikes = NO_FITS, list[float]()
         for flags, count, most in (
             (elsewhere, cohort, EXACT_COHORT),
             (near, near_cohort, EXACT_NEAR_COHORT),
