@@ -62,7 +62,9 @@ class OptimizedTrajectory(NamedTuple):
 
 
 def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
-    """Correct the odometry of all sessions by their loops, within the stated drift. Warns if heights move by metres.
+    """Correct the odometry of all sessions by their loops, within the stated drift.
+
+    Warns if loops that are not registered, and so measure no heights, move heights by metres.
 
     Sessions that loops connect get one frame, that of the first one. The call takes about
     a second for a few hundred frames, and minutes for a few thousand.
@@ -78,6 +80,7 @@ def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
     for session in result.sessions:
         if session.odometry is None:
             raise ValueError(f"{session.recording.name}: expected loops found with odometry, found loops without it")
+    measures_height = all(loop.overlap is not None for loop in result.loops)
     placed = placements(result)
     poses: dict[int, np.ndarray] = {}  # by session
     inliers = np.zeros(len(result.loops), bool)
@@ -89,8 +92,9 @@ def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
         solutions.append(solution)
         inliers[rows] = solution.inliers
         poses |= solved_poses
-        for session, corrected in solved_poses.items():
-            _warn_of_height_change(result.sessions[session], members[session], corrected)
+        if not measures_height:
+            for session, corrected in solved_poses.items():
+                _warn_of_height_change(result.sessions[session], members[session], corrected)
     squared_m2 = sum(solution.moved_rms_m**2 * len(solution.poses) for solution in solutions)
     return OptimizedTrajectory(
         poses=np.concatenate([poses[session] for session in range(len(result.sessions))]),
@@ -147,7 +151,7 @@ def _warn_of_height_change(
     if height_change_m > MAX_HEIGHT_CHANGE_M:
         warn(
             f"{session.recording.name}: expected heights near those of the odometry, found them moved by up to "
-            f"{height_change_m:.1f} m; only registered loops measure heights"
+            f"{height_change_m:.1f} m; only registered loops measure heights, and some are not registered"
         )
 
 
