@@ -133,6 +133,8 @@ class KeyframeComparison:
             if group is third and is_clear:
                 break
             matters = group[coarse[group] >= self._least_that_matters(fits, best)]
+            if not len(matters):
+                continue
             fits = Fits.joined(fits, self._compare_exactly(query, searched, rows[matters]))
             best = self._best_consistent_with_motion(query.frame, fits, EVERY)
         best = self._best(query.frame, fits, EVERY) if best is None else best
@@ -207,6 +209,8 @@ class KeyframeComparison:
 
     def _best_consistent_with_motion(self, query: int, fits: Fits, allowed: Bool[np.ndarray, "*k"]) -> int | None:
         """Result of `_best` among the allowed fits whose poses deviate from the motion by at most `max_deviation`."""
+        if not len(fits.frames):
+            return None
         deviations = self.deviations(query, fits.frames, fits.poses)
         return self._best(query, fits, (deviations <= self.drift.max_deviation) & allowed)
 
