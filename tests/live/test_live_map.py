@@ -19,8 +19,8 @@ from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import read_loops_jsonl
 from sglpr_jax.registration.bev_search import CorrelationPeak
-from sglpr_jax.se3 import inverse
-from tests.live.conftest import SCANS, live_frame
+from sglpr_jax.se3 import inverse, transform
+from tests.live.conftest import BEGIN, SCANS, live_frame
 
 CONFIG = DetectorConfig(min_probability=0.5)
 HALF = 20
@@ -94,6 +94,27 @@ def test_a_damaged_scan_costs_itself_alone(drive, params, whole, tmp_path, said)
     assert len(lost) == 1 and np.array_equal(live.stamps[lost[0]], live.stamps[lost[0] + 1])
     assert len(set(pairs(live.detector.loops)) & set(pairs(edges))) > len(edges) // 2
     live.close()
+
+
+@pytest.mark.slow
+def test_scans_between_keyframes_are_counted_and_recalled(drive, params, tmp_path, said):
+    """Every scan arrives twice, the second time 0.1 m ahead."""
+    live = opened(params, tmp_path, said, expects_odometry=True)
+    live.restore()
+    for i in range(12):
+        for ahead in (0.0, 0.1):
+            pose, seconds = drive.poses.world_from_lidar[i] @ transform(ahead, 0.0, 0.0), float(drive.times[i]) + ahead
+            live.add(live_frame(drive, i, pose=pose, time=BEGIN + seconds, received=seconds))
+    live.close()
+    recalled = opened(params, tmp_path, said, expects_odometry=True)
+    recalled.restore()
+    for one in (live, recalled):
+        assert len(one) == len(one.odometry) == len(one.stamps) == 24 == len(one.trajectory.poses)
+        assert one.detector.finder.rows.tolist() == list(range(0, 24, 2))
+    np.testing.assert_array_equal(live.odometry, recalled.odometry)
+    paths = write_results(recalled, tmp_path)
+    assert len(read_tum(next(path for path in paths if path.name == "trajectory.tum"))[0]) == 24
+    recalled.close()
 
 
 @pytest.mark.slow
