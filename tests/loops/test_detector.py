@@ -1,10 +1,12 @@
 """A stream of scans: its loops are true, their poses right; what cannot be handed in is refused."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 from drives import PASS
+from recordings import of_scans
 
 from sglpr_jax.loops.acceptance import LITTLE_OVERLAP
 from sglpr_jax.loops.candidates import CandidateSearch
@@ -14,6 +16,7 @@ from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
@@ -51,6 +54,30 @@ def test_a_whole_recording_is_searched_registered_and_stopped(street, params, st
         assert loop.overlap >= LITTLE_OVERLAP and np.linalg.norm(error_of(poses, loop)[:3]) < 0.5
     stopped = find_loops(street, params, should_stop=lambda: True)
     assert stopped.sessions[0].frames == 0 and stopped.loops == ()
+
+
+@pytest.mark.slow
+def test_scans_between_keyframes_are_not_read_and_loops_have_the_numbers_of_scans(street, params):
+    """Every scan is followed by two others at the same place."""
+    clouds, poses, reads = [street.points(row) for row in range(len(street))], street.poses.world_from_lidar, []
+
+    def search(times: int) -> LoopSearchResult:
+        """Search the drive with each scan repeated this often."""
+        paths = [Path(f"{row:06d}.bin") for row in range(times * len(street))]
+        plain = of_scans({path: clouds[row // times] for row, path in enumerate(paths)})
+
+        def read(path, labels, lasers):
+            reads.append(path)
+            return plain.read(path, labels, lasers)
+
+        odometry = np.repeat(poses, times, axis=0)
+        return find_loops(dataclasses.replace(plain, read=read), params, odometry=odometry, registered=False)
+
+    sparse, found = search(1), search(3)
+    session = found.sessions[0]
+    assert len(reads) == 2 * len(street) and (session.frames, session.keyframes) == (120, 40)
+    assert [(loop.query, loop.match) for loop in found.loops] == [(3 * x.query, 3 * x.match) for x in sparse.loops]
+    assert len(found.loops) > 5 and found.whole and "in 120 of 120 frames of 08 (40 keyframes)" in str(found)
 
 
 def model_of(log_odds: float) -> LoopModel:
