@@ -80,8 +80,9 @@ def check_odometry(
 ) -> None:
     """Warn if the odometry contradicts most of the frames that have a loop, because it drifts or because places repeat.
 
-    `name` is that of the recording. Loops `against` the odometry are between gravity-aligned frames. Lengths of loops,
-    path and drift are multiplied by `scale`, and those of the message are in metres.
+    `name` is that of the recording. Loops `agreeing` with the odometry and loops `against` it are between
+    gravity-aligned frames of the path. Lengths of loops, path and drift are multiplied by `scale`, and those of the
+    message are in metres.
     """
     agreeing_frames = {loop.query for loop in agreeing}
     contrary_frames = {loop.query for loop in against} - agreeing_frames

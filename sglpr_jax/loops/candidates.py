@@ -29,7 +29,8 @@ from sglpr_jax.se3 import inverse, transform, yaw_of
 KEYFRAME_DEG = 20.0
 """Rotation from the last frame at which a scan is the next frame at any distance, in degrees."""
 DISTINCT = 0.4
-"""Coarse correlation with scans of other places below which a place is distinct. In towns, nine of ten places are."""
+"""Coarse correlation with scans of other places below which a place is distinct. Most places of towns are; rows of
+equal houses, aisles and parking spaces are not."""
 FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
 AGREE_M, AGREE_DEG = 0.8, 6.0

@@ -243,16 +243,12 @@ class KeyframeComparison:
             cohort, near_cohort, least = config.candidates, 0, config.good_correlation
         else:
             cohort, near_cohort, least = config.cohort, config.near_cohort, self._least_that_matters(fits, best)
-        compared, lookalikes = NO_FITS, list[float]()
-        for flags, count, most in (
-            (elsewhere, cohort, EXACT_COHORT),
-            (near, near_cohort, EXACT_NEAR_COHORT),
-        ):
-            rows, coarse = self._most_similar(query, scans, count, flags & distracts)
-            lookalikes.append(float(coarse[0]) if len(coarse) else math.nan)
-            rows = rows[:most][coarse[:most] >= least]
-            compared = Fits.joined(compared, self._compare_exactly(query, scans, rows))
-        return compared._replace(lookalike=lookalikes[0])
+        far_rows, far_coarse = self._most_similar(query, scans, cohort, elsewhere & distracts)
+        near_rows, near_coarse = self._most_similar(query, scans, near_cohort, near & distracts)
+        far_rows = far_rows[:EXACT_COHORT][far_coarse[:EXACT_COHORT] >= least]
+        near_rows = near_rows[:EXACT_NEAR_COHORT][near_coarse[:EXACT_NEAR_COHORT] >= least]
+        fits = Fits.joined(*(self._compare_exactly(query, scans, rows) for rows in (far_rows, near_rows)))
+        return fits._replace(lookalike=float(far_coarse[0]) if len(far_coarse) else math.nan)
 
     def _most_similar(
         self, query: Query, scans: Keyframes, count: int, among: Bool[np.ndarray, " n"]

@@ -263,11 +263,12 @@ def _search_session(
     )
     if finder.scans > (finder.rows[-1] + 1 if len(finder) else 0):
         on_progress(finder.scans)  # with the scans after the last keyframe
-    check_readable(recording, len(finder) - len(finder.missing) if finder.scans == len(recording) else 1)
-    if finder.empty.all() and finder.scans == len(recording):
-        raise ValueError(
-            f"{recording.name}: expected at least one scan that is not empty, found {len(finder)} empty ones"
-        )
+    if finder.scans == len(recording):
+        check_readable(recording, len(finder) - len(finder.missing))
+        if finder.empty.all():
+            raise ValueError(
+                f"{recording.name}: expected at least one scan that is not empty, found {len(finder)} empty ones"
+            )
     if odometry is not None and finder.odometry_check.is_unusable:
         warn(
             f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored; check "
@@ -289,7 +290,7 @@ def _search_session(
     rejected = ordered_rejections([*rejected, *detector.rejected, *detector.undecided()])
     if odometry is not None:
         against = [finder.to_upright(each.loop) for each in rejected if each.reason == "contradicts the odometry"]
-        check_odometry(recording.name, loops, against, path, drift, scale)
+        check_odometry(recording.name, list(map(finder.to_upright, loops)), against, path, drift, scale)
     return SearchedSession(recording, odometry, drift, detector, loops, rejected)
 
 
@@ -390,8 +391,7 @@ def _align_segments(
     for node, searched in zip(loops[0].nodes, sessions, strict=True):
         finder, odometry = searched.detector.finder, searched.odometry
         frames_of_scans[node.session] = np.searchsorted(finder.rows, np.arange(finder.scans))
-        segment = finder.motion.segments[frames_of_scans[node.session][node.frame]]
-        frames = np.flatnonzero(finder.motion.segments == segment)
+        frames = np.flatnonzero(finder.motion.segments == finder.segments_of(np.array([node.frame])))
         first, last = finder.rows[frames[[0, -1]]].tolist()
         segments.append(TrajectorySegment(node.session, first, last, odometry is not None))
         if odometry is None:

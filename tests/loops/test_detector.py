@@ -57,8 +57,10 @@ def test_a_whole_recording_is_searched_registered_and_stopped(street, params, st
 
 
 @pytest.mark.slow
-def test_scans_between_keyframes_are_not_read_and_loops_have_the_numbers_of_scans(street, params):
-    """Every scan is followed by two others at the same place."""
+def test_scans_between_keyframes_are_not_read_and_loops_have_the_numbers_of_scans(street, params, monkeypatch):
+    """Every scan is followed by two others at the same place. Loops are checked against the odometry by keyframe."""
+    checked = []
+    monkeypatch.setattr("sglpr_jax.loops.search.check_odometry", lambda _, agreeing, *__: checked.append(agreeing))
     clouds, poses, reads = [street.points(row) for row in range(len(street))], street.poses.world_from_lidar, []
 
     def search(times: int) -> LoopSearchResult:
@@ -77,6 +79,7 @@ def test_scans_between_keyframes_are_not_read_and_loops_have_the_numbers_of_scan
     session = found.sessions[0]
     assert len(reads) == 2 * len(street) and (session.frames, session.keyframes) == (120, 40)
     assert [(loop.query, loop.match) for loop in found.loops] == [(3 * x.query, 3 * x.match) for x in sparse.loops]
+    assert [[loop.query for loop in loops] for loops in checked] == [[loop.query for loop in sparse.loops]] * 2
     assert len(found.loops) > 5 and found.whole and "in 120 of 120 frames of 08 (40 keyframes)" in str(found)
 
 
