@@ -1,11 +1,10 @@
 """Candidate matches of the scans of a stream: each scan is described, compared with earlier scans, and stored."""
 
 import dataclasses
-from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.data.scan import Scan
@@ -14,7 +13,7 @@ from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.closure import LoopClosure, to_lidar, to_upright
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
-from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan, image_spectra
+from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan
 from sglpr_jax.models.weights import Params, weights_hash
 from sglpr_jax.odometry.bev_odometry import MIN_EXPECTED, BevOdometry
 from sglpr_jax.odometry.drift_check import OdometryCheck
@@ -35,14 +34,6 @@ FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
 AGREE_M, AGREE_DEG = 0.8, 6.0
 """Maximum distance and angle between two estimates of a pose that agree, in metres and degrees."""
-
-
-class Reference(NamedTuple):
-    """An earlier scan with which the next one is registered."""
-
-    frame: int
-    image: UInt8[np.ndarray, "m m"]
-    """Image without the background."""
 
 
 class CandidateSearch:
@@ -84,11 +75,11 @@ class CandidateSearch:
         self._empty = GrowingArray(np.empty(0, bool))
         self._time: float | None = None
         """Time of the last frame, in seconds. None if the frames have no times."""
-        self._last: Reference | None = None
+        self._last: Query | None = None
         """The last frame. None if it is almost empty."""
-        self._keyframe: Reference | None = None
+        self._keyframe: Query | None = None
         """The keyframe of the motion. None if it is almost empty."""
-        self._checked: Reference | None = None
+        self._checked: Query | None = None
         """The last frame that was used to check the odometry."""
 
     def __len__(self) -> int:
@@ -233,7 +224,7 @@ class CandidateSearch:
         has_moved = self.motion.keyframe != previous_motion_keyframe or not frame
         if image.size and has_moved:
             self.background.add(image)
-        self._last = None if is_empty else Reference(frame, foreground)
+        self._last = query
         if self.motion.keyframe == frame:
             self._keyframe = self._last
         if not is_empty and self._is_new_place(frame):
@@ -313,7 +304,7 @@ class CandidateSearch:
         if not is_known and self._checked is not None:
             link, _ = self._register(query, self._checked, NO_PRIOR)
         self.odometry_check.add(pose, link)
-        self._checked = Reference(query.frame, query.image)
+        self._checked = query
         return link
 
     def _register_with_keyframe(self, query: Query | None, time: float) -> BevRegistration | None:
@@ -345,17 +336,16 @@ class CandidateSearch:
         return along_ridge
 
     def _register(
-        self, query: Query, reference: Reference, prior: Float[np.ndarray, " 3"]
+        self, query: Query, reference: Query, prior: Float[np.ndarray, " 3"]
     ) -> tuple[BevRegistration, BevRegistration]:
         """Best pose of a query in the frame of a reference, and best pose near `prior`. Equal with `NO_PRIOR`."""
-        spectrum = image_spectra(reference.image, self.verification).exact
-        peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
+        peaks = jax.device_get(search_near(query.spectra, reference.own_spectrum, prior, config=self.verification))
         best = self._refine(query, reference, peaks.at(0))
         if np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1]:
             return best, best
         return best, self._refine(query, reference, peaks.at(1))
 
-    def _refine(self, query: Query, reference: Reference, peak: CorrelationPeak) -> BevRegistration:
+    def _refine(self, query: Query, reference: Query, peak: CorrelationPeak) -> BevRegistration:
         """Register the image of a query with that of a reference, near a peak of the search."""
         return jax.device_get(refine(query.image, reference.image, peak, config=self.verification))
 

@@ -6,13 +6,14 @@ about as well as the match, the fit proves little. Only travelled distances coun
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int, UInt8
+from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Shaped, UInt8
 
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.keyframes import EVERY, Keyframes
@@ -22,7 +23,14 @@ from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_config import VerificationConfig
-from sglpr_jax.registration.bev_search import NO_PEAKS, CorrelationPeak, coarse_correlations, coarse_query, search
+from sglpr_jax.registration.bev_search import (
+    NO_PEAKS,
+    CorrelationPeak,
+    coarse_correlations,
+    coarse_query,
+    likely_rotations,
+    search,
+)
 from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.se3 import PlanarPose, compose_planar, inverse_planar
 
@@ -72,6 +80,21 @@ class Fits(NamedTuple):
         return cls(np.concatenate([fits.frames for fits in parts]), CorrelationPeak(*map(np.concatenate, fields)))
 
 
+class CoarseFits(NamedTuple):
+    """Coarse comparisons of a query with stored scans."""
+
+    rows: Int[np.ndarray, " k"]
+    """Row of each stored scan."""
+    correlation: Float[np.ndarray, " k"]
+    """Highest correlation at any pose."""
+    rotations: Int[np.ndarray, "k n"]
+    """Likely rotations, at which the images are compared exactly."""
+
+    def at(self, which: slice | np.ndarray) -> "CoarseFits":
+        """Select some of the comparisons."""
+        return CoarseFits(*(field[which] for field in self))
+
+
 NO_FITS = Fits(np.zeros(0, np.int64), NO_PEAKS)
 
 
@@ -87,12 +110,17 @@ class Query:
     verification: VerificationConfig = VerificationConfig()
 
     @functools.cached_property
-    def spectra(self) -> Complex[Array, "2 s t f"]:
+    def spectra(self) -> Complex[Array, "s t f"]:
         """Result of `query_spectra`, computed at the first comparison."""
         return query_spectra(self.image, config=self.verification)
 
+    @property
+    def own_spectrum(self) -> Complex[np.ndarray, "s f"]:
+        """Spectrum of the scan itself, as of a match (`match_spectra`): the first rotation of `spectra`."""
+        return np.asarray(self.spectra)[:, 0]
+
     @functools.cached_property
-    def coarse_spectra(self) -> Complex[Array, "2 r u g"]:
+    def coarse_spectra(self) -> Complex[Array, "r u g"]:
         """Result of `coarse_query`, computed at the first comparison."""
         return coarse_query(self.spectra, config=self.verification)
 
@@ -125,17 +153,17 @@ class KeyframeComparison:
         if possible is None:
             is_other_pass = self.travelled_between(frames, query.frame) >= config.recent_m
             possible = is_other_pass & ~self.are_elsewhere(frames, query.frame)
-        rows, coarse = self._most_similar(query, searched, config.further, possible)
+        coarse = self._most_similar(query, searched, config.further, possible)
         fits, best = NO_FITS, None
-        first, second, third, _ = np.split(np.arange(len(rows)), [1, config.candidates, 2 * config.candidates])
-        for group in (first, second, third):
+        for start, end in itertools.pairwise((0, 1, config.candidates, 2 * config.candidates)):
             is_clear = best is not None and fits.peaks.correlation[best] >= config.good_correlation
-            if group is third and is_clear:
+            if start == config.candidates and is_clear:
                 break
-            matters = group[coarse[group] >= self._least_that_matters(fits, best)]
-            if not len(matters):
+            group = coarse.at(slice(start, end))
+            group = group.at(group.correlation >= self._least_that_matters(fits, best))
+            if not len(group.rows):
                 continue
-            fits = Fits.joined(fits, self._compare_exactly(query, searched, rows[matters]))
+            fits = Fits.joined(fits, self._compare_exactly(query, searched, group))
             best = self._best_consistent_with_motion(query.frame, fits, EVERY)
         best = self._best(query.frame, fits, EVERY) if best is None else best
         if best is not None and fits.peaks.correlation[best] < config.min_correlation:
@@ -243,35 +271,34 @@ class KeyframeComparison:
             cohort, near_cohort, least = config.candidates, 0, config.good_correlation
         else:
             cohort, near_cohort, least = config.cohort, config.near_cohort, self._least_that_matters(fits, best)
-        far_rows, far_coarse = self._most_similar(query, scans, cohort, elsewhere & distracts)
-        near_rows, near_coarse = self._most_similar(query, scans, near_cohort, near & distracts)
-        far_rows = far_rows[:EXACT_COHORT][far_coarse[:EXACT_COHORT] >= least]
-        near_rows = near_rows[:EXACT_NEAR_COHORT][near_coarse[:EXACT_NEAR_COHORT] >= least]
-        fits = Fits.joined(*(self._compare_exactly(query, scans, rows) for rows in (far_rows, near_rows)))
-        return fits._replace(lookalike=float(far_coarse[0]) if len(far_coarse) else math.nan)
+        far = self._most_similar(query, scans, cohort, elsewhere & distracts)
+        close = self._most_similar(query, scans, near_cohort, near & distracts)
+        best_of_each = far.at(slice(EXACT_COHORT)), close.at(slice(EXACT_NEAR_COHORT))
+        fits = [self._compare_exactly(query, scans, group.at(group.correlation >= least)) for group in best_of_each]
+        return Fits.joined(*fits)._replace(lookalike=float(far.correlation[0]) if len(far.rows) else math.nan)
 
-    def _most_similar(
-        self, query: Query, scans: Keyframes, count: int, among: Bool[np.ndarray, " n"]
-    ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Rows of the `count` scans with the nearest descriptors, and their coarse correlations, the highest first.
+    def _most_similar(self, query: Query, scans: Keyframes, count: int, among: Bool[np.ndarray, " n"]) -> CoarseFits:
+        """Compare the `count` scans with the nearest descriptors coarsely. The highest correlation comes first.
 
         Only scans with a flag in `among` count.
         """
         rows = scans.nearest(query.descriptor, count, among)
         if not len(rows):
-            return rows, np.zeros(0)
+            return CoarseFits(rows, np.zeros(0), np.zeros((0, 0), np.int64))
         matches = _batched([spectra.coarse for spectra in scans.spectra(rows)], COARSE_BATCH)
         correlations = coarse_correlations(query.coarse_spectra, matches, len(rows), config=self.verification)
-        coarse = np.asarray(correlations)[: len(rows)]
-        order = np.argsort(-coarse, kind="stable")
-        return rows[order], coarse[order]
+        by_rotation = np.asarray(correlations)[: len(rows)]
+        fits = CoarseFits(rows, by_rotation.max(1), likely_rotations(by_rotation))
+        return fits.at(np.argsort(-fits.correlation, kind="stable"))
 
-    def _compare_exactly(self, query: Query, scans: Keyframes, rows: Int[np.ndarray, " k"]) -> Fits:
-        """Compare the images of a query and of stored scans at all rotations and shifts."""
+    def _compare_exactly(self, query: Query, scans: Keyframes, coarse: CoarseFits) -> Fits:
+        """Compare the images of a query and of stored scans at the likely rotations and all shifts."""
+        rows = coarse.rows
         if not len(rows):
             return NO_FITS
         matches = _batched([spectra.exact for spectra in scans.spectra(rows)], BATCH)
-        peaks = jax.device_get(search(query.spectra, matches, len(rows), config=self.verification))
+        rotations = _batched(list(coarse.rotations), BATCH)
+        peaks = jax.device_get(search(query.spectra, matches, len(rows), rotations, config=self.verification))
         return Fits(scans.frames[rows], peaks.at(slice(len(rows))))
 
     def deviations(
@@ -292,9 +319,9 @@ class KeyframeComparison:
         return joined
 
 
-def _batched(spectra: Sequence[Complex64[np.ndarray, "s f"]], multiple: int) -> Complex64[np.ndarray, "k s f"]:
-    """Stack spectra, and pad the stack with zeros to a multiple of `multiple`, because each size compiles a program."""
-    padded_length = -(-len(spectra) // multiple) * multiple
-    batch = np.zeros((padded_length, *spectra[0].shape), np.complex64)
-    batch[: len(spectra)] = spectra
+def _batched(arrays: Sequence[Shaped[np.ndarray, "*s"]], multiple: int) -> Shaped[np.ndarray, "k *s"]:
+    """Stack arrays, and pad the stack with zeros to a multiple of `multiple`, because each size compiles a program."""
+    padded_length = -(-len(arrays) // multiple) * multiple
+    batch = np.zeros((padded_length, *arrays[0].shape), arrays[0].dtype)
+    batch[: len(arrays)] = arrays
     return batch

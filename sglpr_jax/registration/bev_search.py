@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from sglpr_jax.grid import DENSITY_RESOLUTION_M
 from sglpr_jax.registration.bev_config import VerificationConfig
-from sglpr_jax.registration.bev_spectra import DEFAULT, AnyArray, cell_count, correlations, lower_half, quarters
+from sglpr_jax.registration.bev_spectra import DEFAULT, AnyArray, Halves, cell_count, correlations, lower_half
 
 SECOND_M, SECOND_DEG = 3.0, 15.0
 """Minimum distance of the second peak from the best one, in metres or in degrees."""
@@ -23,37 +23,50 @@ PRIOR_M, PRIOR_DEG = 2.0, 10.0
 """Maximum distance from an expected pose of a pose near it, in metres and degrees."""
 NO_PRIOR = np.full(3, np.nan)
 """Value of an expected pose (x, y, yaw) that is unknown: NaN allows every pose."""
+LIKELY = 4
+"""Number of rotations, of the coarse comparison, around which the exact search looks. It takes a third of the time of
+a search at all rotations."""
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def coarse_correlations(
-    query: Complex[AnyArray, "2 r u g"],
+    query: Complex[AnyArray, "r u g"],
     matches: Complex[AnyArray, "k r g"],
     count: Int[AnyArray, ""] | int | None = None,
     *,
     config: VerificationConfig = DEFAULT,
-) -> Float[Array, " k"]:
-    """Highest correlation of a query with each of k matches at any pose, on cells twice as large as in `search`.
+) -> Float[Array, "k u"]:
+    """Highest correlation of a query with each of k matches at any shift, on cells twice as large as in `search`.
 
-    The arguments are the results of `coarse_query` and, for the spectra of `match_spectra`, of `lower_half`. Matches
-    beyond the first `count` get -1.
+    Correlations are listed by rotation, every other one of the first half turn. Those of the opposite direction count
+    with them. The arguments are the results of `coarse_query` and, for the spectra of `match_spectra`, of `lower_half`.
+    Matches beyond the first `count` get -1.
     """
-    rotated, matches = quarters(jnp.asarray(query)), jnp.asarray(matches)
+    rotated, matches = Halves.of(jnp.asarray(query)), jnp.asarray(matches)
     max_shift = cell_count(config.max_shift_m, 2 * DENSITY_RESOLUTION_M * config.coarse)
 
-    def compare(row: Int[Array, ""], highest: Float[Array, " k"]) -> Float[Array, " k"]:
-        return highest.at[row].set(correlations(rotated, matches[row], max_shift).max((0, 2)).max())
+    def compare(row: Int[Array, ""], highest: Float[Array, "k u"]) -> Float[Array, "k u"]:
+        by_rotation = correlations(rotated, matches[row], max_shift).max((0, 2))
+        return highest.at[row].set(by_rotation.reshape(2, -1).max(0))
 
-    return jax.lax.fori_loop(0, len(matches) if count is None else count, compare, jnp.full(len(matches), -1.0))
+    unknown = jnp.full((len(matches), query.shape[1]), -1.0)
+    return jax.lax.fori_loop(0, len(matches) if count is None else count, compare, unknown)
+
+
+def likely_rotations(coarse: Float[np.ndarray, "k u"]) -> Int[np.ndarray, "k n"]:
+    """Numbers of the rotations at which `search` looks, given the result of `coarse_correlations`.
+
+    They are the `LIKELY` best rotations of the coarse comparison and their neighbours among the rotations of `search`.
+    """
+    best = np.argsort(-coarse, axis=1)[:, :LIKELY, None]
+    return ((2 * best + np.arange(-1, 2)) % (2 * coarse.shape[1])).reshape(len(coarse), -1)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def coarse_query(
-    query: Complex[AnyArray, "2 s t f"], *, config: VerificationConfig = DEFAULT
-) -> Complex[Array, "2 r u g"]:
+def coarse_query(query: Complex[AnyArray, "s t f"], *, config: VerificationConfig = DEFAULT) -> Complex[Array, "r u g"]:
     """Convert the result of `query_spectra` for `coarse_correlations`: every other rotation, on larger cells."""
-    every_other_turn = jnp.asarray(query)[:, :, ::2].swapaxes(1, 2)  # `lower_half` halves the last two axes
-    return lower_half(every_other_turn, config).swapaxes(1, 2)
+    every_other_turn = jnp.asarray(query)[:, ::2].swapaxes(0, 1)  # `lower_half` halves the last two axes
+    return lower_half(every_other_turn, config).swapaxes(0, 1)
 
 
 class CorrelationPeak(NamedTuple):
@@ -79,21 +92,34 @@ NO_PEAKS = CorrelationPeak(*[np.zeros(0, np.float32)] * len(CorrelationPeak._fie
 
 @functools.partial(jax.jit, static_argnames="config")
 def search(
-    query: Complex[AnyArray, "2 s t f"],
+    query: Complex[AnyArray, "s t f"],
     matches: Complex[AnyArray, "k s f"],
     count: Int[AnyArray, ""] | int | None = None,
+    rotations: Int[AnyArray, "k n"] | None = None,
     *,
     config: VerificationConfig = DEFAULT,
 ) -> CorrelationPeak:
     """Return the best pose of a query in the frame of each of k matches.
 
-    The arguments are results of `query_spectra` and `match_spectra`. With `count`, only the first matches are searched,
-    by one compiled program for every count. The other peaks are 0.
+    Arguments:
+      query: Result of `query_spectra`.
+      matches: Result of `match_spectra`.
+      count: Number of matches that are searched, the first ones, by one compiled program for every count. The peaks of
+        the others are 0. None: all.
+      rotations: Result of `likely_rotations`. The correlation at other rotations counts as 0. None: all rotations.
     """
-    rotated, matches, max_shift = quarters(jnp.asarray(query)), jnp.asarray(matches), _max_shift_cells(config)
+    rotated, matches, max_shift = Halves.of(jnp.asarray(query)), jnp.asarray(matches), _max_shift_cells(config)
+
+    def volume_of(row: Int[Array, ""]) -> Float[Array, "d t d"]:
+        if rotations is None:
+            return correlations(rotated, matches[row], max_shift)
+        likely = jnp.asarray(rotations)[row]
+        values = correlations(rotated.at(likely), matches[row], max_shift)
+        everywhere = jnp.zeros((values.shape[0], config.turns, values.shape[2]))
+        return everywhere.at[:, jnp.concatenate([likely, likely + config.turns // 2])].set(values)
 
     def search_row(row: Int[Array, ""], peaks: CorrelationPeak) -> CorrelationPeak:
-        peak = _highest_peak(correlations(rotated, matches[row], max_shift), jnp.asarray(NO_PRIOR, jnp.float32), config)
+        peak = _highest_peak(volume_of(row), jnp.asarray(NO_PRIOR, jnp.float32), config)
         return jax.tree.map(lambda field, value: field.at[row].set(value), peaks, peak)
 
     zeros = CorrelationPeak(*[jnp.zeros(len(matches))] * len(CorrelationPeak._fields))
@@ -102,7 +128,7 @@ def search(
 
 @functools.partial(jax.jit, static_argnames="config")
 def search_near(
-    query: Complex[AnyArray, "2 s t f"],
+    query: Complex[AnyArray, "s t f"],
     match: Complex[AnyArray, "s f"],
     prior: Float[AnyArray, " 3"],
     *,
@@ -115,7 +141,7 @@ def search_near(
       match: Row of `match_spectra`.
       prior: Expected x, y (metres) and yaw (radians), or `NO_PRIOR`.
     """
-    volume = correlations(quarters(jnp.asarray(query)), jnp.asarray(match), _max_shift_cells(config))
+    volume = correlations(Halves.of(jnp.asarray(query)), jnp.asarray(match), _max_shift_cells(config))
     priors = jnp.stack([jnp.asarray(NO_PRIOR, jnp.float32), jnp.asarray(prior, jnp.float32)])
     return jax.lax.map(lambda prior: _highest_peak(volume, prior, config), priors)
 

@@ -50,17 +50,17 @@ def cell_count(length_m: float, cell_m: float) -> int:
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def query_spectra(query: Num[AnyArray, "h w"], *, config: VerificationConfig = DEFAULT) -> Complex[Array, "2 s t f"]:
+def query_spectra(query: Num[AnyArray, "h w"], *, config: VerificationConfig = DEFAULT) -> Complex[Array, "s t f"]:
     """Compute the spectra of a rotated query, for `search`.
 
     The query is a square image of counts in the orientation of eq. 1. Its cells are merged, `config.coarse` per side.
-    The axes of the result are quarter turn (rotations from 0 and from 90 degrees), row frequency, rotation and column
-    frequency. `correlations` computes the other half turn from these. Raises the ValueError of `within_reach`.
+    The axes of the result are row frequency, rotation (the first half of `config.turns`) and column frequency.
+    `correlations` computes the other half turn from these. Raises the ValueError of `within_reach`.
     """
     angles = np.arange(config.turns // 4, dtype=np.float32) * np.float32(2 * np.pi / config.turns)
     images = rotate(merge_cells(prepare_image(query, config), config.coarse), jnp.asarray(angles))
     first_quarter = spectrum(images, DENSITY_RESOLUTION_M * config.coarse, config)
-    return jnp.stack([first_quarter, _rotate_by_90_degrees(first_quarter)]).transpose(0, 2, 1, 3)
+    return jnp.concatenate([first_quarter, _rotate_by_90_degrees(first_quarter)]).swapaxes(0, 1)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -165,35 +165,37 @@ def _rotated_indices(size: int) -> tuple[Int[np.ndarray, " n"], Float32[np.ndarr
 
 
 class Halves(NamedTuple):
-    """Real and imaginary parts of spectra (row frequency, rotation, column frequency) by sign of the row frequency."""
+    """Real and imaginary parts of spectra (row frequency, rotation, column frequency) by sign of the row frequency.
+
+    This is the result of `query_spectra` in the form that `correlations` reads, made once for many matches.
+    """
 
     positive: tuple[Float[Array, "h t f"], Float[Array, "h t f"]]
     """Row frequencies 0 to size / 2."""
     negative: tuple[Float[Array, "g t f"], Float[Array, "g t f"]]
     """Row frequencies -1, -2 and so on."""
 
+    @classmethod
+    def of(cls, spectra: Complex[Array, "s t f"]) -> "Halves":
+        """Split spectra by the sign of the row frequency."""
+        size = len(spectra)
+        positive, negative = spectra[: size // 2 + 1], spectra[::-1][: (size - 1) // 2]
+        return cls((positive.real, positive.imag), (negative.real, negative.imag))
 
-def quarters(query: Complex[Array, "2 s t f"]) -> list[Halves]:
-    """Convert the result of `query_spectra` to the input of `correlations`, once for many matches."""
-    return [_halves(quarter) for quarter in query]
+    def at(self, rotations: Int[Array, " n"]) -> "Halves":
+        """Select some rotations."""
+        return jax.tree.map(lambda part: part[:, rotations], self)
 
 
-def correlations(query: list[Halves], match: Complex[Array, "s f"], reach: int) -> Float[Array, "d _ d"]:
-    """Correlation of a match with a query at every pose: by row shift, rotation (`config.turns`), column shift.
+def correlations(query: Halves, match: Complex[Array, "s f"], reach: int) -> Float[Array, "d _ d"]:
+    """Correlation of a match with a query at many poses: by row shift, rotation and column shift.
+
+    The t rotations of the query come first, then these plus 180 degrees.
 
     Arguments:
-      query: Result of `quarters`.
+      query: Spectra of the query at t rotations.
       match: One row of `match_spectra`.
       reach: Maximum shift in cells. Shifts run from -reach to reach, down and to the right.
-    """
-    # Each call covers a quarter turn and the one opposite to it: 0 and 180 degrees, then 90 and 270.
-    from_0, from_180 = jnp.split(_correlations_of_quarter(query[0], match, reach), 2, axis=1)
-    from_90, from_270 = jnp.split(_correlations_of_quarter(query[1], match, reach), 2, axis=1)
-    return jnp.concatenate([from_0, from_90, from_180, from_270], axis=1)
-
-
-def _correlations_of_quarter(query: Halves, match: Complex[Array, "s f"], reach: int) -> Float[Array, "d _ d"]:
-    """Correlations (see `correlations`) for the t rotations of a quarter, then for these plus 180 degrees.
 
     This is an inverse Fourier transform at few shifts, by matrix products. Even and odd parts are transformed
     separately, for shifts of zero and more: at the opposite shift the cosine is the same and the sine changes its sign.
@@ -201,7 +203,7 @@ def _correlations_of_quarter(query: Halves, match: Complex[Array, "s f"], reach:
     """
     size, (_, turns, width) = len(match), query.positive[0].shape
     row_cosines, row_sines, column_cosines, column_sines = map(jnp.asarray, _waves(reach, size))
-    match_halves = _halves(match[:, None])
+    match_halves = Halves.of(match[:, None])
     positive = _products(match_halves.positive, query.positive)
     negative = _products(match_halves.negative, query.negative)
     # Row frequencies 0 and, if size is even, size / 2 have no negative partner.
@@ -214,13 +216,6 @@ def _correlations_of_quarter(query: Halves, match: Complex[Array, "s f"], reach:
     imaginary = _all_shifts(cosine_imaginary, -sine_real, axis=0).reshape(-1, width)
     values = _all_shifts(real @ column_cosines, imaginary @ column_sines, axis=1)
     return values.reshape(-1, 2 * turns, values.shape[1])
-
-
-def _halves(spectra: Complex[Array, "s t f"]) -> Halves:
-    """Split spectra by the sign of the row frequency."""
-    size = len(spectra)
-    positive, negative = spectra[: size // 2 + 1], spectra[::-1][: (size - 1) // 2]
-    return Halves((positive.real, positive.imag), (negative.real, negative.imag))
 
 
 def _products(

@@ -13,6 +13,7 @@ from sglpr_jax.registration.bev_search import (
     SECOND_M,
     coarse_correlations,
     coarse_query,
+    likely_rotations,
     search,
     search_near,
 )
@@ -110,12 +111,24 @@ PLACES, TRUE = 12, 7
 def test_the_true_place_has_the_highest_coarse_correlation():
     images = np.stack([seen_from(place(seed), (0.0, 0.0, 0.0)).astype(np.uint8) for seed in range(PLACES)])
     query = query_spectra(seen_from(place(TRUE), (1.2, -0.8, 2.5)).astype(np.uint8))
-    found = np.asarray(
-        coarse_correlations(coarse_query(query), lower_half(match_spectra(images), VerificationConfig()))
-    )
+    matches = lower_half(match_spectra(images), VerificationConfig())
+    by_rotation = np.asarray(coarse_correlations(coarse_query(query), matches))
+    found = by_rotation.max(1)
     assert found.argmax() == TRUE and np.delete(found, TRUE).max() < 0.5 < found[TRUE]
-    some = np.asarray(
-        coarse_correlations(coarse_query(query), lower_half(match_spectra(images), VerificationConfig()), TRUE)
-    )
-    np.testing.assert_allclose(some[:TRUE], found[:TRUE], atol=1e-6)
+    some = np.asarray(coarse_correlations(coarse_query(query), matches, TRUE))
+    np.testing.assert_allclose(some[:TRUE], by_rotation[:TRUE], atol=1e-6)
     assert (some[TRUE:] == -1).all()
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.04, 1.6, 3.1, 4.8])
+def test_the_likely_rotations_have_the_highest_peak(yaw):
+    """Of a true place, the search at few rotations finds the same pose as the search at all, also next to 0 degrees."""
+    query = query_spectra(seen_from(place(TRUE), (1.2, -0.8, yaw)).astype(np.uint8))
+    there = match_spectra(seen_from(place(TRUE), (0.0, 0.0, 0.0)).astype(np.uint8)[None])
+    likely = likely_rotations(
+        np.asarray(coarse_correlations(coarse_query(query), lower_half(there, VerificationConfig())))
+    )
+    assert likely.shape == (1, 12)
+    at_all, at_likely = search(query, there), search(query, there, rotations=likely)
+    np.testing.assert_allclose(np.stack(at_likely)[:4], np.stack(at_all)[:4], atol=1e-4)
+    assert float(at_likely.second[0]) <= float(at_all.second[0]) + 1e-6
