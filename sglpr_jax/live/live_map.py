@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
-from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
+from sglpr_jax.pose_graph.files import loop_lines, read_loops_jsonl, write_loops_jsonl
 from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
 SETTINGS_FILE, FRAMES_LOG, LOOPS_FILE = "settings.json", "frames.log", "loops.jsonl"
@@ -116,6 +117,18 @@ class LiveMap:
         return len(self.detector)
 
     @property
+    def nbytes(self) -> int:
+        """Number of bytes of detector, times, odometry and its correction. The memory of programs is not counted."""
+        names = sum(map(sys.getsizeof, self.names))
+        parts = [self.detector, self._stamps, self._poses, *([] if self.trajectory is None else [self.trajectory])]
+        return names + sum(part.nbytes for part in parts)
+
+    @property
+    def loops(self) -> list[LoopClosure]:
+        """All loops: those of the detector or, with `max_places`, which limits them, those of the file."""
+        return self.detector.loops if self.detector.config.max_places is None else read_loops_jsonl(self._loops_path)
+
+    @property
     def stamps(self) -> Float[np.ndarray, " n"]:
         """Time of the header of each scan, in seconds."""
         return self._stamps.rows
@@ -138,15 +151,15 @@ class LiveMap:
         comparisons use its image. Raises ValueError if another program wrote the log.
         """
         assert self._log is not None
-        scan, damaged, motion_is_known = None, 0, True
+        loops, scan, damaged, motion_is_known = list[LoopClosure](), None, 0, True
         for frame, content in self._log.records():
             keyframe, compared, pose, about = read_frame(content, frame, ABOUT, source=self._log.path)
             scan = LiveScan(keyframe, compared, pose, **about)
             motion_is_known = scan.part == self._part
             for _ in range(len(self), frame):  # frames that are missing in the log
-                self._add(scan._replace(keyframe=None, is_keyframe=True, compared=None, name=""))
+                loops += self._add(scan._replace(keyframe=None, is_keyframe=True, compared=None, name=""))
                 damaged += 1
-            self._add(scan._replace(compared=None) if damaged else scan)
+            loops += self._add(scan._replace(compared=None) if damaged else scan)
         if damaged:
             self._report("lost", f"{self._log.path}: {damaged} damaged scans are left out")
         if self._log.removed_bytes:
@@ -156,12 +169,12 @@ class LiveMap:
             self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - pause_s)
             self._continuity.resume(scan.pose, scan.time, known=motion_is_known)
             self._mounting.resume(self.detector.finder.mountings[-1])
-            self._report("recall", f"the map continues after {len(self)} scans and {len(self.detector.loops)} loops")
-        return [self._loop_edge(loop, time.monotonic()) for loop in self._rewrite_loops()]
+            self._report("recall", f"the map continues after {len(self)} scans and {len(loops)} loops")
+        return [self._loop_edge(loop, time.monotonic()) for loop in self._rewrite_loops(loops)]
 
-    def _rewrite_loops(self) -> list[LoopClosure]:
-        """Write all loops so far to a new file and open it for appending. Returns loops that the old file lacks."""
-        path, loops = self._loops_path, self.detector.loops
+    def _rewrite_loops(self, loops: list[LoopClosure]) -> list[LoopClosure]:
+        """Write the loops to a new file and open it for appending. Returns loops that the old file lacks."""
+        path = self._loops_path
         written = _written_pairs(path)
         missed = [loop for loop in loops if (loop.query, loop.match) not in written]
         if missed and written:

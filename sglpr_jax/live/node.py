@@ -58,7 +58,7 @@ class Node:
 
     def __str__(self) -> str:
         rate = f", {1000 * float(np.mean(self._scan_seconds)):.0f} ms a scan" if self._scan_seconds else ""
-        memory = f"{self._live.detector.nbytes / 1e6:.0f} MB"
+        memory = f"{self._live.nbytes / 1e6:.0f} MB"
         return (
             f"{self.scans} scans{rate}, {self.dropped} dropped, {self.left_out} left out, {self.loops} loops; "
             f"the map has {len(self._live)} scans, {memory}"
@@ -86,7 +86,7 @@ class Node:
             latency_s=end - frame.received,
             dropped=self.dropped,
             places=len(self._live.detector.finder.stored),
-            nbytes=self._live.detector.nbytes,
+            nbytes=self._live.nbytes,
             map_from_world=self._live.map_from_world,
         )
         self._send_to_sinks("frame", status)

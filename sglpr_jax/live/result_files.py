@@ -27,7 +27,7 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
         segment_starts = np.flatnonzero(np.diff(detector.finder.segments_of(scans))) + 1  # where the motion is unknown
         segments = np.split(scans, segment_starts)
         chains = [(frames, odometry[frames]) for frames in segments]
-    files = graph_files(detector.loops, detector.rejected, chains, drift=detector.config.drift)
+    files = graph_files(live.loops, detector.rejected, chains, drift=detector.config.drift)
     if len(odometry):
         files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)
         if live.trajectory is not None:

@@ -20,6 +20,8 @@ from sglpr_jax.models.weights import Params
 
 MAX_WAITING = 240
 """Maximum number of pairs that wait for their neighbours. It limits the computation per frame if the sensor is slow."""
+RESULT_BYTES = 1000
+"""Memory of a loop, or of a compared or rejected pair, in bytes."""
 
 
 class LoopDetector:
@@ -42,7 +44,7 @@ class LoopDetector:
         self.model = default_model() if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
-        """All compared pairs or, with `max_places`, that many of the last ones."""
+        """All compared pairs. With `max_places`, this list and the next two have that many of the last ones."""
         self.loops: list[LoopClosure] = []
         """All returned loops."""
         self.rejected: list[RejectedClosure] = []
@@ -60,11 +62,11 @@ class LoopDetector:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of all frames, without results and without the kept spectra (17 MB at most).
+        """Number of bytes of all frames and, about, of the results, without the kept spectra (17 MB at most).
 
         With `max_places`, only the motion grows: by 305 bytes a keyframe, and up to as much in spare capacity.
         """
-        return self.finder.nbytes
+        return self.finder.nbytes + RESULT_BYTES * sum(map(len, (self.candidates, self.loops, self.rejected)))
 
     def add(
         self,
@@ -119,7 +121,8 @@ class LoopDetector:
             pair._replace(query=int(rows[pair.query]), match=int(rows[pair.match])) for pair in candidates
         ]
         if self.config.max_places is not None:
-            del self.candidates[: -self.config.max_places]
+            for results in (self.candidates, self.loops, self.rejected):
+                del results[: -self.config.max_places]
         for candidate in candidates:
             pair = pair_of(candidate, self.model, finder.motion, finder.mountings, knows_height=finder.knows_height)
             self._waiting.append(pair)

@@ -18,9 +18,9 @@ EDGE = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, np.eye(4), None, 0
 class FakeMap(LiveMap):
     """A map whose scan 1 is invalid, and whose scan 2 is left out."""
 
-    class detector:
-        nbytes = 5_000_000
+    nbytes = 5_000_000
 
+    class detector:
         class finder:
             stored = (1, 2, 3)
 

@@ -1,9 +1,11 @@
 """A drifted drive is corrected while it goes on; wrong loops barely bend it; an unknown motion waits for a loop."""
 
 import numpy as np
+import pytest
 
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.pose_graph.incremental import LOOP_EVERY_M, IncrementalTrajectory
+from sglpr_jax.pose_graph import incremental
+from sglpr_jax.pose_graph.incremental import LOOP_EVERY, NODE_EVERY_M, IncrementalTrajectory
 from sglpr_jax.pose_graph.optimize import solve_pose_graph, trajectory_error
 from sglpr_jax.se3 import inverse, transform
 
@@ -77,4 +79,17 @@ def test_a_route_driven_again_and_again_needs_few_loops():
     np.testing.assert_allclose(trajectory.poses, poses, atol=1e-4)
     loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._node_frames)
     travelled = 3 * 2 * np.pi * 40
-    assert travelled / LOOP_EVERY_M - 2 <= loops <= travelled / LOOP_EVERY_M + 1
+    expected = travelled / (LOOP_EVERY * NODE_EVERY_M)
+    assert expected - 2 <= loops <= expected + 1
+
+
+@pytest.mark.parametrize("new_world_at", [None, 70])
+def test_a_long_drive_has_a_bounded_graph(monkeypatch, two_laps, two_laps_odometry, second_lap_loops, new_world_at):
+    whole = driven(two_laps_odometry, second_lap_loops, new_world_at=new_world_at)
+    most = len(whole._node_frames) // 3
+    monkeypatch.setattr(incremental, "MOST_NODES", most)
+    few = driven(two_laps_odometry, second_lap_loops, new_world_at=new_world_at)
+    assert most / 4 < len(few._node_frames) <= most and few.nbytes < whole.nbytes
+    errors = [trajectory_error(trajectory.poses, two_laps[:, :3, 3]) for trajectory in (few, whole)]
+    assert errors[0] < 1.4 * errors[1]
+    np.testing.assert_allclose(few.map_from_world, few._correction_at(few._node_frames[-1]), atol=1e-9)
