@@ -34,6 +34,8 @@ _BROKEN_PIPE_STATUS = 141
 """Exit status after a write to a pipe without a reader, as in shells (128 + SIGPIPE)."""
 _MAX_ERROR_LENGTH = 2000
 """Maximum number of characters of an error message. File names and tables may contain long names."""
+COMPILATION = "/jax/compilation_cache/compile_requests_use_cache"
+"""Event of JAX before it compiles a program, or reads it from the cache."""
 T = TypeVar("T")
 
 
@@ -123,8 +125,10 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
         if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # keep compiled programs for the next start
             import jax  # slow import, not needed for --help or a wrong flag
 
-            jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+            compiled = cache_folder() / "compiled"
+            jax.config.update("jax_compilation_cache_dir", str(compiled))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+            _announce_first_compilation(compiled)
         exit_status = work(command)
         if isinstance(exit_status, int):
             sys.exit(exit_status)
@@ -142,6 +146,22 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
             sys.stdout.flush()
         except BrokenPipeError:  # Python would flush again at exit, and report the error
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _announce_first_compilation(folder: Path) -> None:
+    """Print a line at the first compilation, if the folder has no programs of an earlier start."""
+    if folder.is_dir() and any(folder.iterdir()):
+        return
+    import jax
+
+    lines = iter([f"first start: compiling for this computer, which takes some seconds; kept in {folder}"])
+
+    def announce(event: str, **_: object) -> None:
+        if event == COMPILATION:
+            for line in lines:  # at the first event only
+                print(line, file=sys.stderr)
+
+    jax.monitoring.register_event_listener(announce)
 
 
 def _error_line(error: Exception) -> str:

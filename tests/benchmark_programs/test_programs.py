@@ -55,7 +55,7 @@ PARSED = (
     "sensors imu --blind 0.3",
     "speed embed --scans 65",
     "speed live --rates 5",
-    "speed start-up --repeats 1",
+    "speed start-up --repeats 1 --places 30 --commands embed",
     "speed trees elsewhere --repeats 1",
     "torch describe --preset circular --compiled",
     "torch step --no-labels",

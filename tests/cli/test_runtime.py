@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 import sglpr_jax
@@ -84,3 +85,15 @@ def test_an_error_is_one_line_of_limited_length(text, found):
         runtime.run(lambda: None, work)
     assert isinstance(ended.value.code, str) and len(ended.value.code) < 2100
     assert found is None or ended.value.code == found
+
+
+def test_the_first_start_says_that_it_compiles_and_the_next_does_not(tmp_path, capsys):
+    runtime._announce_first_compilation(tmp_path / "compiled")
+    assert not capsys.readouterr().err
+    for _ in range(2):
+        jax.monitoring.record_event(runtime.COMPILATION)
+    assert capsys.readouterr().err.count("first start: compiling for this computer") == 1
+    (tmp_path / "program").touch()
+    runtime._announce_first_compilation(tmp_path)
+    jax.monitoring.record_event(runtime.COMPILATION)
+    assert not capsys.readouterr().err
