@@ -125,7 +125,7 @@ class LiveMap:
 
     @property
     def loops(self) -> list[LoopClosure]:
-        """All loops: those of the detector or, with `max_places`, which limits them, those of the file."""
+        """All loops: those of the detector or, with `max_places`, those of the file, because old ones are removed."""
         return self.detector.loops if self.detector.config.max_places is None else read_loops_jsonl(self._loops_path)
 
     @property
@@ -221,7 +221,7 @@ class LiveMap:
         if scan.is_keyframe:
             options = {"fits": scan.compared, "continues": scan.part == self._part}
             loops = self.detector.add_keyframe(scan.keyframe, time=scan.time, odometry=scan.pose, **options)
-            self.detector.candidates.clear()  # to save memory: `fits`, from which they are chosen, are in the log
+            self._forget_results()
         else:
             finder.skip()
         self._part = scan.part
@@ -235,6 +235,14 @@ class LiveMap:
                 ordered = sorted(loops, key=lambda loop: loop.query)
                 self.trajectory.add(scan.pose, ordered, continues=bool(segments[0] == segments[-1]))
         return loops
+
+    def _forget_results(self) -> None:
+        """Remove results from memory: candidates, whose `fits` are in the log, and with `max_places` old loops and
+        rejected pairs, too."""
+        self.detector.candidates.clear()
+        most = self.detector.config.max_places
+        if most is not None:
+            del self.detector.loops[:-most], self.detector.rejected[:-most]
 
     def _log_scan(self, scan: LiveScan, compared: Fits, loops: list[LoopClosure]) -> None:
         """Write a scan to the log and its loops to their file. After an error, the map continues in memory only."""

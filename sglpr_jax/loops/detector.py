@@ -44,7 +44,7 @@ class LoopDetector:
         self.model = default_model() if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
-        """All compared pairs. With `max_places`, this list and the next two have that many of the last ones."""
+        """All compared pairs or, with `max_places`, that many of the last ones."""
         self.loops: list[LoopClosure] = []
         """All returned loops."""
         self.rejected: list[RejectedClosure] = []
@@ -121,8 +121,7 @@ class LoopDetector:
             pair._replace(query=int(rows[pair.query]), match=int(rows[pair.match])) for pair in candidates
         ]
         if self.config.max_places is not None:
-            for results in (self.candidates, self.loops, self.rejected):
-                del results[: -self.config.max_places]
+            del self.candidates[: -self.config.max_places]
         for candidate in candidates:
             pair = pair_of(candidate, self.model, finder.motion, finder.mountings, knows_height=finder.knows_height)
             self._waiting.append(pair)

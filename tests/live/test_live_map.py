@@ -76,8 +76,8 @@ def test_a_map_is_recalled_and_its_unfinished_end_removed(params, whole, tmp_pat
     assert pairs(missed) == found[kept:] and pairs(read_loops_jsonl(tmp_path / LOOPS_FILE)) == found
     assert live.names == {f"scan {i}" for i in range(SCANS - 1)}
     live.detector.config = dataclasses.replace(live.detector.config, max_places=9)
-    del live.detector.loops[:-9]
-    assert pairs(live.loops) == found
+    live._forget_results()
+    assert pairs(live.loops) == found and pairs(live.detector.loops) == found[-9:]
     live.close()
     assert (tmp_path / FRAMES_LOG).stat().st_size < len(content) - 5
 
