@@ -102,6 +102,9 @@ def test_loops_with_limits_are_right_and_limits_that_are_not_reached_change_noth
         assert np.linalg.norm(error[:2, 3]) < 2
     assert len({loop.query for loop in few.loops}) > len(whole.loops) / 3
     assert few.nbytes < whole.nbytes
+    same.config = dataclasses.replace(same.config, max_places=3)
+    same.add_keyframe(None, time=float(street.times[-1]) + 1, odometry=poses[-1])
+    assert len(same.candidates) == 3 and pairs(same) == pairs(whole)  # loops are never forgotten
 
 
 @pytest.mark.parametrize(
