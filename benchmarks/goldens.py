@@ -56,7 +56,7 @@ def steps(before: Path | None) -> Iterator[str]:
     for method in ("sglpr", "scan-context"):
         yield f"embed --data towns --seq 00 --method {method} --out {method}.npz"
         yield f"evaluate {method}.npz --out {method}"
-    for preset in ("circular", "sglpr"):
+    for preset in ("sglpr-small", "sglpr"):
         yield f"train --data towns --seq 08 --preset {preset} --out train-{preset} --steps 20 --score-every 20"
     if before is not None:
         earlier_map, earlier = (shlex.quote(str(before / name)) for name in ("town.safetensors", "sglpr.npz"))

@@ -48,7 +48,7 @@ def installed(tmp_path_factory):
 def test_the_package_and_its_help_are_the_wheel_s(installed):
     ended = installed("python", "-c", "import sglpr_jax; print(sglpr_jax.__file__, sglpr_jax.shipped_weights())")
     assert str(ROOT) not in ended.stdout and "site-packages" in ended.stdout, ended.stdout + ended.stderr
-    assert "'circular', 'sglpr'" in ended.stdout
+    assert "'sglpr', 'sglpr-small'" in ended.stdout
     help = installed("sglpr-embed", "--help").stdout
     assert "sglpr-embed" in help and "bin/" not in help
 
@@ -57,7 +57,7 @@ def test_the_whole_job_without_the_checkout(installed):
     """Simulate, embed, evaluate."""
     for command in (
         ("sglpr-simulate", "--out", "town", "--seq", "08", "--scans", 12, "--azimuth-steps", 60),
-        ("sglpr-embed", "--weights", "circular", "--data", "town", "--seq", "08", "--out", "08.npz"),
+        ("sglpr-embed", "--weights", "sglpr-small", "--data", "town", "--seq", "08", "--out", "08.npz"),
         ("sglpr-evaluate", "08.npz", "--protocol", "pairs-f1max"),
     ):
         ended = installed(*command)

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 ROUTES = ("00", "02", "05", "06", "07", "08")
-PRESETS = ("circular", "sglpr", "paper-112", "paper")
+PRESETS = ("sglpr-small", "sglpr", "paper-112", "paper")
 TYPES = ("bfloat16", "float32")
 TRAINING_SHARE = 0.85
 """Of the minutes; in the rest of them a checkpoint is written and the weights are tested."""

@@ -55,12 +55,12 @@ class Writer:
 
 
 WRITERS = {
-    "embed": Writer(f"--weights circular --data {TOWN} --seq 08 --out {OUT}/08.npz"),
+    "embed": Writer(f"--weights sglpr-small --data {TOWN} --seq 08 --out {OUT}/08.npz"),
     "evaluate": Writer(f"../{INPUTS}/08.npz --data {TOWN} --seq 08 --out {OUT}/08"),
     "simulate": Writer(f"--out {OUT}/town {DRIVE} --seq 08 --scans 12"),
     "simulate images": Writer(f"--out {OUT}/town {DRIVE} --seq 08 --scans 12 --images"),
-    "export": Writer(f"--weights circular --out {OUT}/mine", refuses="not exist yet"),
-    "export stablehlo": Writer(f"--weights circular --format stablehlo --out {OUT}/mine", refuses="not exist yet"),
+    "export": Writer(f"--weights sglpr-small --out {OUT}/mine", refuses="not exist yet"),
+    "export stablehlo": Writer(f"--weights sglpr-small --format stablehlo --out {OUT}/mine", refuses="not exist yet"),
     "map": Writer(f"{TOWN} --seq 08 {POSES % '08'} --out {OUT}/town.safetensors", varies=("town.unfinished/*",)),
     "map more": Writer(
         f"{TOWN} --seq 05 {POSES % '05'} --add-to ../{INPUTS}/town.safetensors --out {OUT}/town.safetensors",

@@ -21,7 +21,7 @@ BATCH = 8
 def embed(
     *,
     data: Path | None = None,
-    weights: tuple[str, ...] = ("sglpr", "circular"),
+    weights: tuple[str, ...] = ("sglpr", "sglpr-small"),
     scans: int = 640,
     repeats: int = 3,
     azimuth_steps: int = 1800,

@@ -36,7 +36,7 @@ OPERATION = re.compile(r"^\s*(?:ROOT )?%?(\S+) = .*? ([\w-]+)\(.*op_name=\"([^\"
 """In the text of a compiled program: an operation's name, its kind, and where in the Python program it comes from."""
 
 
-def profile(*, preset: tuple[str, ...] = ("circular", "sglpr"), steps: int = 3) -> None:
+def profile(*, preset: tuple[str, ...] = ("sglpr-small", "sglpr"), steps: int = 3) -> None:
     """Print the time of each part of a training step, a table for each preset.
 
     Args:

@@ -19,7 +19,7 @@ STEPS = 20
 """Training steps."""
 TESTED = "00"
 """Recording whose loops are searched. It is not trained on."""
-PRESET = "circular"
+PRESET = "sglpr-small"
 WEIGHTS = DEFAULT_WEIGHTS
 COMPARED_METHODS = (UNTRAINED, SHIPPED)
 

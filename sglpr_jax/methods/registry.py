@@ -23,7 +23,7 @@ from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.models.weights import Params, weights_hash
+from sglpr_jax.models.weights import Params, own_hash, weights_hash
 from sglpr_jax.models.weights_file import load
 
 
@@ -74,9 +74,11 @@ def trained_method(method: LearnedMethod, weights: str) -> Method:
 def network(params: Params) -> Method:
     """Return the method that describes images with `params`."""
     config = params.config
+    model = dataclasses.asdict(config)
+    learned = {"weights": own_hash(params)} if model.pop("descriptors_of") else {}  # `weights_hash` is the teacher's
     options = {"image": config.image, "categories": config.categories_read, "field": field_of_view(config)[0]}
     return Method(
-        about={"method": NETWORK, "model": dataclasses.asdict(config)},
+        about={"method": NETWORK, "model": model} | learned,
         takes="labelled images" if config.categories_read else "images",
         prepare=functools.partial(checked_view, grid=config.grid, **options),
         describe=lambda views: describe(params, *views),

@@ -31,12 +31,14 @@ class _SwinStages(abc.ABC):
     embed_dim: int
     depths: tuple[int, ...]
     heads: tuple[int, ...]
+    fewest_stages = 1
 
     def __post_init__(self):
         check_fields(self)
-        if not self.depths or len(self.depths) != len(self.heads):
+        if len(self.depths) < self.fewest_stages or len(self.depths) != len(self.heads):
             found = f"depths {self.depths}, heads {self.heads}"
-            raise ValueError(f"expected at least one stage, and a number of heads for each, found {found}")
+            expected = f"{self.fewest_stages} or more stages, and a number of heads for each"
+            raise ValueError(f"expected {expected}, found {found}")
         for i, heads in enumerate(self.heads):
             channels = self.embed_dim * 2**i
             if channels % heads:
@@ -53,7 +55,7 @@ class _SwinStages(abc.ABC):
 
     @property
     def multiple(self) -> tuple[int, int]:
-        tokens_per_feature = 2 ** (len(self.depths) - 1)  # along rows and columns of the last stage
+        tokens_per_feature = 2 ** max(len(self.depths) - 1, 0)  # along rows and columns of the last stage
         return self.token[0] * tokens_per_feature, self.token[1] * tokens_per_feature
 
     @property
@@ -143,7 +145,7 @@ class SglprConfig(_SwinStages):
     additional blocks at full resolution, and `means` the numbers of sectors averaged into one after each block."""
     embed_dim: Size = 64
     depths: Depths = (2, 2)
-    """Number of blocks of each stage."""
+    """Number of blocks of each stage. (): no stages, so that the tokens of the stem are the features."""
     heads: Sizes = (2, 4)
     """Number of attention heads of each stage."""
     window: Size = 4
@@ -154,14 +156,20 @@ class SglprConfig(_SwinStages):
     """Stochastic depth: fraction of samples that skip the last block in training. It is 0 for the first block."""
 
     needs_polar = True
+    fewest_stages = 0
 
     @property
     def token(self) -> tuple[int, int]:
         return self.stem.token
 
     @property
+    def width(self) -> int:
+        return self.embed_dim if self.depths else self.stem.width
+
+    @property
     def pictures(self) -> dict[str, str]:
-        return {"stem": f"circular_block{len(self.stem.widths) - 1}", **super().pictures}
+        stem = {"stem": f"circular_block{len(self.stem.widths) - 1}"}
+        return stem | super().pictures if self.depths else stem
 
 
 BackboneConfig = SwinConfig | CircularConfig | SglprConfig

@@ -23,7 +23,7 @@ from sglpr_jax.fields import (
 )
 from sglpr_jax.files import naming
 from sglpr_jax.grid import Grid, ImageKind, check_density_grid
-from sglpr_jax.models.backbone_config import BackboneConfig, CircularConfig, SglprConfig, SwinConfig, check_lengths
+from sglpr_jax.models.backbone_config import BackboneConfig, SglprConfig, SwinConfig, check_lengths
 
 WHITENING_POWER = 0.4
 """Default power of whitening: each principal component is divided by its spread raised to this power."""
@@ -44,7 +44,7 @@ class HeadConfig:
     strides: Sizes = (2, 2, 2)
     means: Sizes = ()
     """Number of neighbouring sectors of a polar map that are averaged into one after each convolution. The strides then
-    apply to the radius only, and CBAM uses circular padding. (): no averaging, as in the paper."""
+    apply to the radius only. (): no averaging, as in the paper."""
     cbam: bool = True
     """Whether CBAM first weights the map by channel and by position."""
     cbam_reduction: Size = 16
@@ -109,6 +109,9 @@ class ModelConfig:
     """Number of categories of the labels (figure 9, docs/reference/labels.md). 0: no segmentation head."""
     detail: SizeOrNone = 0
     """Width of a layer that adds the image to the features of the segmentation head. 0: no layer, as in the paper."""
+    descriptors_of: str = ""
+    """SHA-256 of the weights whose descriptors this model learned (`loss.teacher`). Maps and files of both have this
+    hash, so each model can search those of the other. Empty: the model has descriptors of its own."""
     compute: Literal["float32", "bfloat16"] = "float32"
     """Data type of matrix products and convolutions. Weights, norms, softmax, descriptors and losses are float32."""
 
@@ -176,7 +179,13 @@ RENAMED_KINDS = {"rings": "circular"}
 """Kinds of backbones: from the name in files of earlier versions to today's name."""
 REMOVED = (("backbone.stem", []),)
 """Fields of earlier versions, with their values, that the configuration no longer has. They are ignored in files."""
-ADDED_LATER = {"head.means": (), "head.whiten": False, "backbone.fine": (), "backbone.stem.fine": ()}
+ADDED_LATER = {
+    "head.means": (),
+    "head.whiten": False,
+    "backbone.fine": (),
+    "backbone.stem.fine": (),
+    "descriptors_of": "",
+}
 """Fields that files of earlier versions lack, and the values that these files imply."""
 
 
@@ -241,11 +250,12 @@ MODELS: dict[str, ModelConfig] = {
     # The default: the paper's parts in a form that follows rotations. Circular convolutions, then windows, CBAM and
     # NetVLAD, on polar images of the window of the ready-made KITTI images (+-25.6 m).
     "sglpr": _SGLPR,
-    # A circular CNN with NetVLAD: less computation, without CBAM and attention.
-    "circular": dataclasses.replace(
+    # The same without attention, and with fewer sectors in the head: a third of the computation.
+    "sglpr-small": dataclasses.replace(
         _SGLPR,
-        backbone=CircularConfig(),
-        head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=()),
+        backbone=SglprConfig(depths=(), heads=()),
+        head=dataclasses.replace(_SGLPR.head, means=(2, 2, 1), whiten=True),
+        categories=0,
     ),
     # The paper's model with a literal head: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
     "paper": ModelConfig(),

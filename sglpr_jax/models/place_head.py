@@ -57,7 +57,7 @@ class PlaceHead(nn.Module):
         """Returns descriptors of length 1, and the intermediate maps by name."""
         config, x, maps = self.config, features, {}
         if config.cbam:
-            x = maps["cbam"] = CBAM(config.cbam_reduction, circular=bool(config.means), name="cbam")(x)
+            x = maps["cbam"] = CBAM(config.cbam_reduction, circular=self.circular, name="cbam")(x)
         sizes = zip(config.channels, config.kernels, config.strides, strict=True)
         for i, (channels, kernel, stride) in enumerate(sizes):
             if config.means:

@@ -94,7 +94,9 @@ class CircularSwin(nn.Module):
     ) -> tuple[list[Float[Array, "b _ _ _"]], dict[str, Float[Array, "b _ _ _"]]]:
         """Return the maps of the stem with the tokens in place of the last map, and all intermediate maps by name."""
         stem_maps = CircularNet(self.config.stem, name="stem")(polar)
+        named_stem_maps = {f"circular_block{i}": block for i, block in enumerate(stem_maps[1:])}
+        if not self.config.depths:
+            return stem_maps, named_stem_maps
         swin_unet = SwinUnet(self.config, patch=1, circular=True, shift_each_way=True, name="swin_unet")
         tokens, swin_maps = swin_unet(stem_maps[-1], train=train)
-        named_stem_maps = {f"circular_block{i}": block for i, block in enumerate(stem_maps[1:])}
         return [*stem_maps[:-1], tokens], named_stem_maps | swin_maps

@@ -64,6 +64,13 @@ def graft(source: Params, target: Params) -> Params:
     return dataclasses.replace(target, weights=as_tree(weights))
 
 
+def adopt(source: Params, target: Params) -> Params:
+    """Return `target` with the weights of `source` that have the same name and shape."""
+    weights, theirs = by_name(target.weights), by_name(source.weights)
+    same = {name: theirs[name] for name, own in weights.items() if name in theirs and theirs[name].shape == own.shape}
+    return dataclasses.replace(target, weights=as_tree(weights | same))
+
+
 def descriptor_layers(params: Params) -> Any:
     """Return the weights of the layers that `describe` uses, without those that only serve the segmentation head."""
     unused = SEGMENTATION_LAYERS if params.config.head.tap == "pixels" else SEGMENTATION_LAYERS + PIXEL_LAYERS
@@ -83,7 +90,12 @@ def freeze_descriptor_layers(params: Params) -> Params:
 
 
 def weights_hash(params: Params) -> str:
-    """Return the SHA-256 of the weights that `describe` uses. It identifies the weights that made a descriptor."""
+    """Return the SHA-256 that all models with comparable descriptors share: that of the teacher, if there is one."""
+    return params.config.descriptors_of or own_hash(params)
+
+
+def own_hash(params: Params) -> str:
+    """Return the SHA-256 of the weights that `describe` uses."""
     return hash_of(by_name(descriptor_layers(params)))
 
 
@@ -121,7 +133,8 @@ def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) 
     def mean(*arrays: Any) -> Any:
         return sum(jnp.asarray(array, jnp.float32) * factor for array, factor in zip(arrays, factors, strict=True))
 
-    return Params(jax.tree.map(mean, *(model.weights for model in models)), models[0].config)
+    config = dataclasses.replace(models[0].config, descriptors_of="")
+    return Params(jax.tree.map(mean, *(model.weights for model in models)), config)
 
 
 def fit_whitening(descriptors: Float[np.ndarray, "n d"], *, power: float = WHITENING_POWER) -> Float[np.ndarray, "d d"]:
@@ -158,6 +171,10 @@ def without_whitening(params: Params) -> Params:
 
 
 def _with_place_head(params: Params, place_head: dict[str, Any], *, whiten: bool) -> Params:
-    """Return `params` with the weights `place_head` in the place head, and with `whiten` in its configuration."""
-    head_config = dataclasses.replace(params.config.head, whiten=whiten)
-    return Params({**params.weights, "place_head": place_head}, dataclasses.replace(params.config, head=head_config))
+    """Return `params` with the weights `place_head` in the place head, and with `whiten` in its configuration.
+
+    These weights make descriptors of their own.
+    """
+    head = dataclasses.replace(params.config.head, whiten=whiten)
+    config = dataclasses.replace(params.config, head=head, descriptors_of="")
+    return Params({**params.weights, "place_head": place_head}, config)

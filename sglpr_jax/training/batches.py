@@ -42,6 +42,8 @@ class Batch:
     """Number of valid points of each place (b,)."""
     classes: Any = None
     """Classes of the points (b, n)."""
+    teacher: Any = None
+    """Descriptors of the teacher (b, d), including those of `second`, or None without `loss.teacher`."""
     second: Any = None
     """None, or the batch of a second dataset, such as simulated scans with labels beside real images without labels."""
 

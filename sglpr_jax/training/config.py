@@ -39,6 +39,9 @@ class LossConfig:
     image. 0 in the paper."""
     ignore_unlabelled: bool = False
     """Exclude cells of class 0 (empty or unlabelled) from the segmentation losses, as the scores do."""
+    teacher: str | None = None
+    """Weights whose descriptors the network learns instead of the triplet loss: a name or a folder, as in --weights.
+    Maps and descriptor files of the teacher can then be searched by the network, and the reverse."""
     segmentation_alone: bool = False
     """Train only the layers of the semantic map. Descriptors stay bit-identical. The paper trains both together."""
 
@@ -47,6 +50,10 @@ class LossConfig:
         if self.segmentation_alone and not self.segments:
             raise ValueError(
                 "loss.segmentation_alone leaves no loss: expected ce_weight or dice_weight above 0, found 0"
+            )
+        if self.segmentation_alone and self.teacher:
+            raise ValueError(
+                f"loss.segmentation_alone trains no descriptors: expected no loss.teacher, found {self.teacher}"
             )
 
     @property

@@ -7,14 +7,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
-from sglpr_jax.models.sglpr import forward, init
+from sglpr_jax.models.sglpr import describe, forward, init
 from sglpr_jax.models.weights import Params, freeze_descriptor_layers
-from sglpr_jax.training.batches import Batch, in_network_order, views
+from sglpr_jax.models.weights_file import load
+from sglpr_jax.training.batches import Batch, in_batch_order, in_network_order, views
 from sglpr_jax.training.config import LossConfig, OcclusionConfig, TrainConfig
 from sglpr_jax.training.devices import keep_sharding, per_device
 from sglpr_jax.training.loss_terms import Summary, joint_loss, segmentation_sums
@@ -61,6 +62,8 @@ class ImageNetwork:
         """Return the gradient of the joint loss (equation 8) for the rotated batch, and the metrics of the loss."""
         angle_key, model_key = jax.random.split(key)
         chunks = _network_input(batch, angle_key, model_key, self.config)
+        if self.config.loss.teacher:
+            batch = dataclasses.replace(batch, teacher=_teacher_descriptors(batch, chunks, self.config.loss))
         gradient, metrics = gradients(state.params, chunks, batch, self.config.loss)
         return Gradient(dataclasses.replace(state.params, weights=gradient), {}, metrics)
 
@@ -150,6 +153,14 @@ def _network_input(batch: Batch, angle_key: Array, model_key: Array, config: Tra
 
     chunks = jax.tree.map(cut_into_chunks, (images, maps, jnp.asarray(batch.labelled)))
     return Chunk(*keep_sharding(chunks, axis=1), key=keys)  # without it, each chunk would be on one device
+
+
+def _teacher_descriptors(batch: Batch, chunks: Chunk, config: LossConfig) -> Float[Array, "b d"]:
+    """Return the descriptors of the teacher for the images of all chunks, in the order of the batch."""
+    assert config.teacher is not None
+    teacher = load(config.teacher)
+    descriptors = jax.lax.map(lambda images: describe(teacher, images), chunks.images)
+    return in_batch_order(descriptors.reshape(-1, descriptors.shape[-1]), batch, every=config.segment_every)
 
 
 def _random_angles(key: Array, config: TrainConfig) -> Array:

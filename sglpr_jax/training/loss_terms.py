@@ -62,7 +62,15 @@ def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfi
     return (losses.lazy_triplet(to_positives, to_places, **_triplet_options(batch, config)) > 0).mean()
 
 
-DESCRIPTOR_TERMS = {"triplet": DescriptorTerm(lambda config: 0.0 if config.segmentation_alone else 1.0, triplet)}
+def teacher_distance(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
+    """Return the mean squared distance of the descriptors from those of the teacher."""
+    return losses.descriptor_distance(descriptors, batch.teacher, squared=True).mean()
+
+
+DESCRIPTOR_TERMS = {
+    "triplet": DescriptorTerm(lambda config: 0.0 if config.segmentation_alone or config.teacher else 1.0, triplet),
+    "teacher": DescriptorTerm(lambda config: 1.0 if config.teacher else 0.0, teacher_distance),
+}
 SEGMENTATION_TERMS = {
     "cross_entropy": SegmentationTerm(  # equation 6, averaged over the labelled images
         weight=lambda config: config.ce_weight,

@@ -13,8 +13,9 @@ from jaxtyping import Float32, Int
 
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights import Params, graft, without_whitening
+from sglpr_jax.models.weights import Params, adopt, graft, weights_hash, without_whitening
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.batches import positions_of, tuple_pool
@@ -114,7 +115,7 @@ def train(
       print(result)
     """
     folder = Path(out)
-    config = without_untrained_head(config)
+    config = _with_teacher(without_untrained_head(config))
     _require_usable(config, recordings, also, test)
     if config.loss.segmentation_alone and weights is None and not resume:
         raise ValueError("loss.segmentation_alone trains no descriptors: expected weights to begin with, found none")
@@ -132,7 +133,7 @@ def train(
         )
         source, score = _batches_and_score(recordings, also, config, folder)
         last_step = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
-        start_from = None if weights is None or last_step else _initial_weights(weights, config)
+        start_from = None if last_step else _initial_weights(weights, config)
         if config.steps < last_step:
             expected = f"at least the {last_step} steps that are already done"
             raise ValueError(f"{folder}: expected {expected}, found {config.steps}")
@@ -221,6 +222,8 @@ def _require_usable(
             "loss.segmentation_alone trains on labels alone: expected labels beside some scans, "
             f"found none in {len(recordings) + len(also)} recording(s)"
         )
+    if config.loss.teacher:
+        _require_teacher(config.model, config.loss.teacher)
     if not config.model.categories_read:
         return
     for recording in (*recordings, *also, *([] if test is None else [test])):
@@ -230,6 +233,24 @@ def _require_usable(
                 f"model.head.input reads labels: expected labels beside every scan of sequence {recording.name}, "
                 f"found {labelled} of {len(recording)}"
             )
+
+
+def _with_teacher(config: TrainConfig) -> TrainConfig:
+    """Return the configuration of a model that states whose descriptors it learns."""
+    descriptors_of = weights_hash(load(config.loss.teacher)) if config.loss.teacher else ""
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, descriptors_of=descriptors_of))
+
+
+def _require_teacher(model: ModelConfig, weights: str) -> None:
+    """Raise ValueError if the teacher does not describe the images of the model by as many numbers."""
+    teacher = load(weights).config
+    for name, own, found in (
+        ("grid", model.grid, teacher.grid),
+        ("image", model.image, teacher.image),
+        ("head.descriptor_size", model.head.descriptor_size, teacher.head.descriptor_size),
+    ):
+        if own != found:
+            raise ValueError(f"loss.teacher {weights}: expected the {name} of the trained model, {own}, found {found}")
 
 
 def _packed(
@@ -247,8 +268,14 @@ def _packed(
     return [packed(recording, cache, on_progress=functools.partial(report, recording)) for recording in recordings]
 
 
-def _initial_weights(weights: Params | Path | str, config: TrainConfig) -> Params:
-    """Return the weights with random values for missing ones, and with a whitening layer only if the model has one."""
+def _initial_weights(weights: Params | Path | str | None, config: TrainConfig) -> Params:
+    """Return the weights with random values for missing ones, and with a whitening layer only if the model has one.
+
+    Without weights, the layers that a teacher has in the same form begin with its weights.
+    """
+    random = init(jax.random.key(config.seed), config=config.model)
+    if weights is None:
+        return adopt(load(config.loss.teacher), random) if config.loss.teacher else random
     params = weights if isinstance(weights, Params) else load(weights)
     if config.loss.segmentation_alone and params.config.head.whiten and not config.model.head.whiten:
         raise ValueError(
@@ -256,4 +283,4 @@ def _initial_weights(weights: Params | Path | str, config: TrainConfig) -> Param
             "expected model.head.whiten True"
         )
     params = params if config.model.head.whiten else without_whitening(params)
-    return graft(params, init(jax.random.key(config.seed), config=config.model))
+    return graft(params, random)

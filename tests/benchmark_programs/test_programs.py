@@ -18,16 +18,16 @@ ROOT = Path(__file__).resolve().parents[2]
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
 TINY = f"{ROOT}/tests/tiny.py"
 """A preset of next to no arithmetic."""
-SMALL, LIGHT = "--scans 12 --azimuth-steps 90", "--weights circular"
+SMALL, LIGHT = "--scans 12 --azimuth-steps 90", "--weights sglpr-small"
 RUN = (
     "methods baselines --data town --methods solid --frames 100",
     f"loops --world walls town --route same --sensor vlp16 --method sglpr scan-context {SMALL} {LIGHT} --out d",
-    "loops evidence d --sensor vlp16 --weights circular",
-    "sensors rotation --data images --weights circular --scans 2 --step-deg 120 --among 20",
+    "loops evidence d --sensor vlp16 --weights sglpr-small",
+    "sensors rotation --data images --weights sglpr-small --scans 2 --step-deg 120 --among 20",
     "realism compare --real town --simulated images --scans 2 --out compared",
     f"speed training --preset {TINY} --size 64 --repeats 1 --steps 1",
     f"speed profile --preset {TINY} --steps 1",
-    "speed loops --frames 40 --repeats 1 --azimuth-steps 90 --weights circular",
+    "speed loops --frames 40 --repeats 1 --azimuth-steps 90 --weights sglpr-small",
     "fleet index --drives drawn.npz --places 2000 --queries 3",
     f"learned data --out learned --only test/town-601 {SMALL}",
     "learned score ring --data learned --only town-601-00 --out learned/scores",
@@ -139,7 +139,9 @@ def test_presets_are_measured_as_on_a_gpu(folder, benchmarks, monkeypatch, capsy
 @pytest.mark.slow
 def test_a_recording_of_a_fleet_is_described(folder, benchmarks):
     """By the worker of the recipe for Ray."""
-    describer = importlib.import_module("benchmarks.fleet.ray").Describer(out=f"{folder}/places/", weights="circular")
+    describer = importlib.import_module("benchmarks.fleet.ray").Describer(
+        out=f"{folder}/places/", weights="sglpr-small"
+    )
     row = describer({"source": str(folder / "town")})
     assert (row["added"], row["error"]) == (60, "")
     assert describer({"source": str(folder / "nothing")})["error"]

@@ -28,7 +28,7 @@ LINES = {
     "reproduce": ("table1", "figure5", "--preset", "paper", "--seq", "00", "07", "--loss.margin", "0.25"),
     "segment": ("--data", "scans", "--out", "maps", "--min-confidence", "1", "--seq", "null"),
     "simulate": ("--out", "towns", "--seq", "00", "05", "--sensor", "vlp16", "--rate-hz", "5"),
-    "train": ("--seq", "07", "--preset", "circular", "--model.head.cbam", "True", "--optimizer.clip-norm", "None"),
+    "train": ("--seq", "07", "--preset", "sglpr-small", "--model.head.cbam", "True", "--optimizer.clip-norm", "None"),
 }
 """A command line of each command, with texts that YAML or a careless reader takes for other values."""
 TINY = Path(__file__).resolve().parents[1] / "tiny.py"
@@ -124,5 +124,5 @@ def test_paths_that_are_not_utf_8_survive(tmp_path):
 def test_a_flag_sets_the_backbone_of_the_preset_and_flags_of_other_backbones_are_unknown():
     swin = parsed("train", "--preset", "paper", "--model.backbone.window", "4").config.model
     assert (swin.backbone.kind, swin.backbone.window, swin.backbone.patch) == ("swin", 4, 4)
-    ended = run_command("train", "--preset", "circular", "--model.backbone.window", "4")
+    ended = run_command("train", "--preset", "sglpr-small", "--model.backbone.window", "4")
     assert_one_line_error(ended, "found '--model.backbone.window'")

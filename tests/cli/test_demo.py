@@ -17,7 +17,7 @@ def tiny_demo(monkeypatch, town, preset):
             root.symlink_to(town)
 
     monkeypatch.setattr(datasets, "simulate", simulate)
-    monkeypatch.setattr(demo, "WEIGHTS", "circular")
+    monkeypatch.setattr(demo, "WEIGHTS", "sglpr-small")
     monkeypatch.setattr(demo, "PRESET", str(preset))
     monkeypatch.setattr(demo, "STEPS", 2)
     return asked

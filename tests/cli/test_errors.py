@@ -25,7 +25,7 @@ ERRORS = {
     f"{EMBED} {{town}} --seq 08 --weights sglpr": "expected --method sglpr or one of bin/peers with --weights",
     "embed --data {town} --out {out}": "expected --out to end in .npz or /",
     "evaluate {root}/no.npz": "no.npz: expected a descriptor file, .npy, top-k list or scored pairs, found none",
-    "export --weights circularr --out {out}": "circularr: expected a folder",
+    "export --weights sglpr-smal --out {out}": "sglpr-smal: expected a folder",
     "export --out {root}": "expected a folder that does not exist yet",
     "live ros:1 --out {out}": "ros:1: expected one of the sources folder, bag, dds, zenoh, found ros",
     "live folder:{root} --out {out} --poses {out}/trajectory.tum": "odometry that this run does not overwrite",

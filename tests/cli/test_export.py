@@ -27,9 +27,9 @@ def weights(random_params, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def exported(command, weights, tmp_path, monkeypatch) -> Path:
-    """These weights, exported under the name `circular` into a package folder of their own."""
+    """These weights, exported under the name `sglpr-small` into a package folder of their own."""
     monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
-    folder = shipped.FOLDER / "circular"
+    folder = shipped.FOLDER / "sglpr-small"
     ended = command("export", "--weights", weights, "--out", folder, "--half")
     assert ended.status == 0, ended.error
     assert f"{folder}: 0." in ended.out and "MB of weights" in ended.out
@@ -37,11 +37,11 @@ def exported(command, weights, tmp_path, monkeypatch) -> Path:
 
 
 def test_exported_weights_embed_by_name_as_the_whole_ones_do(command, exported, weights, town, tmp_path):
-    for name in ("circular", weights):
+    for name in ("sglpr-small", weights):
         options = ("--weights", name, "--data", town, "--seq", "08", "--out", tmp_path / f"{Path(name).name}.npz")
         ended = command("embed", *options)
         assert ended.status == 0, ended.error
-    found, whole = (load(tmp_path / f"{name}.npz").descriptors for name in ("circular", "weights"))
+    found, whole = (load(tmp_path / f"{name}.npz").descriptors for name in ("sglpr-small", "weights"))
     assert 0 < np.abs(found - whole).max() < 1e-2
 
 

@@ -27,7 +27,7 @@ def test_a_stopped_node_continues_its_map(town, tmp_path):
     write_tum(tmp_path / "poses.tum", read_odometry(town / "sequences/08/poses.txt", format="kitti"), times)
     scans.mkdir()
     flags = ("--poses", tmp_path / "poses.tum", "--sinks", f"json:{lines}", "--min-probability", "0.01")
-    command = ("live", f"folder:{scans}", "--out", tmp_path / "map", "--weights", "circular", *flags)
+    command = ("live", f"folder:{scans}", "--out", tmp_path / "map", "--weights", "sglpr-small", *flags)
 
     def found() -> list[dict]:
         text = lines.read_text() if lines.exists() else ""

@@ -12,7 +12,7 @@ from sglpr_jax.pose_graph.files import write_tum
 from .conftest import assert_one_line_error
 
 SCANS, STEP_M = 6, 2.0
-HEIGHT = ("--weights", "circular", "--sensor-height", "1.73")
+HEIGHT = ("--weights", "sglpr-small", "--sensor-height", "1.73")
 
 
 @pytest.fixture(scope="module")
@@ -70,5 +70,5 @@ def test_a_scan_is_located_only_in_a_map_of_the_same_scale(command, drive, tmp_p
     assert ", scale 2" in ended.out and PlaceMap.load(out).scale == 2
     wrong = "town.safetensors: expected descriptors with scale {}, found 2: they are not comparable"
     assert_one_line_error(command(*query, "--scale", "4"), wrong.format(4))
-    more = ("map", folder, "--poses", poses, "--add-to", out, "--out", out, "--weights", "circular")
+    more = ("map", folder, "--poses", poses, "--add-to", out, "--out", out, "--weights", "sglpr-small")
     assert_one_line_error(command(*more), wrong.format(1))

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.models.weights import weights_hash, with_whitening
-from sglpr_jax.models.weights_file import load
+from sglpr_jax.models.weights import for_places, weights_hash, with_whitening
+from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.recipe import train
+from sglpr_jax.training.trainer import METRICS_FILE
 
 
 @pytest.mark.slow
@@ -46,6 +48,19 @@ def test_a_training_is_one_call(images, preset, tmp_path):
     assert weights_hash(whole.params) == weights_hash(result.params)
 
 
+@pytest.mark.slow
+def test_a_network_learns_the_descriptors_of_a_teacher_and_says_so(images, preset, random_params, tmp_path):
+    config = load_preset(str(preset))
+    teacher = for_places(random_params(config.model))
+    save(teacher, tmp_path / "teacher")
+    loss = dataclasses.replace(config.loss, teacher=str(tmp_path / "teacher"), ce_weight=0.0, dice_weight=0.0)
+    config = dataclasses.replace(config, loss=loss, steps=1, score_every=1)
+    params = train(config, [open_recording(images, "00")], out=tmp_path / "run").params
+    assert params.config.descriptors_of == weights_hash(load(tmp_path / "run")) == weights_hash(teacher)
+    (step, *_) = read_metrics(tmp_path / "run" / METRICS_FILE)
+    assert step["teacher"] < 1e-6  # the same layers began with the weights of the teacher
+
+
 def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
     images, labelled_images, random_params, preset, tmp_path
 ):
@@ -54,6 +69,9 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
         train(config, [recording], out=tmp_path / "run", test=recording)
     with pytest.raises(ValueError, match="sequence 00 has no poses"):
         train(config, [dataclasses.replace(recording, positions=None)], out=tmp_path / "run")
+    taught = dataclasses.replace(config, loss=dataclasses.replace(config.loss, teacher="sglpr"))
+    with pytest.raises(ValueError, match=r"loss\.teacher sglpr: expected the grid of .*, found Grid"):
+        train(taught, [recording], out=tmp_path / "run")
     head = dataclasses.replace(config.model.head, input="labels")
     reads = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
     with pytest.raises(ValueError, match="expected labels beside every scan of sequence 00, found 0 of 30"):

@@ -70,7 +70,7 @@ def test_python_runs(page, in_examples, monkeypatch):
     """All blocks of a page, one after another, in a folder with a small dataset, with the cheaper weights; loops
     are not registered, and what is trained is a tiny model."""
     model, load, preset, find = model_preset("tiny"), sglpr_jax.load, sglpr_jax.preset, sglpr_jax.find_loops
-    monkeypatch.setattr(sglpr_jax, "load", lambda name: load("circular"))
+    monkeypatch.setattr(sglpr_jax, "load", lambda name: load("sglpr-small"))
     monkeypatch.setattr(sglpr_jax, "find_loops", functools.partial(find, registered=False))
     monkeypatch.setattr(sglpr_jax, "preset", lambda name: dataclasses.replace(preset(name), model=model))
     found = {"__name__": "page"}

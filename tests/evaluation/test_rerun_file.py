@@ -42,7 +42,7 @@ def test_a_file_without_poses_has_the_images(found_loops, tmp_path):
 
 def test_the_file_has_scans_and_probabilities(tmp_path):
     drive = simulate_recording("08", scans=12, seed=3, sensor=SMALL)
-    found = find_loops(drive, load("circular"), odometry=drive.poses.world_from_lidar, registered=False)
+    found = find_loops(drive, load("sglpr-small"), odometry=drive.poses.world_from_lidar, registered=False)
     write_rerun(found, tmp_path / "a.rrd")
     scans = {name for name in entities(tmp_path / "a.rrd") if name.startswith("/map/scans/")}
     assert "/map/scans/0" in scans and len(scans) >= 3

@@ -18,7 +18,7 @@ drive = street
 
 @pytest.fixture(scope="session")
 def params():
-    return sglpr_jax.load("circular")
+    return sglpr_jax.load("sglpr-small")
 
 
 class Said(list):

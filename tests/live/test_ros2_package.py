@@ -152,7 +152,7 @@ def test_the_node_runs_until_ros_ends(package, said, tmp_path, monkeypatch):
         assert time.monotonic() - begun < 60
         return sent == 2
 
-    given = {"out": str(tmp_path / "map"), "weights": "circular", "odometry_topic": "/odom"}
+    given = {"out": str(tmp_path / "map"), "weights": "sglpr-small", "odometry_topic": "/odom"}
     values = {**package.parameters.defaults(), **given}
     command = package.parameters.command_of(values)
     package.node.run(command, lambda: wire, said, say=lines.append, should_stop=should_stop)

@@ -18,7 +18,7 @@ from sglpr_jax.se3 import yaw_of
 
 @pytest.fixture(scope="session")
 def params() -> Params:
-    return sglpr_jax.load("circular")
+    return sglpr_jax.load("sglpr-small")
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from sglpr_jax.sim.recording import SimulatedRecording
 
 @pytest.fixture(scope="session")
 def params() -> Params:
-    return sglpr_jax.load("circular")
+    return sglpr_jax.load("sglpr-small")
 
 
 @pytest.fixture(scope="session")

@@ -21,10 +21,10 @@ def test_every_preset_s_configuration_survives_json(preset):
     assert found == config and hash(found) == hash(config)
 
 
-@pytest.mark.parametrize("path", ["image", "backbone.average"])
+@pytest.mark.parametrize("path", ["image", "backbone.stem.average"])
 def test_a_missing_field_is_an_error_and_no_default(path):
     """Weights of density images without `image` would be fed point counts."""
-    values = values_of(model_preset("circular"))
+    values = values_of(model_preset("sglpr-small"))
     *way, name = path.split(".")
     del functools.reduce(lambda place, step: place[step], way, values)[name]
     with pytest.raises(ValueError, match=rf"^here: .*expected the fields of a \w+ \(.*\), found no '{name}'$"):
@@ -53,12 +53,12 @@ def test_files_of_earlier_versions_are_read():
         ("blind_m", 30.0, "blind_m: expected less than the 25.6 m that the image reaches, found 30.0"),
         ("grid.height", 127, "grid: height: expected an even number of cells, found 127"),
         ("head.clusters", 0, "head.clusters: expected a number from 1 up to 1048576, found 0"),
-        ("backbone.widths", [], "backbone: widths: expected at least one block, found ()"),
+        ("backbone.stem.widths", [], "backbone.stem: widths: expected at least one block, found ()"),
         ("depths", [2, 2], "here: expected the fields of a ModelConfig (grid, "),
     ],
 )
 def test_a_wrong_value_is_one_line_with_file_field_expected_and_found(path, value, message):
-    values = values_of(model_preset("circular"))
+    values = values_of(model_preset("sglpr-small"))
     *way, name = path.split(".")
     functools.reduce(lambda place, step: place[step], way, values)[name] = value
     with pytest.raises(ValueError) as error:

@@ -64,7 +64,7 @@ def test_onnx_gives_the_same_descriptors_for_any_number_of_images(params, tmp_pa
 
 
 def test_the_input_of_densities_is_made_as_it_is_said():
-    config = model_preset("circular")
+    config = model_preset("sglpr-small")
     config = dataclasses.replace(config, image="density")
     said = input_description(config)
     assert "u = 64 + i for i > 0, 63 + i for i < 0" in said["cells"] and "v = 63 - j for j > 0, 64 - j" in said["cells"]

@@ -15,6 +15,7 @@ from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.sglpr import describe, init, weight_shapes
 from sglpr_jax.models.weights import (
     Params,
+    adopt,
     as_tree,
     average,
     by_name,
@@ -22,6 +23,7 @@ from sglpr_jax.models.weights import (
     fit_whitening,
     for_places,
     graft,
+    own_hash,
     weights_hash,
     with_whitening,
     without_whitening,
@@ -140,9 +142,29 @@ def test_the_hash_changes_with_one_value_and_one_name(params):
     assert len(hashes[0]) == 64
 
 
+def test_a_model_that_learned_from_a_teacher_has_its_hash_until_it_is_changed():
+    teacher, own = fresh(0), fresh(1)
+    student = Params(own.weights, dataclasses.replace(own.config, descriptors_of=weights_hash(teacher)))
+    assert weights_hash(student) == weights_hash(for_places(student)) == weights_hash(teacher)
+    assert own_hash(student) == weights_hash(own) != weights_hash(teacher)
+    whitened = with_whitening(student, np.random.default_rng(0).normal(size=(600, 256)))
+    assert weights_hash(whitened) == own_hash(whitened) and weights_hash(average([student])) == own_hash(student)
+
+
+def test_layers_are_adopted_by_name_and_shape():
+    source = fresh(0)
+    head = dataclasses.replace(source.config.head, clusters=7)
+    target = init(jax.random.key(1), config=dataclasses.replace(source.config, head=head, categories=0))
+    adopted, theirs, own = (by_name(params.weights) for params in (adopt(source, target), source, target))
+    assert adopted.keys() == own.keys()
+    different = {name for name, value in adopted.items() if value is not theirs[name]}
+    assert {name.split("/")[1] for name in different} == {"netvlad"}
+    assert all(adopted[name] is own[name] for name in different)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tap", ["tokens", "pixels"])
-@pytest.mark.parametrize("name", ["paper", "circular", "sglpr"])
+@pytest.mark.parametrize("name", ["paper", "sglpr-small", "sglpr"])
 def test_the_layers_of_descriptors_are_those_of_a_model_without_a_segmentation_head(name, tap):
     config = model_preset(name)
     config = dataclasses.replace(config, head=dataclasses.replace(config.head, tap=tap))

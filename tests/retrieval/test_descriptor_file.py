@@ -111,6 +111,15 @@ def test_descriptors_of_another_method_or_model_cannot_be_compared(file, change,
         check_same_method(file, dataclasses.replace(file, sequence="05", **change))
 
 
+def test_a_network_and_its_teacher_can_be_compared(file):
+    image, files = {"polar": (64, 256)}, []
+    for network in ({"backbone": {"depths": (2, 2)}, "categories": 20}, {"backbone": {"depths": ()}, "categories": 0}):
+        files.append(dataclasses.replace(file, config={"method": "sglpr", "model": image | network}))
+    check_same_method(*files)
+    with pytest.raises(ValueError, match="with model"):
+        check_same_method(*(dataclasses.replace(one, weights_hash="") for one in files))
+
+
 def test_scans_that_are_left_out_are_remembered_by_their_rows(file):
     assert file.is_described.tolist() == [True, True, True]
     fewer = file.only(np.array([True, False, True]))

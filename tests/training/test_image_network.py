@@ -11,10 +11,11 @@ import pytest
 
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.models.sglpr import forward
+from sglpr_jax.models.sglpr import describe, forward, init
 from sglpr_jax.models.weights import by_name, for_places
+from sglpr_jax.models.weights_file import save
 from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
-from sglpr_jax.training.config import LossConfig, OcclusionConfig
+from sglpr_jax.training.config import LossConfig, OcclusionConfig, without_untrained_head
 from sglpr_jax.training.image_network import (
     ImageNetwork,
     _network_input,
@@ -24,7 +25,7 @@ from sglpr_jax.training.image_network import (
     unoccluded_cells,
 )
 from sglpr_jax.training.loss_terms import Summary, joint_loss
-from sglpr_jax.training.step import train_step
+from sglpr_jax.training.step import TrainState, train_step
 
 from .conftest import FAST_COMPILE, SWIN
 
@@ -125,6 +126,31 @@ def test_training_the_segmentation_alone_keeps_the_descriptors(config, random_pa
     for name, gradient in by_name(found).items():
         assert_same(gradient, np.zeros_like(gradient) if name in described else by_name(expected)[name])
     assert {"segmentation_head/kernel", "narrow/kernel"} <= set(by_name(found)) - set(described)
+
+
+@pytest.mark.parametrize("chunk", [0, 2])
+def test_a_teacher_replaces_the_triplet_loss(config, random_params, make_batch, tmp_path, chunk):
+    """The loss is the mean squared distance from the descriptors of the teacher, which has no loss itself."""
+    teacher = init(jax.random.key(7), config=dataclasses.replace(config.model, categories=0))
+    save(teacher, tmp_path / "teacher")
+    config = dataclasses.replace(
+        config, loss=LossConfig(teacher=str(tmp_path / "teacher"), ce_weight=0.0, dice_weight=0.0), chunk=chunk
+    )
+    config = without_untrained_head(config)
+    params, batch, key = random_params(config.model), make_batch(0), jax.random.key(0)
+
+    def step(params):
+        return ImageNetwork(config).gradient(TrainState(jnp.int32(0), params, None), batch, key)
+
+    found = jax.jit(step, compiler_options=FAST_COMPILE)(params)
+    images = chunks_of(batch, config).images.reshape(-1, 16, 16)
+    apart = np.asarray(describe(params, images)) - np.asarray(describe(teacher, images))
+    assert set(found.metrics) == {"loss", "teacher", "violations"}
+    np.testing.assert_allclose(found.metrics["loss"], (apart**2).sum(-1).mean(), rtol=1e-4)
+    same = jax.jit(step, compiler_options=FAST_COMPILE)(teacher)
+    assert float(same.metrics["loss"]) < 1e-6
+    with pytest.raises(ValueError, match=r"expected no loss.teacher, found sglpr"):
+        LossConfig(teacher="sglpr", segmentation_alone=True)
 
 
 def test_segmentation_alone_needs_a_segmentation_loss_and_no_weight_decay(config):
