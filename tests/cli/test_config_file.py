@@ -124,5 +124,5 @@ def test_paths_that_are_not_utf_8_survive(tmp_path):
 def test_a_flag_sets_the_backbone_of_the_preset_and_flags_of_other_backbones_are_unknown():
     swin = parsed("train", "--preset", "paper", "--model.backbone.window", "4").config.model
     assert (swin.backbone.kind, swin.backbone.window, swin.backbone.patch) == ("swin", 4, 4)
-    ended = run_command("train", "--preset", "sglpr-small", "--model.backbone.window", "4")
-    assert_one_line_error(ended, "found '--model.backbone.window'")
+    ended = run_command("train", "--preset", "paper", "--model.backbone.stem.average", "4")
+    assert_one_line_error(ended, "found '--model.backbone.stem.average'")
