@@ -141,7 +141,7 @@ def test_wrong_queries_and_maps_are_one_clear_error(command, scans, places_file,
     np.array([5, 0, 0, 1], np.float32).tofile(tmp_path / "dot.bin")
     assert_one_line_error(ask(tmp_path / "dot.bin"), "dot.bin: expected a scan that shows a place")
     assert_one_line_error(ask(scans), "08: expected one scan or image, found a folder; name a file in it")
-    ended = command("relocalize", tmp_path / "dot.bin", "--map", places_file, "--weights", "sglpr-small")
+    ended = command("relocalize", tmp_path / "dot.bin", "--map", places_file, "--weights", "submaps")
     assert_one_line_error(ended, "one.safetensors: expected descriptors with weights")
     content = places_file.read_bytes()
     places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
@@ -150,10 +150,10 @@ def test_wrong_queries_and_maps_are_one_clear_error(command, scans, places_file,
 
 
 def test_relocalize_reads_a_frame_of_a_recording(command, town, places_file, monkeypatch):
-    """The scan, the mounting and the name are those of the recording."""
+    """The scan, the mounting and the name are those of the recording. A network can search the map of its teacher."""
     asked = []
     monkeypatch.setattr(PlaceMap, "relocate", lambda self, params, scan, **options: asked.append(scan) or [])
-    run = ("relocalize", town, "--seq", "08", "--map", places_file)
+    run = ("relocalize", town, "--seq", "08", "--map", places_file, "--weights", "sglpr-small")
     ended = command(*run, "--frame", "12", "--sensor-height", "2")
     assert_one_line_error(ended, f"frame 12 of {town.name}: expected a scan that shows a place")
     (scan,) = asked
