@@ -63,7 +63,7 @@ def test_an_invalid_value_is_an_error_with_field_expected_and_found(values, mess
         (HeadConfig, dict(pooling="gem")),
         (ModelConfig, dict(blind_m=-2.0)),
         (SwinConfig, dict(heads=(5, 6, 12, 24))),
-        (SglprConfig, dict(depths=(), heads=())),
+        (SglprConfig, dict(depths=(), heads=(2,))),
         (TupleConfig, dict(positive_m=float("inf"))),
         (LossConfig, dict(margin="0.3")),
         (OptimizerConfig, dict(warmup_steps=1.5)),

@@ -57,7 +57,7 @@ PARSED = (
     "speed live --rates 5",
     "speed start-up --repeats 1 --places 30 --commands embed",
     "speed trees elsewhere --repeats 1",
-    "torch describe --preset circular --compiled",
+    "torch describe --preset sglpr-small --compiled",
     "torch step --no-labels",
     "fleet embed recordings/* --out places",
     "fleet loops places index found",

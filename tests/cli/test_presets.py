@@ -21,7 +21,7 @@ def test_every_file_of_configs_is_a_preset():
         ("CONFIG = {'steps': 3}", "expected CONFIG, a TrainConfig, found dict"),
         ("CONFIG = TrainConfig(stepz=3)", "expected a preset, found one that fails: TypeError: .*stepz"),
         ("CONFIG = TrainConfig(", "expected a preset, found one that fails: SyntaxError: "),
-        (None, "no preset '.*mine.py': expected a .py file or one of .*paper-112, sglpr, tiny"),
+        (None, "no preset '.*mine.py': expected a .py file or one of .*paper-112, sglpr, sglpr-small, tiny"),
     ],
 )
 def test_a_wrong_preset_is_named(text, found, tmp_path):
