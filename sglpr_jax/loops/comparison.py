@@ -274,8 +274,8 @@ class KeyframeComparison:
         far = self._most_similar(query, scans, cohort, elsewhere & distracts)
         close = self._most_similar(query, scans, near_cohort, near & distracts)
         best_of_each = far.at(slice(EXACT_COHORT)), close.at(slice(EXACT_NEAR_COHORT))
-        fits = [self._compare_exactly(query, scans, group.at(group.correlation >= least)) for group in best_of_each]
-        return Fits.joined(*fits)._replace(lookalike=float(far.correlation[0]) if len(far.rows) else math.nan)
+        compared = [self._compare_exactly(query, scans, group.at(group.correlation >= least)) for group in best_of_each]
+        return Fits.joined(*compared)._replace(lookalike=float(far.correlation[0]) if len(far.rows) else math.nan)
 
     def _most_similar(self, query: Query, scans: Keyframes, count: int, among: Bool[np.ndarray, " n"]) -> CoarseFits:
         """Compare the `count` scans with the nearest descriptors coarsely. The highest correlation comes first.
