@@ -24,7 +24,7 @@ NODE_EVERY_M = 5.0
 MOST_NODES = 4000
 """Number of nodes at which this distance doubles, so that time and memory stay bounded."""
 NODE_BYTES = 5000
-"""Memory of a node with its factors in the solver, in bytes, measured over 30 km."""
+"""Approximate memory of a node with its factors in the solver, in bytes."""
 LOOP_EVERY = 10
 """Minimum distance between two loops in the graph that agree with it, as a multiple of the distance between two nodes.
 It limits the growth of time and memory on routes that are driven again and again."""
