@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
-from sglpr_jax.files import parse_json, raising_write_error, read_json, write_json
+from sglpr_jax.files import raising_write_error, read_json, write_json
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
@@ -125,8 +125,9 @@ class LiveMap:
 
     @property
     def loops(self) -> list[LoopClosure]:
-        """All loops: those of the detector or, with `max_places`, those of the file, because old ones are removed."""
-        return self.detector.loops if self.detector.config.max_places is None else read_loops_jsonl(self._loops_path)
+        """All loops: those of the file and, if it cannot be written any more, those of the detector that it lacks."""
+        written = read_loops_jsonl(self._loops_path, skip_damaged=True)
+        return [*written, *_missing(self.detector.loops, written)]
 
     @property
     def stamps(self) -> Float[np.ndarray, " n"]:
@@ -175,8 +176,8 @@ class LiveMap:
     def _rewrite_loops(self, loops: list[LoopClosure]) -> list[LoopClosure]:
         """Write the loops to a new file and open it for appending. Returns loops that the old file lacks."""
         path = self._loops_path
-        written = _written_pairs(path)
-        missed = [loop for loop in loops if (loop.query, loop.match) not in written]
+        written = read_loops_jsonl(path, skip_damaged=True) if path.is_file() else []
+        missed = _missing(loops, written)
         if missed and written:
             self._report("log", f"{path}: {len(missed)} loops were added that the last process missed")
         write_loops_jsonl(path, loops)
@@ -237,12 +238,14 @@ class LiveMap:
         return loops
 
     def _forget_results(self) -> None:
-        """Remove results from memory: candidates, whose `fits` are in the log, and with `max_places` old loops and
-        rejected pairs, too."""
+        """Remove results from memory: candidates, whose `fits` are in the log, and with `max_places` also old rejected
+        pairs, and old loops, which are in their file."""
         self.detector.candidates.clear()
         most = self.detector.config.max_places
         if most is not None:
-            del self.detector.loops[:-most], self.detector.rejected[:-most]
+            del self.detector.rejected[:-most]
+            if self._log is not None:
+                del self.detector.loops[:-most]
 
     def _log_scan(self, scan: LiveScan, compared: Fits, loops: list[LoopClosure]) -> None:
         """Write a scan to the log and its loops to their file. After an error, the map continues in memory only."""
@@ -321,11 +324,7 @@ def _has_wanted(stored: Any, wanted: Any) -> bool:
     return stored == wanted
 
 
-def _written_pairs(path: Path) -> set[tuple[int, int]]:
-    """Return query and match of each loop in a file of `loop_lines`. A cut or damaged line is skipped."""
-    pairs = set()
-    for line in path.read_bytes().splitlines() if path.is_file() else ():
-        with contextlib.suppress(ValueError, KeyError, TypeError):
-            loop = parse_json(line, source=path)
-            pairs.add((loop["query"], loop["match"]))
-    return pairs
+def _missing(loops: list[LoopClosure], written: list[LoopClosure]) -> list[LoopClosure]:
+    """Return the loops of other pairs than those of `written`."""
+    pairs = {(loop.query, loop.match) for loop in written}
+    return [loop for loop in loops if (loop.query, loop.match) not in pairs]

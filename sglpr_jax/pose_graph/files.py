@@ -177,14 +177,20 @@ def loop_lines(
     return "".join(lines)
 
 
-def read_loops_jsonl(path: Path | str) -> list[LoopClosure]:
+def read_loops_jsonl(path: Path | str, *, skip_damaged: bool = False) -> list[LoopClosure]:
     """Read the loops of a file of `write_loops_jsonl`. Raises FileNotFoundError, or ValueError, which names the line,
-    if a line is not a valid loop."""
+    if a line is not a valid loop. With `skip_damaged`, such a line is left out."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
-    lines = enumerate(path.read_bytes().splitlines(), start=1)
-    return [_loop_of_json(line, f"{path}, line {number}") for number, line in lines]
+    loops = []
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+        try:
+            loops.append(_loop_of_json(line, f"{path}, line {number}"))
+        except ValueError:
+            if not skip_damaged:
+                raise
+    return loops
 
 
 def _loop_of_json(line: bytes, where: str) -> LoopClosure:

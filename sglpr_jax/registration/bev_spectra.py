@@ -192,14 +192,14 @@ def correlations(query: Halves, match: Complex[Array, "s f"], reach: int) -> Flo
 
     The t rotations of the query come first, then these plus 180 degrees.
 
+    This is an inverse Fourier transform at few shifts, by matrix products. Even and odd parts are transformed
+    separately, for shifts of zero and more: at the opposite shift the cosine is the same and the sine changes its sign.
+    This takes a quarter of the multiplications of the full transform.
+
     Arguments:
       query: Spectra of the query at t rotations.
       match: One row of `match_spectra`.
       reach: Maximum shift in cells. Shifts run from -reach to reach, down and to the right.
-
-    This is an inverse Fourier transform at few shifts, by matrix products. Even and odd parts are transformed
-    separately, for shifts of zero and more: at the opposite shift the cosine is the same and the sine changes its sign.
-    This takes a quarter of the multiplications of the full transform.
     """
     size, (_, turns, width) = len(match), query.positive[0].shape
     row_cosines, row_sines, column_cosines, column_sines = map(jnp.asarray, _waves(reach, size))

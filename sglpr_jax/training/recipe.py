@@ -13,7 +13,6 @@ from jaxtyping import Float32, Int
 
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import Params, adopt, graft, weights_hash, without_whitening
 from sglpr_jax.models.weights_file import load, save
@@ -222,8 +221,6 @@ def _require_usable(
             "loss.segmentation_alone trains on labels alone: expected labels beside some scans, "
             f"found none in {len(recordings) + len(also)} recording(s)"
         )
-    if config.loss.teacher:
-        _require_teacher(config.model, config.loss.teacher)
     if not config.model.categories_read:
         return
     for recording in (*recordings, *also, *([] if test is None else [test])):
@@ -236,21 +233,24 @@ def _require_usable(
 
 
 def _with_teacher(config: TrainConfig) -> TrainConfig:
-    """Return the configuration of a model that states whose descriptors it learns."""
-    descriptors_of = weights_hash(load(config.loss.teacher)) if config.loss.teacher else ""
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, descriptors_of=descriptors_of))
+    """Return the configuration of a model that states whose descriptors it learns, if there is a teacher.
 
-
-def _require_teacher(model: ModelConfig, weights: str) -> None:
-    """Raise ValueError if the teacher does not describe the images of the model by as many numbers."""
-    teacher = load(weights).config
-    for name, own, found in (
-        ("grid", model.grid, teacher.grid),
-        ("image", model.image, teacher.image),
-        ("head.descriptor_size", model.head.descriptor_size, teacher.head.descriptor_size),
+    Raises ValueError if the teacher does not describe the images of the model by as many numbers.
+    """
+    name, model = config.loss.teacher, config.model
+    if not name:
+        return dataclasses.replace(config, model=dataclasses.replace(model, descriptors_of=""))
+    teacher = load(name)
+    for part, expected, found in (
+        ("grid", model.grid, teacher.config.grid),
+        ("image", model.image, teacher.config.image),
+        ("head.descriptor_size", model.head.descriptor_size, teacher.config.head.descriptor_size),
     ):
-        if own != found:
-            raise ValueError(f"loss.teacher {weights}: expected the {name} of the trained model, {own}, found {found}")
+        if expected != found:
+            raise ValueError(
+                f"loss.teacher {name}: expected the {part} of the trained model, {expected}, found {found}"
+            )
+    return dataclasses.replace(config, model=dataclasses.replace(model, descriptors_of=weights_hash(teacher)))
 
 
 def _packed(
