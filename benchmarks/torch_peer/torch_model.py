@@ -15,7 +15,7 @@ from benchmarks.torch_peer.torch_circular import CircularDecoder, CircularNet, D
 from benchmarks.torch_peer.torch_layers import InputImage, from_polar, to_polar
 from benchmarks.torch_peer.torch_swin import SwinUnet
 from sglpr_jax.losses import DICE_EPSILON
-from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig
+from sglpr_jax.models.backbone_config import SglprConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.weights import Params
 from sglpr_jax.training.config import LossConfig, TrainConfig
@@ -26,59 +26,26 @@ INFERENCE = {"freezing": True}
 """Lets `torch.compile` take the weights for constants and reorder them beforehand."""
 
 
-class Circular(nn.Module):
-    """The circular CNN, and its decoder."""
-
-    def __init__(self, config: ModelConfig):
-        super().__init__()
-        self.rings = CircularNet(config.channels, config.backbone)
-        self.pixel_size = _averaged(config, config.backbone)
-        if config.segments:
-            self.decoder = CircularDecoder(config.backbone.width, config.channels, config.backbone)
-            self.width = self.decoder.width
-
-    def forward(self, image: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The features, and the maps that the way back looks at again."""
-        *finer, features = self.rings(image)
-        return features, finer
-
-    def decode(self, features: Tensor, finer: list[Tensor]) -> Tensor:
-        """`pixel_size` pixels of `width` channels."""
-        return self.decoder([*finer, features])
-
-
 class Sglpr(nn.Module):
     """The Swin-Unet on the tokens of the circular CNN, and the circular CNN's decoder."""
 
     def __init__(self, config: ModelConfig):
         super().__init__()
-        own: SglprConfig = config.backbone
+        own = config.backbone
         rows, columns = (edge // token for edge, token in zip(config.image_size, own.token, strict=True))
         swin_unet = SwinUnet(own.stem.width, (rows, columns), own)
         self.backbone = nn.ModuleDict({"stem": CircularNet(config.channels, own.stem), "swin_unet": swin_unet})
-        self.pixel_size = _averaged(config, own.stem)
         if config.segments:
             self.decoder = CircularDecoder(own.width, config.channels, own.stem)
-            self.width = self.decoder.width
 
     def forward(self, image: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """As `Circular.forward`."""
+        """The features, and the maps that the decoder reads."""
         *finer, last = self.backbone["stem"](image)
         return self.backbone["swin_unet"](last), finer
 
     def decode(self, features: Tensor, finer: list[Tensor]) -> Tensor:
-        """As `Circular.decode`."""
+        """Pixels of the size of the averaged image."""
         return self.decoder([*finer, features])
-
-
-BACKBONES = {"circular": Circular, "sglpr": Sglpr}
-"""By the kind that their configuration names."""
-
-
-def _averaged(config: ModelConfig, rings: CircularConfig) -> tuple[int, int]:
-    """Rows and columns of the averaged image."""
-    rows, columns = (edge // rings.average for edge in config.image_size)
-    return rows, columns
 
 
 class SGLPR(nn.Module):
@@ -89,11 +56,11 @@ class SGLPR(nn.Module):
         _check(config)
         self.input_image = InputImage(config)
         self.view = to_polar(config.grid, *config.polar)
-        self.backbone = BACKBONES[config.backbone.kind](config)
+        self.backbone = Sglpr(config)
         self.place_head = Place(config.backbone.width, config.head)
         if config.segments:
-            self.back = from_polar(config.grid, *self.backbone.pixel_size)
-            self.narrow = nn.Linear(self.backbone.width, config.detail)
+            self.back = from_polar(config.grid, *(edge // config.backbone.stem.average for edge in config.image_size))
+            self.narrow = nn.Linear(self.backbone.decoder.width, config.detail)
             self.detail = Detail(config.channels, config.detail)
             self.segmentation_head = nn.Linear(config.detail, config.classes, bias=False)
 
@@ -110,6 +77,8 @@ class SGLPR(nn.Module):
 def _check(config: ModelConfig) -> None:
     """Raises ValueError for a model of which PyTorch's has no counterpart."""
     head = config.head
+    if not isinstance(config.backbone, SglprConfig) or not config.backbone.depths:
+        raise ValueError("the PyTorch model has a circular stem and a Swin-Unet")
     if not config.polar or not config.range_channel or head.tap != "tokens" or bool(head.channels) != bool(head.means):
         raise ValueError("the PyTorch model has a polar image, and a place head of tokens with circular blocks")
     if head.pooling != "netvlad" or head.whiten or config.counts != "log1p" or config.compute != "float32":

@@ -1,4 +1,4 @@
-"""Configurations of the backbones: Swin-Unet, circular CNN, and a Swin-Unet on the tokens of the circular CNN.
+"""Configurations of the backbones: Swin-Unet, and a Swin-Unet on the tokens of a circular CNN.
 
 Each has these properties:
 * `token`: rows and columns of the image that one feature represents.
@@ -94,19 +94,16 @@ class SwinConfig(_SwinStages):
 class CircularConfig:
     """Circular convolutions on the polar image, with one block for each width."""
 
-    kind: Literal["circular"] = "circular"
     average: Size = 2
     """Edge of the squares of polar pixels that are averaged first, because a smaller polar image would skip cells."""
-    fine: Sizes = ()
+    fine: Sizes = (14,)
     """Channels of additional blocks at the full number of sectors. Each joins the input of the block in `widths`."""
-    widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
+    widths: Sizes = (16, 32, 64)
     """Channels of each block."""
-    strides: Sizes = (2, 2, 1, 2, 1, 1, 1)
+    strides: Sizes = (2, 2, 1)
     """Stride of each block along the radius."""
-    means: Sizes = (1, 1, 2, 1, 2, 1, 1)
+    means: Sizes = (1, 1, 2)
     """Number of neighbouring sectors that are averaged into one after each block."""
-
-    needs_polar = True
 
     def __post_init__(self):
         check_fields(self)
@@ -120,19 +117,8 @@ class CircularConfig:
 
     @property
     def token(self) -> tuple[int, int]:
+        """Rows and columns of the image that one pixel of the last map represents."""
         return self.average * math.prod(self.strides), self.average * math.prod(self.means)
-
-    multiple = token
-
-    @property
-    def width(self) -> int:
-        return self.widths[-1]
-
-    @property
-    def pictures(self) -> dict[str, str]:
-        last = len(self.widths) - 1
-        first_middle_and_last = sorted({0, last // 2, last})
-        return {f"block {i + 1}": f"circular_block{i}" for i in first_middle_and_last}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +126,7 @@ class SglprConfig(_SwinStages):
     """Swin-Unet whose tokens come from circular convolutions on the polar image."""
 
     kind: Literal["sglpr"] = "sglpr"
-    stem: CircularConfig = CircularConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
+    stem: CircularConfig = CircularConfig()
     """Circular CNN that makes the tokens. Its last map has one pixel for each token. `fine` are the widths of
     additional blocks at full resolution, and `means` the numbers of sectors averaged into one after each block."""
     embed_dim: Size = 64
@@ -164,7 +150,7 @@ class SglprConfig(_SwinStages):
 
     @property
     def width(self) -> int:
-        return self.embed_dim if self.depths else self.stem.width
+        return self.embed_dim if self.depths else self.stem.widths[-1]
 
     @property
     def pictures(self) -> dict[str, str]:
@@ -172,4 +158,4 @@ class SglprConfig(_SwinStages):
         return stem | super().pictures if self.depths else stem
 
 
-BackboneConfig = SwinConfig | CircularConfig | SglprConfig
+BackboneConfig = SwinConfig | SglprConfig

@@ -1,4 +1,4 @@
-"""Backbone of circular convolutions on the polar image: a rotation of the scan only shifts its features.
+"""Circular convolutions on the polar image: a rotation of the scan only shifts its features.
 
 Strides reduce the radius, along which a rotation moves nothing. Average pooling reduces the sectors, because it skips
 none. A rotation by whole sectors of the last map therefore shifts this map, exactly up to the resampling of the image.

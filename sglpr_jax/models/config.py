@@ -175,14 +175,11 @@ class ModelConfig:
         return self.head.pictures or {"input of the place head": "raw_input"}
 
 
-RENAMED_KINDS = {"rings": "circular"}
-"""Kinds of backbones: from the name in files of earlier versions to today's name."""
-REMOVED = (("backbone.stem", []),)
+REMOVED = (("backbone.stem", []), ("backbone.stem.kind", "rings"), ("backbone.stem.kind", "circular"))
 """Fields of earlier versions, with their values, that the configuration no longer has. They are ignored in files."""
 ADDED_LATER = {
     "head.means": (),
     "head.whiten": False,
-    "backbone.fine": (),
     "backbone.stem.fine": (),
     "descriptors_of": "",
 }
@@ -213,11 +210,9 @@ def _read_field(annotation: Any, value: Any, field: str) -> Any:
     require(value, isinstance(value, dict), f"the fields of a {' or '.join(c.__name__ for c in classes)}", field)
     prefix = f"{field}." if field else ""
     values = {name: entry for name, entry in value.items() if (prefix + name, entry) not in REMOVED}
-    kind = values.get("kind")
-    if isinstance(kind, str):
-        values["kind"] = kind = RENAMED_KINDS.get(kind, kind)
     config_class = classes[0]
     if len(classes) > 1:
+        kind = values.get("kind")
         by_kind: dict[Any, Any] = {member.kind: member for member in classes}
         require(kind, isinstance(kind, str) and kind in by_kind, f"a kind, {' or '.join(by_kind)}", field)
         config_class = by_kind[kind]

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.models.backbone_config import BackboneConfig, SglprConfig, SwinConfig
-from sglpr_jax.models.circular import CircularDecoder, CircularNet
+from sglpr_jax.models.backbone_config import BackboneConfig, SwinConfig
+from sglpr_jax.models.circular import CircularDecoder
 from sglpr_jax.models.config import ModelConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
@@ -32,18 +32,14 @@ def _encode(
     if isinstance(config, SwinConfig):
         tokens, maps_by_name = SwinUnet(config, config.patch, circular, name="backbone")(image, train=train)
         return [tokens], maps_by_name
-    if isinstance(config, SglprConfig):
-        return CircularSwin(config, name="backbone")(image, train=train)
-    maps = CircularNet(config, name="rings")(image)  # "rings" is the name in weight files
-    return maps, {f"circular_block{i}": block for i, block in enumerate(maps[1:])}
+    return CircularSwin(config, name="backbone")(image, train=train)
 
 
 def _decode(config: BackboneConfig, maps: list[Array]) -> Float[Array, "b _ _ _"]:
     """Compute features of pixels from the maps of `_encode`, in layers of the calling Flax module."""
     if isinstance(config, SwinConfig):
         return PatchExpand(config.patch, maps[-1].shape[-1], name="expand")(maps[-1])
-    widths = config.stem.widths if isinstance(config, SglprConfig) else config.widths
-    return CircularDecoder(widths, name="decoder")(maps)
+    return CircularDecoder(config.stem.widths, name="decoder")(maps)
 
 
 class Outputs(NamedTuple):

@@ -10,15 +10,18 @@ import pytest
 from sglpr_jax.models import sglpr
 from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig
 from sglpr_jax.models.circular import CircularNet
-from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
+from sglpr_jax.models.config import HeadConfig, model_preset
 
-RINGS = CircularConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))
+RINGS = CircularConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1), fine=())
 HEAD = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
-CONFIG = dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=RINGS, detail=6, head=HEAD)
+STEM_ALONE = SglprConfig(stem=RINGS, depths=(), heads=())
+CONFIG = dataclasses.replace(
+    model_preset("tiny"), field="circle", polar=(16, 32), backbone=STEM_ALONE, detail=6, head=HEAD
+)
 SGLPR = dataclasses.replace(
     CONFIG,
     backbone=SglprConfig(
-        stem=CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1)),
+        stem=CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1), fine=()),
         embed_dim=8,
         depths=(2, 2),
         heads=(1, 2),
@@ -52,7 +55,7 @@ def test_maps_shrink_as_configured_and_turn_with_the_image(fine, random_variable
     np.testing.assert_allclose(turned[-1], jnp.roll(maps[-1], 2, axis=2), atol=1e-5)
 
 
-@pytest.mark.parametrize("config", [CONFIG, SGLPR], ids=["circular", "sglpr"])
+@pytest.mark.parametrize("config", [CONFIG, SGLPR], ids=["stem alone", "with attention"])
 def test_quarter_turns_leave_the_descriptor(config, random_params):
     params = random_params(config)
     straight = describe(params, BEV)
@@ -67,7 +70,5 @@ def test_what_does_not_fit_is_an_error():
         CircularConfig(widths=(4, 8))
     with pytest.raises(ValueError, match="at most one value for each width"):
         CircularConfig(widths=(4,), strides=(1,), means=(1,), fine=(3, 3))
-    with pytest.raises(ValueError, match="'circular' requires a polar image"):
-        ModelConfig(backbone=RINGS)
     with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):
         dataclasses.replace(CONFIG, polar=(20, 32))

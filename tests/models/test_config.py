@@ -48,8 +48,8 @@ def test_files_of_earlier_versions_are_read():
     [
         ("categories", 7, "categories: expected one of 0, 6, 15, 20, 25, 34, found 7"),
         ("polar", [64, "256"], "polar: expected a value of type int, found '256'"),
-        ("backbone", None, "expected the fields of a SwinConfig or CircularConfig or SglprConfig, found None"),
-        ("backbone.kind", "vgg", "backbone: expected a kind, swin or circular or sglpr, found 'vgg'"),
+        ("backbone", None, "expected the fields of a SwinConfig or SglprConfig, found None"),
+        ("backbone.kind", "vgg", "backbone: expected a kind, swin or sglpr, found 'vgg'"),
         ("blind_m", 30.0, "blind_m: expected less than the 25.6 m that the image reaches, found 30.0"),
         ("grid.height", 127, "grid: height: expected an even number of cells, found 127"),
         ("head.clusters", 0, "head.clusters: expected a number from 1 up to 1048576, found 0"),

@@ -152,7 +152,7 @@ def check_gradients(gradients, expected, assert_parity):
             assert_parity(gradient, moved.reshape(gradient.shape), key)
 
 
-STEM = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1))
+STEM = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1), fine=())
 BACKBONE = SglprConfig(stem=STEM, embed_dim=8, depths=(2, 2), heads=(1, 2), window=2)
 POLAR = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
 

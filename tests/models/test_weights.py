@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models.backbone_config import CircularConfig
+from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig
 from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.sglpr import describe, init, weight_shapes
 from sglpr_jax.models.weights import (
@@ -109,9 +109,10 @@ def test_weights_with_and_without_a_segmentation_head_are_grafted_onto_each_othe
 
 
 def with_fine_blocks(*channels):
-    rings = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 2), fine=channels)
+    stem = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 2), fine=channels)
+    backbone = SglprConfig(stem=stem, depths=(), heads=())
     head = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
-    return dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=rings, head=head)
+    return dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=backbone, head=head)
 
 
 @pytest.mark.slow
@@ -122,7 +123,7 @@ def test_a_network_grown_by_fine_blocks_begins_as_the_smaller_one():
     describe, segment = jax.jit(sglpr_jax.describe), jax.jit(sglpr_jax.segment)
     np.testing.assert_allclose(describe(grown, bev), describe(small, bev), atol=1e-6)
     np.testing.assert_allclose(segment(grown, bev), segment(small, bev), atol=1e-5)
-    expected = r"decoder/block_1/convolution/kernel has shape \(3, 3, 10, 4\), expected \(3, 3, 5, 4\)"
+    expected = r"backbone/stem/block_0/convolution/kernel has shape \(3, 3, 6, 4\), expected \(3, 3, 1, 4\)"
     with pytest.raises(ValueError, match=expected):
         graft(small, sglpr_jax.init(jax.random.key(1), config=with_fine_blocks()))
 

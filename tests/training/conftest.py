@@ -9,7 +9,7 @@ import pytest
 
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.recipe import TupleConfig
-from sglpr_jax.models.backbone_config import CircularConfig, SwinConfig
+from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig, SwinConfig
 from sglpr_jax.models.config import HeadConfig, model_preset
 from sglpr_jax.models.weights import Params
 from sglpr_jax.training.batch_source import TupleBatches
@@ -40,7 +40,7 @@ MODEL = dataclasses.replace(
     grid=Grid(resolution_m=3.2, height=16, width=16),
     field="circle",
     polar=(8, 16),
-    backbone=CircularConfig(widths=(4,), strides=(1,), means=(1,)),
+    backbone=SglprConfig(stem=CircularConfig(widths=(4,), strides=(1,), means=(1,), fine=()), depths=(), heads=()),
     head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4, descriptor_size=16),
 )
 """A step of it compiles in half the time of one with attention."""
