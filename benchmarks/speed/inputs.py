@@ -25,15 +25,15 @@ WEIGHT_NOISE = 0.01
 def comparable_model(preset: str, *, labels: bool = True) -> ModelConfig:
     """Model of a preset without the parts that differ between frameworks.
 
-    Stochastic depth is off because it is random. Input images are images of counts. Without `labels`, there is no
-    segmentation head.
+    Stochastic depth is off because it is random, and there is no whitening. Input images are images of counts.
+    Without `labels`, there is no segmentation head.
     """
     config = model_preset(preset)
     backbone = config.backbone
     if hasattr(backbone, "drop_path"):
         backbone = dataclasses.replace(backbone, drop_path=0.0)
-    categories = config.categories if labels else 0
-    return dataclasses.replace(config, image="points", backbone=backbone, categories=categories)
+    categories, head = config.categories if labels else 0, dataclasses.replace(config.head, whiten=False)
+    return dataclasses.replace(config, image="points", backbone=backbone, head=head, categories=categories)
 
 
 def random_params(config: ModelConfig) -> Params:

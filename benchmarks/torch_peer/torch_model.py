@@ -33,15 +33,18 @@ class Sglpr(nn.Module):
         super().__init__()
         own = config.backbone
         rows, columns = (edge // token for edge, token in zip(config.image_size, own.token, strict=True))
-        swin_unet = SwinUnet(own.stem.width, (rows, columns), own)
-        self.backbone = nn.ModuleDict({"stem": CircularNet(config.channels, own.stem), "swin_unet": swin_unet})
+        self.backbone = nn.ModuleDict({"stem": CircularNet(config.channels, own.stem)})
+        if own.depths:
+            self.backbone["swin_unet"] = SwinUnet(own.stem.widths[-1], (rows, columns), own)
         if config.segments:
             self.decoder = CircularDecoder(own.width, config.channels, own.stem)
 
     def forward(self, image: Tensor) -> tuple[Tensor, list[Tensor]]:
         """The features, and the maps that the decoder reads."""
-        *finer, last = self.backbone["stem"](image)
-        return self.backbone["swin_unet"](last), finer
+        *finer, features = self.backbone["stem"](image)
+        if "swin_unet" in self.backbone:
+            features = self.backbone["swin_unet"](features)
+        return features, finer
 
     def decode(self, features: Tensor, finer: list[Tensor]) -> Tensor:
         """Pixels of the size of the averaged image."""
@@ -77,8 +80,8 @@ class SGLPR(nn.Module):
 def _check(config: ModelConfig) -> None:
     """Raises ValueError for a model of which PyTorch's has no counterpart."""
     head = config.head
-    if not isinstance(config.backbone, SglprConfig) or not config.backbone.depths:
-        raise ValueError("the PyTorch model has a circular stem and a Swin-Unet")
+    if not isinstance(config.backbone, SglprConfig):
+        raise ValueError(f"the PyTorch model has the backbone sglpr, found {config.backbone.kind}")
     if not config.polar or not config.range_channel or head.tap != "tokens" or bool(head.channels) != bool(head.means):
         raise ValueError("the PyTorch model has a polar image, and a place head of tokens with circular blocks")
     if head.pooling != "netvlad" or head.whiten or config.counts != "log1p" or config.compute != "float32":
