@@ -118,8 +118,8 @@ def _pairs(drive: DescribedDrive, odometry: Odometry, params: Params, *, breaks:
     candidates = [pair for of_scan in replay(search, drive, poses, breaks=breaks) for pair in of_scan]
     candidates = [pair for pair in candidates if pair.evidence.deviation <= search.present_drift.max_deviation]
     estimated_poses = [transform(*(float(value) for value in pair.alignment[:3])) for pair in candidates]
-    frames = [(pair.query, pair.match) for pair in candidates]
-    errors = pose_errors(frames, np.array(estimated_poses), drive.world_from_lidar)
+    scans = [(int(search.rows[pair.query]), int(search.rows[pair.match])) for pair in candidates]
+    errors = pose_errors(scans, np.array(estimated_poses), drive.world_from_lidar)
     evidence = np.array([pair.evidence for pair in candidates], np.float64).reshape(-1, len(Evidence._fields))
     loops = [planar_loop(pair.query, pair.match, pair.alignment, probability=0.5) for pair in candidates]
     travelled_m = np.maximum.accumulate([float(search.motion.travelled[pair.query]) for pair in candidates])

@@ -17,6 +17,7 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.figures import overlaid
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Fits
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_config import VerificationConfig
 from sglpr_jax.registration.bev_spectra import within_reach
@@ -103,7 +104,8 @@ def evidence(
 
 def _compared_revisits(drive: DescribedDrive, params: sglpr_jax.Params) -> list[Revisit]:
     """Revisits of a drive that were compared with their right place."""
-    poses, revisits, search = drive.world_from_lidar, list[Revisit](), CandidateSearch(params)
+    poses, revisits = drive.world_from_lidar, list[Revisit]()
+    search = CandidateSearch(params, DetectorConfig(keyframe_m=0.0))  # each scan is a frame
     travelled_m, is_revisit = travelled(poses), drive.revisits
     for query, _ in enumerate(replay(search, drive)):
         fits = search.fits
