@@ -53,7 +53,7 @@ def start_up(
         environment = {**os.environ, "XDG_CACHE_HOME": folder, "PYTHONPATH": str(BIN.parent)}
         # The commands keep compiled programs in the cache folder. Programs of users do if they ask for it.
         environment["JAX_COMPILATION_CACHE_DIR"] = f"{folder}/compiled"
-        environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+        environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
         def ours(line: str) -> tuple[str, ...]:
             return sys.executable, "-m", "sglpr_jax.cli", *line.split()

@@ -127,7 +127,7 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
 
             compiled = cache_folder() / "compiled"
             jax.config.update("jax_compilation_cache_dir", str(compiled))
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             _announce_first_compilation(compiled)
         exit_status = work(command)
         if isinstance(exit_status, int):
