@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -137,13 +137,14 @@ def live(
     """
     table = None
     for rate in rates:
-        row = _measured(source, rate, int(rate * (seconds + warm_s)), warm_s, scans, weights)
+        row = _measured(source, rate, seconds, warm_s, scans, weights)
         table = table or Table(*row)
         table.add(*(f"{value:.4g}" for value in row.values()))
 
 
-def _measured(source: str, rate: float, count: int, warm_s: float, scans: int, weights: str) -> dict[str, float]:
+def _measured(source: str, rate: float, seconds: float, warm_s: float, scans: int, weights: str) -> dict[str, float]:
     """Run both processes at one rate. Returns a row of the table."""
+    count = int(rate * (seconds + warm_s))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         name, _, where = source.partition(":")
@@ -162,12 +163,21 @@ def _measured(source: str, rate: float, count: int, warm_s: float, scans: int, w
         _wait_until(lambda: results.frames, node)
         time.sleep(warm_s)
         before = results.memory()
+        process.join(seconds / 2)
+        middle = results.memory()
         process.join()
         time.sleep(1.0)
         after = results.memory()
         node.send_signal(signal.SIGTERM)
         results.close()
-        memory = {"resident [MB]": after[0], "grown [MB]": after[0] - before[0], "map grown [MB]": after[1] - before[1]}
+        memory = {
+            "resident [MB]": after.resident_mb,
+            "grown [MB]": after.resident_mb - before.resident_mb,
+            "in the second half [MB]": after.resident_mb - middle.resident_mb,
+            "map grown [MB]": after.map_mb - before.map_mb,
+            "places": after.places,
+            "kB a place": 1e3 * (after.map_mb - before.map_mb) / max(after.places - before.places, 1),
+        }
         return {"Hz": rate, "start [s]": start_s, **results.row(count), **memory}
 
 
@@ -183,6 +193,14 @@ def _publish(name: str, where: str, rate: float, count: int, scans: int) -> None
         time.sleep(max(0.0, begin + number / rate - time.monotonic()))
         row = there_and_back[number % len(there_and_back)]
         publisher.put(clouds[row], poses[row], time.time())
+
+
+class Memory(NamedTuple):
+    """Memory of a node in 10^6 bytes, with its own count of the map's bytes, and the places of the map."""
+
+    resident_mb: float
+    map_mb: float
+    places: int
 
 
 class Results:
@@ -203,9 +221,10 @@ class Results:
         assert self._node.stdout is not None
         self._node.stdout.close()
 
-    def memory(self) -> tuple[float, float]:
-        """Resident memory of the node in MB, and its count of the map's bytes in MB."""
-        return resident_mb(self._node.pid), self.frames[-1]["nbytes"] / 1e6
+    def memory(self) -> Memory:
+        """Memory of the node now, and the map at its last line."""
+        last = self.frames[-1]
+        return Memory(resident_mb(self._node.pid), last["nbytes"] / 1e6, last["places"])
 
     def row(self, published: int) -> dict[str, float]:
         """Numbers of the table."""
