@@ -40,6 +40,7 @@ PROGRAMS = {
     "realism semantics": Program("quality.realism", "semantics", "semantics of real scans by simulated training"),
     "speed embed": Program("speed.embed", "embed", "from a scan's file to its descriptor"),
     "speed loops": Program("speed.loops", "loops", "memory and time of the loop detector on a long drive"),
+    "speed stages": Program("speed.stages", "stages", "time of the loop search by stage"),
     "speed live": Program("speed.live", "live", "latency, dropped scans and memory of bin/live"),
     "speed start-up": Program("speed.start_up", "start_up", "time until a command starts"),
     "speed trees": Program("speed.trees", "trees", "commands of this checkout and of another one in turn"),

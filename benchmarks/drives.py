@@ -9,6 +9,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sglpr_jax.data.formats.pose_files import read_poses
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
@@ -158,6 +160,14 @@ def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
         return Scan(points=np.fromfile(folder / f"{path.name}.bin", "<f4").reshape(-1, 4)[:, :3])
 
     return dataclasses.replace(recording, read=read, label_paths=())
+
+
+def ready_made(data: Path, name: str) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
+    """Returns a recording of ready-made images, in the layout NN/imgs/*.png, and its poses from NN/pose.txt."""
+    recording = open_recording(data, name)
+    poses = np.tile(np.eye(4), (len(recording), 1, 1))
+    poses[:, :3] = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
+    return recording, poses
 
 
 def recording_of(name: str, scans: Sequence[Scan], times: Float[np.ndarray, " n"] | None = None) -> Recording:

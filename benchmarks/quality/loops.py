@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int
 import sglpr_jax
 from benchmarks import described
 from benchmarks.described import DescribedDrive, replay
-from benchmarks.drives import EVERYWHERE, Drives, Odometry, odometry_of, on_disk
+from benchmarks.drives import EVERYWHERE, Drives, Odometry, odometry_of, on_disk, ready_made
 from benchmarks.quality.scoring import (
     STOREY_M,
     Closure,
@@ -33,7 +33,7 @@ from benchmarks.quality.scoring import (
 from benchmarks.table import Table
 from benchmarks.timing import run_command
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.formats.pose_files import read_poses, read_tum
+from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import only
@@ -294,9 +294,7 @@ def images(
     """
     params, config = sglpr_jax.load(weights), DetectorConfig(keyframe_m=keyframe_m)
     for name in seqs:
-        recording = sglpr_jax.open_recording(data, name)
-        poses = np.tile(np.eye(4), (len(recording), 1, 1))
-        poses[:, :3] = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
+        recording, poses = ready_made(data, name)
         given = odometry_of("drifting" if odometry else "none", poses, seed=seed)
         options = {"registered": False, "config": config}
         sglpr_jax.find_loops(only(recording, range(WARM_UP)), params, **options)  # compiles

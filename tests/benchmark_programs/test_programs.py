@@ -28,6 +28,7 @@ RUN = (
     f"speed training --preset {TINY} --size 64 --repeats 1 --steps 1",
     f"speed profile --preset {TINY} --steps 1",
     "speed loops --frames 40 --repeats 1 --azimuth-steps 90 --weights sglpr-small",
+    "speed stages --scans 4 --rates 10 --weights sglpr-small",
     "fleet index --drives drawn.npz --places 2000 --queries 3",
     f"learned data --out learned --only test/town-601 {SMALL}",
     "learned score ring --data learned --only town-601-00 --out learned/scores",
