@@ -77,8 +77,8 @@ class CandidateSearch:
         """Time of the last frame, in seconds. None if the frames have no times."""
         self._last: Query | None = None
         """The last frame. None if it is almost empty."""
-        self._keyframe: Query | None = None
-        """The keyframe of the motion. None if it is almost empty."""
+        self._reference: Query | None = None
+        """The reference of the motion. None if it is almost empty."""
         self._checked: Query | None = None
         """The last frame that was used to check the odometry."""
 
@@ -215,18 +215,18 @@ class CandidateSearch:
             self.stored.check(frame, image)
         foreground = self.background.without(image)
         query = None if is_empty else Query(frame, keyframe.descriptor, foreground, self.verification)
-        previous_motion_keyframe = self.motion.keyframe
+        previous_reference = self.motion.reference
         link = self._add_motion(query, keyframe.mounting, time, odometry, fits, continues=continues)
         comparer = KeyframeComparison(self.motion, self.present_drift, self.config, self.verification, self.loops.rows)
         if fits is None:
             fits = (NO_FITS if query is None else comparer.compare(query, self.stored))._replace(link=link)
         candidates = [] if query is None else comparer.candidates(query, fits, self.stored)
-        has_moved = self.motion.keyframe != previous_motion_keyframe or not frame
+        has_moved = self.motion.reference != previous_reference or not frame
         if image.size and has_moved:
             self.background.add(image)
         self._last = query
-        if self.motion.keyframe == frame:
-            self._keyframe = self._last
+        if self.motion.reference == frame:
+            self._reference = self._last
         if not is_empty and self._is_new_place(frame):
             self.stored.add(frame, keyframe.descriptor, foreground)
         self._empty.append(is_empty)
@@ -285,7 +285,7 @@ class CandidateSearch:
         if pose is not None:
             link = self._check_odometry(query, pose, link, is_known=fits is not None)
         elif fits is None and continues:
-            link = self._register_with_keyframe(query, time)
+            link = self._register_with_reference(query, time)
         self.motion.add(time, pose=pose, link=link, continues=continues)
         self.motion.path.tilted |= is_tilted(to_upright)
         self.mountings.append(mounting)
@@ -307,27 +307,27 @@ class CandidateSearch:
         self._checked = query
         return link
 
-    def _register_with_keyframe(self, query: Query | None, time: float) -> BevRegistration | None:
-        """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
+    def _register_with_reference(self, query: Query | None, time: float) -> BevRegistration | None:
+        """Pose of the next frame in the frame of the motion's reference, or None if the images do not show it.
 
-        The image is registered with that of the keyframe and, if this is ambiguous, with that of the last frame. Two
+        The image is registered with that of the reference and, if this is ambiguous, with that of the last frame. Two
         ambiguous poses that agree are trusted, too. If the images show the position in one direction only, the sensor
         is assumed to move on as before.
         """
         if query is None:
             return None
         links, along_ridge = list[BevRegistration](), None
-        references = {each.frame: each for each in (self._keyframe, self._last) if each is not None}
-        for reference in references.values():
+        known = {each.frame: each for each in (self._reference, self._last) if each is not None}
+        for reference in known.values():
             prior = self.motion.prior(time, reference.frame)
             best, expected = self._register(query, reference, prior)
             if self.motion.is_trusted(best, prior):
-                return self._from_keyframe(best, reference.frame)
+                return self._from_reference(best, reference.frame)
             fits_expected = expected.correlation >= MIN_EXPECTED * best.correlation
             if self.motion.is_ridge(best) and fits_expected and np.isfinite(prior).all():
                 x, y, yaw = prior
-                along_ridge = self._from_keyframe(best._replace(x=x, y=y, yaw=yaw), reference.frame)
-            links.append(self._from_keyframe(expected, reference.frame))
+                along_ridge = self._from_reference(best._replace(x=x, y=y, yaw=yaw), reference.frame)
+            links.append(self._from_reference(expected, reference.frame))
         if len(links) == 2 and not any(map(self.motion.is_ridge, links)):
             first, second = links
             apart_m, angle = np.hypot(first.x - second.x, first.y - second.y), first.angle_to(float(second.yaw))
@@ -349,11 +349,13 @@ class CandidateSearch:
         """Register the image of a query with that of a reference, near a peak of the search."""
         return jax.device_get(refine(query.image, reference.image, peak, config=self.verification))
 
-    def _from_keyframe(self, link: BevRegistration, frame: int) -> BevRegistration:
-        """Convert a registration with an earlier frame to one with the motion's keyframe."""
-        keyframe, poses = self.motion.keyframe, self.motion.poses
-        if frame == keyframe:
+    def _from_reference(self, link: BevRegistration, frame: int) -> BevRegistration:
+        """Convert a registration with an earlier frame to one with the motion's reference."""
+        reference, poses = self.motion.reference, self.motion.poses
+        if frame == reference:
             return link
         frame_from_query = transform(float(link.x), float(link.y), float(link.yaw))
-        keyframe_from_query = inverse(poses[keyframe]) @ poses[frame] @ frame_from_query
-        return link._replace(x=keyframe_from_query[0, 3], y=keyframe_from_query[1, 3], yaw=yaw_of(keyframe_from_query))
+        reference_from_query = inverse(poses[reference]) @ poses[frame] @ frame_from_query
+        return link._replace(
+            x=reference_from_query[0, 3], y=reference_from_query[1, 3], yaw=yaw_of(reference_from_query)
+        )

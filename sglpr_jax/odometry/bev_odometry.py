@@ -1,4 +1,4 @@
-"""Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
+"""Motion of the sensor from frame to frame, from odometry or by registration of images with a reference frame.
 
 Over some hundred metres, the motion is accurate enough to tell which scans show other places. If the images show the
 position in one direction only, as in a tunnel, the sensor is assumed to move on as before, and the drift grows fast. If
@@ -46,8 +46,8 @@ MAX_JUMP, MAX_JUMP_M = 2.0, 1.0
 """A pose is far from the expected one beyond `MAX_JUMP` times the last step, plus `MAX_JUMP_M` metres."""
 MAX_COASTING = 3
 """Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
-KEYFRAME_M, KEYFRAME_DEG = 3.0, 20.0
-"""Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
+REFERENCE_M, REFERENCE_DEG = 3.0, 20.0
+"""Distance or angle from the reference beyond which a frame becomes the next reference, in metres and degrees."""
 GUESS_FACTOR = 300.0
 """Length of measured path with as much drift as one metre of guessed motion, in metres."""
 AMBIGUOUS_SHARE = 0.25
@@ -64,7 +64,7 @@ class BevOdometry:
     """Motion of the sensor: poses of all added frames, in order, with travelled distance and drift."""
 
     def __init__(self):
-        self.keyframe = 0
+        self.reference = 0
         """Frame with which the next image is registered."""
         self.path = DrivenPath()
         """Planar poses of all added frames by their images or, with odometry, its gravity-aligned poses."""
@@ -115,7 +115,7 @@ class BevOdometry:
 
     @property
     def travelled(self) -> Float[np.ndarray, " n"]:
-        """Travelled distance at each frame, in metres: the sum of steps between keyframes and of guesses."""
+        """Travelled distance at each frame, in metres: the sum of steps between references and of guesses."""
         return self._table.rows["travelled"]
 
     @property
@@ -140,7 +140,7 @@ class BevOdometry:
         link: BevRegistration | None = None,
         continues: bool = True,
     ) -> None:
-        """Add a frame by its gravity-aligned `pose` from odometry or by the registration `link` with the keyframe.
+        """Add a frame by its gravity-aligned `pose` from odometry or by the registration `link` with the reference.
 
         An ambiguous registration drifts like a guess. Without pose and registration, the pose is extrapolated for up to
         `MAX_COASTING` frames, then guessed. With `continues=False`, the motion since the last frame is unknown.
@@ -150,11 +150,11 @@ class BevOdometry:
             return
         extrapolates, is_ambiguous, along_m = False, False, math.inf
         if pose is None and link is not None:
-            prior = self.prior(time, self.keyframe)
+            prior = self.prior(time, self.reference)
             is_surprising = link.angle_to(prior[2]) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
             is_ambiguous = is_surprising or not self.is_trusted(link, prior)
             along_m = float(link.along_m) if self.is_ridge(link) else math.inf
-            pose = self.poses[self.keyframe] @ transform(float(link.x), float(link.y), float(link.yaw))
+            pose = self.poses[self.reference] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < MAX_COASTING:
             pose, extrapolates = self.extrapolated(time), True
         self._coasted = self._coasted + 1 if extrapolates else 0
@@ -163,21 +163,21 @@ class BevOdometry:
         elif pose is None:
             self._add_guess(time)
         else:
-            moved_m, rotation = self.moved(self.keyframe, pose)
+            moved_m, rotation = self.moved(self.reference, pose)
             is_guess = extrapolates or is_ambiguous
-            guessed_m = self.guessed_m[self.keyframe]
+            guessed_m = self.guessed_m[self.reference]
             if is_guess:
                 after_guess_m = self._guessed_m_after(time, share=1.0 if extrapolates else AMBIGUOUS_SHARE)
                 guessed_m = min(after_guess_m, self.guessed_m[-1] + M_PER_UNCERTAIN_M * along_m)
-            travelled_m, segment = self.travelled[self.keyframe] + moved_m, int(self.segments[self.keyframe])
+            travelled_m, segment = self.travelled[self.reference] + moved_m, int(self.segments[self.reference])
             seconds, step_m = time - self._times[-1], float(np.linalg.norm((pose - self.poses[-1])[:3, 3]))
             if not is_guess and seconds > 0:
                 self._top_m_per_s = max(self._top_m_per_s, step_m / seconds)
             self._append(time, pose, segment=segment, travelled=travelled_m, guessed_m=guessed_m)
-            is_near_keyframe = moved_m <= KEYFRAME_M and rotation <= np.radians(KEYFRAME_DEG)
-            if is_near_keyframe and not is_guess:
-                return  # the keyframe stays
-        self.keyframe = len(self) - 1
+            is_near_reference = moved_m <= REFERENCE_M and rotation <= np.radians(REFERENCE_DEG)
+            if is_near_reference and not is_guess:
+                return  # the reference stays
+        self.reference = len(self) - 1
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
         """Expected x, y (metres) and yaw (radians) in an earlier frame, at constant velocity. `NO_PRIOR` if unknown."""
@@ -228,7 +228,7 @@ class BevOdometry:
             travelled=self.travelled[-1] + GAP_M,
             guessed_m=self.guessed_m[-1] + UNKNOWN_M,
         )
-        self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
+        self._coasted, self._m_per_s, self.reference = 0, None, len(self) - 1
 
     def _add_guess(self, time: float) -> None:
         """Add a frame in a new segment. Its motion is a guess: straight on at the last known speed."""

@@ -16,20 +16,20 @@ def link(
 
 
 def moved(links: list[BevRegistration | None], *, factor: float = 1.0) -> BevOdometry:
-    """Motion of frames 0.1 s apart with these registrations with the keyframe. Times are multiplied by `factor`."""
+    """Motion of frames 0.1 s apart with these registrations with the reference. Times are multiplied by `factor`."""
     motion = BevOdometry()
     for frame, one in enumerate(links):
         motion.add(0.1 * factor * frame, link=one)
     return motion
 
 
-def test_links_to_keyframes_add_up():
+def test_links_to_references_add_up():
     motion = BevOdometry()
-    for frame in range(10):  # 1 m each; the keyframe is the last frame that was more than 3 m from the one before
-        motion.add(float(frame), link=link(float(frame - motion.keyframe)) if frame else None)
+    for frame in range(10):  # 1 m each; the reference is the last frame that was more than 3 m from the one before
+        motion.add(float(frame), link=link(float(frame - motion.reference)) if frame else None)
     for found in ([pose[0, 3] for pose in motion.poses], motion.travelled):
         np.testing.assert_allclose(found, np.arange(10.0))
-    assert motion.keyframe == 8 and set(motion.segments) == {0}
+    assert motion.reference == 8 and set(motion.segments) == {0}
 
 
 def test_across_a_gap_the_pose_is_a_guess_that_drifts():
@@ -91,7 +91,7 @@ def test_after_an_unknown_motion_nothing_is_known_about_the_way():
         motion.add(float(i), pose=transform(float(i), 0.0, 0.0))
     motion.add(3.0, pose=transform(500.0, 0.0, 1.0), continues=False)
     motion.add(4.0, pose=transform(501.0, 0.0, 1.0))
-    assert motion.segments.tolist() == [0, 0, 0, 1, 1] and motion.keyframe == 3
+    assert motion.segments.tolist() == [0, 0, 0, 1, 1] and motion.reference == 3
     assert motion.path.travelled[3] - motion.path.travelled[2] >= UNKNOWN_M
     np.testing.assert_allclose(np.diff(motion.path.travelled)[[0, 1, 3]], 1.0, rtol=1e-6)
 
