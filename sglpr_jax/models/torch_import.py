@@ -90,7 +90,7 @@ def import_swin_t(params: Params, path: Path | str) -> tuple[Params, tuple[str, 
             return re.sub(r"^layers_up\.(\d+)\.blocks", mirrored_stage, torch_name(name))
 
         sources = {name: source for name in shapes if (source := swin_t_name(name)) in checkpoint}
-        converted = {name: _flax_layout(name, checkpoint[source]) for name, source in sources.items()}
+        converted = {name: _flax_layout(name, checkpoint[at], shapes[name], at) for name, at in sources.items()}
         fitting = {name: weight for name, weight in converted.items() if weight.shape == shapes[name]}
         unused = sorted(set(checkpoint) - {sources[name] for name in fitting})
         unknown = [name for name in unused if name not in sources.values() and not _SWIN_T_ONLY.fullmatch(name)]
@@ -139,7 +139,7 @@ def from_torch_names(checkpoint: dict[str, np.ndarray], config: ModelConfig) -> 
         source = torch_name(name)
         if source not in checkpoint:
             raise ValueError(f"expected a weight {source}, found none")
-        weights[name] = _flax_layout(name, checkpoint[source])
+        weights[name] = _flax_layout(name, checkpoint[source], shape, source)
         if weights[name].shape != shape:
             raise ValueError(f"{source}: expected shape {shape} (in Flax's axis order), found {weights[name].shape}")
     return as_tree(weights)
@@ -161,8 +161,14 @@ def _expected_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     return {name: leaf.shape for name, leaf in weight_shapes(config).items() if not name.startswith("place_head/")}
 
 
-def _flax_layout(name: str, weight: np.ndarray) -> np.ndarray:
-    """Convert a kernel from PyTorch's axes (out, in, ...) to Flax's (..., in, out). Other weights stay."""
+def _flax_layout(name: str, weight: np.ndarray, shape: tuple[int, ...], source: str) -> np.ndarray:
+    """Convert a kernel from PyTorch's axes (out, in, ...) to Flax's (..., in, out), of `shape`. Other weights stay.
+
+    Raises ValueError, which names the weight `source` of the checkpoint, if it has another number of axes.
+    """
+    axes = 4 if name == "segmentation_head/kernel" else len(shape)
+    if weight.ndim != axes:
+        raise ValueError(f"{source}: expected {axes} axes (in Flax's order {shape}), found shape {weight.shape}")
     if name == "backbone/patch_embed/projection/kernel":
         weight = weight.sum(1, keepdims=True)  # three equal colours become one channel
     if name == "segmentation_head/kernel":

@@ -7,6 +7,8 @@ import csv
 import io
 import itertools
 import json
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,13 +17,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers
-from sglpr_jax.files import in_short, parse_json, write_text
+from sglpr_jax.files import in_short, parse_json, warn, write_text
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.odometry_deviation import step_deviations
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import are_rotations, from_quaternions, inverse, quaternions
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
+OTHER_TYPE = re.compile(r"FIX|(VERTEX|EDGE|PARAMS|CACHE)_[A-Z0-9_:]+")
+"""First word of a line of g2o: other types than those that are read."""
 UPPER_TRIANGLE = np.triu_indices(6)
 """Indices of the 21 numbers of an information matrix in a g2o file: upper triangle by rows, translation first."""
 Ids = Sequence[str] | Mapping[int, str]
@@ -72,35 +76,55 @@ def write_g2o(
 
 
 def read_g2o(path: Path | str) -> Graph:
-    """Read vertices and edges of a g2o file (`VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`). Other lines are ignored.
+    """Read vertices and edges of a g2o file (`VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`). Lines of other types are left out,
+    with a `DataWarning` that counts them.
 
     Edges without an information matrix, 9 numbers instead of 30, get the unit matrix.
 
     Raises:
       FileNotFoundError: If the file does not exist.
-      ValueError: If a line has too few numbers or repeats a vertex. The message names the line.
+      ValueError: If the file has no vertices and edges, if a line has too few numbers, repeats a vertex or begins with
+        an unknown word, or if an information matrix is not positive semidefinite. The message names the line.
     """
     path, graph = Path(path), Graph({}, [])
     edge_columns = 0  # numbers of an edge, set by the first one
+    other_types = Counter[str]()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a g2o file, found none")
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+    content = path.read_bytes()
+    if b"\0" in content:
+        raise ValueError(f"{path}: expected text in UTF-8, found bytes that are 0, as in UTF-16 or in a damaged file")
+    for number, line in enumerate(content.decode(errors="replace").splitlines(), start=1):
         words, where = line.split(), f"{path}, line {number}"
-        if words and words[0] == VERTEX:
+        if not words or words[0].startswith("#"):
+            continue
+        if words[0] == VERTEX:
             values = parse_numbers(words[1:], columns=8, where=where)
             (frame,) = _frame_numbers(values[:1], where)
             if frame in graph.poses:
                 raise ValueError(f"{where}: expected each vertex once, found vertex {frame} again")
             graph.poses[frame] = _pose_of_numbers(values[1:], where)
-        elif words and words[0] == EDGE:
+        elif words[0] == EDGE:
             edge_columns = edge_columns or (9 if len(words) == 10 else 30)  # a later edge with fewer is cut off
             values = parse_numbers(words[1:], columns=edge_columns, where=where)
             information = np.eye(6)
             if edge_columns == 30:
                 information[UPPER_TRIANGLE] = values[9:]
                 information += np.triu(information, 1).T  # make it symmetric
+                eigenvalues = np.linalg.eigvalsh(information)
+                if eigenvalues[0] < -1e-6 * abs(eigenvalues[-1]):
+                    raise ValueError(f"{where}: expected a positive semidefinite matrix, found {values[9:]}")
             first, second = _frame_numbers(values[:2], where)
             graph.edges.append((first, second, _pose_of_numbers(values[2:9], where), information))
+        elif OTHER_TYPE.fullmatch(words[0]):
+            other_types[words[0]] += 1
+        else:
+            raise ValueError(f"{where}: expected a type of g2o, such as {VERTEX}, found {words[0][:40]!r}")
+    found = ", ".join(f"{name} ({count})" for name, count in other_types.most_common())
+    if not graph.poses and not graph.edges:
+        raise ValueError(f"{path}: expected lines of {VERTEX} or {EDGE}, found {found or 'none'}")
+    if found:
+        warn(f"{path}: only {VERTEX} and {EDGE} are read, other lines are left out: {found}")
     return graph
 
 
@@ -203,8 +227,8 @@ def _loop_of_json(line: bytes, where: str) -> LoopClosure:
             raise ValueError(f"match {match} and query {query}")
         if pose.shape != (4, 4) or not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
             raise ValueError(f"an invalid pose: {pose.tolist()}")
-        if covariance.shape != (6, 6) or not (np.isfinite(covariance).all() and np.isfinite(pose).all()):
-            raise ValueError(f"a covariance {covariance.shape}: {covariance.tolist()}")
+        if covariance.shape != (6, 6) or not np.isfinite(pose).all() or not _is_covariance(covariance):
+            raise ValueError(f"no covariance, symmetric and positive definite: {covariance.tolist()}")
         overlap = None if value["overlap"] is None else float(value["overlap"])
         loop = LoopClosure(query, match, pose, covariance, float(value["probability"]), overlap)
         if not all(0 <= share <= 1 for share in (loop.probability, loop.overlap or 0.0)):
@@ -212,6 +236,17 @@ def _loop_of_json(line: bytes, where: str) -> LoopClosure:
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
     return loop
+
+
+def _is_covariance(matrix: Float[np.ndarray, "6 6"]) -> bool:
+    """Whether a matrix is finite, symmetric up to rounding, and positive definite."""
+    if not np.isfinite(matrix).all() or np.abs(matrix - matrix.T).max() > 1e-6 * np.abs(matrix).max():
+        return False
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _pose_texts(poses: Sequence[np.ndarray] | Float[np.ndarray, "n 4 4"]) -> list[str]:

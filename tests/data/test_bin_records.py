@@ -138,6 +138,24 @@ def test_one_scan_with_few_points_is_kittis(tmp_path):
     assert read_scan(tmp_path / "0.bin").shape == (150, 3)
 
 
+@pytest.mark.parametrize("name", ["not finite", "bytes of ones", "random bytes", "four columns", "other byte order"])
+def test_a_scan_that_is_not_what_its_name_says_is_told(tmp_path, name):
+    whole = columns(scan(0)[:2000], "ii").astype("<f4")
+    contents = {
+        "not finite": np.full_like(whole, np.nan).tobytes(),
+        "bytes of ones": b"\xff" * whole.nbytes,
+        "random bytes": np.random.default_rng(0).bytes(whole.nbytes),
+        "four columns": np.ascontiguousarray(whole[:, :4]).tobytes(),
+        "other byte order": whole.astype(">f4").tobytes(),
+    }
+    path = tmp_path / "a.pcd.bin"
+    path.write_bytes(whole.tobytes())
+    assert read_scan(path).shape == (len(whole), 3)
+    path.write_bytes(contents[name])
+    with pytest.warns(DataWarning, match=r"a\.pcd\.bin: expected scans of nuscenes \(20 bytes a point\), found"):
+        read_scan(path)
+
+
 @pytest.mark.slow
 def test_real_scans(shared, tmp_path):
     """Real scans of four sensors in every layout."""

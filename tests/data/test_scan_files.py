@@ -1,6 +1,7 @@
 """Single scans of every format: points, times and lasers, one clear error for each flaw, and no memory for lies."""
 
 import io
+import math
 import struct
 import zipfile
 from pathlib import Path
@@ -19,6 +20,7 @@ from sglpr_jax.data.formats.scan_files import (
     read_scan_file,
     scan_id,
 )
+from sglpr_jax.files import DataWarning
 
 CLOUD = np.array([[1, 2, 3], [np.nan, np.nan, np.nan], [-4, 5.5, 6]], np.float32)
 WHOLE = np.array([[1, 2, 3], [7, -8, 9], [-4, 5.5, 6]], np.float32)
@@ -108,8 +110,8 @@ def archive(content: bytes) -> bytes:
     return stream.getvalue()
 
 
-def changed(whole: bytes, at: int, number: int) -> bytes:
-    return whole[:at] + struct.pack("<I", number) + whole[at + 4 :]
+def changed(whole: bytes, at: int, number: float, format: str = "<I") -> bytes:
+    return whole[:at] + struct.pack(format, number) + whole[at + struct.calcsize(format) :]
 
 
 PACKED, TEXT, LAS = pcd(PLAIN, "binary_compressed"), ply(PLAIN), las(WHOLE)
@@ -147,6 +149,9 @@ BROKEN = [
         for array in (np.zeros(9), np.zeros((0, 3)), np.zeros((4, 2)), np.zeros((3, 4000)), np.array(["x"]))
     ),
     ("a.las", LAS[:100], "expected a .las file, found an unreadable one"),
+    ("a.las", changed(LAS, 131, math.nan, "<d"), "expected positive scales and finite offsets"),
+    ("a.las", changed(LAS, 139, 0.0, "<d"), "expected positive scales and finite offsets"),
+    ("a.las", changed(LAS, 155, math.inf, "<d"), "expected positive scales and finite offsets"),
     ("a.las", LAS[:-40], "expected 3 points by the header, found 1"),
     ("a.las", changed(LAS, 100, 2**32 - 1), "expected 4294967295 and 0 records by the header, found"),
     ("a.las", changed(LAS, 107, 2**32 - 1), "expected a scan of at most 16777216 points, found 4294967295"),
@@ -161,6 +166,24 @@ def test_a_broken_file_is_named(tmp_path, name, content, message):
         read_scan_file(write(tmp_path, name, content))
     with pytest.raises(FileNotFoundError, match=r"none\.pcd: expected a scan, found none"):
         read_scan(tmp_path / "none.pcd")
+
+
+@pytest.mark.parametrize("viewpoint", ["0 0 2 1 0 0 0", "0 0 0 0.7071068 0.7071068 0 0"])
+def test_a_viewpoint_that_is_not_applied_is_told(tmp_path, viewpoint):
+    path = write(tmp_path, "a.pcd", pcd(PLAIN).replace(b"DATA", f"VIEWPOINT {viewpoint}\nDATA".encode(), 1))
+    with pytest.warns(DataWarning, match=rf"a\.pcd: .* its VIEWPOINT, {viewpoint}, is not applied"):
+        np.testing.assert_array_equal(read_scan(path), CLOUD)
+
+
+def test_coordinates_at_the_limit_of_las_are_left_out(tmp_path):
+    far = WHOLE.astype(np.float64)
+    far[1, 1] = (2**31 - 1) * 0.001
+    path = write(tmp_path, "a.las", las(far))
+    for read in (read_scan, lambda path: np.concatenate(list(cloud_blocks(path)))):
+        with pytest.warns(DataWarning, match=r"a\.las: 1 coordinates are at the limit"):
+            found = read(path)
+        np.testing.assert_allclose(found[[0, 2]], WHOLE[[0, 2]], atol=1e-3)
+        assert np.isnan(found[1, 1])
 
 
 @pytest.mark.parametrize("data", ["binary", "binary_compressed", "ascii"])

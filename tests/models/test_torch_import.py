@@ -92,6 +92,9 @@ def test_swin_t_fills_the_encoder_and_the_mirrored_decoder_where_shapes_match(st
         ({"norm_up.weight": None}, "expected a weight norm_up.weight, found none"),
         ({"norm_up.gain": np.ones(8)}, "not a weight of Swin-Unet: norm_up.gain"),
         ({"norm_up.weight": np.ones(9)}, r"norm_up.weight: expected shape \(8,\) .* found \(9,\)"),
+        ({"norm_up.weight": np.ones((8, 1))}, r"norm_up.weight: expected 1 axes .* found shape \(8, 1\)"),
+        ({"patch_embed.proj.weight": np.ones(8)}, r"patch_embed.proj.weight: expected 4 axes .* found shape \(8,\)"),
+        ({"output.weight": np.ones(8)}, r"output.weight: expected 4 axes .* found shape \(8,\)"),
     ],
 )
 def test_a_checkpoint_of_another_model_is_refused(change, message, state, params):

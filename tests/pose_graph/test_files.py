@@ -1,5 +1,6 @@
 """What is written is read back; g2o's numbers stand where g2o looks for them."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_trajectory, read_tum
+from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.pose_graph.files import (
     read_g2o,
@@ -67,7 +69,8 @@ def test_the_numbers_of_an_edge_by_hand(tmp_path):
 def test_edges_without_information_have_the_unit_matrix(tmp_path):
     path = tmp_path / "a.g2o"
     path.write_text("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nFIX 0\nEDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1\n")
-    ((first, second, pose, information),) = read_g2o(path).edges
+    with pytest.warns(DataWarning, match=r"a\.g2o: only VERTEX_SE3:QUAT and EDGE_SE3:QUAT are read.*: FIX \(1\)"):
+        ((first, second, pose, information),) = read_g2o(path).edges
     assert (first, second, pose[:3, 3].tolist()) == (3, 7, [1, 2, 3])
     np.testing.assert_array_equal(information, np.eye(6))
     path.write_text("EDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1" + " 1" * 21 + "\nEDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1\n")
@@ -100,6 +103,14 @@ def test_loops_come_back_from_json_lines_and_csv(tmp_path, loops):
     [
         (read_g2o, "EDGE_SE3:QUAT 1 2 3\n", "line 1: expected 30 numbers, found 3"),
         (read_g2o, "FIX 0\nVERTEX_SE3:QUAT 1 2 3 4 5 6 7 x\n", "line 2: expected numbers"),
+        (read_g2o, "# a comment\nFIX 0\nVERTEX_SE2 0 1 2 3\n", r"found FIX \(1\), VERTEX_SE2 \(1\)"),
+        (
+            read_g2o,
+            "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEY_SE3:QUAT 1 0 0 0 0 0 0 1\n",
+            "line 2: expected a type of g2o",
+        ),
+        (read_g2o, "V\0E\0R\0", "expected text in UTF-8"),
+        (read_g2o, "EDGE_SE3:QUAT 0 1 1 2 3 0 0 0 1 -1" + " 0" * 20 + "\n", "line 1: expected a positive semidefinite"),
         (read_loops_jsonl, '{"query": 1}\n', "line 1: expected a loop as JSON"),
         (read_tum, "0 1 2 3 0 0 0 2\n", "expected a rotation qx qy qz qw of length 1 in row 1"),
         (read_tum, "1 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", "row 2: expected a time >= 1"),
@@ -113,6 +124,19 @@ def test_wrong_files_are_one_clear_error(tmp_path, read, text, message):
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"file.*{message}"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [-np.eye(6), np.zeros((6, 6)), np.triu(np.ones((6, 6))), np.eye(6) + 5 * np.eye(6)[::-1], np.full((6, 6), np.nan)],
+    ids=["negative", "zero", "not symmetric", "indefinite", "not finite"],
+)
+def test_a_loop_with_an_impossible_covariance_is_refused(tmp_path, loops, covariance):
+    path = tmp_path / "loops.jsonl"
+    write_loops_jsonl(path, [loops[0], dataclasses.replace(loops[1], covariance=covariance)])
+    with pytest.raises(ValueError, match=r"loops\.jsonl, line 2: expected a loop as JSON"):
+        read_loops_jsonl(path)
+    assert len(read_loops_jsonl(path, skip_damaged=True)) == 1
 
 
 def test_trajectories_come_back_with_all_digits(tmp_path, poses):

@@ -150,7 +150,8 @@ def warn_of_other_format(paths: Sequence[Path], format: RecordFormat) -> None:
     """Warn if the files have enough points to judge and do not look like scans in the given format."""
     samples = _sample_files(paths)
     if _has_enough_points(samples, format) and (misfit := _misfit(samples, format)):
-        warn(f"{paths[0].parent}: expected scans of {describe_format(format)}, found {misfit}")
+        where = paths[0] if len(paths) == 1 else paths[0].parent
+        warn(f"{where}: expected scans of {describe_format(format)}, found {misfit}")
 
 
 def _sample_files(paths: Sequence[Path]) -> list[Path]:

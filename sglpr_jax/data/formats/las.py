@@ -1,15 +1,18 @@
 """Reads points from .las and .laz files with laspy (extra `las`)."""
 
+import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_scan
 from sglpr_jax.data.scan import Scan, time_field_of
+from sglpr_jax.files import warn
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
 """Minimum size of a variable-length record (before the points) and of an extended one (after them), in bytes."""
@@ -24,8 +27,10 @@ def las_scan(path: Path) -> Scan:
     with _checked_laspy(path, one_scan=True).open(path) as stream:
         points = stream.read()  # laspy applies the scale and offset of the header to x, y and z
     time = time_field_of(list(points.point_format.dimension_names))
-    names = ("x", "y", "z") if time is None else ("x", "y", "z", time)
-    return cloud_scan({name: np.asarray(points[name]) for name in names}, time=time)
+    columns = dict(zip("xyz", _coordinates(points, path), strict=True))
+    if time is not None:
+        columns[time] = np.asarray(points[time])
+    return cloud_scan(columns, time=time)
 
 
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
@@ -35,7 +40,21 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
         raise ImportError(".laz files need lazrs (pip install 'sglpr-jax[las]')")
     with laspy.open(path) as stream:
         for block in stream.chunk_iterator(BLOCK_POINTS):
-            yield np.stack([np.asarray(axis, np.float64) for axis in (block.x, block.y, block.z)], axis=1)
+            yield np.stack(_coordinates(block, path), axis=1)
+
+
+def _coordinates(points: Any, path: Path) -> list[Float64[np.ndarray, " n"]]:
+    """Return x, y and z of points in metres. Those at the limit of their integers, which cuts values off, are NaN."""
+    limits = np.iinfo(np.int32)
+    axes, cut_off = list[np.ndarray](), 0
+    for name in "xyz":
+        integers = np.asarray(points[name.upper()])
+        is_cut_off = (integers == limits.min) | (integers == limits.max)
+        axes.append(np.where(is_cut_off, np.nan, np.asarray(points[name], np.float64)))
+        cut_off += int(is_cut_off.sum())
+    if cut_off:
+        warn(f"{path}: {cut_off} coordinates are at the limit of the format, so their points are left out")
+    return axes
 
 
 def _checked_laspy(path: Path, *, one_scan: bool) -> ModuleType:
@@ -53,6 +72,9 @@ def _checked_laspy(path: Path, *, one_scan: bool) -> ModuleType:
     if header[:4] != b"LASF" or size < _SHORTEST_HEADER:
         raise ValueError(f"expected a .las file, found an unreadable one ({size} bytes, which begin {header[:4]!r})")
     minor_version = header[25]
+    scales, offsets = struct.unpack_from("<3d", header, 131), struct.unpack_from("<3d", header, 155)
+    if not (all(map(math.isfinite, scales + offsets)) and min(scales) > 0):
+        raise ValueError(f"expected positive scales and finite offsets, found {scales} and {offsets}")
     header_size, points_start, records, point_format, width, points = struct.unpack_from("<HIIBHI", header, 94)
     extended_start = extended = 0  # offset and number of the extended records
     if minor_version >= 4:

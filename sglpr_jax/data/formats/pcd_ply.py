@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from sglpr_jax.data.formats import clouds
 from sglpr_jax.data.formats.clouds import check_points, cloud_scan
 from sglpr_jax.data.scan import Scan, time_field_of
-from sglpr_jax.files import in_short
+from sglpr_jax.files import in_short, warn
 
 Content = bytes | memoryview
 AXES = ("x", "y", "z")
@@ -208,6 +208,9 @@ def _check_axes(names: Sequence[str]) -> None:
 
 PCD_KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 """First words of the lines of a header."""
+IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+"""VIEWPOINT without movement and rotation: x, y, z, and a quaternion w, x, y, z."""
+_LONGEST_HEADER = 65536
 PCD_REQUIRED = ("FIELDS", "SIZE", "TYPE", "POINTS", "DATA")
 PCD_ENCODINGS = ("binary", "binary_compressed", "ascii")
 PCD_TYPES = {
@@ -240,6 +243,24 @@ def parse_pcd(content: Content) -> PointTable:
     if encoding not in PCD_ENCODINGS:
         raise ValueError(f"expected DATA {', '.join(PCD_ENCODINGS)}, found {encoding}")
     return PointTable(points, _pcd_fields(header), encoding, body)
+
+
+def warn_of_viewpoint(path: Path) -> None:
+    """Warn if a .pcd file has a pose of the sensor (VIEWPOINT) other than the identity, which is not applied."""
+    with path.open("rb") as stream:
+        beginning = stream.read(_LONGEST_HEADER)
+    viewpoint = re.search(rb"^VIEWPOINT +(.*)$", beginning.partition(b"\nDATA")[0], re.MULTILINE)
+    words = viewpoint[1].decode("ascii", errors="replace").split() if viewpoint else []
+    if any(not _is_close(word, number) for word, number in zip(words, IDENTITY, strict=False)):
+        warn(f"{path}: the points are read as they are; its VIEWPOINT, {' '.join(words)}, is not applied")
+
+
+def _is_close(word: str, number: float) -> bool:
+    """Whether a word is this number, up to rounding."""
+    try:
+        return abs(float(word) - number) < 1e-6
+    except ValueError:
+        return False
 
 
 def _pcd_fields(header: dict[str, list[str]]) -> list[Field]:

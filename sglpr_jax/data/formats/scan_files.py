@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,10 +11,15 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti, is_headerless, read_records
+from sglpr_jax.data.formats.bin_records import (
+    detect_format_unless_kitti,
+    is_headerless,
+    read_records,
+    warn_of_other_format,
+)
 from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_scan
 from sglpr_jax.data.formats.las import las_blocks, las_scan
-from sglpr_jax.data.formats.pcd_ply import parse_pcd, parse_ply, table_blocks, table_scan
+from sglpr_jax.data.formats.pcd_ply import parse_pcd, parse_ply, table_blocks, table_scan, warn_of_viewpoint
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import in_short
@@ -94,8 +99,23 @@ def format_by_name(path: Path) -> ScanFormat | None:
 
 
 def detect_format(path: Path) -> ScanFormat:
-    """Return the format of one scan by its name, or else by its content (kitti if the content does not contradict)."""
-    return format_by_name(path) or detect_format_unless_kitti([path]) or "kitti"
+    """Return the format of one scan by its name, or else by its content (kitti if the content does not contradict).
+
+    Warns of doubts about the content (`warn_of_doubts`).
+    """
+    by_name = format_by_name(path)
+    if by_name is None:
+        return detect_format_unless_kitti([path]) or "kitti"
+    warn_of_doubts([path], by_name)
+    return by_name
+
+
+def warn_of_doubts(paths: Sequence[Path], format: ScanFormat) -> None:
+    """Warn if scans do not look like scans of their format, or if the first one has a pose that is not applied."""
+    if is_headerless(format):
+        warn_of_other_format(paths, format)
+    elif format == "pcd" and paths[0].is_file():
+        warn_of_viewpoint(paths[0])
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:

@@ -13,9 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.bin_records import describe_format, detect_point_format, is_headerless, warn_of_other_format
+from sglpr_jax.data.formats.bin_records import describe_format, detect_point_format
 from sglpr_jax.data.formats.pose_files import read_times, read_trajectory, warn_of_jumps
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_name, scan_id, scan_of_file
+from sglpr_jax.data.formats.scan_files import (
+    ARRAY_ENDINGS,
+    ENDINGS,
+    format_by_name,
+    scan_id,
+    scan_of_file,
+    warn_of_doubts,
+)
 from sglpr_jax.data.poses import poses_at_scans, poses_of
 from sglpr_jax.data.readers.listing import describe_contents, files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
@@ -99,14 +106,15 @@ def _read_trajectory(
 def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
     """Return the format of .bin files whose name does not define it, and a description of the formats of all files."""
     if format != "auto":
-        if is_headerless(format):
-            warn_of_other_format(paths, format)
+        warn_of_doubts(paths, format)
         return "kitti", describe_format(format)  # all files have the given format, so "kitti" is not used
     formats = [format_by_name(path) for path in paths]
     unknown = [path for path, name in zip(paths, formats, strict=True) if name is None]
     detected, how = detect_point_format(unknown) if unknown else (None, "")
     bin_format: RecordFormat = detected or "kitti"
     counts = Counter(name or bin_format for name in formats)
+    for known in counts.keys() & {*formats}:
+        warn_of_doubts([path for path, name in zip(paths, formats, strict=True) if name == known], known)
     description = ", ".join(f"{count} {describe_format(name)}" for name, count in counts.items())
     if len(counts) == 1:
         description = describe_format(next(iter(counts)))
