@@ -107,6 +107,19 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
         raise BlockingIOError(f"{folder}: expected exclusive use, found another process at work") from error
 
 
+def append_whole(file: int, content: bytes, *, size: int) -> None:
+    """Write `content` at the end of an open file of `size` bytes, completely or not at all. Raises OSError if it cannot
+    be written: a full disk may take a part without an error, which is then removed."""
+    rest = memoryview(content)
+    try:
+        os.lseek(file, size, os.SEEK_SET)
+        while rest:
+            rest = rest[os.write(file, rest) :]
+    except OSError:
+        os.ftruncate(file, size)
+        raise
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8, completely or not at all. Raises WriteError if it cannot be written."""
     with replacing(path) as temporary:

@@ -13,12 +13,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.files import parse_json, raising_write_error, warn
+from sglpr_jax.files import append_whole, parse_json, raising_write_error, warn
 
 HEAD = struct.Struct("<4sIII")
 """Bytes before a record: `MARK`, number of the record, its length, and the CRC-32 of number and record."""
 MARK = b"\x93FR1"
 """First bytes of each record, for finding the next record after a damaged one."""
+
+
+SETTINGS_COPIES = 2
+"""Number of copies of the settings in a `RunLog`."""
 
 
 class FrameLog:
@@ -66,17 +70,15 @@ class FrameLog:
 
         Raises WriteError if the record cannot be written, for instance on a full disk. The file then stays as it was.
         """
-        content = memoryview(HEAD.pack(MARK, number, len(record), _checksum(number, record)) + record)
+        content = HEAD.pack(MARK, number, len(record), _checksum(number, record)) + record
         with raising_write_error(self.path):
-            os.lseek(self._file, self._size, os.SEEK_SET)
-            try:
-                written = 0
-                while written < len(content):
-                    written += os.write(self._file, content[written:])
-            except OSError:
-                self.truncate(self._size)
-                raise
+            append_whole(self._file, content, size=self._size)
         self._size += len(content)
+
+    @property
+    def has_content(self) -> bool:
+        """Whether the file has records."""
+        return self._size > 0
 
     def sync(self) -> None:
         """Wait until the disk has all records."""
@@ -100,7 +102,8 @@ class FrameLog:
 class RunLog:
     """Log with one record per step of a run. A run that was killed resumes after its last complete step.
 
-    Record 0 of the file contains the settings of the run as JSON, and record n + 1 contains step n.
+    Record 0 of the file contains the settings of the run as JSON, twice, because without them all steps are lost.
+    Record n + 1 contains step n.
 
     Example:
       with RunLog(path, settings) as log:
@@ -127,6 +130,8 @@ class RunLog:
             if number <= len(records):  # a larger number follows a damaged record
                 records[number:] = [record]  # a repeated step replaces that step and all after it
         settings = json.loads(json.dumps(settings))  # as parsed: tuples are lists
+        if not records and self._log.has_content:
+            warn(f"{path}: expected a checkpoint with its settings, found damaged ones; restarting")
         stored = parse_json(records[0], source=path) if records else {}
         if stored == settings:
             self.records = records[1:]
@@ -135,7 +140,8 @@ class RunLog:
             changed = ", ".join(name for name in settings if stored.get(name) != settings[name])
             warn(f"{path}: expected a checkpoint with the same settings, found another {changed}; restarting")
         self._log.truncate(0)
-        self._log.append(0, json.dumps(settings).encode())
+        for _ in range(SETTINGS_COPIES):
+            self._log.append(0, json.dumps(settings).encode())
 
     def __enter__(self) -> "RunLog":
         return self

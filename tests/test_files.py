@@ -11,6 +11,7 @@ from sglpr_jax.files import (
     MOST_BYTES,
     MOST_SHOWN,
     WriteError,
+    append_whole,
     check_writable,
     exclusive_lock,
     file_name,
@@ -110,6 +111,18 @@ def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files)
         temporary.write_bytes(bytes(100))
     assert str(raised.value) == f"{path}: cannot be written: File too large"
     assert names(tmp_path) == []
+
+
+def test_what_is_appended_to_a_file_is_whole_or_taken_back(tmp_path, small_files):
+    path = tmp_path / "lines"
+    path.write_bytes(b"first\n")
+    file = os.open(path, os.O_WRONLY | os.O_APPEND)
+    with small_files(10), pytest.raises(OSError, match="File too large"):  # the system takes four bytes
+        append_whole(file, b"second\n", size=6)
+    assert path.read_bytes() == b"first\n"
+    append_whole(file, b"third\n", size=6)
+    os.close(file)
+    assert path.read_bytes() == b"first\nthird\n"
 
 
 def test_unfinished_files_of_a_killed_process_are_removed(tmp_path):

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from sglpr_jax.files import DataWarning, WriteError
-from sglpr_jax.frame_log import HEAD, FrameLog, RunLog
+from sglpr_jax.frame_log import HEAD, MARK, FrameLog, RunLog
 
 RECORDS = [(0, b"first"), (1, b"second" * 9), (2, b"\0third")]
 ENDS = [HEAD.size + 5, 2 * HEAD.size + 59, 3 * HEAD.size + 65]
@@ -77,6 +77,17 @@ def test_a_run_resumes_after_its_last_whole_step_with_the_same_settings_alone(tm
     assert RunLog(path, settings).records == [b"step 0", b"other"]
     with pytest.warns(DataWarning, match=rf"{path}: expected .* the same settings, found another weights; restarting"):
         assert RunLog(path, {**settings, "weights": "b"}).records == []
-    assert json.loads(path.read_bytes()[HEAD.size :]) == {"weights": "b", "sizes": [1, 2]}
+    content = bytearray(path.read_bytes())
+    assert json.loads(content[HEAD.size : len(content) // 2]) == {"weights": "b", "sizes": [1, 2]}
+    with RunLog(path, {**settings, "weights": "b"}) as log:
+        log.append(0, b"kept")
+    content = bytearray(path.read_bytes())
+    content[HEAD.size + 1] ^= 1  # the second copy of the settings is whole
+    path.write_bytes(content)
+    assert RunLog(path, {**settings, "weights": "b"}).records == [b"kept"]
+    content[content.index(MARK, 1) + HEAD.size + 1] ^= 1
+    path.write_bytes(content)
+    with pytest.warns(DataWarning, match=rf"{path}: expected a checkpoint with its settings, found damaged ones"):
+        assert RunLog(path, settings).records == []
     with RunLog(None, {}) as log:
         log.append(0, b"is not kept")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import WAIT_S, LatestScan, LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import IsInMap
@@ -62,8 +63,8 @@ class BagSource:
         """Read a scan. If it cannot be read, report the error and return None."""
         try:
             scan = self._recording.scan(row, labels=False)
-        except (ValueError, OSError) as error:
-            return self._report("scan", f"a scan is left out: {error}")
+        except Exception as error:  # whatever a scan holds, the replay goes on
+            return self._report("scan", f"a scan is left out: {in_short(error, most=300)}")
         pose = None if self._poses is None else self._poses[row]
         stamp = 0.0 if self._recording.times is None else float(self._recording.times[row])
         scan = dataclasses.replace(scan, name=self._scan_name(row))

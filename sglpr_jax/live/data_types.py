@@ -1,5 +1,6 @@
 """What the live node receives and publishes: scans from a source, loop edges and status for sinks, and reports."""
 
+import contextlib
 import math
 import sys
 import threading
@@ -120,4 +121,5 @@ class Reports:
             self._printed[kind] = printed_at, count + 1
             return
         self._printed[kind] = now, 0
-        self._write(f"{text} ({count} more since the last line)" if count else text)
+        with contextlib.suppress(OSError, ValueError):  # a closed terminal must not end the node
+            self._write(f"{text} ({count} more since the last line)" if count else text)

@@ -16,6 +16,7 @@ from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_
 from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.times import EPOCH, PER_SECOND
+from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import IsInMap
@@ -108,8 +109,8 @@ class FolderSource:
                 self._bin_layout = detect_format_unless_kitti([path]) or "kitti"
             scan = scan_of_file(path, format=self._options.format, records=self._bin_layout or "kitti")
             stamp, written = _time_in_name(path), path.stat().st_mtime
-        except (ValueError, OSError, ImportError) as error:
-            return self._report("scan", f"a scan is left out: {error}")
+        except Exception as error:  # whatever a file holds, the source lives on
+            return self._report("scan", f"a scan is left out: {in_short(error, most=300)}")
         pose = None
         row = len(self._taken) - 1  # of the scan, and of its line in a file of poses without times
         if self._poses is not None:
@@ -125,8 +126,8 @@ class FolderSource:
         try:
             poses.read_appended()
             return poses.of(row, stamp)
-        except ValueError as error:
-            return self._report("poses", f"a pose is left out: {error}")
+        except (ValueError, OSError) as error:
+            return self._report("poses", f"a pose is left out: {in_short(error, most=300)}")
 
 
 def _scan_name(path: Path) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
-from sglpr_jax.files import raising_write_error, read_json, write_json
+from sglpr_jax.files import append_whole, raising_write_error, read_json, write_json
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
@@ -255,7 +255,8 @@ class LiveMap:
             about = {name: getattr(scan, name) for name in ABOUT}
             self._log.append(len(self) - 1, frame_bytes(scan.keyframe, compared, pose=scan.pose, **about))
             with raising_write_error(self._loops_path):
-                os.write(self._loops_file, loop_lines(loops).encode())
+                size = os.fstat(self._loops_file).st_size
+                append_whole(self._loops_file, loop_lines(loops).encode(), size=size)
             if time.monotonic() - self._synced_at > SYNC_S:
                 self._log.sync()
                 os.fsync(self._loops_file)

@@ -69,7 +69,7 @@ class Node:
         begin = time.monotonic()
         try:
             edges = self._live.add(frame)
-        except (ValueError, TypeError, FloatingPointError) as error:
+        except Exception as error:  # whatever a scan holds, the node lives on
             self._report("scan", f"a scan is left out: {in_short(error, most=300)}")
             edges = None
         if edges is None:

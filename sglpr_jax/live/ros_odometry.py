@@ -59,6 +59,9 @@ class LiveOdometry:
             for frames, pose in map(_with_frame_names, poses):
                 if self._chosen is not None and frames != self._chosen[0]:
                     continue
+                if not pose.is_valid:
+                    self._report("pose", f"{self.topic}: expected a position and a rotation, found {pose.numbers}")
+                    continue
                 track = self._poses[frames]
                 if track and pose.time < track[-1].time - RESET_S:
                     track.clear()
@@ -70,7 +73,8 @@ class LiveOdometry:
     def receive_static(self, message: Received) -> None:
         """Add the transforms of a message of /tf_static."""
         with self._changed:
-            self._static |= map(_with_frame_names, read_transforms(RosMessage(message.raw, cdr=True)))
+            transforms = read_transforms(RosMessage(message.raw, cdr=True))
+            self._static |= (_with_frame_names(pose) for pose in transforms if pose.is_valid)
 
     def pose(self, time: float, lidar: str, *, wait_s: float) -> Float[np.ndarray, "4 4"] | None:
         """Return the pose of the LiDAR at the time of a scan, or None with a report if it is unknown.

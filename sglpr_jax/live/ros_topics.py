@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import WAIT_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_encoding import (
@@ -89,7 +90,11 @@ class RosSource:
             message = self._latest.take(WAIT_S)
             if message is None:
                 self._report_silence()
-            yield None if message is None else self._frame(message)
+            try:
+                frame = None if message is None else self._frame(message)
+            except Exception as error:  # whatever a message holds, the source lives on
+                frame = self._report("message", f"{self.topic}: a scan is left out: {in_short(error, most=300)}")
+            yield frame
 
     def close(self) -> None:
         self._closed.set()

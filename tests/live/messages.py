@@ -29,8 +29,8 @@ def livox(seconds: float = 12.5, points: np.ndarray = POINTS) -> bytes:
     return encoded(bags.livox("ros2", seconds, points, driver=bags.LIVOX_DRIVERS[1], frame="lidar"))
 
 
-def odometry(seconds: float, at, *, child: str = "base") -> bytes:
-    return encoded(dataclasses.replace(bags.pose("ros2", seconds, at), child_frame_id=child))
+def odometry(seconds: float, at, quaternion=(0, 0, 0, 1), *, child: str = "base") -> bytes:
+    return encoded(dataclasses.replace(bags.pose("ros2", seconds, at, quaternion), child_frame_id=child))
 
 
 def transforms(seconds: float, found) -> bytes:

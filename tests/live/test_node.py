@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.scan import Scan
+from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import AGAIN_S, FrameStatus, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.node import Node
@@ -24,15 +25,15 @@ class FakeMap(LiveMap):
         class finder:
             stored = (1, 2, 3)
 
-    def __init__(self):
-        self.added, self.trajectory = [], None
+    def __init__(self, error: Exception):
+        self.added, self.trajectory, self.error = [], None, error
 
     def __len__(self) -> int:
         return len(self.added)
 
     def add(self, frame):
         if frame.time == 1:
-            raise ValueError("expected points, found none")
+            raise self.error
         if frame.time == 2:
             return None
         self.added.append(frame)
@@ -79,15 +80,16 @@ def frame() -> LiveFrame:
     return LiveFrame(Scan(points=np.ones((3, 3), np.float32)), 0.0, None, 0.0)
 
 
-def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said):
+@pytest.mark.parametrize("error", [ValueError, np.linalg.LinAlgError, KeyError, RuntimeError])
+def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said, error):
     good, bad, lines = Kept(), Kept(fails=True), []
-    node = Node(FakeMap(), [bad, good], report=said, say=lines.append)
+    node = Node(FakeMap(error("expected points, found none")), [bad, good], report=said, say=lines.append)
     node.run(Frames(frame))
     assert [type(one) for one in good.seen] == [FrameStatus, LoopEdge, FrameStatus, FrameStatus]
     assert [one.frame for one in good.seen if isinstance(one, FrameStatus)] == [0, 1, 2]
     assert len(bad.seen) == 1 and good.seen[0].dropped == 4 and good.seen[0].places == 3
     assert [text for _, text in said] == [
-        "a scan is left out: expected points, found none",
+        f"a scan is left out: {in_short(error('expected points, found none'))}",
         "Kept is left out: connection lost",
     ]
     assert str(node).endswith("4 dropped, 2 left out, 1 loops; the map has 3 scans, 5 MB")
@@ -102,6 +104,13 @@ def test_equal_kinds_share_a_line():
     now[0] = AGAIN_S
     report("a", "a5")
     assert lines == ["a0", "b3", "a5 (4 more since the last line)"]
+
+
+def test_a_closed_terminal_does_not_end_the_node():
+    def write(text: str) -> None:
+        raise BrokenPipeError("closed")
+
+    Reports(write)("a", "a0")
 
 
 def test_results_are_lines_of_json(tmp_path, said):

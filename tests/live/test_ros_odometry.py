@@ -42,6 +42,23 @@ def test_a_scan_does_not_wait_for_odometry_that_stopped(live, said):
     assert said.of("odometry") == ["/odom: expected a pose at 10.900, found none for 3 s"]
 
 
+@pytest.mark.parametrize(
+    "position, rotation",
+    [
+        ((1, 0, 0), (0, 0, 0, 0)),
+        ((1, 0, 0), (0, 0, 0, 3)),
+        ((np.nan, 0, 0), (0, 0, 0, 1)),
+        ((1e300, 0, 0), (0, 0, 0, 1)),
+    ],
+)
+def test_a_pose_that_cannot_be_is_left_out(live, said, position, rotation):
+    drive(live, 10.0, 10.1)
+    live.receive(received(ODOMETRY, odometry(10.15, position, rotation, child="lidar")))
+    assert said.kinds == ["pose"] and "/odom: expected a position and a rotation, found" in said[0][1]
+    drive(live, 10.2)
+    np.testing.assert_allclose(live.pose(10.15, "lidar", wait_s=0.0)[:3, 3], [20.3, 0, 0])
+
+
 def test_poses_of_another_clock_are_reported(live, said):
     drive(live, 10.0, 10.1)
     assert live.pose(1e9, "lidar", wait_s=0.01) is None

@@ -65,6 +65,18 @@ def test_an_invalid_cloud_is_reported_and_the_next_one_taken(transport, source, 
     assert next(frames) is not None
 
 
+def test_whatever_a_message_holds_the_source_lives_on(transport, source, said, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        raise KeyError("a fault that nobody thought of")
+
+    monkeypatch.setattr(source._odometry, "pose", fail)
+    frames = source.frames()
+    for _ in range(2):
+        transport.receive["/points"](received(CLOUD, cloud()))
+        assert next(frames) is None
+    assert "/points: a scan is left out: " in said.of("message")[0]
+
+
 def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(transport, source, said):
     frames = source.frames()
     for publisher, at, taken in (

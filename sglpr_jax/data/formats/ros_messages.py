@@ -33,6 +33,8 @@ LIVOX_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectiv
 """Fields of a point of Livox, and their numpy types."""
 QUATERNION_TOLERANCE = 0.01
 """Maximum deviation of the length of a quaternion from 1."""
+MOST_POSITION_M = 1e8
+"""Maximum absolute coordinate of a position in metres: more than that of any map projection."""
 IMU = "sensor_msgs/msg/Imu"
 """Message type of an IMU."""
 
@@ -166,6 +168,12 @@ class StampedPose(NamedTuple):
     """Reference frame, such as "odom"."""
     numbers: Float[np.ndarray, " 7"]
     """Position x, y, z in metres, and quaternion x, y, z, w."""
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether the position is on the Earth, and the quaternion has length 1. Some drivers begin with zeros."""
+        is_on_earth = bool((np.abs(self.numbers[:3]) <= MOST_POSITION_M).all())  # False for NaN
+        return is_on_earth and bool(_have_length_1(self.numbers[None, 3:]).all())
 
 
 def _read_pose(message: RosMessage, *, with_child: bool = True) -> StampedPose:
