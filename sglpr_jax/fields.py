@@ -74,8 +74,8 @@ def check_value(value: Any, annotation: Any, field: str) -> None:
 def read_value(value: Any, annotation: Any, field: str, *, json: bool = True) -> Any:
     """Convert a JSON value to the annotated type of a field: lists to tuples, strings to paths, integers to floats.
 
-    With `json=False`, the value must have the type already, and numbers without bounds must be finite. Raises
-    ValueError, with the name of the `field`, if the value does not fit the annotation.
+    With `json=False`, the value must have the type already. Numbers must be finite. Raises ValueError, with the name of
+    the `field`, if the value does not fit the annotation.
     """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
@@ -94,8 +94,7 @@ def read_value(value: Any, annotation: Any, field: str, *, json: bool = True) ->
         return tuple(read_value(item, type_, field, json=json) for item, type_ in zip(value, item_types, strict=True))
     if annotation is float:
         require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
-        is_finite = abs(value) <= sys.float_info.max  # works for integers of any size
-        require(value, is_finite or (json and isinstance(value, float)), "a finite number", field)
+        require(value, abs(value) <= sys.float_info.max, "a finite number", field)  # works for integers of any size
         return float(value) if json else value
     if origin is Literal:
         is_choice = any(type(value) is type(choice) and value == choice for choice in arguments)

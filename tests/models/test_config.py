@@ -51,6 +51,7 @@ def test_files_of_earlier_versions_are_read():
         ("backbone", None, "expected the fields of a SwinConfig or SglprConfig, found None"),
         ("backbone.kind", "vgg", "backbone: expected a kind, swin or sglpr, found 'vgg'"),
         ("blind_m", 30.0, "blind_m: expected less than the 25.6 m that the image reaches, found 30.0"),
+        ("grid.resolution_m", float("inf"), "grid.resolution_m: expected a finite number, found inf"),
         ("grid.height", 127, "grid: height: expected an even number of cells, found 127"),
         ("head.clusters", 0, "head.clusters: expected a number from 1 up to 1048576, found 0"),
         ("backbone.stem.widths", [], "backbone.stem: widths: expected at least one block, found ()"),
