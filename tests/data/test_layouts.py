@@ -221,6 +221,9 @@ BROKEN = [
     ("nclt", edited(TRUTH, ""), "expected rows of a time and 6 numbers, found none"),
     ("nclt", edited(TRUTH, f"{US},1,2,3,0,0,0\n{US - 1},1,2,3,0,0,0\n"), r"row 2: expected a time >= 13"),
     ("nuscenes", row_of("sample_data", 0, timestamp="noon"), "expected numbers t as 'timestamp', found others"),
+    ("nuscenes", row_of("sample_data", 0, timestamp=-5), "expected timestamps in microseconds since 1970, found -5"),
+    ("nuscenes", row_of("sample_data", 0, timestamp=1e30), "timestamps in microseconds since 1970, found"),
+    ("nuscenes", row_of("ego_pose", 0, token="e1"), r"ego_pose\.json: expected each token once, found 1 repeated"),
     ("nuscenes", row_of("calibrated_sensor", 1, rotation=[2, 0, 0, 0]), "a rotation qx qy qz qw of length 1 in row 1"),
     ("nuscenes", row_of("sample_data", 0, filename="../LIDAR_TOP/a.pcd.bin"), "expected paths of files inside"),
     (

@@ -20,6 +20,7 @@ from sglpr_jax.data.formats.json_tables import column_of, poses_in_table, read_t
 from sglpr_jax.data.formats.scan_files import scan_id, scan_of_file
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import time_unit_problem
 from sglpr_jax.files import naming, path_inside
 
 CHANNEL = "LIDAR_TOP"
@@ -45,6 +46,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         raise FileNotFoundError(f"{root}: expected {expected}, found {found}")
     times_us = vectors_of(scan_table, [row for _, row in existing], "timestamp", "t")[:, 0]
     order = np.argsort(times_us, kind="stable")
+    if (times_us <= 0).any() or (problem := time_unit_problem(times_us[order] / 1e6)):
+        found = f"{times_us.min():g}" if (times_us <= 0).any() else problem
+        raise ValueError(f"{scan_table}: expected timestamps in microseconds since 1970, found {found}")
     paths, rows = zip(*(existing[i] for i in order), strict=True)
     key_frames = sum(path.parent.parent.name == "samples" for path in paths)
     missing = f", {len(listed) - len(paths)} more are listed but missing" if len(listed) > len(paths) else ""
@@ -91,7 +95,10 @@ def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray
 def _referenced_poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> Float[np.ndarray, "n 4 4"]:
     """Return the pose in the table `path` whose token is in a column of each of `rows` of `sample_data.json`."""
     tokens = texts_of(path.with_name("sample_data.json"), rows, column)
-    pose_rows = {row["token"]: row for row in read_table(path, "token", set(tokens))}
+    found_rows = read_table(path, "token", set(tokens))
+    pose_rows = {row["token"]: row for row in found_rows}
+    if len(pose_rows) < len(found_rows):
+        raise ValueError(f"{path}: expected each token once, found {len(found_rows) - len(pose_rows)} repeated ones")
     missing = [token for token in tokens if token not in pose_rows]
     if missing:
         found = f"found none ({len(missing)} broken references)"
