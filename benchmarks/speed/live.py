@@ -68,7 +68,7 @@ class RosPublisher:
 
     @functools.cached_property
     def _topics(self) -> tuple[Callable[[bytes], None], Callable[[bytes], None]]:
-        wire = self._connect()
+        wire = self._wire = self._connect()  # kept, because the session closes when nothing refers to it
         clouds = wire.advertise("/points", CLOUD, depth=1, latched=False)
         return clouds, wire.advertise("/odometry", TRANSFORMS, depth=100, latched=False)
 
