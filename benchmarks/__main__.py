@@ -62,6 +62,7 @@ PROGRAMS = {
     "robustness kills": Program("robustness.disturbed", "kills", "commands that are killed again and again"),
     "robustness together": Program("robustness.disturbed", "together", "commands started twice at once on one folder"),
     "robustness disk": Program("robustness.disturbed", "disk", "full disk, read-only folder, missing files"),
+    "fuzz": Program("robustness.fuzz", "fuzz", "damaged files of every format, for hours"),
     "robustness mutations": Program("robustness.mutations", "mutations", "wrong lines, and whether tests notice them"),
     "robustness platforms": Program("robustness.platforms", "platforms", "wheels of every dependency, by platform"),
 }

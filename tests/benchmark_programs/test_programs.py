@@ -45,6 +45,7 @@ PARSED = (
     "poses pairs --drives outskirts:06:622 --carrier handheld --gravity auto --registered",
     "poses search --scans 60",
     "realism semantics --weights sglpr --out out --prior towns",
+    "fuzz --hours 0.5 --seed 3",
     "loops fit drives --out model.json",
     "robustness disk --times 1",
     "robustness kills --commands embed --times 1",

@@ -7,10 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import bags
 import numpy as np
 import safetensors.numpy
-from clouds import las, pcd, ply, records_of, stream_of
 from PIL import Image
 
 from sglpr_jax.data.formats.png import read_label_image
@@ -37,6 +35,8 @@ from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.mining import DescriptorCache
+from tests import bags
+from tests.clouds import las, pcd, ply, records_of, stream_of
 
 N = 5
 RNG = np.random.default_rng(0)

@@ -1,44 +1,13 @@
 """A damaged file is read, or refused by one ValueError or OSError whose line names the file."""
 
-import tempfile
-import warnings
-from pathlib import Path
-from typing import Any
-
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from .damage import damaged
-from .formats import FORMATS, Format
+from .damage import damaged, read, refused
+from .formats import FORMATS
 
-
-def read(format: Format, content: bytes) -> Any:
-    """Read a file in a folder with nothing but the files that must lie beside it."""
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for name, one in {**format.beside, format.file: content}.items():
-            path = Path(folder) / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(one)
-        before = sorted(Path(folder).rglob("*"))
-        try:
-            return format.read(Path(folder) / format.file)
-        finally:
-            assert sorted(Path(folder).rglob("*")) == before, "reading wrote a file"
-
-
-def refused(format: Format, content: bytes) -> bool:
-    """Read a damaged file. Returns whether it is refused; any other error than a good one fails the test."""
-    try:
-        read(format, content)
-    except (ValueError, OSError) as error:
-        line, named = str(error), {Path(name).name for name in (*format.beside, format.file)}
-        named |= {Path(name).parts[0] for name in format.beside}
-        assert any(name in line for name in (*named, tempfile.gettempdir())), line
-        assert "expected" in line and "found" in line and "\n" not in line and len(line) < 1500, line
-        return True
-    return False
+pytestmark = pytest.mark.filterwarnings("ignore")
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -1,0 +1,148 @@
+"""Damaged files of every format, for hours: each is read or refused by one clear error, and nothing else happens.
+
+The formats and the damage are those of the tests (`tests/fuzz`). Each format is read in a process with a limit of
+memory. Cases that are neither read nor refused are kept in `out`.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import resource
+import signal
+import time
+import traceback
+import warnings
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+import hypothesis
+from hypothesis import HealthCheck, Phase, given, settings
+
+from benchmarks.table import Table
+
+Outcome = Literal["clear error", "warning", "silent", "unclear error", "traceback", "hang", "memory", "crash"]
+OUTCOMES = get_args(Outcome)
+GOOD = OUTCOMES[:3]
+"""Outcomes of a case without a fault. A crash is the end of the process of a round."""
+SETTINGS = settings(
+    max_examples=200,
+    deadline=None,
+    database=None,
+    phases=[Phase.generate],
+    suppress_health_check=list(HealthCheck),
+)
+"""Cases of a round."""
+
+
+class Round(NamedTuple):
+    """Cases of one format."""
+
+    name: str
+    seed: int
+    limit_bytes: int
+    """Memory that reading may take."""
+    limit_s: int
+    """Seconds that a case may take."""
+    out: Path
+
+
+def fuzz(
+    *,
+    hours: float = 1.0,
+    seed: int = 0,
+    only: tuple[str, ...] = (),
+    limit_gb: float = 1.5,
+    limit_s: int = 20,
+    out: Path = Path("build/fuzz"),
+) -> None:
+    """Read damaged files of each format in turn, and print the outcomes.
+
+    Args:
+        hours: time after which no further round begins.
+        seed: seed of the first round.
+        only: formats, by their names in tests/fuzz/formats.py. None: all.
+        limit_gb: memory that reading may take, in 10^9 bytes.
+        limit_s: seconds that a case may take.
+        out: folder for the cases with a fault.
+    """
+    from tests.fuzz.formats import FORMATS
+
+    begin, outcomes, rounds = time.monotonic(), {name: Counter[str]() for name in only or FORMATS}, 0
+    while not rounds or time.monotonic() - begin < 3600 * hours:
+        for name, counts in outcomes.items():
+            counts.update(_in_process(Round(name, seed + rounds, int(limit_gb * 1e9), limit_s, out)))
+        rounds += 1
+    table = Table("format", "cases", *OUTCOMES)
+    for name, counts in (*outcomes.items(), ("all", sum(outcomes.values(), Counter[str]()))):
+        table.add(name, str(sum(counts.values())), *(str(counts[outcome]) for outcome in OUTCOMES))
+    print(f"{rounds} rounds, seeds {seed} to {seed + rounds - 1}")
+
+
+def _in_process(one: Round) -> Counter[str]:
+    """Outcomes of a round in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        try:
+            return pool.submit(_outcomes, one).result()
+        except BrokenProcessPool:
+            return Counter(["crash"])
+
+
+def _outcomes(one: Round) -> Counter[str]:
+    """Outcomes of the cases of a round."""
+    from tests.fuzz.damage import damaged
+    from tests.fuzz.formats import FORMATS
+
+    format, counts = FORMATS[one.name], Counter[str]()
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (used + one.limit_bytes, resource.RLIM_INFINITY))
+    signal.signal(signal.SIGALRM, _raise_timeout)
+
+    @hypothesis.seed(one.seed)
+    @settings(SETTINGS)
+    @given(damaged(format.whole))
+    def read(content: bytes) -> None:
+        outcome, error = _outcome(format, content, one.limit_s)
+        counts[outcome] += 1
+        if outcome not in GOOD:
+            one.out.mkdir(parents=True, exist_ok=True)
+            stem = one.out / f"{one.name.replace(' ', '-').replace('/', '-')}-{one.seed}-{counts[outcome]}"
+            stem.with_suffix(".bin").write_bytes(content)
+            stem.with_suffix(".txt").write_text(f"{outcome}\n{error}")
+
+    read()
+    return counts
+
+
+def _outcome(format, content: bytes, limit_s: int) -> tuple[Outcome, str]:
+    """Outcome of reading a damaged file, and its error."""
+    from tests.fuzz.damage import refused
+
+    signal.alarm(limit_s)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            is_refused = refused(format, content)
+        return ("clear error" if is_refused else "warning" if caught else "silent"), ""
+    except AssertionError as error:
+        return "unclear error", str(error)
+    except _Timeout:
+        return "hang", f"more than {limit_s} s"
+    except MemoryError as error:
+        return "memory", str(error)
+    except Exception:
+        return "traceback", traceback.format_exc()
+    finally:
+        with contextlib.suppress(_Timeout):
+            signal.alarm(0)
+
+
+class _Timeout(BaseException):
+    """A case takes too long. Not an Exception, so that no reader turns it into a clear error."""
+
+
+def _raise_timeout(*_: object) -> None:
+    raise _Timeout
