@@ -119,7 +119,10 @@ def nuscenes() -> dict[str, bytes]:
     tables = {
         "scene": [{"token": "t", "name": "scene-0061"}],
         "sample": [{"token": "s", "scene_token": "t"}],
-        "sample_data": [{"token": f"d{i}", **keys, "timestamp": i, "filename": file} for i, file in enumerate(scans)],
+        "sample_data": [
+            {"token": f"d{i}", **keys, "timestamp": 1532402927000000 + 50000 * i, "filename": file}
+            for i, file in enumerate(scans)
+        ],
         "ego_pose": [{"token": "e", **posed}],
         "calibrated_sensor": [{"token": "c", **posed}],
     }
