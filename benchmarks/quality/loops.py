@@ -103,9 +103,11 @@ def _search_with(detector: LoopDetector, task: Task) -> Answer:
     """All loops of the detector that are consistent with the odometry."""
     for _ in replay(detector, task.drive, task.odometry):
         pass
-    loops, drift = detector.loops, detector.finder.present_drift
+    loops, finder = detector.loops, detector.finder
     if task.odometry is not None:
-        loops = accept_loops(loops, detector.finder.motion.path, drift=drift)[0]
+        upright_loops = list(map(finder.to_upright, loops))
+        accepted_loops, _ = accept_loops(upright_loops, finder.motion.path, drift=finder.present_drift)
+        loops = list(map(finder.to_lidar, accepted_loops))
     return Answer(closures_of(loops), None, loops)
 
 
@@ -164,6 +166,10 @@ METHODS: dict[str, Callable[[Task], Answer]] = {
 }
 
 
+READ_FILES = {"bin-loops", "kiss-slam", "map-closures"}
+"""Methods that read the files of the scans."""
+
+
 def _peer_python(environment: Path) -> Path:
     """Python of an environment with kiss-slam and MapClosures, which is created if it does not exist."""
     python = environment / "bin" / "python"
@@ -219,6 +225,8 @@ def loops(
         task = Task(stored, simulate, stored.odometry(odometry, drive.seed), params, weights, environment, keyframe_m)
         poses = scaled_poses(stored.world_from_lidar, 1 / stored.scale)
         rule = rule_of(drive, poses, stored.times)
+        if READ_FILES & set(method):
+            task.files()  # rendering is not timed
         for name in method:
             start, processor_start = time.perf_counter(), _processor_s()
             answer = METHODS[name](task)
