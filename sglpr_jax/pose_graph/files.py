@@ -83,7 +83,7 @@ def read_g2o(path: Path | str) -> Graph:
 
     Raises:
       FileNotFoundError: If the file does not exist.
-      ValueError: If the file has no vertices and edges, if a line has too few numbers, repeats a vertex or begins with
+      ValueError: If all lines have other types, if a line has too few numbers, repeats a vertex or begins with
         an unknown word, or if an information matrix is not positive semidefinite. The message names the line.
     """
     path, graph = Path(path), Graph({}, [])
@@ -121,8 +121,8 @@ def read_g2o(path: Path | str) -> Graph:
         else:
             raise ValueError(f"{where}: expected a type of g2o, such as {VERTEX}, found {words[0][:40]!r}")
     found = ", ".join(f"{name} ({count})" for name, count in other_types.most_common())
-    if not graph.poses and not graph.edges:
-        raise ValueError(f"{path}: expected lines of {VERTEX} or {EDGE}, found {found or 'none'}")
+    if found and not graph.poses and not graph.edges:
+        raise ValueError(f"{path}: expected lines of {VERTEX} or {EDGE}, found {found}")
     if found:
         warn(f"{path}: only {VERTEX} and {EDGE} are read, other lines are left out: {found}")
     return graph
