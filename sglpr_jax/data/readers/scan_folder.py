@@ -113,7 +113,7 @@ def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordForm
     detected, how = detect_point_format(unknown) if unknown else (None, "")
     bin_format: RecordFormat = detected or "kitti"
     counts = Counter(name or bin_format for name in formats)
-    for known in counts.keys() & {*formats}:
+    for known in dict.fromkeys(name for name in formats if name is not None):
         warn_of_doubts([path for path, name in zip(paths, formats, strict=True) if name == known], known)
     description = ", ".join(f"{count} {describe_format(name)}" for name, count in counts.items())
     if len(counts) == 1:
