@@ -113,8 +113,12 @@ def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordForm
     detected, how = detect_point_format(unknown) if unknown else (None, "")
     bin_format: RecordFormat = detected or "kitti"
     counts = Counter(name or bin_format for name in formats)
-    for known in dict.fromkeys(name for name in formats if name is not None):
-        warn_of_doubts([path for path, name in zip(paths, formats, strict=True) if name == known], known)
+    paths_by_format: dict[ScanFormat, list[Path]] = {}
+    for path, name in zip(paths, formats, strict=True):
+        if name is not None:
+            paths_by_format.setdefault(name, []).append(path)
+    for name, of_format in paths_by_format.items():
+        warn_of_doubts(of_format, name)
     description = ", ".join(f"{count} {describe_format(name)}" for name, count in counts.items())
     if len(counts) == 1:
         description = describe_format(next(iter(counts)))
