@@ -108,7 +108,7 @@ def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordForm
     if format != "auto":
         warn_of_doubts(paths, format)
         return "kitti", describe_format(format)  # all files have the given format, so "kitti" is not used
-    formats = [format_by_name(path) for path in paths]
+    formats: list[ScanFormat | None] = [format_by_name(path) for path in paths]
     unknown = [path for path, name in zip(paths, formats, strict=True) if name is None]
     detected, how = detect_point_format(unknown) if unknown else (None, "")
     bin_format: RecordFormat = detected or "kitti"
