@@ -60,7 +60,9 @@ class LiveOdometry:
                 if self._chosen is not None and frames != self._chosen[0]:
                     continue
                 if not pose.is_valid:
-                    self._report("pose", f"{self.topic}: expected a position and a rotation, found {pose.numbers}")
+                    self._report(
+                        "pose", f"{self.topic}: expected a position and a rotation, found {pose.numbers.tolist()}"
+                    )
                     continue
                 track = self._poses[frames]
                 if track and pose.time < track[-1].time - RESET_S:

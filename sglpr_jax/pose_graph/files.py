@@ -113,7 +113,8 @@ def read_g2o(path: Path | str) -> Graph:
                 information += np.triu(information, 1).T  # make it symmetric
                 eigenvalues = np.linalg.eigvalsh(information)
                 if eigenvalues[0] < -1e-6 * abs(eigenvalues[-1]):
-                    raise ValueError(f"{where}: expected a positive semidefinite matrix, found {values[9:]}")
+                    found = in_short(" ".join(words[10:]))
+                    raise ValueError(f"{where}: expected a positive semidefinite matrix, found {found}")
             first, second = _frame_numbers(values[:2], where)
             graph.edges.append((first, second, _pose_of_numbers(values[2:9], where), information))
         elif OTHER_TYPE.fullmatch(words[0]):
