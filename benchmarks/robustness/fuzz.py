@@ -4,7 +4,6 @@ The formats and the damage are those of the tests (`tests/fuzz`). Each format is
 memory. Cases that are neither read nor refused are kept in `out`.
 """
 
-import contextlib
 import multiprocessing
 import os
 import resource
@@ -22,6 +21,8 @@ import hypothesis
 from hypothesis import HealthCheck, Phase, given, settings
 
 from benchmarks.table import Table
+from tests.fuzz.damage import damaged, refused
+from tests.fuzz.formats import FORMATS, Format
 
 Outcome = Literal["clear error", "warning", "silent", "unclear error", "traceback", "hang", "memory", "crash"]
 OUTCOMES = get_args(Outcome)
@@ -63,13 +64,11 @@ def fuzz(
     Args:
         hours: time after which no further round begins.
         seed: seed of the first round.
-        only: formats, by their names in tests/fuzz/formats.py. None: all.
+        only: formats, by their names in tests/fuzz/formats.py. Empty: all.
         limit_gb: memory that reading may take, in 10^9 bytes.
         limit_s: seconds that a case may take.
         out: folder for the cases with a fault.
     """
-    from tests.fuzz.formats import FORMATS
-
     begin, outcomes, rounds = time.monotonic(), {name: Counter[str]() for name in only or FORMATS}, 0
     while not rounds or time.monotonic() - begin < 3600 * hours:
         for name, counts in outcomes.items():
@@ -93,9 +92,6 @@ def _in_process(one: Round) -> Counter[str]:
 
 def _outcomes(one: Round) -> Counter[str]:
     """Outcomes of the cases of a round."""
-    from tests.fuzz.damage import damaged
-    from tests.fuzz.formats import FORMATS
-
     format, counts = FORMATS[one.name], Counter[str]()
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (used + one.limit_bytes, resource.RLIM_INFINITY))
@@ -117,10 +113,8 @@ def _outcomes(one: Round) -> Counter[str]:
     return counts
 
 
-def _outcome(format, content: bytes, limit_s: int) -> tuple[Outcome, str]:
+def _outcome(format: Format, content: bytes, limit_s: int) -> tuple[Outcome, str]:
     """Outcome of reading a damaged file, and its error."""
-    from tests.fuzz.damage import refused
-
     signal.alarm(limit_s)
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -133,11 +127,10 @@ def _outcome(format, content: bytes, limit_s: int) -> tuple[Outcome, str]:
         return "hang", f"more than {limit_s} s"
     except MemoryError as error:
         return "memory", str(error)
-    except Exception:
+    except Exception:  # the fault that is sought: it is counted, and kept with its case
         return "traceback", traceback.format_exc()
     finally:
-        with contextlib.suppress(_Timeout):
-            signal.alarm(0)
+        signal.alarm(0)
 
 
 class _Timeout(BaseException):

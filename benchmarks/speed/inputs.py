@@ -29,9 +29,7 @@ def comparable_model(preset: str, *, labels: bool = True) -> ModelConfig:
     Without `labels`, there is no segmentation head.
     """
     config = model_preset(preset)
-    backbone = config.backbone
-    if hasattr(backbone, "drop_path"):
-        backbone = dataclasses.replace(backbone, drop_path=0.0)
+    backbone = dataclasses.replace(config.backbone, drop_path=0.0)
     categories, head = config.categories if labels else 0, dataclasses.replace(config.head, whiten=False)
     return dataclasses.replace(config, image="points", backbone=backbone, head=head, categories=categories)
 

@@ -1,5 +1,6 @@
 """Common parts of all commands: command line, compilation cache, one-line errors."""
 
+import contextlib
 import dataclasses
 import functools
 import gc
@@ -198,8 +199,9 @@ def _show_unraisable(unraisable) -> None:
 
 
 def print_error(text: str) -> None:
-    """Print a line on stderr at once."""
-    print(text, file=sys.stderr, flush=True)
+    """Print a line on stderr at once. A closed terminal does not end the command."""
+    with contextlib.suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def console() -> Console:

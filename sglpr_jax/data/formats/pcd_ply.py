@@ -211,6 +211,7 @@ PCD_KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT",
 IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """VIEWPOINT without movement and rotation: x, y, z, and a quaternion w, x, y, z."""
 _LONGEST_HEADER = 65536
+"""Number of bytes in which the header of a .pcd file is searched for its VIEWPOINT."""
 PCD_REQUIRED = ("FIELDS", "SIZE", "TYPE", "POINTS", "DATA")
 PCD_ENCODINGS = ("binary", "binary_compressed", "ascii")
 PCD_TYPES = {

@@ -46,9 +46,9 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         raise FileNotFoundError(f"{root}: expected {expected}, found {found}")
     times_us = vectors_of(scan_table, [row for _, row in existing], "timestamp", "t")[:, 0]
     order = np.argsort(times_us, kind="stable")
-    if (times_us <= 0).any() or (problem := time_unit_problem(times_us[order] / 1e6)):
-        found = f"{times_us.min():g}" if (times_us <= 0).any() else problem
-        raise ValueError(f"{scan_table}: expected timestamps in microseconds since 1970, found {found}")
+    first_us = times_us.min()
+    if problem := f"{first_us:g}" if first_us <= 0 else time_unit_problem(times_us[order] / 1e6):
+        raise ValueError(f"{scan_table}: expected timestamps in microseconds since 1970, found {problem}")
     paths, rows = zip(*(existing[i] for i in order), strict=True)
     key_frames = sum(path.parent.parent.name == "samples" for path in paths)
     missing = f", {len(listed) - len(paths)} more are listed but missing" if len(listed) > len(paths) else ""
