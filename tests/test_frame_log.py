@@ -1,93 +1,124 @@
 """A log returns the records that were appended, but for a damaged one or the end of an unfinished one."""
 
+import itertools
 import json
 
 import pytest
+from hypothesis import given, settings
 
 from sglpr_jax.files import DataWarning, WriteError
-from sglpr_jax.frame_log import HEAD, MARK, FrameLog, RunLog
+from sglpr_jax.frame_log import HEAD, MARK, FrameLog
+from tests.fuzz.damage import damaged
+from tests.fuzz.formats import FRAME_LOG, check_log
 
-RECORDS = [(0, b"first"), (1, b"second" * 9), (2, b"\0third")]
-ENDS = [HEAD.size + 5, 2 * HEAD.size + 59, 3 * HEAD.size + 65]
+ABOUT = {"weights": "a", "sizes": (1, 2)}
+RECORDS = [b"first", b"second" * 9, b"\0third"]
+SETTINGS_SIZE = HEAD.size + len(json.dumps(ABOUT))
+SIZES = [SETTINGS_SIZE, HEAD.size + 5, SETTINGS_SIZE, HEAD.size + 54, HEAD.size + 6]
+"""Sizes of settings, the first record, the second copy of the settings, and the other records."""
+ENDS = list(itertools.accumulate(SIZES))
+FRAME_ENDS = [ENDS[1], ENDS[3], ENDS[4]]
 
 
 @pytest.fixture
 def path(tmp_path):
-    log = FrameLog(tmp_path / "frames.log")
-    assert list(log.records()) == []
-    for number, record in RECORDS:
+    log = FrameLog(tmp_path / "new" / "frames.log", ABOUT)
+    assert log.end == 0
+    for number, record in enumerate(RECORDS):
         log.append(number, record)
+    assert log.path.stat().st_size == ENDS[-1]
     return log.path  # not closed, as after a kill
 
 
-def read(path) -> tuple[list[tuple[int, bytes]], int]:
-    log = FrameLog(path)
-    found = list(log.records())
-    log.close()
-    return found, log.removed_bytes
+def read(path, **options) -> tuple[list[bytes | None], int]:
+    with FrameLog(path, ABOUT, **options) as log:
+        return [log.record(frame) for frame in range(log.end)], log.damaged_bytes
 
 
 def test_a_log_cut_at_any_byte_keeps_whole_records_and_continues(path):
     content = path.read_bytes()
-    for size in range(4, len(content) + 1):
+    for size in range(len(content) + 1):
         path.write_bytes(content[:size])
-        whole = [record for record, end in zip(RECORDS, ENDS, strict=True) if end <= size]
-        assert read(path) == (whole, size - ([0, *ENDS][len(whole)]))
-        log = FrameLog(path)
-        assert list(log.records()) == whole and log.removed_bytes == 0
-        log.append(7, b"more")
-        assert read(path) == ([*whole, (7, b"more")], 0)
+        whole = [record for record, end in zip(RECORDS, FRAME_ENDS, strict=True) if end <= size]
+        unfinished = size - max(end for end in (0, *ENDS) if end <= size)
+        assert read(path) == (whole, unfinished)
+        with FrameLog(path, ABOUT) as log:
+            log.append(log.end, b"more")
+        assert read(path) == ([*whole, b"more"], unfinished)
 
 
 def test_a_damaged_byte_loses_one_record_only(path):
     content = path.read_bytes()
     for at in range(len(content)):
         path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
-        damaged = sum(end <= at for end in ENDS)
-        assert read(path)[0] == [record for record in RECORDS if record[0] != damaged]
+        begins = (ENDS[0], ENDS[2], ENDS[3])
+        lost = [begin <= at < end for begin, end in zip(begins, FRAME_ENDS, strict=True)]
+        expected = [None if is_lost else record for record, is_lost in zip(RECORDS, lost, strict=True)]
+        found, damaged_bytes = read(path)
+        assert found == expected[: 2 if lost[-1] else 3] and damaged_bytes > 0
 
 
-def test_a_file_that_is_no_log_is_refused_and_unchanged(path):
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(content=damaged(FRAME_LOG))
+def test_a_damaged_log_keeps_all_that_is_whole(content, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "damaged.log"
+    path.write_bytes(content)
+    try:
+        check_log(path)
+    except ValueError as error:
+        assert "expected a log" in str(error)
+
+
+def test_a_later_record_of_a_frame_replaces_the_earlier_one(path):
+    with FrameLog(path, ABOUT) as log:
+        log.append(1, b"other")
+    assert read(path) == ([RECORDS[0], b"other", RECORDS[2]], 0)
+
+
+def test_another_file_is_refused_and_unchanged(path):
     path.write_bytes(b"something else")
     with pytest.raises(ValueError, match=r"frames\.log: expected a log of frames, found another file"):
-        read(path)
+        read(path, restarts=True)
     assert path.read_bytes() == b"something else"
 
 
 def test_an_unwritable_log_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(WriteError, match="file"):
-        FrameLog(tmp_path / "file" / "frames.log")
+        FrameLog(tmp_path / "file" / "frames.log", ABOUT)
 
 
-def test_a_run_resumes_after_its_last_whole_step_with_the_same_settings_alone(tmp_path):
-    path, settings = tmp_path / "new" / "run.log", {"weights": "a", "sizes": (1, 2)}
-    with RunLog(path, settings) as log:
-        for step in range(4):
-            log.append(step, b"step %d" % step)
+def test_a_log_of_other_settings_is_refused_or_begun_anew(path):
+    other = {**ABOUT, "weights": "b"}
+    with pytest.raises(ValueError, match=rf"{path}: .* same settings, found another weights; use"):
+        FrameLog(path, other)
+    with (
+        pytest.warns(DataWarning, match="found another weights; restarting"),
+        FrameLog(path, other, restarts=True) as log,
+    ):
+        assert log.end == 0
+    with FrameLog(path, other) as log:
+        assert log.end == 0 and sorted(path.parent.iterdir()) == [path]
+
+
+def test_a_log_with_damaged_settings_is_refused_or_kept_aside(path):
     content = bytearray(path.read_bytes())
-    content[content.index(b"step 2")] ^= 1
+    content[HEAD.size + 1] ^= 1  # the second copy is whole
     path.write_bytes(content)
-    with RunLog(path, settings) as log:
-        assert log.records == [b"step 0", b"step 1"]
-        log.append(2, b"again")
-    with RunLog(path, settings) as log:
-        assert log.records == [b"step 0", b"step 1", b"again"]
-        log.append(1, b"other")
-    assert RunLog(path, settings).records == [b"step 0", b"other"]
-    with pytest.warns(DataWarning, match=rf"{path}: expected .* the same settings, found another weights; restarting"):
-        assert RunLog(path, {**settings, "weights": "b"}).records == []
-    content = bytearray(path.read_bytes())
-    assert json.loads(content[HEAD.size : len(content) // 2]) == {"weights": "b", "sizes": [1, 2]}
-    with RunLog(path, {**settings, "weights": "b"}) as log:
-        log.append(0, b"kept")
-    content = bytearray(path.read_bytes())
-    content[HEAD.size + 1] ^= 1  # the second copy of the settings is whole
+    assert read(path)[0] == RECORDS
+    with FrameLog(path, ABOUT) as log:
+        log.append(3, b"")
+    assert path.read_bytes().count(b'"weights"') == 2  # the copy that was missing follows
+    content[content.index(MARK, ENDS[0] + 1) + HEAD.size + 1] ^= 1
     path.write_bytes(content)
-    assert RunLog(path, {**settings, "weights": "b"}).records == [b"kept"]
-    content[content.index(MARK, 1) + HEAD.size + 1] ^= 1
-    path.write_bytes(content)
-    with pytest.warns(DataWarning, match=rf"{path}: expected a checkpoint with its settings, found damaged ones"):
-        assert RunLog(path, settings).records == []
-    with RunLog(None, {}) as log:
+    with pytest.raises(ValueError, match=rf"{path}: expected a log with its settings, found damaged ones; use"):
+        read(path)
+    with pytest.warns(DataWarning, match="found damaged ones; restarting"):
+        assert read(path, restarts=True) == ([], 0)
+    assert path.with_name("frames.log.damaged").read_bytes() == content
+
+
+def test_without_a_path_nothing_is_stored():
+    with FrameLog(None, {}) as log:
         log.append(0, b"is not kept")
+        assert log.end == 0 and log.record(0) is None

@@ -2,18 +2,17 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 import sys
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
-from sglpr_jax.files import append_whole, raising_write_error, read_json, write_json
+from sglpr_jax.files import append_whole, raising_write_error
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
@@ -27,9 +26,9 @@ from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import loop_lines, read_loops_jsonl, write_loops_jsonl
 from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
-SETTINGS_FILE, FRAMES_LOG, LOOPS_FILE = "settings.json", "frames.log", "loops.jsonl"
-OLD_LOG = "journal.bin"
-"""File by which a map of an earlier version is recognised. Such maps cannot be read."""
+FRAMES_LOG, LOOPS_FILE = "frames.log", "loops.jsonl"
+OLD_FILES = ("journal.bin", "settings.json")
+"""Files by which a map of an earlier version is recognised. Such maps cannot be read."""
 SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""
 MAX_PAUSE_S = 1e8
@@ -108,8 +107,9 @@ class LiveMap:
         self._continuity = OdometryContinuity(report, expected=expects_odometry)
         self._mounting = FixedMounting(sensor_height)
         about = {"format": FRAME_FORMAT, "weights": detector.finder.index.weights_hash, "sensor_height": sensor_height}
-        _check_settings(folder, {**about, **dataclasses.asdict(detector.config)})
-        self._log: FrameLog | None = FrameLog(folder / FRAMES_LOG)
+        _check_version(folder)
+        settings = {**about, **dataclasses.asdict(detector.config)}
+        self._log: FrameLog | None = FrameLog(folder / FRAMES_LOG, settings)
         self._loops_path, self._loops_file = folder / LOOPS_FILE, -1
         self._synced_at = time.monotonic()
 
@@ -153,7 +153,10 @@ class LiveMap:
         """
         assert self._log is not None
         loops, scan, damaged, motion_is_known = list[LoopClosure](), None, 0, True
-        for frame, content in self._log.records():
+        for frame in range(self._log.end):
+            content = self._log.record(frame)
+            if content is None:
+                continue
             keyframe, compared, pose, about = read_frame(content, frame, ABOUT, source=self._log.path)
             scan = LiveScan(keyframe, compared, pose, **about)
             motion_is_known = scan.part == self._part
@@ -161,10 +164,9 @@ class LiveMap:
                 loops += self._add(scan._replace(keyframe=None, is_keyframe=True, compared=None, name=""))
                 damaged += 1
             loops += self._add(scan._replace(compared=None) if damaged else scan)
-        if damaged:
-            self._report("lost", f"{self._log.path}: {damaged} damaged scans are left out")
-        if self._log.removed_bytes:
-            self._report("cut", f"{self._log.path}: {self._log.removed_bytes} bytes of an unfinished scan were removed")
+        if self._log.damaged_bytes:
+            found = f"{self._log.damaged_bytes} damaged or unfinished bytes; scans lost before the last one: {damaged}"
+            self._report("damaged", f"{self._log.path}: expected whole scans, found {found}")
         if scan is not None:
             pause_s = min(max(time.time() - scan.wall, 0.0), MAX_PAUSE_S)
             self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - pause_s)
@@ -296,33 +298,13 @@ class LiveMap:
         )
 
 
-def _check_settings(folder: Path, wanted: dict[str, Any]) -> None:
-    """Write the settings of a new map. If the folder has a map, raise ValueError unless its settings are `wanted`."""
-    path = folder / SETTINGS_FILE
-    wanted = json.loads(json.dumps(wanted))  # tuples become lists, as in the file
-    if (folder / OLD_LOG).exists():
-        expected = f"{folder}: expected a map of this version"
-        raise ValueError(f"{expected}, found {OLD_LOG} of an earlier one; use another --out")
-    if not (folder / FRAMES_LOG).exists():
-        return write_json(path, wanted)
-    stored = read_json(path)
-    if not isinstance(stored, dict) or stored.get("format") != FRAME_FORMAT:
-        raise ValueError(
-            f"{path}: expected the settings of a live map ({FRAME_FORMAT}), found others; use another --out"
-        )
-    different = [name for name, value in wanted.items() if not _has_wanted(stored.get(name), value)]
-    if different:
-        raise ValueError(
-            f"{path}: expected a map with the same settings, found another {', '.join(different)}; "
-            "use the flags and weights of the map, or another --out"
-        )
-
-
-def _has_wanted(stored: Any, wanted: Any) -> bool:
-    """Whether a stored setting is the wanted one. Additional fields, which earlier versions wrote, are ignored."""
-    if isinstance(stored, dict) and isinstance(wanted, dict):
-        return all(_has_wanted(stored.get(name), value) for name, value in wanted.items())
-    return stored == wanted
+def _check_version(folder: Path) -> None:
+    """Raise ValueError if a folder has the map of an earlier version."""
+    for name in OLD_FILES:
+        if (folder / name).exists():
+            raise ValueError(
+                f"{folder}: expected a map of this version, found {name} of an earlier one; use another --out"
+            )
 
 
 def _missing(loops: list[LoopClosure], written: list[LoopClosure]) -> list[LoopClosure]:

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, scan_stream
 from sglpr_jax.files import in_short
-from sglpr_jax.frame_log import RunLog
+from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.keyframes import Keyframe
@@ -133,47 +133,56 @@ def add_scans(
     finder: CandidateSearch,
     add: Callable[[Keyframe | None, Fits | None], object],
     *,
-    rows: Iterable[int] | None = None,
+    rows: Iterator[int],
     kept_in: Path | str | None,
     on_bad_scan: OnBadScan | None,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
     **arguments: np.ndarray | int | float | str | None,
 ) -> None:
-    """Add the frames of a checkpoint, then read, describe and add further scans, and append them to the checkpoint.
+    """Add the frames of a checkpoint. Read, describe and add the other scans, and append them to the checkpoint.
 
     Arguments:
       recording: The scans.
       finder: Candidate search without frames.
       add: Function that adds the next frame to the finder. It receives the keyframe, or None for a bad scan, and the
         comparisons of a frame of the checkpoint, or None for a new frame.
-      rows: Rows of the scans that the checkpoint lacks, by default all further rows. A row is taken after the previous
-        scan was added.
+      rows: Rows of the scans that the checkpoint lacks. A row is taken after the previous scan was added.
       kept_in: Checkpoint directory, or None.
-      on_bad_scan: Called with id and error of a bad scan. Without it, the error is raised, and frames of the checkpoint
-        after a bad scan are ignored.
+      on_bad_scan: Called with id and error of a bad scan. Without it, the error is raised, and a bad scan of the
+        checkpoint is read again.
       should_stop: If it returns True, no further scan is read.
       on_progress: Called with the number of added frames.
       arguments: Further arguments that determine the frames (`settings`).
 
-    Raises ValueError for a checkpoint of an earlier version, and the errors of `RunLog` and `scan_stream`.
+    Raises ValueError for a checkpoint of an earlier version, and the errors of `FrameLog` and `scan_stream`.
     """
     path = None if kept_in is None else Path(kept_in) / LOG
     if path is not None and path.with_name(OLD).exists():
         raise ValueError(
             f"{path.parent}: expected a checkpoint of this version, found that of an earlier one; delete it"
         )
-    with RunLog(path, {} if path is None else settings(recording, finder, **arguments)) as log:
-        for frame, content in enumerate(log.records):
-            keyframe, fits, *_ = read_frame(content, frame, {}, source=log.path)
-            if keyframe is None and on_bad_scan is None:
-                break
-            add(keyframe, fits)
-        if len(finder):
-            on_progress(len(finder))
-        rows = range(len(finder), len(recording)) if rows is None else rows
+    with FrameLog(path, {} if path is None else settings(recording, finder, **arguments), restarts=True) as log:
+
+        def rows_to_read() -> Iterator[int]:
+            """Add the frames that the checkpoint has next, and then yield a row."""
+            while True:
+                before = len(finder)
+                while (content := log.record(len(finder))) is not None:
+                    keyframe, fits, *_ = read_frame(content, len(finder), {}, source=path)
+                    if keyframe is None and on_bad_scan is None:
+                        break
+                    add(keyframe, fits)
+                if len(finder) > before:
+                    on_progress(len(finder))
+                row = next(rows, None)
+                if row is None:
+                    return
+                yield row
+
         options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-        for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), rows=rows, **options):
+        options["rows"] = rows_to_read()
+        for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), **options):
             add(keyframe, None)
             if path is not None:
                 log.append(len(finder) - 1, frame_bytes(keyframe, finder.fits))

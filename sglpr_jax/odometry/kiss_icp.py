@@ -20,7 +20,7 @@ from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.files import warn
-from sglpr_jax.frame_log import RunLog
+from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.odometry.config import OdometryConfig
 from sglpr_jax.se3 import inverse, transformed
 
@@ -85,13 +85,15 @@ def scan_odometry(
     if recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans for odometry, found ready-made images")
     check_installed()
-    path, results = None if kept_in is None else Path(kept_in), np.zeros((0, RESULT_NUMBERS))
-    with RunLog(path, {} if path is None else _settings(recording, config, scale)) as log:
-        if log.records:
-            results = np.frombuffer(b"".join(log.records)).reshape(-1, RESULT_NUMBERS)
-        if len(results) < len(recording):
+    path = None if kept_in is None else Path(kept_in)
+    with FrameLog(path, {} if path is None else _settings(recording, config, scale), restarts=True) as log:
+        records = {row: record for row in range(log.end) if (record := log.record(row)) is not None}
+        logged = {row: np.frombuffer(record) for row, record in records.items()}
+        if len(logged) < len(recording):
             options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-            results = _register_scans(recording, log, results, _FrontEnd(config), scale, **options)
+            results = _register_scans(recording, log, logged, _FrontEnd(config), scale, **options)
+        else:
+            results = np.array([logged[row] for row in range(len(recording))])
     poses = scaled_poses(results[:, :16].reshape(-1, 4, 4), 1 / scale)
     return _poses_at_scan_times(poses, recording, results[:, 16])
 
@@ -104,27 +106,28 @@ def _settings(recording: Recording, config: OdometryConfig, scale: Scale) -> dic
 
 def _register_scans(
     recording: Recording,
-    log: RunLog,
-    logged: Float[np.ndarray, "k 17"],
+    log: FrameLog,
+    logged: dict[int, Float[np.ndarray, "17"]],
     front_end: "_FrontEnd",
     scale: Scale,
     **options: Any,
 ) -> Float[np.ndarray, "n 17"]:
-    """Add all scans to kiss-icp, the first k at their logged poses. Returns `RESULT_NUMBERS` of each scan.
+    """Add all scans to kiss-icp, those of the log at their logged poses. Returns `RESULT_NUMBERS` of each scan.
 
     New results are appended to the log. If no scan is left, doubtful scans are reported. The options are those of
     `scan_stream`.
     """
     is_timed = has_point_times(recording)
-    results, registered = list(logged), dict[int, _RegisteredScan]()
+    results, registered = list[np.ndarray](), dict[int, _RegisteredScan]()
     for row, cloud in scan_stream(scaled(recording, scale), lambda _, scan: _cloud(scan, is_timed), **options):
-        logged_pose = logged[row, :16].reshape(4, 4) if row < len(logged) else None
-        result = front_end.add(cloud, known_pose=logged_pose)
+        known = logged.get(row)
+        result = front_end.add(cloud, known_pose=None if known is None else known[:16].reshape(4, 4))
         if cloud is not None:
             registered[row] = result
-        if logged_pose is None:
-            results.append(np.append(result.pose, 0.0 if cloud is None else cloud[1].max(initial=0)))
-            log.append(row, results[row].tobytes())
+        if known is None:
+            known = np.append(result.pose, 0.0 if cloud is None else cloud[1].max(initial=0))
+            log.append(row, known.tobytes())
+        results.append(known)
     if len(results) == len(recording):
         check_readable(recording, len(registered))
         _warn_of_doubtful(recording, registered)

@@ -173,6 +173,16 @@ def test_a_viewpoint_that_is_not_applied_is_told(tmp_path, viewpoint):
     path = write(tmp_path, "a.pcd", pcd(PLAIN).replace(b"DATA", f"VIEWPOINT {viewpoint}\nDATA".encode(), 1))
     with pytest.warns(DataWarning, match=rf"a\.pcd: .* its VIEWPOINT, {viewpoint}, is not applied"):
         np.testing.assert_array_equal(read_scan(path), CLOUD)
+    x, y, z = CLOUD.T
+    expected = [x, y, z + 2] if viewpoint.startswith("0 0 2") else [x, -z, y]  # 90 degrees about x
+    np.testing.assert_allclose(read_scan(path, format="pcd-viewpoint"), np.stack(expected, axis=1), atol=1e-5)
+
+
+@pytest.mark.parametrize(("viewpoint", "found"), [("0 0 2 0 0 0 0", "rotation.*found 0 0 0 0"), ("0 0", "found 2")])
+def test_a_viewpoint_that_is_no_pose_is_refused_where_it_is_applied(tmp_path, viewpoint, found):
+    path = write(tmp_path, "a.pcd", pcd(PLAIN).replace(b"DATA", f"VIEWPOINT {viewpoint}\nDATA".encode(), 1))
+    with pytest.raises(ValueError, match=rf"a\.pcd: expected a readable \.pcd file.*{found}"):
+        read_scan(path, format="pcd-viewpoint")
 
 
 def test_coordinates_at_the_limit_of_las_are_left_out(tmp_path):

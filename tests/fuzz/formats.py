@@ -1,6 +1,7 @@
 """One intact file of each format that the package reads, and the function that reads it."""
 
 import dataclasses
+import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
@@ -21,6 +22,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation.inputs import read_input
 from sglpr_jax.files import read_json
+from sglpr_jax.frame_log import HEAD, FrameLog
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.maps.place_map import PlaceMap
@@ -33,6 +35,7 @@ from sglpr_jax.pose_graph import files as loop_files
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.se3 import transform
+from sglpr_jax.training.checkpoint import rename_damaged
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.mining import DescriptorCache
 from tests import bags
@@ -155,9 +158,52 @@ UTIMES = [[1326652795280148 + 500000 * i, *POSITIONS[i], 0, 0, 0] for i in range
 METRICS = "".join(f'{{"step": {step}, "loss": {step / 8}}}\n' for step in range(1, N + 1)).encode()
 
 
+LOG_SETTINGS, LOG_RECORDS = {"weights": "ab" * 32}, [RNG.bytes(size) for size in (900, 20, 4000, 300, 900)]
+
+
+def frame_log(path: Path) -> None:
+    """Write a log."""
+    with FrameLog(path, LOG_SETTINGS) as log:
+        for frame, record in enumerate(LOG_RECORDS):
+            log.append(frame, record)
+
+
+FRAME_LOG = written(frame_log, "frames.log")
+
+
+def check_log(path: Path) -> None:
+    """Read a damaged log. All records outside the damaged bytes must be there, and no others."""
+    content = path.read_bytes()
+    pairs = list(zip(FRAME_LOG, content, strict=False))
+    before = next((at for at, (one, other) in enumerate(pairs) if one != other), len(pairs))
+    backwards = list(zip(reversed(FRAME_LOG), reversed(content), strict=False))
+    after = next((at for at, (one, other) in enumerate(backwards) if one != other), len(backwards))
+    with FrameLog(path, LOG_SETTINGS) as log:
+        found = [log.record(frame) for frame in range(log.end)]
+    assert len(found) <= len(LOG_RECORDS)
+    for frame, record in enumerate(LOG_RECORDS):
+        begin = FRAME_LOG.index(record)
+        is_whole = begin + len(record) <= before or begin - HEAD.size >= len(FRAME_LOG) - after
+        got = found[frame] if frame < len(found) else None
+        assert got == record or (got is None and not is_whole), f"frame {frame} of {path.name} is lost or changed"
+
+
+def training_checkpoint() -> dict[str, bytes]:
+    """Files of a checkpoint of a training."""
+    about, state = {"loss": 0.5}, safetensors.numpy.save(WEIGHTS)
+    sums = {"about.json": json.dumps(about).encode(), "state/data": state}
+    content = {"about": about, "sha256": {name: hashlib.sha256(one).hexdigest() for name, one in sums.items()}}
+    return {"4/state/data": state, "4/about.json": json.dumps(content).encode()}
+
+
 def read_list(path: Path) -> Any:
     """A matrix or list of another program."""
     return read_input(path, TRAJECTORY, sequence="08")
+
+
+def read_checkpoint(path: Path) -> None:
+    """Check the only checkpoint of a folder."""
+    rename_damaged(next(parent for parent in path.parents if parent.name == "4").parent)
 
 
 def read_scenes(path: Path) -> Recording:
@@ -165,6 +211,7 @@ def read_scenes(path: Path) -> Recording:
     return open_recording(path.parents[1], sensor_height=1.84)
 
 
+CHECKPOINT = training_checkpoint()
 FORMATS = {
     "scan .bin": Format("1.bin", POINTS.tobytes(), read_scan),
     **{
@@ -219,5 +266,10 @@ FORMATS = {
         {CONFIG_FILE: CONFIG_JSON},
     ),
     "metrics": Format("metrics.jsonl", METRICS, read_metrics),
+    "frame log": Format("frames.log", FRAME_LOG, check_log),
+    **{
+        f"checkpoint {Path(name).name}": Format(name, CHECKPOINT[name], read_checkpoint, CHECKPOINT)
+        for name in CHECKPOINT
+    },
 }
 """All formats by name."""

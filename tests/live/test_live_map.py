@@ -1,7 +1,6 @@
 """A map that is continued by another process is that of one process, whatever the odometry does meanwhile."""
 
 import dataclasses
-import itertools
 import os
 import shutil
 
@@ -10,8 +9,8 @@ import pytest
 
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.frame_log import FrameLog
-from sglpr_jax.live.live_map import FRAMES_LOG, LOOPS_FILE, OLD_LOG, SETTINGS_FILE, LiveMap
+from sglpr_jax.frame_log import MARK
+from sglpr_jax.live.live_map import FRAMES_LOG, LOOPS_FILE, OLD_FILES, LiveMap
 from sglpr_jax.live.result_files import write_results
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
@@ -61,16 +60,15 @@ def test_edges_of_a_drive_are_true_and_on_disk(drive, whole):
 
 
 @pytest.mark.slow
-def test_a_map_is_recalled_and_its_unfinished_end_removed(params, whole, tmp_path, said):
+def test_a_map_is_recalled_without_its_unfinished_end(params, whole, tmp_path, said):
     folder, edges = whole
-    shutil.copy(folder / SETTINGS_FILE, tmp_path)
     content, lines = (folder / FRAMES_LOG).read_bytes(), (folder / LOOPS_FILE).read_bytes()
     (tmp_path / FRAMES_LOG).write_bytes(content[:-5])
     kept = len(edges) - 4
     (tmp_path / LOOPS_FILE).write_bytes(b"".join(lines.splitlines(True)[:kept]) + lines[:9])  # the next line is cut
     live = opened(params, tmp_path, said)
     missed = live.restore()
-    assert len(live) == SCANS - 1 and said.kinds == ["cut", "recall", "log"]
+    assert len(live) == SCANS - 1 and said.kinds == ["damaged", "recall", "log"]
     found = pairs(live.detector.loops)
     assert kept < len(found) <= len(edges) and found == pairs(edges)[: len(found)]
     assert pairs(missed) == found[kept:] and pairs(read_loops_jsonl(tmp_path / LOOPS_FILE)) == found
@@ -79,7 +77,7 @@ def test_a_map_is_recalled_and_its_unfinished_end_removed(params, whole, tmp_pat
     live._forget_results()
     assert pairs(live.loops) == found and pairs(live.detector.loops) == found[-9:]
     live.close()
-    assert (tmp_path / FRAMES_LOG).stat().st_size < len(content) - 5
+    assert (tmp_path / FRAMES_LOG).read_bytes() == content[:-5]
 
 
 @pytest.mark.slow
@@ -87,11 +85,11 @@ def test_a_damaged_scan_costs_itself_alone(drive, params, whole, tmp_path, said)
     folder, edges = whole
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     content = bytearray((folder / FRAMES_LOG).read_bytes())
-    content[content.index(b"\x93FR1", len(content) * 9 // 10) + 50] ^= 1
+    content[content.index(MARK, len(content) * 9 // 10) + 50] ^= 1
     (tmp_path / FRAMES_LOG).write_bytes(content)
     live = opened(params, tmp_path, said)
     live.restore()
-    assert said.kinds[0] == "lost" and "1 damaged scans are left out" in said[0][1]
+    assert said.kinds[0] == "damaged" and "lost before the last one: 1" in said[0][1]
     assert len(live) == SCANS and len(set(live.detector.finder.motion.segments.tolist())) == 1
     lost = [i for i in range(SCANS) if f"scan {i}" not in live.names]
     assert len(lost) == 1 and np.array_equal(live.stamps[lost[0]], live.stamps[lost[0] + 1])
@@ -123,11 +121,8 @@ def test_scans_between_keyframes_are_counted_and_recalled(drive, params, tmp_pat
 @pytest.mark.slow
 def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(drive, params, whole, tmp_path, said):
     poses = drive.poses.world_from_lidar
-    shutil.copy(whole[0] / SETTINGS_FILE, tmp_path)
-    log = FrameLog(tmp_path / FRAMES_LOG)
-    for number, scan in itertools.islice(FrameLog(whole[0] / FRAMES_LOG).records(), HALF):
-        log.append(number, scan)
-    log.close()
+    content = (whole[0] / FRAMES_LOG).read_bytes()
+    (tmp_path / FRAMES_LOG).write_bytes(content[: content.index(MARK + (HALF + 1).to_bytes(4, "little"))])
     live = opened(params, tmp_path, said, expects_odometry=True)
     assert live.map_from_world is None and live.restore() == [] and len(live) == HALF
     edges, again = [], inverse(poses[HALF]) @ poses[HALF:]
@@ -144,7 +139,7 @@ def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(
     assert apart[:HALF].max() < 1 and apart[HALF:].max() < 5
     np.testing.assert_allclose(live.map_from_world @ again[-1], corrected[-1], atol=1e-9)
     paths = {path.name for path in write_results(live, tmp_path)}
-    tables = {"loops.g2o", "loops.csv", "rejected.jsonl"}
+    tables = {"loops.g2o", "loops.jsonl", "loops.csv", "rejected.jsonl"}
     assert paths == {*tables, "trajectory.tum", "trajectory-optimized.tum"}
     assert len(read_tum(tmp_path / "trajectory-optimized.tum")[0]) == len(live)
     steps = [line.split()[1:3] for line in (tmp_path / "loops.g2o").read_text().splitlines() if line.startswith("EDGE")]
@@ -156,12 +151,9 @@ def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(
 
 def test_a_map_of_other_settings_or_of_an_earlier_version_is_not_continued(params, tmp_path, said):
     opened(params, tmp_path, said).close()
-    with pytest.raises(ValueError, match=r"settings.json: .*same settings, found another sensor_height; use the flags"):
+    with pytest.raises(ValueError, match=r"frames.log: .*same settings, found another sensor_height; use the settings"):
         opened(params, tmp_path, said, sensor_height=2.0)
-    (tmp_path / SETTINGS_FILE).write_text("{}")
-    with pytest.raises(ValueError, match=r"settings.json: expected the settings of a live map .* found others"):
-        opened(params, tmp_path, said)
-    (tmp_path / OLD_LOG).touch()
+    (tmp_path / OLD_FILES[0]).touch()
     with pytest.raises(ValueError, match=r"expected a map of this version, found journal\.bin of an earlier one"):
         opened(params, tmp_path, said)
 

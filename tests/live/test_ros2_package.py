@@ -1,6 +1,7 @@
 """The package for ROS 2, with a stand-in for rclpy: its files agree, and its node has the core of bin/live."""
 
 import ast
+import signal
 import sys
 import time
 import tomllib
@@ -48,6 +49,12 @@ class Standing:
     def count_publishers(self, topic):
         return topic == "/points"
 
+    def declare_parameter(self, name, value):
+        return types.SimpleNamespace(value=value)
+
+    def get_logger(self):
+        return types.SimpleNamespace(info=str, warning=str)
+
 
 @pytest.fixture
 def package(monkeypatch):
@@ -59,14 +66,23 @@ def package(monkeypatch):
         for name in ("DurabilityPolicy", "HistoryPolicy", "ReliabilityPolicy")
     }
 
+    running = []
+
     def get_message(kind: str) -> str:
         if kind.startswith("livox"):
             raise ModuleNotFoundError(kind)
         return kind
 
     for name, members in {
-        "rclpy": {},
+        "rclpy": {
+            "init": lambda *, signal_handler_options: running.append(signal_handler_options),
+            "create_node": lambda name: Standing(),
+            "spin": lambda node: None,
+            "ok": lambda: bool(running),
+            "try_shutdown": running.clear,
+        },
         "rclpy.qos": {"QoSProfile": dict, **policies},
+        "rclpy.signals": {"SignalHandlerOptions": types.SimpleNamespace(NO="none")},
         "rclpy.executors": {"ExternalShutdownException": RuntimeError},
         "rosidl_runtime_py": {},
         "rosidl_runtime_py.utilities": {"get_message": get_message},
@@ -158,3 +174,18 @@ def test_the_node_runs_until_ros_ends(package, said, tmp_path, monkeypatch):
     package.node.run(command, lambda: wire, said, say=lines.append, should_stop=should_stop)
     assert [topic for topic, *_ in wire.sent] == ["/tf", "/tf"]
     assert lines[-2].startswith("2 scans") and (tmp_path / "map" / "frames.log").is_file()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_node_while_ros_is_running(package, monkeypatch, number):
+    ended = []
+
+    def run(*_, should_stop, **__):
+        assert not should_stop()
+        signal.raise_signal(number)
+        assert should_stop() and sys.modules["rclpy"].ok()
+        ended.append(number)
+
+    monkeypatch.setattr(package.node, "run", run)
+    package.node.main()
+    assert ended == [number] and not sys.modules["rclpy"].ok()

@@ -7,10 +7,12 @@ from collections.abc import Callable
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.signals import SignalHandlerOptions
 
 from sglpr_jax.cli.live import LiveCommand, run_node
 from sglpr_jax.live.data_types import Report, Reports
 from sglpr_jax.live.ros_topics import RosSink, RosSource, Transport
+from sglpr_jax.stop_request import stop_on_signal
 from sglpr_ros.parameters import command_of, defaults
 from sglpr_ros.transport import RclpyTransport
 
@@ -36,21 +38,22 @@ def run(
 
 
 def main() -> None:
-    """Run the node until ROS shuts down. Entry point of `ros2 run`."""
-    rclpy.init()
+    """Run the node until Ctrl-C, SIGTERM or the end of ROS, and write the results. Entry point of `ros2 run`."""
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # ROS would end before the results are written
     node = rclpy.create_node("sglpr")
     values = {name: node.declare_parameter(name, value).value for name, value in defaults().items()}
     log = node.get_logger()
     report = Reports(log.warning)
     threading.Thread(target=_spin, args=(node,), daemon=True).start()
     try:
-        run(
-            command_of(values),
-            lambda: RclpyTransport(node, report),
-            report,
-            say=log.info,
-            should_stop=lambda: not rclpy.ok(),
-        )
+        with stop_on_signal() as stop:
+            run(
+                command_of(values),
+                lambda: RclpyTransport(node, report),
+                report,
+                say=log.info,
+                should_stop=lambda: stop() or not rclpy.ok(),
+            )
     except (ValueError, OSError, ImportError) as error:
         sys.exit(f"error: {error}")
     finally:

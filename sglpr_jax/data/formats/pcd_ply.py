@@ -4,6 +4,7 @@ Both formats begin with a text header that lists the fields of a point. `parse_p
 to a `PointTable`; `table_scan` and `table_blocks` decode the points.
 """
 
+import dataclasses
 import itertools
 import mmap
 import re
@@ -16,8 +17,10 @@ from jaxtyping import Float64
 
 from sglpr_jax.data.formats import clouds
 from sglpr_jax.data.formats.clouds import check_points, cloud_scan
+from sglpr_jax.data.formats.pose_files import parse_numbers, quaternion_poses
 from sglpr_jax.data.scan import Scan, time_field_of
 from sglpr_jax.files import in_short, warn
+from sglpr_jax.se3 import transformed
 
 Content = bytes | memoryview
 AXES = ("x", "y", "z")
@@ -246,14 +249,29 @@ def parse_pcd(content: Content) -> PointTable:
     return PointTable(points, _pcd_fields(header), encoding, body)
 
 
+def posed_scan(path: Path) -> Scan:
+    """Read a .pcd file, and move its points from the frame of the sensor by the pose that it states (VIEWPOINT)."""
+    scan, words = table_scan(path, parse=parse_pcd), _viewpoint(path)
+    x, y, z, qw, *vector = parse_numbers(words, columns=7, where="VIEWPOINT")
+    (world_from_sensor,) = quaternion_poses(path, np.array([[x, y, z]]), np.array([[*vector, qw]]))
+    points = transformed(world_from_sensor, scan.cloud.astype(np.float64))
+    return dataclasses.replace(scan, points=points.astype(np.float32))
+
+
 def warn_of_viewpoint(path: Path) -> None:
     """Warn if a .pcd file has a pose of the sensor (VIEWPOINT) other than the identity, which is not applied."""
+    words = _viewpoint(path)
+    if any(not _is_close(word, number) for word, number in zip(words, IDENTITY, strict=False)):
+        found = f"its VIEWPOINT, {' '.join(words)}, is not applied (--format pcd-viewpoint applies it)"
+        warn(f"{path}: the points are read as they are; {found}")
+
+
+def _viewpoint(path: Path) -> list[str]:
+    """Return the words of the VIEWPOINT of a .pcd file, without a VIEWPOINT none."""
     with path.open("rb") as stream:
         beginning = stream.read(_LONGEST_HEADER)
     viewpoint = re.search(rb"^VIEWPOINT +(.*)$", beginning.partition(b"\nDATA")[0], re.MULTILINE)
-    words = viewpoint[1].decode("ascii", errors="replace").split() if viewpoint else []
-    if any(not _is_close(word, number) for word, number in zip(words, IDENTITY, strict=False)):
-        warn(f"{path}: the points are read as they are; its VIEWPOINT, {' '.join(words)}, is not applied")
+    return viewpoint[1].decode("ascii", errors="replace").split() if viewpoint else []
 
 
 def _is_close(word: str, number: float) -> bool:

@@ -19,7 +19,14 @@ from sglpr_jax.data.formats.bin_records import (
 )
 from sglpr_jax.data.formats.clouds import MOST_POINTS, check_bytes, cloud_scan
 from sglpr_jax.data.formats.las import las_blocks, las_scan
-from sglpr_jax.data.formats.pcd_ply import parse_pcd, parse_ply, table_blocks, table_scan, warn_of_viewpoint
+from sglpr_jax.data.formats.pcd_ply import (
+    parse_pcd,
+    parse_ply,
+    posed_scan,
+    table_blocks,
+    table_scan,
+    warn_of_viewpoint,
+)
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import in_short
@@ -61,12 +68,13 @@ def _read_npz(path: Path) -> np.ndarray:
 
 READERS: dict[ScanFormat, Callable[[Path], Scan]] = {
     "pcd": partial(table_scan, parse=parse_pcd),
+    "pcd-viewpoint": posed_scan,
     "ply": partial(table_scan, parse=parse_ply),
     "npy": array_scan,
     "npz": array_scan,
     "las": las_scan,
 }
-"""Readers of formats with a header. The name of each format is also its file ending."""
+"""Readers of formats with a header. The name of each format, up to a hyphen, is also its file ending."""
 BLOCKS: dict[str, Callable[[Path], Iterator[Float64[np.ndarray, "_ 3"]]]] = {
     ".pcd": partial(table_blocks, parse=parse_pcd),
     ".ply": partial(table_blocks, parse=parse_ply),
@@ -129,6 +137,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
       down, so both are negated. This is a rotation; negating only z would mirror the scan.
     - float32x5, float64x3 and so on: 5 or 3 numbers per point, beginning with x, y, z. The axes are not changed.
     - pcd, ply, npy, npz, las: see their readers. The axes are not changed.
+    - pcd-viewpoint: as pcd, moved by the pose of the sensor in the file (VIEWPOINT).
 
     Arguments:
       path: File of the scan.
@@ -154,7 +163,7 @@ def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFo
     file_format = (format_by_name(path) or records) if format == "auto" else format
     if is_headerless(file_format):
         return read_records(path, file_format)
-    with _format_errors(path, file_format):
+    with _format_errors(path, file_format.partition("-")[0]):
         check_bytes(path.stat().st_size)
         return READERS[file_format](path)
 
