@@ -4,10 +4,13 @@ The formats and the damage are those of the tests (`tests/fuzz`). Each format is
 memory. Cases that are neither read nor refused are kept in `out`.
 """
 
+import faulthandler
 import multiprocessing
 import os
 import resource
 import signal
+import sys
+import tempfile
 import time
 import traceback
 import warnings
@@ -24,10 +27,12 @@ from benchmarks.table import Table
 from tests.fuzz.damage import damaged, refused
 from tests.fuzz.formats import FORMATS, Format
 
-Outcome = Literal["clear error", "warning", "silent", "unclear error", "traceback", "hang", "memory", "crash"]
+Outcome = Literal[
+    "clear error", "warning", "silent", "unclear error", "traceback", "hang", "memory", "write outside", "crash"
+]
 OUTCOMES = get_args(Outcome)
 GOOD = OUTCOMES[:3]
-"""Outcomes of a case without a fault. A crash is the end of the process of a round."""
+"""Outcomes of a case without a fault. A crash is the end of the process of a round, also by a library that hangs."""
 SETTINGS = settings(
     max_examples=200,
     deadline=None,
@@ -96,12 +101,16 @@ def _outcomes(one: Round) -> Counter[str]:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (used + one.limit_bytes, resource.RLIM_INFINITY))
     signal.signal(signal.SIGALRM, _raise_timeout)
+    written = _paths_written_outside()
 
     @hypothesis.seed(one.seed)
     @settings(SETTINGS)
     @given(damaged(format.whole))
     def read(content: bytes) -> None:
+        written.clear()
         outcome, error = _outcome(format, content, one.limit_s)
+        if written and outcome in GOOD:
+            outcome, error = "write outside", "\n".join(written)
         counts[outcome] += 1
         if outcome not in GOOD:
             one.out.mkdir(parents=True, exist_ok=True)
@@ -116,6 +125,7 @@ def _outcomes(one: Round) -> Counter[str]:
 def _outcome(format: Format, content: bytes, limit_s: int) -> tuple[Outcome, str]:
     """Outcome of reading a damaged file, and its error."""
     signal.alarm(limit_s)
+    faulthandler.dump_traceback_later(2 * limit_s, exit=True)  # a library may not return for the alarm
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -131,6 +141,21 @@ def _outcome(format: Format, content: bytes, limit_s: int) -> tuple[Outcome, str
         return "traceback", traceback.format_exc()
     finally:
         signal.alarm(0)
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _paths_written_outside() -> list[str]:
+    """List to which Python adds each file outside the folder for temporary files that it opens for writing."""
+    paths = list[str]()
+
+    def listen(event: str, arguments: tuple) -> None:
+        if event == "open" and isinstance(arguments[0], str) and arguments[2] & (os.O_WRONLY | os.O_RDWR):
+            path = os.path.realpath(arguments[0])
+            if not path.startswith((os.path.realpath(tempfile.gettempdir()), "/dev/")):
+                paths.append(path)
+
+    sys.addaudithook(listen)
+    return paths
 
 
 class _Timeout(BaseException):
