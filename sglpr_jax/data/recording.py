@@ -44,6 +44,9 @@ class Recording:
     """Times in seconds, or None if unknown."""
     pose_source: str | None = None
     """Source of the positions, or None."""
+    world: str = ""
+    """Name of the world whose frame the positions have, such as a dataset with one frame for all days. Recordings of
+    one world may show the same places. Empty: the recording has a frame of its own."""
     label_paths: tuple[Path | None, ...] = ()
     """Label file of each scan or image, None if it has no labels. Empty if the recording has no labels."""
     resolution_m: float | None = None

@@ -16,9 +16,9 @@ from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
 from sglpr_jax.reproduce.reproduction import Reproduction, content_of
 from sglpr_jax.revisits import revisits
 from sglpr_jax.training.batch_source import training_batches
-from sglpr_jax.training.batches import tuple_pool
 from sglpr_jax.training.image_network import ImageNetwork
 from sglpr_jax.training.step import train_step
+from sglpr_jax.training.tuples import tuple_pool
 
 TIMED_STEPS = 3
 
@@ -126,7 +126,8 @@ def _has_revisits(recording: Recording) -> bool:
 def time_a_step(reproduction: Reproduction, variant: str, seq: str) -> float:
     """Measure the duration of a training step of a run in seconds, on its first batches, without compilation."""
     config, recordings = reproduction.config_of(variant), reproduction.recordings_but(seq)
-    network, batches = ImageNetwork(config), training_batches(recordings, tuple_pool(recordings, config), config)
+    network, pool = ImageNetwork(config), tuple_pool(recordings, config.sampling)
+    batches = training_batches(recordings, pool, config)
     state, start = network.new_state(), 0.0
     for step in range(1 + TIMED_STEPS):
         if step == 1:  # step 0 compiles and is not timed

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.training.batches import Batch, mix, read_batch, tuple_pool
+from sglpr_jax.training.batches import Batch, mix, read_batch
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.devices import host_slice
 from sglpr_jax.training.mining import DescriptorCache, refresh_cache
 from sglpr_jax.training.step import TrainState
-from sglpr_jax.training.tuples import TuplePool
+from sglpr_jax.training.tuples import TuplePool, tuple_pool
 
 T = TypeVar("T")
 DescribeFn = Callable[[TrainState, Int[np.ndarray, "n"]], Float32[np.ndarray, "n d"]]
@@ -129,7 +129,7 @@ def training_batches(
     first = TupleBatches(recordings, pool, read_first, seed=config.seed, tuples=tuples, describe=describe, run=run)
     if not also:
         return first
-    second_pool = tuple_pool(also, config)
+    second_pool = tuple_pool(also, config.sampling)
     second = TupleBatches(
         also,
         second_pool,

@@ -14,7 +14,6 @@ from sglpr_jax.data.scan import check_cloud
 from sglpr_jax.data.views import View, check_ready_made, cloud_view, image_view, picture
 from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.tuples import TuplePool
 
 
@@ -204,17 +203,3 @@ def _network_order(batch: Batch, every: int) -> Int[np.ndarray, "b"]:
     order = np.empty(places, int)
     order[segmented_positions_first] = second_batch_first
     return order
-
-
-def tuple_pool(
-    recordings: Sequence[Recording], config: TrainConfig, *, frames: Sequence[Int[np.ndarray, "_"]] | None = None
-) -> TuplePool:
-    """Return the pool of all frames, or of the `frames` of each recording. Raises ValueError without positives."""
-    return TuplePool([positions_of(recording) for recording in recordings], config.sampling, frames=frames)
-
-
-def positions_of(recording: Recording) -> Float[np.ndarray, "n 3"]:
-    """Return the positions of a recording, in metres. Raises ValueError if it has none."""
-    if recording.positions is None:
-        raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
-    return recording.positions

@@ -16,8 +16,7 @@ from sglpr_jax.files import file_name, in_short, replacing
 from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.method import LABELLED
 from sglpr_jax.progress import Progress, no_progress
-from sglpr_jax.training.batches import positions_of
-from sglpr_jax.training.tuples import TuplePool
+from sglpr_jax.training.tuples import TuplePool, positions_of
 
 SCANS_AHEAD = 8
 """Number of scans that are read ahead."""

@@ -21,14 +21,13 @@ from sglpr_jax.methods.learned.trained import describe_inputs, learned_distance,
 from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.training.batch_source import TupleBatches
-from sglpr_jax.training.batches import positions_of
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.devices import AXIS
 from sglpr_jax.training.peer_inputs import TrainingInputs
 from sglpr_jax.training.run_folder import CONFIG_FILE, lock_run
 from sglpr_jax.training.step import Gradient, TrainState
 from sglpr_jax.training.trainer import Schedule, Trained, Trainer
-from sglpr_jax.training.tuples import TuplePool
+from sglpr_jax.training.tuples import TuplePool, positions_of, tuple_pool
 from sglpr_jax.training.validation import RECALL, recall_at_1, require_revisits
 
 RATES_FILE = "rates.json"
@@ -168,7 +167,7 @@ def train_learned(
     config = {"method": method.name, "settings": settings_json, "recipe": recipe, "recordings": recordings}
     lock = lock_run(out, config, seed=settings.seed, resume=resume, limits=LIMITS)
     with lock, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
-        pool = TuplePool([positions_of(recording) for recording in data.recordings], method.recipe.sampling)
+        pool = tuple_pool(data.recordings, method.recipe.sampling)
         trainer = Trainer(
             network,
             _peer_batches(network, data, pool, out),

@@ -17,7 +17,6 @@ from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import Params, adopt, graft, weights_hash, without_whitening
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.batch_source import TupleBatches, training_batches
-from sglpr_jax.training.batches import positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.devices import data_mesh, host_copy, is_first_host, on_all_hosts
@@ -26,7 +25,7 @@ from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
 from sglpr_jax.training.run_folder import CHECKPOINTS, checkpoint_steps, lock_run
 from sglpr_jax.training.step import TrainState
 from sglpr_jax.training.trainer import METRICS_FILE, Schedule, Trained, Trainer
-from sglpr_jax.training.tuples import hold_out
+from sglpr_jax.training.tuples import split_recordings, tuple_pool
 from sglpr_jax.training.validation import describe_places, training_recall, validation_score
 
 WEIGHTS = "weights"
@@ -187,8 +186,8 @@ def _batches_and_score(
     recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
 ) -> tuple[TupleBatches, ScoreFn]:
     """Return batches of the training places, and a score, on held-out places or, without them, on training places."""
-    splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
-    pool = tuple_pool(recordings, config, frames=[training for training, _ in splits])
+    splits = split_recordings(recordings, config)
+    pool = tuple_pool(recordings, config.sampling, frames=[training for training, _ in splits])
 
     def describe(state: TrainState, places: Int[np.ndarray, "n"]) -> Float32[np.ndarray, "n d"]:
         return describe_places(state.params, recordings, pool, places, np.zeros(len(places)), config)

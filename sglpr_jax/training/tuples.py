@@ -1,16 +1,21 @@
 """Training tuples: an anchor, k_p positives near it and k_n negatives far from it. Held-out parts of recordings."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.revisits import close_pairs
-from sglpr_jax.training.config import ValidationConfig
+from sglpr_jax.training.config import TrainConfig, ValidationConfig
 from sglpr_jax.training.mining import DescriptorCache
+
+WORLDS_APART_M = 1e9
+"""Distance between places of different worlds, in metres. No place on Earth is as far."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +40,8 @@ class TuplePool:
     """The places of a training, and the tuples that can be drawn from them.
 
     Every frame of several recordings is one place. Places are numbered from 0, recording after recording. Place i is
-    frame `frame_of[i]` of recording `recording_of[i]`, at `positions[i]` in metres.
+    frame `frame_of[i]` of recording `recording_of[i]`, at `positions[i]` in metres in the frame of world `world_of[i]`.
+    Recordings of one world, such as drives of several days or sensors, have positives in each other.
     """
 
     def __init__(
@@ -44,18 +50,25 @@ class TuplePool:
         config: TupleConfig,
         *,
         frames: Sequence[Int[np.ndarray, "_"]] | None = None,
+        worlds: Sequence[int] | None = None,
     ):
         """Number the places and find their positives. Raises ValueError if no place has a positive.
 
-        `positions` has those of each recording, in metres, and `frames` the frames to use of each one (default: all).
+        Arguments:
+          positions: Positions of each recording, in metres.
+          config: Choice of the tuples.
+          frames: Frames to use of each recording, by default all.
+          worlds: Number of the world of each recording (`worlds_of`), by default one for each.
         """
         self.config = config
         frames = [np.arange(len(recording)) for recording in positions] if frames is None else frames
         self.positions = np.concatenate([recording[rows] for recording, rows in zip(positions, frames, strict=True)])
         self.recording_of = np.repeat(np.arange(len(positions)), [len(rows) for rows in frames])
         self.frame_of = np.concatenate(frames)
-        pairs = np.concatenate([self._positive_pairs(recording) for recording in range(len(positions))])
-        same_visit = np.abs(self.frame_of[pairs[:, 0]] - self.frame_of[pairs[:, 1]]) <= config.revisit_gap
+        self.world_of = self.recording_of if worlds is None else np.asarray(worlds)[self.recording_of]
+        pairs = close_pairs(self.separated, closer_than_m=config.positive_m)
+        pairs = np.concatenate([pairs, pairs[:, ::-1]])  # (anchor, positive), in both orders
+        same_visit = self.are_of_one_visit(pairs[:, 0], pairs[:, 1], gap=config.revisit_gap)
         self.neighbours = self._positives_by_anchor(pairs[same_visit])
         self.revisits = self._positives_by_anchor(pairs[~same_visit])
         if not len(pairs):
@@ -123,27 +136,30 @@ class TuplePool:
         return rng.choice(candidates, size, replace=len(candidates) < size)
 
     def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
-        """Return whether places a and b are in different recordings or farther apart than the negative distance."""
+        """Return whether places a and b are in different worlds or farther apart than the negative distance."""
         return ~self._are_within(a, b, self.config.negative_m)
 
+    def are_of_one_visit(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."], *, gap: int) -> np.ndarray:
+        """Return whether places a and b are in one recording and at most `gap` frames apart."""
+        return (self.recording_of[a] == self.recording_of[b]) & (np.abs(self.frame_of[a] - self.frame_of[b]) <= gap)
+
     def distances_from_anchors(self, places: Int[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
-        """Return the horizontal distance of each place from its anchor, in metres. Infinite between recordings."""
-        anchors = places[:, :1]
-        offset_m = self.positions[places, :2] - self.positions[anchors, :2]
-        same_recording = self.recording_of[places] == self.recording_of[anchors]
-        return np.where(same_recording, np.hypot(offset_m[..., 0], offset_m[..., 1]), np.inf).astype(np.float32)
+        """Return the horizontal distance of each place from its anchor, in metres. Infinite between worlds."""
+        distances_m = self._distances(places, places[:, :1])
+        return np.where(distances_m < WORLDS_APART_M / 2, distances_m, np.inf).astype(np.float32)
+
+    @functools.cached_property
+    def separated(self) -> Float[np.ndarray, "n 3"]:
+        """Horizontal position of each place, and a third coordinate that puts worlds `WORLDS_APART_M` apart."""
+        return np.column_stack([self.positions[:, :2], WORLDS_APART_M * self.world_of])
+
+    def _distances(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return the horizontal distances of places a and b in metres, or `WORLDS_APART_M` and more between worlds."""
+        return np.linalg.norm(self.separated[a] - self.separated[b], axis=-1)
 
     def _are_within(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."], max_m: float) -> np.ndarray:
-        """Return whether places a and b are in one recording and at most this horizontal distance apart, in metres."""
-        offset_m = self.positions[a, :2] - self.positions[b, :2]
-        same_recording = self.recording_of[a] == self.recording_of[b]
-        return same_recording & (np.hypot(offset_m[..., 0], offset_m[..., 1]) <= max_m)
-
-    def _positive_pairs(self, recording: int) -> Int[np.ndarray, "pairs 2"]:
-        """Return all pairs (anchor, positive) of places of a recording. Each pair appears in both orders."""
-        places = np.flatnonzero(self.recording_of == recording)
-        pairs = close_pairs(self.positions[places, :2], closer_than_m=self.config.positive_m)
-        return places[np.concatenate([pairs, pairs[:, ::-1]])].reshape(-1, 2)
+        """Return whether places a and b are in one world and at most this horizontal distance apart, in metres."""
+        return self._distances(a, b) <= max_m
 
     def _positives_by_anchor(self, pairs: Int[np.ndarray, "pairs 2"]) -> Positives:
         """Group pairs (anchor, positive) by anchor."""
@@ -155,29 +171,78 @@ def _first_unless_empty(preferred: Int[np.ndarray, "_"], fallback: Int[np.ndarra
     return preferred if len(preferred) else fallback
 
 
+def tuple_pool(
+    recordings: Sequence[Recording], config: TupleConfig, *, frames: Sequence[Int[np.ndarray, "_"]] | None = None
+) -> TuplePool:
+    """Return the pool of all frames, or of the `frames` of each recording. Raises ValueError without positives."""
+    positions = [positions_of(recording) for recording in recordings]
+    return TuplePool(positions, config, frames=frames, worlds=worlds_of(recordings))
+
+
+def worlds_of(recordings: Sequence[Recording]) -> list[int]:
+    """Return the number of each recording's world, from 0. A recording without one (`Recording.world`) has its own."""
+    names = [recording.world or number for number, recording in enumerate(recordings)]
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return [numbers[name] for name in names]
+
+
+def split_recordings(
+    recordings: Sequence[Recording], config: TrainConfig
+) -> list[tuple[Int[np.ndarray, "training"], Int[np.ndarray, "validation"]]]:
+    """Return the frames of each recording for training and for validation (`hold_out`, for each world)."""
+    splits, worlds = {}, np.array(worlds_of(recordings))
+    for world in range(worlds.max() + 1):
+        rows = np.flatnonzero(worlds == world)
+        positions = [positions_of(recordings[row]) for row in rows]
+        splits |= zip(rows, hold_out(positions, config.validation, config.sampling), strict=True)
+    return [splits[row] for row in range(len(recordings))]
+
+
+def positions_of(recording: Recording) -> Float[np.ndarray, "n 3"]:
+    """Return the positions of a recording, in metres. Raises ValueError if it has none."""
+    if recording.positions is None:
+        raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
+    return recording.positions
+
+
 def hold_out(
-    positions: Float[np.ndarray, "n 3"], config: ValidationConfig, sampling: TupleConfig
-) -> tuple[Int[np.ndarray, "training"], Int[np.ndarray, "validation"]]:
-    """Split a recording: distant frames for training, and a stretch of frames with all its revisits for validation.
+    positions: Sequence[Float[np.ndarray, "_ 3"]], config: ValidationConfig, sampling: TupleConfig
+) -> list[tuple[Int[np.ndarray, "training"], Int[np.ndarray, "validation"]]]:
+    """Split the recordings of a world: distant frames for training, and for validation those at a stretch of the first.
 
     Every validation frame is within the positive distance of the stretch. Every training frame is beyond the negative
     distance of all validation frames, so that no house is visible in both parts. Both distances are horizontal. The
     stretch is the first one whose fraction of the revisiting frames is nearest to its fraction of all frames.
+
+    Returns the frames for training and for validation of each recording.
     """
-    frames = np.arange(len(positions))
+    stretch = _stretch(positions[0][:, :2], config, sampling)
+    if not len(stretch):
+        return [(np.arange(len(recording)), np.arange(0)) for recording in positions]
+    planes = [recording[:, :2] for recording in positions]
+    below_positive_m = np.nextafter(sampling.positive_m, 0)  # as `close_pairs`, which excludes the distance itself
+    validation = [_is_near(plane, stretch, below_positive_m) for plane in planes]
+    held_out = np.concatenate([plane[rows] for plane, rows in zip(planes, validation, strict=True)])
+    return [
+        (np.flatnonzero(~_is_near(plane, held_out, sampling.negative_m)), np.flatnonzero(rows))
+        for plane, rows in zip(planes, validation, strict=True)
+    ]
+
+
+def _stretch(
+    plane: Float[np.ndarray, "n 2"], config: ValidationConfig, sampling: TupleConfig
+) -> Float[np.ndarray, "_ 2"]:
+    """Return the positions of the stretch of a recording for `hold_out`."""
+    frames = np.arange(len(plane))
     stretch_length = round(config.share * len(frames))
     if stretch_length == 0:
-        return frames, frames[:0]
-    plane = positions[:, :2]
+        return plane[:0]
     pairs = close_pairs(plane, closer_than_m=sampling.positive_m)
     revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
     is_revisiting = np.isin(frames, revisits)
     revisiting_by_start = np.convolve(is_revisiting, np.ones(stretch_length), mode="valid")
     start = int(np.abs(revisiting_by_start - config.share * is_revisiting.sum()).argmin())
-    below_positive_m = np.nextafter(sampling.positive_m, 0)  # as `close_pairs`, which excludes the distance itself
-    in_validation = _is_near(plane, plane[start : start + stretch_length], below_positive_m)
-    near_validation = _is_near(plane, plane[in_validation], sampling.negative_m)
-    return np.flatnonzero(~near_validation), np.flatnonzero(in_validation)
+    return plane[start : start + stretch_length]
 
 
 def _is_near(

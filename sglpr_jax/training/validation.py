@@ -14,9 +14,9 @@ from sglpr_jax.metrics import decision_curve
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import Params
 from sglpr_jax.revisits import database_end, revisits
-from sglpr_jax.training.batches import Batch, positions_of, read_batch, tuple_pool, views
+from sglpr_jax.training.batches import Batch, read_batch, views
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.tuples import TuplePool
+from sglpr_jax.training.tuples import TuplePool, positions_of, tuple_pool
 
 CHUNK = 16
 """Number of places that are described at a time."""
@@ -40,10 +40,9 @@ def training_recall(
     similar of all positives is within the positive distance. The score says little about new places.
     """
     pairs = pool.draw(seed=_SEED, step=0, tuples=PAIRS)[:, :2]
-    anchors, positives = pairs[:, :1], pairs[None, :, 1]
-    offset_m = pool.positions[anchors, :2] - pool.positions[positives, :2]
-    same_recording = pool.recording_of[anchors] == pool.recording_of[positives]
-    is_match = same_recording & (np.linalg.norm(offset_m, axis=-1) < pool.config.positive_m)  # (anchor, positive)
+    anchors, positives = pairs[:, 0], pairs[:, 1]
+    distance_m = cdist(pool.separated[anchors], pool.separated[positives])
+    is_match = distance_m < pool.config.positive_m  # (anchor, positive)
     angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, pairs.shape).astype(np.float32)
 
     def score(params: Params) -> dict[str, float]:
@@ -68,7 +67,7 @@ def validation_score(
     Raises ValueError if no two held-out frames are within the positive distance.
     """
     try:
-        pool = tuple_pool(recordings, config, frames=frames)
+        pool = tuple_pool(recordings, config.sampling, frames=frames)
     except ValueError as error:
         raise ValueError(f"the part held out by validation.share is too small: {error}") from error
     angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, len(pool)) * config.rotate
@@ -89,15 +88,13 @@ def recall_and_f1_max(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, 
     """Return Recall@1 and top-1 F1max. Every place of the pool is a query, and `descriptors` are those of its places.
 
     The database of a query has all places of other recordings, and those of its own more than `gap` frames away. A
-    match is in the same recording and within the positive distance. Recall@1 counts queries with a match; there must be
+    match is in the same world and within the positive distance. Recall@1 counts queries with a match; there must be
     at least one. F1max accepts the nearest place up to a threshold on the descriptor distance: a match is right, a
     place beyond the negative distance is wrong.
     """
     queries = np.arange(len(pool))
-    same_recording = pool.recording_of[:, None] == pool.recording_of[None]
-    same_visit = same_recording & (np.abs(pool.frame_of[:, None] - pool.frame_of[None]) <= gap)
-    distance_m = cdist(pool.positions[:, :2], pool.positions[:, :2])
-    is_match = same_recording & ~same_visit & (distance_m < pool.config.positive_m)  # (query, place)
+    same_visit = pool.are_of_one_visit(queries[:, None], queries[None], gap=gap)
+    is_match = ~same_visit & (cdist(pool.separated, pool.separated) < pool.config.positive_m)  # (query, place)
     descriptor_distance = np.where(same_visit, np.inf, cdist(descriptors, descriptors))
     nearest = descriptor_distance.argmin(1)
     nearest_is_match = is_match[queries, nearest]

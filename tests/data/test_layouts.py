@@ -162,6 +162,10 @@ def tree(tmp_path, kitti_root):
     return made
 
 
+WORLDS = {"nclt": "NCLT", "mulran": "MulRan", "helipr": "HeLiPR", "boreas": "Boreas"}
+"""By the layout of datasets whose sequences have one frame."""
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout(tree, layout):
     expected = LAYOUTS[layout]
@@ -177,6 +181,7 @@ def test_every_layout(tree, layout):
         assert scan.points.dtype == np.float32
         assert (None if scan.lasers is None else scan.lasers.tolist()) == expected.lasers
         assert found.found[0].startswith(expected.found)
+        assert found.world == WORLDS.get(layout.split()[0], "")
 
 
 def edited(file: str, change: Callable[[str], str] | Any) -> Callable[[Path], None]:
@@ -281,6 +286,24 @@ def test_simulated_drives_know_how_high_their_sensor_stood(tree):
     np.testing.assert_allclose(found.scan(0).upright_points, lowered, rtol=1e-6)
     write(root / "simulation.json", {"sensor": {"height_m": MODEL_HEIGHT_M}})
     assert open_recording(root).mounting is None
+
+
+def test_simulated_drives_of_one_route_have_one_world_by_any_sensor(tree):
+    root, town = tree("kitti"), {"scenery": {"lamp_m": 9.0}, "seed": 1, "scans": 9}
+
+    def world(**changes) -> str:
+        write(root / "simulation.json", {**town, "sensor": {"height_m": 1.7}, "carrier": {"height_m": 1.0}, **changes})
+        return open_recording(root).world
+
+    first = world()
+    assert first and first == world(sensor={"height_m": 0.7}) == world(carrier={"height_m": 2.0})
+    indoors = {"scenery": {"repeating": "indoors"}}
+    others = [world(seed=2), world(scans=10), world(**{"drive 08": "ab"}), world(**indoors)]
+    others += [world(**indoors, carrier={"height_m": 2.0}), world(sessions=["2012-01-15"])]
+    assert len({first, *others}) == 7
+    write(root / "simulation.json", [])
+    with pytest.raises(ValueError, match=r"simulation\.json: expected the settings of a simulated dataset"):
+        open_recording(root)
 
 
 def test_ready_made_images(bev_root):

@@ -18,8 +18,8 @@ from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.training.batch_source import training_batches
-from sglpr_jax.training.batches import Batch, mix, read_batch, tuple_pool, views
-from sglpr_jax.training.tuples import TuplePool
+from sglpr_jax.training.batches import Batch, mix, read_batch, views
+from sglpr_jax.training.tuples import TuplePool, tuple_pool
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 RAW_LABELS = np.array([40, 10, 70, 252, 0], np.uint32)
@@ -260,8 +260,8 @@ def straight(name: str) -> Recording:
 def test_scan_names_are_those_of_both_datasets(config, triplets):
     config = dataclasses.replace(config, also_tuples=1, also_triplets=triplets)
     main, also = [straight("00")], [straight("town")]
-    batches = training_batches(main, tuple_pool(main, config), config, also=also)
-    pool = tuple_pool(also, config)
+    batches = training_batches(main, tuple_pool(main, config.sampling), config, also=also)
+    pool = tuple_pool(also, config.sampling)
     draw = pool.draw if triplets else pool.draw_places
     for step in range(3):
         first, second = batches.scan_names(step).split("; ")

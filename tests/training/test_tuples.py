@@ -1,14 +1,17 @@
 """Tuples follow their configuration and are a pure function of seed and step. Held-out places are far apart."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recordings import of_images
 
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.training.config import ValidationConfig
 from sglpr_jax.training.mining import DescriptorCache
-from sglpr_jax.training.tuples import TuplePool, hold_out
+from sglpr_jax.training.tuples import TuplePool, hold_out, worlds_of
 
 LAP = 60
 
@@ -173,6 +176,35 @@ def test_excluded_frames_are_in_no_tuple_and_the_others_keep_their_numbers():
         assert ((np.abs(pool.frame_of[anchors] - pool.frame_of[group.places]) > LAP // 2) == other_visit).all()
 
 
+def test_recordings_of_one_world_have_positives_and_no_near_negatives_in_each_other():
+    config = TupleConfig(negatives=4, revisit_fraction=1.0, revisit_gap=LAP)
+    pool = TuplePool([circuit(1), circuit(1, seed=1), circuit(1, seed=2)], config, worlds=[0, 1, 0])
+    first, other, same = np.split(np.arange(3 * LAP), 3)
+    np.testing.assert_array_equal(pool.world_of, np.repeat([0, 1, 0], LAP))
+    assert np.isin(pool.revisits.anchors, np.r_[first, same]).all() and len(pool.revisits.anchors) > LAP
+    anchors, near, far = columns(pool.draw(seed=0, step=0, tuples=200), config)
+    assert (pool.recording_of[anchors] != pool.recording_of[near]).all()
+    assert (horizontal(pool, anchors, near) < 3).all()
+    assert ((horizontal(pool, anchors, far) > 20) | np.isin(far, other)).all() and np.isin(far, other).any()
+    distances = pool.distances_from_anchors(np.stack([first, same, other], axis=1))
+    np.testing.assert_allclose(distances[:, 1], horizontal(pool, first, same), rtol=1e-6)
+    assert np.isinf(distances[:, 2]).all()
+
+
+def test_recordings_without_a_world_have_one_of_their_own():
+    recordings = [of_images({Path("1.png"): np.zeros((4, 4))}, world=world) for world in ("", "a", "", "a")]
+    assert worlds_of(recordings) == [0, 1, 2, 1]
+
+
+def test_the_held_out_stretch_is_held_out_of_every_recording_of_its_world():
+    positions = np.column_stack([np.arange(0, 400, 2.0), np.zeros((200, 2))])
+    other_positions = positions[::-1] + np.array([1.0, 1.0, 0.0])
+    day, other_day = hold_out([positions, other_positions], ValidationConfig(share=0.25), SAMPLING)
+    np.testing.assert_array_equal(day[1], np.arange(51))
+    np.testing.assert_array_equal(other_day[1], np.arange(150, 200))
+    np.testing.assert_array_equal(other_day[0], np.arange(140))
+
+
 SAMPLING = TupleConfig(revisit_gap=20)
 
 
@@ -192,7 +224,7 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 @given(seed=st.integers(0, 10**6), share=st.floats(0.02, 0.5))
 def test_no_training_frame_lies_within_the_negative_distance_of_a_validation_frame(seed, share):
     positions = wandering(seed)
-    training, validation = hold_out(positions, ValidationConfig(share=share), SAMPLING)
+    ((training, validation),) = hold_out([positions], ValidationConfig(share=share), SAMPLING)
     assert not set(training) & set(validation)
     assert len(validation) >= round(share * len(positions))
     if len(training):
@@ -205,7 +237,7 @@ def test_no_training_frame_lies_within_the_negative_distance_of_a_validation_fra
 def test_the_held_out_stretch_contains_its_revisits_and_a_proportional_share_of_them():
     out_and_back = np.r_[np.arange(0, 600, 2.0), np.arange(600, 300, -2.0)]  # the second half of the way out comes back
     positions = np.column_stack([out_and_back, np.zeros((len(out_and_back), 2))])
-    training, validation = hold_out(positions, ValidationConfig(share=0.1), SAMPLING)
+    ((training, validation),) = hold_out([positions], ValidationConfig(share=0.1), SAMPLING)
     there, back = validation[validation < 300], validation[validation >= 300]
     assert len(there) and len(back)
     assert apart(positions[there], positions[back]).min(0).max() < SAMPLING.positive_m
@@ -215,8 +247,8 @@ def test_the_held_out_stretch_contains_its_revisits_and_a_proportional_share_of_
 
 def test_without_revisits_the_first_frames_are_held_out_and_with_share_0_none():
     positions = np.column_stack([np.arange(0, 400, 2.0), np.zeros((200, 2))])
-    training, validation = hold_out(positions, ValidationConfig(share=0.25), SAMPLING)
+    ((training, validation),) = hold_out([positions], ValidationConfig(share=0.25), SAMPLING)
     np.testing.assert_array_equal(validation, np.arange(51))  # and the one frame less than 3 m further on
     np.testing.assert_array_equal(training, np.arange(61, 200))
-    training, validation = hold_out(positions, ValidationConfig(), SAMPLING)
+    ((training, validation),) = hold_out([positions], ValidationConfig(), SAMPLING)
     assert len(validation) == 0 and len(training) == 200

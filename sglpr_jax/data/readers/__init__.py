@@ -3,6 +3,7 @@
 To support a new layout, add a module with a `READER` (or several as `READERS`) and a test. It is found automatically.
 """
 
+import dataclasses
 import functools
 import importlib
 import pkgutil
@@ -13,6 +14,7 @@ from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.readers.listing import describe_contents
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.simulation import simulated_world
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
 
@@ -103,6 +105,7 @@ def open_recording(
         imu_topic=imu_topic,
     )
     recording = reader.open(root, name, options)
+    recording = dataclasses.replace(recording, world=simulated_world(root, name) or recording.world)
     if recording.times is not None:
         check_order(recording.times, source=f"{root}, sequence {name}")
         check_jumps(recording.times, source=f"{root}, sequence {name}")

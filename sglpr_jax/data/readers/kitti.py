@@ -17,15 +17,11 @@ from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import describe_format, detect_format_unless_kitti
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of_frames
 from sglpr_jax.data.formats.scan_files import scan_of_file
-from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.simulation import simulated_mounting
 from sglpr_jax.data.recording import ReadRecord, Recording
-from sglpr_jax.files import naming, read_json
 from sglpr_jax.se3 import positions_from_camera
-
-SIMULATION = "simulation.json"
-"""File with the settings of a simulated dataset, written by `bin/simulate`."""
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
@@ -42,7 +38,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     times = read_times(times_file, unit=options.time_unit) if times_file.is_file() else None
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
     read, format_description = _scan_reader(paths, options.format)
-    mounting = _simulated_mounting(root)
+    mounting = simulated_mounting(root)
     return Recording(
         name=name,
         ids=ids,
@@ -55,21 +51,6 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         mounting=mounting,
         found=(f"format: {format_description}", *([] if mounting is None else [f"sensor: {mounting}, as simulated"])),
     )
-
-
-def _simulated_mounting(root: Path) -> Mounting | None:
-    """Return the mounting of the sensor of a simulated dataset, or None for a height of 1.73 m (KITTI)."""
-    path = root / SIMULATION
-    if not path.is_file():
-        return None
-    settings = read_json(path)
-    try:
-        height_m = float(settings["sensor"]["height_m"])
-    except (TypeError, KeyError, ValueError) as error:
-        expected = "the settings of a simulated dataset with sensor.height_m"
-        raise ValueError(f"{path}: expected {expected}, found none") from error
-    with naming(path):  # `Mounting` raises ValueError for implausible heights
-        return None if height_m == MODEL_HEIGHT_M else Mounting(height_m)
 
 
 def _scan_reader(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:

@@ -102,6 +102,8 @@ class Layout(NamedTuple):
     read_poses: Callable[[Path], StampedPositions]
     description: str
     """Description of the format for the user."""
+    world: str
+    """Name of the dataset, whose sequences have one frame (`Recording.world`)."""
     suffix: str = ""
     """Suffix that is appended to the name of the sequence to form the name of the recording: "-Ouster"."""
     folders: str = "*"
@@ -133,6 +135,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             read_scan=partial(read_records, format="nclt"),
             read_poses=read_nclt_poses,
             description="sensor: coordinates are relative to the ground below it",
+            world="NCLT",
             folders="[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]",
             max_gap_s=0.5,  # a Segway moves half a metre in this time
             mounting=Mounting(0.0),
@@ -146,6 +149,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             read_scan=lambda path: Scan(points=read_records(path, "kitti").cloud * FORWARD_FROM_OUSTER),
             read_poses=read_mulran_poses,
             description=f"format: MulRan, {describe_format('kitti')}, rotated to x forward",
+            world="MulRan",
         ),
     ),
     "NAME/LiDAR/SENSOR/*.bin with NAME/LiDAR_GT/SENSOR_gt.txt (HeLiPR)": tuple(
@@ -156,6 +160,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             read_scan=partial(read_helipr, sensor=sensor),
             read_poses=partial(read_positions, columns=8),
             description=f"format: HeLiPR's {sensor} ({record.itemsize} bytes a point)",
+            world="HeLiPR",
             suffix=f"-{sensor}",
         )
         for sensor, record in HELIPR.items()
@@ -168,6 +173,7 @@ LAYOUTS: dict[str, tuple[Layout, ...]] = {
             read_scan=partial(read_record_file, record=BOREAS, format="float32x6"),
             read_poses=partial(read_positions, columns=13, header_lines=1),
             description=f"format: Boreas, {describe_format('float32x6')}",
+            world="Boreas",
         ),
     ),
 }
@@ -220,6 +226,7 @@ def open_recording(root: Path, name: str, options: ReadOptions, *, layouts: tupl
         positions=positions[pose_rows[scan_rows]],
         times=scan_times[scan_rows] * layout.time_unit_s,
         pose_source=f"{pose_file.name}{left_out}",
+        world=layout.world,
         rows=scan_rows,
         mounting=layout.mounting,
         found=(layout.description,),
