@@ -192,7 +192,7 @@ def split_recordings(
     """Return the frames of each recording for training and for validation (`hold_out`, for each world)."""
     splits, worlds = {}, np.array(worlds_of(recordings))
     for world in range(worlds.max() + 1):
-        rows = np.flatnonzero(worlds == world)
+        rows = np.flatnonzero(worlds == world).tolist()
         positions = [positions_of(recordings[row]) for row in rows]
         splits |= zip(rows, hold_out(positions, config.validation, config.sampling), strict=True)
     return [splits[row] for row in range(len(recordings))]

@@ -98,7 +98,7 @@ def recall_and_f1_max(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, 
     descriptor_distance = np.where(same_visit, np.inf, cdist(descriptors, descriptors))
     nearest = descriptor_distance.argmin(1)
     nearest_is_match = is_match[queries, nearest]
-    has_match = is_match.any(1)
+    has_match = np.asarray(is_match.any(1))
     curve = decision_curve(
         -descriptor_distance[queries, nearest],
         true_if_accepted=nearest_is_match,
