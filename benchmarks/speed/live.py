@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,21 +62,27 @@ class RosPublisher:
 
     def put(self, points: np.ndarray, world_from_lidar: np.ndarray, stamp: float) -> None:
         """Publish a scan with its odometry at a time in seconds since 1970."""
-        clouds, poses = self._topics
+        clouds, poses = self.topics
         poses(transform_message(world_from_lidar, time=stamp, frame="odom", child="lidar"))
-        clouds(_cloud(points, stamp))
+        clouds(encode(CLOUD, cloud_fields(points, stamp)))
 
     @functools.cached_property
-    def _topics(self) -> tuple[Callable[[bytes], None], Callable[[bytes], None]]:
-        wire = self._wire = self._connect()  # kept, because the session closes when nothing refers to it
+    def topics(self) -> tuple[Callable[[bytes], None], Callable[[bytes], None]]:
+        """Functions that publish a cloud and transforms."""
+        wire = self.wire
         clouds = wire.advertise("/points", CLOUD, depth=1, latched=False)
         return clouds, wire.advertise("/odometry", TRANSFORMS, depth=100, latched=False)
 
+    @functools.cached_property
+    def wire(self) -> Transport:
+        """The connection."""
+        return self._connect()
 
-def _cloud(points: np.ndarray, stamp: float) -> bytes:
-    """PointCloud2 with the fields x, y and z."""
+
+def cloud_fields(points: np.ndarray, stamp: float) -> dict[str, Any]:
+    """Fields of a PointCloud2 with x, y and z."""
     padded = np.pad(points.astype(np.float32), ((0, 0), (0, 1)))
-    fields = {
+    return {
         "header": header(stamp, "lidar"),
         "height": 1,
         "width": len(points),
@@ -86,7 +92,6 @@ def _cloud(points: np.ndarray, stamp: float) -> bytes:
         "data": padded.view(np.uint8).reshape(-1),
         "is_dense": True,
     }
-    return encode(CLOUD, fields)
 
 
 def _dds(where: str) -> Transport:
@@ -149,27 +154,22 @@ def _measured(source: str, rate: float, seconds: float, warm_s: float, scans: in
         folder = Path(place)
         name, _, where = source.partition(":")
         where = str(folder / "scans") if name == "folder" else where
-        flags = [f"{name}:{where}" if where else name, "--out", folder / "map", "--weights", weights]
-        command = [sys.executable, "-m", "sglpr_jax.cli", "live", *flags, *PUBLISHERS[name](where).flags]
-        log = folder / "errors.txt"
-        with log.open("w") as errors:
-            node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
-        begin, results = time.monotonic(), Results(node)
-        _wait_until(lambda: "ready:" in log.read_text(), node)
+        begin = time.monotonic()
+        node = LiveProcess(name, where, folder, weights)
+        node.wait_until(lambda: "ready:" in node.log.read_text())
         start_s = time.monotonic() - begin
         context = multiprocessing.get_context("spawn")
         process = context.Process(target=_publish, args=(name, where, rate, count, scans))
         process.start()
-        _wait_until(lambda: results.frames, node)
+        node.wait_until(lambda: node.frames)
         time.sleep(warm_s)
-        before = results.memory()
+        before = node.memory()
         process.join(seconds / 2)
-        middle = results.memory()
+        middle = node.memory()
         process.join()
         time.sleep(1.0)
-        after = results.memory()
-        node.send_signal(signal.SIGTERM)
-        results.close()
+        after = node.memory()
+        node.close()
         memory = {
             "resident [MB]": after.resident_mb,
             "grown [MB]": after.resident_mb - before.resident_mb,
@@ -178,21 +178,27 @@ def _measured(source: str, rate: float, seconds: float, warm_s: float, scans: in
             "places": after.places,
             "kB a place": 1e3 * (after.map_mb - before.map_mb) / max(after.places - before.places, 1),
         }
-        return {"Hz": rate, "start [s]": start_s, **results.row(count), **memory}
+        return {"Hz": rate, "start [s]": start_s, **node.row(count), **memory}
 
 
 def _publish(name: str, where: str, rate: float, count: int, scans: int) -> None:
     """Publish scans at a rate, in a process of its own."""
+    publisher = PUBLISHERS[name](where)
+    for points, pose in scans_at(rate, count, scans):
+        publisher.put(points, pose, time.time())
+
+
+def scans_at(rate: float, count: int, scans: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield `count` scans of a drive there and back, and their poses, at a rate."""
     recording = simulate_recording("08", scans=scans, sensor=SENSORS["vlp16"], seed=3)
     clouds = [recording.points(i) for i in range(len(recording))]
     poses = recording.poses.world_from_lidar
     there_and_back = [*range(len(recording)), *range(len(recording) - 2, 0, -1)]
-    publisher = PUBLISHERS[name](where)
     begin = time.monotonic()
     for number in range(count):
         time.sleep(max(0.0, begin + number / rate - time.monotonic()))
         row = there_and_back[number % len(there_and_back)]
-        publisher.put(clouds[row], poses[row], time.time())
+        yield clouds[row], poses[row]
 
 
 class Memory(NamedTuple):
@@ -203,23 +209,42 @@ class Memory(NamedTuple):
     places: int
 
 
-class Results:
-    """Reads the lines of bin/live as they come."""
+class LiveProcess:
+    """A process of bin/live, whose lines are read as they come."""
 
-    def __init__(self, node: subprocess.Popen):
-        self.frames: list[dict] = []
+    def __init__(self, source: str, where: str, folder: Path, weights: str):
+        """Start bin/live for a source, with its map and its stderr in a folder."""
+        self.log, self.frames, self.loops = folder / "errors.txt", list[dict](), list[dict]()
+        """File of stderr, and the lines of scans and of loops."""
         self.latencies_s: dict[str, list[float]] = {"frame": [], "edge": []}
         """Latency of each scan, and of each scan with loops, to its last loop."""
-        self._node = node
+        flags = [f"{source}:{where}" if where else source, "--out", folder / "map", "--weights", weights]
+        command = [sys.executable, "-m", "sglpr_jax.cli", "live", *flags, *PUBLISHERS[source](where).flags]
+        with self.log.open("w") as errors:
+            self._node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Wait for the end of the node."""
-        self._node.wait()
+    def close(self) -> int:
+        """End the node by SIGTERM, if it runs. Returns its exit status."""
+        self._node.send_signal(signal.SIGTERM)  # nothing for a process that has ended
+        status = self._node.wait()
         self._thread.join()
         assert self._node.stdout is not None
         self._node.stdout.close()
+        return status
+
+    def wait_until(self, condition: Callable[[], Any]) -> None:
+        """Wait for a condition while the node runs."""
+        while not condition():
+            if self._node.poll() is not None:
+                raise RuntimeError(f"bin/live ended with {self._node.returncode}")
+            time.sleep(0.05)
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the node runs."""
+        return self._node.poll() is None
 
     def memory(self) -> Memory:
         """Memory of the node now, and the map at its last line."""
@@ -242,17 +267,10 @@ class Results:
             now, message = time.time(), json.loads(line)
             if message["type"] == "loop":
                 last_loop_time = now
+                self.loops.append(message)
                 continue
             self.frames.append(message)
             self.latencies_s["frame"].append(now - message["time"])
             if last_loop_time is not None:
                 self.latencies_s["edge"].append(last_loop_time - message["time"])
             last_loop_time = None
-
-
-def _wait_until(condition, node: subprocess.Popen) -> None:
-    """Wait for a condition while the node runs."""
-    while not condition():
-        if node.poll() is not None:
-            raise RuntimeError(f"bin/live ended with {node.returncode}")
-        time.sleep(0.05)

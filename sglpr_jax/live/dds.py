@@ -5,11 +5,12 @@ such as `sensor_msgs::msg::dds_::PointCloud2_`. Types are declared with the fiel
 information of newer releases of rmw_cyclonedds. Messages stay encoded (CDR, XCDR1).
 """
 
+import contextlib
 import functools
 import os
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, NamedTuple
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -72,7 +73,7 @@ class DdsTransport:
         self._waiting = WaitSet(self._participant)
         self._topics: dict[tuple[str, str], Topic] = {}
         self._readers: list[_Reader] = []
-        self._writers: dict[str, DataWriter] = {}
+        self._writers: dict[tuple[str, str], DataWriter] = {}
         self._qos_statuses: list[tuple[str, Callable[[], Any]]] = []
         """Report of each topic, and function that returns the status of its QoS mismatches."""
         self._closed = threading.Event()
@@ -97,12 +98,12 @@ class DdsTransport:
         expected = f"{topic}: expected subscribers that accept the QoS {_qos_text(True, latched)}"
         mismatch = f"{expected}, found one that asks for more"
         self._qos_statuses.append((mismatch, writer.get_offered_incompatible_qos_status))
-        self._writers[topic] = writer
+        self._writers[topic, kind] = writer
         del writer  # held by the dictionary alone, so that `close` deletes it
 
         def publish(cdr: bytes) -> None:
             try:
-                self._writers[topic].write(_raw_type(kind)(cdr), timestamp=time.time_ns())
+                self._writers[topic, kind].write(_raw_type(kind)(cdr), timestamp=time.time_ns())
             except DDSException as error:  # a slow subscriber
                 self._report(f"publish {topic}", f"{topic}: cannot publish a message ({in_short(error)})")
 
@@ -144,14 +145,22 @@ class DdsTransport:
                 self._report_qos_mismatches()
 
     def _deliver(self, source: _Reader) -> None:
-        """Pass the new messages of a reader to its `receive`. An error is reported, and the message is lost."""
-        kind = source.kind
-        try:
-            for sample in source.reader.take(N=source.depth, condition=source.condition):
+        """Pass the new messages of a reader to its `receive`."""
+        samples = list[Any]()
+        with self._reporting(source.kind):
+            samples = source.reader.take(N=source.depth, condition=source.condition)
+        for sample in samples:
+            with self._reporting(source.kind):
                 if sample.sample_info.valid_data:
                     publisher = sample.sample_info.publication_handle
-                    source.receive(Received(kind, sample.cdr, publisher, time.monotonic()))
-        except Exception as error:  # must not end the thread, which serves the other topics, too
+                    source.receive(Received(source.kind, sample.cdr, publisher, time.monotonic()))
+
+    @contextlib.contextmanager
+    def _reporting(self, kind: str) -> Iterator[None]:
+        """Report an error, which loses one message. It must not end the thread, which serves the other topics, too."""
+        try:
+            yield
+        except Exception as error:  # whatever a message holds
             self._report(f"message {kind}", f"{kind}: expected a valid message, found {in_short(error)}")
 
     def _report_qos_mismatches(self) -> None:

@@ -16,7 +16,7 @@ from sglpr_jax.files import append_whole, raising_write_error
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
-from sglpr_jax.live.odometry_input import FixedMounting, OdometryContinuity, ScanClock
+from sglpr_jax.live.odometry_input import FixedMounting, OdometryContinuity, OdometryState, ScanClock, agree
 from sglpr_jax.loops.arguments import as_pose
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import LoopClosure
@@ -103,6 +103,7 @@ class LiveMap:
         self._stamps = GrowingArray(np.empty(0))
         self._poses = GrowingArray(np.empty((0, 4, 4)))
         self._part = 0  # `LiveScan.part` of the last scan
+        self._is_by_scans = False  # whether the pose of the last scan is not by odometry, which is missing
         self._clock = ScanClock(report)
         self._continuity = OdometryContinuity(report, expected=expects_odometry)
         self._mounting = FixedMounting(sensor_height)
@@ -200,9 +201,19 @@ class LiveMap:
         state = self._continuity.add(pose, scan_time)
         if state is None:
             return None
+        keyframe = None
+        if finder.has_odometry and (state.pose is None or self._is_by_scans):
+            keyframe = finder.keyframe(scan)
+            state = self._state_by_scans(state, keyframe, scan_time)
+            if state is None:
+                return None
         is_keyframe = finder.is_due(time=scan_time, odometry=state.pose, continues=state.continues)
+        if not is_keyframe:
+            keyframe = None
+        elif keyframe is None:
+            keyframe = finder.keyframe(scan)
         described = LiveScan(
-            keyframe=finder.keyframe(scan) if is_keyframe else None,
+            keyframe=keyframe,
             is_keyframe=is_keyframe,
             compared=None,
             pose=state.pose,
@@ -217,6 +228,20 @@ class LiveMap:
             self._report("empty", f"{scan.name or f'scan {len(self) - 1}'}: expected a place, found almost no points")
         self._log_scan(described, finder.fits if is_keyframe else NO_FITS, loops)
         return [self._loop_edge(loop, frame.received) for loop in loops]
+
+    def _state_by_scans(self, state: OdometryState, keyframe: Keyframe, time: float) -> OdometryState | None:
+        """Return the state of a scan while odometry is missing, by the motion that the scans show, or of the first one
+        after that. If they show none, the scan is left out (None) or has the last pose with unknown motion."""
+        shown = self.detector.finder.pose_by_image(keyframe, time=time) if state.continues else None
+        if state.pose is not None:
+            self._is_by_scans, continues = False, shown is not None and agree(shown, state.pose)
+            if state.continues and not continues:
+                self._report("jump", "the odometry contradicts the scans while it was missing; it begins anew")
+            return OdometryState(state.pose, continues)
+        if shown is None and state.may_be_left_out and not self._is_by_scans:
+            return self._report("hold", "expected odometry or scans that show the motion, found none; left out")
+        self._is_by_scans = True
+        return OdometryState(self.odometry[-1], False) if shown is None else OdometryState(shown, True)
 
     def _add(self, scan: LiveScan) -> list[LoopClosure]:
         """Add a scan to the detector and the trajectory, and return the loops that it closes."""

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.mounting import Mounting, common_mounting, estimate_mounting
 from sglpr_jax.live.data_types import Report
-from sglpr_jax.se3 import inverse
+from sglpr_jax.se3 import inverse, yaw_of
 
 JUMP_S = 60.0
 """Maximum lead of a header's time over the time since the last scan, in seconds. Beyond it, the clock changed."""
@@ -22,7 +22,10 @@ RESTART_S = 60.0
 RESET_M = 0.2
 """Radius about the origin, in metres. Odometry that jumps into it by more than five times this distance was reset."""
 HOLD_S = 2.0
-"""Time without odometry for which scans are skipped, in seconds. Later scans are added without known motion."""
+"""Time without odometry for which scans that do not show their motion are left out, in seconds, at least one."""
+AGREE_M, AGREE_DEG = 0.8, 6.0
+"""Maximum distance and angle between odometry after a pause and the motion that the scans show, in metres and degrees.
+"""
 WAIT_S = 10.0
 """Time for which the first scans wait for odometry that was asked for, in seconds."""
 
@@ -31,8 +34,11 @@ class OdometryState(NamedTuple):
     """Odometry of a scan for the detector."""
 
     pose: Float[np.ndarray, "4 4"] | None
+    """Pose by odometry. None in a map without odometry, and while it is missing."""
     continues: bool
-    """Whether the motion since the last scan is known."""
+    """Whether the motion since the last scan is known or, without a pose, can be estimated from the scans."""
+    may_be_left_out: bool = False
+    """Whether odometry is missing for so short a time that the scan can be left out."""
 
 
 class OdometryContinuity:
@@ -45,15 +51,15 @@ class OdometryContinuity:
         self._began: float | None = None  # time of the first scan, in seconds
         self._last: Float[np.ndarray, "4 4"] | None = None  # last pose by odometry
         self._last_time = 0.0  # time of `_last`, in seconds
-        self._last_scan_has_pose = True
-        """Whether `_last` is the pose of the last scan, so that the motion since then is known."""
+        self._is_known = True  # whether the motion up to the last scan before a restart is known
+        self._misses_pose = False  # whether the last scan had no pose
         self._resumed = False  # whether the next scan is the first one after a restart
 
     def resume(self, pose: Float[np.ndarray, "4 4"] | None, time: float, *, known: bool = True) -> None:
         """Continue a map of an earlier process, whose last scan had this pose at this time. With `known=False`, the
         motion up to that scan was unknown, and its pose may be that of an earlier scan."""
         self._has_odometry, self._last, self._last_time = pose is not None, pose, time
-        self._last_scan_has_pose, self._resumed = known, True
+        self._is_known, self._resumed = known, True
 
     def add(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> OdometryState | None:
         """Return the odometry of the next scan, or None if the scan must be skipped. Times must not decrease."""
@@ -67,8 +73,11 @@ class OdometryContinuity:
                 self._report("restart", "the motion since the last scan before the restart is unknown")
             return OdometryState(None, not resumed)
         if pose is None:
-            return self._without_pose(time, resumed)
-        continues = self._last is None or (self._last_scan_has_pose and self._is_plausible(pose, time, resumed))
+            passed_s, is_first = time - self._last_time, not self._misses_pose
+            self._misses_pose = True
+            self._report("missing", f"expected odometry, found none for {passed_s:.1f} s; the scans show the motion")
+            return OdometryState(None, not resumed, not resumed and (is_first or passed_s < HOLD_S))
+        continues = self._last is None or (self._is_known and self._is_plausible(pose, time, resumed))
         if not continues or resumed:
             outcome = "continues" if continues else "is taken as unknown, and begins in a frame of its own"
             message = f"the odometry {outcome}"
@@ -76,7 +85,7 @@ class OdometryContinuity:
                 self._report("restart", f"{message} after the restart")
             else:
                 self._report("jump", message)
-        self._last, self._last_time, self._last_scan_has_pose = pose, time, True
+        self._last, self._last_time, self._is_known, self._misses_pose = pose, time, True, False
         return OdometryState(pose, continues)
 
     def _awaits_odometry(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> bool:
@@ -90,16 +99,6 @@ class OdometryContinuity:
             self._report("wait over", f"expected odometry, found none for {WAIT_S:.0f} s; the map is made without it")
         return False
 
-    def _without_pose(self, time: float, resumed: bool) -> OdometryState | None:
-        """Return the odometry of a scan without a pose in a map with odometry, or None to skip it (see `HOLD_S`). The
-        last pose is repeated, with unknown motion."""
-        passed_s = time - self._last_time
-        if not resumed and self._last_scan_has_pose and passed_s < HOLD_S:
-            return self._report("hold", "expected odometry at a scan, found none; the scan is left out")
-        self._report("stopped", f"expected odometry, found none for {passed_s:.0f} s; loops are found by scans")
-        self._last_scan_has_pose = False
-        return OdometryState(np.eye(4) if self._last is None else self._last, False)
-
     def _is_plausible(self, pose: Float[np.ndarray, "4 4"], time: float, resumed: bool) -> bool:
         """Whether a pose can follow the last one: near enough, not reset to the origin, not after a long restart."""
         assert self._last is not None
@@ -110,14 +109,21 @@ class OdometryContinuity:
         return is_near and not is_reset and (not resumed or passed_s <= RESTART_S)
 
 
+def agree(pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether two poses of a scan are at most `AGREE_M` and `AGREE_DEG` apart in the plane: scans show no height."""
+    apart = inverse(pose) @ other
+    return bool(np.linalg.norm(apart[:2, 3]) <= AGREE_M and abs(np.degrees(yaw_of(apart))) <= AGREE_DEG)
+
+
 class ScanClock:
-    """Times of scans that never decrease: header times plus an offset, which changes when the sensor's clock changes.
-    Scans without a header time, and the first scan after a change, get a time by their arrival."""
+    """Times of scans that never decrease: header times plus an offset, which changes when the sensor's clock changes,
+    as two scans in turn show. Scans without a header time, and those two, get a time by their arrival."""
 
     def __init__(self, report: Report):
         self._report = report
         self._offset = 0.0
         self._last: float | None = None  # time of the last scan by this clock, in seconds
+        self._doubtful: float | None = None  # header time of the last scan, if it cannot follow the one before
         self._received = 0.0  # time of arrival of the last scan, in seconds
 
     def resume(self, time: float, stamp: float, *, received: float) -> None:
@@ -129,17 +135,20 @@ class ScanClock:
         """Return the time of the next scan, in seconds, from its header time and its time of arrival."""
         passed_s = max(received - self._received, 0.0)
         expected = received if self._last is None else self._last + passed_s
-        time = stamp + self._offset
+        time, doubtful = stamp + self._offset, None
         if not _is_time(stamp):
             self._report("time", f"expected the time of a scan in its header, found {stamp:g}; its arrival is used")
             time = expected
         elif self._last is not None and not self._last <= time <= expected + JUMP_S:
-            self._report(
-                "clock",
-                f"expected a scan about {passed_s:.1f} s after the last one, found {time - self._last:+.1f} s in its "
-                "header; from now on times are counted from its arrival",
-            )
-            self._offset, time = expected - stamp, expected
+            step = f"expected a scan about {passed_s:.1f} s after the last one, found {time - self._last:+.1f} s"
+            if self._doubtful is not None and 0 <= stamp - self._doubtful <= passed_s + JUMP_S:
+                self._report("clock", f"{step} in its header; from now on times are counted from its arrival")
+                self._offset, doubtful = expected - stamp, None
+            else:
+                self._report("time", f"{step} in its header; its arrival is used")
+                doubtful = stamp
+            time = expected
+        self._doubtful = doubtful
         self._last, self._received = time, received
         return time
 

@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.files import write_all
-from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.live.live_map import LOOPS_FILE, LiveMap
+from sglpr_jax.pose_graph.files import write_loops_jsonl, write_tum
 from sglpr_jax.pose_graph.folder import graph_files
 
 TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
 
 
 def write_results(live: LiveMap, folder: Path) -> list[Path]:
-    """Write the loops as g2o and csv, the rejected pairs, and the odometry and its correction as tum, if there is any.
+    """Write the loops as g2o, csv and JSON lines, the rejected pairs, and the odometry and its correction as tum, if
+    there is any. The JSON lines replace those of `LiveMap`, which may lack loops after an error of the disk.
 
     The graph has no edge between scans whose motion is unknown, such as before and after a restart. The corrected
     trajectory lacks the parts that loops do not connect with the first one. Returns the paths. Raises
@@ -27,7 +28,9 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
         segment_starts = np.flatnonzero(np.diff(detector.finder.segments_of(scans))) + 1  # where the motion is unknown
         segments = np.split(scans, segment_starts)
         chains = [(frames, odometry[frames]) for frames in segments]
-    files = graph_files(live.loops, detector.rejected, chains, drift=detector.config.drift)
+    loops = live.loops
+    files = graph_files(loops, detector.rejected, chains, drift=detector.config.drift)
+    files[LOOPS_FILE] = partial(write_loops_jsonl, loops=loops)
     if len(odometry):
         files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)
         if live.trajectory is not None:

@@ -1,5 +1,6 @@
 """Poses of the LiDAR at the times of scans, from the odometry messages of a robot."""
 
+import math
 import threading
 import time as clock
 from collections import defaultdict, deque
@@ -18,6 +19,7 @@ from sglpr_jax.data.formats.ros_messages import (
 )
 from sglpr_jax.data.poses import pose_at
 from sglpr_jax.live.data_types import Report
+from sglpr_jax.live.odometry_input import FASTEST_M_PER_S, SLACK_M
 from sglpr_jax.live.ros_encoding import TRANSFORMS, Received
 
 ODOMETRY_TYPES = (*POSES, TRANSFORMS)
@@ -28,8 +30,12 @@ SILENCE_S = 1.0
 """Time without poses after which scans no longer wait for one, in seconds."""
 MOUNTING_WAIT_S = 3.0
 """Time from the first pose for which the mounting of the LiDAR is awaited on /tf_static, in seconds."""
-RESET_S = 1.0
-"""Step back in the times of poses, in seconds, beyond which the odometry has restarted: earlier poses are dropped."""
+RESET_S, PAUSE_S = 1.0, 2.0
+"""Steps back and forth in the times of poses, in seconds, beyond which the odometry has restarted."""
+FASTEST_DEG_PER_S, SLACK_DEG = 360.0, 45.0
+"""Maximum rate of rotation, and an additional rotation between two poses, in degrees."""
+LEAST_POSES = 2
+"""Number of poses of a pair of frames from which on it may be the odometry. A single one may be a damaged name."""
 
 
 FrameNames = tuple[str, str]
@@ -44,6 +50,8 @@ class LiveOdometry:
         self._report = report
         # of each pair of frames, in order
         self._poses: dict[FrameNames, deque[StampedPose]] = defaultdict(lambda: deque(maxlen=MAX_POSES))
+        self._doubtful: dict[FrameNames, StampedPose] = {}
+        """Last pose of each pair of frames, if it cannot follow those before it."""
         self._static: dict[FrameNames, StampedPose] = {}
         self._first_received = self._last_received = -np.inf  # until a pose arrives
         """Times of arrival of the first and the last pose, by `time.monotonic()`, in seconds."""
@@ -64,13 +72,23 @@ class LiveOdometry:
                         "pose", f"{self.topic}: expected a position and a rotation, found {pose.numbers.tolist()}"
                     )
                     continue
-                track = self._poses[frames]
-                if track and pose.time < track[-1].time - RESET_S:
-                    track.clear()
-                track.append(pose)
+                self._add(frames, pose)
                 self._first_received = message.at if np.isinf(self._first_received) else self._first_received
                 self._last_received = message.at
             self._changed.notify_all()
+
+    def _add(self, frames: FrameNames, pose: StampedPose) -> None:
+        """Add a pose. If it cannot follow the last one, the next one shows whether it is wrong or the odometry has
+        restarted, which drops earlier poses."""
+        track, doubtful = self._poses[frames], self._doubtful.pop(frames, None)
+        if not track or _can_follow(track[-1], pose):
+            track.append(pose)
+        elif doubtful is not None and _can_follow(doubtful, pose):
+            track.clear()
+            track.extend((doubtful, pose))
+        else:
+            self._doubtful[frames] = pose
+            self._report("step", f"{self.topic}: expected a pose near the last one, found a jump; the next one decides")
 
     def receive_static(self, message: Received) -> None:
         """Add the transforms of a message of /tf_static."""
@@ -92,33 +110,35 @@ class LiveOdometry:
             """Whether the poses reach the time of the scan, or no longer come."""
             self._choose_frames(lidar)
             track = self._poses[self._chosen[0]] if self._chosen else ()
-            return clock.monotonic() - self._last_received > SILENCE_S or bool(track and track[-1].time >= time)
+            is_awaited = not track or track[-1].time < time <= track[-1].time + SILENCE_S
+            return not is_awaited or clock.monotonic() - self._last_received > SILENCE_S
 
         with self._changed:
             self._changed.wait_for(is_decided, wait_s)
             frames, child_from_lidar = self._chosen or (None, np.eye(4))
             track = self._poses[frames] if frames else ()
-            near = [pose for pose in track if abs(pose.time - time) <= SILENCE_S]
+            near = {pose.time: pose for pose in track if abs(pose.time - time) <= SILENCE_S}  # some tf repeats poses
             reason = self._why_missing(lidar)
-        world_from_child = _interpolate(near, time)
+        world_from_child = _interpolate(list(near.values()), time)
         if world_from_child is None:
             return self._report("odometry", f"{self.topic}: expected a pose at {time:.3f}, found {reason}")
         return world_from_child @ child_from_lidar
 
     def _choose_frames(self, lidar: str) -> None:
-        """Choose the first frames whose child frame has a known pose of the LiDAR, by its name or /tf_static. After
-        `MOUNTING_WAIT_S`, poses of a single pair of frames are used as those of the LiDAR, which is reported."""
+        """Choose the frames with most poses whose child frame has a known pose of the LiDAR, by its name or /tf_static.
+        After `MOUNTING_WAIT_S`, poses of a single pair of frames are used as those of the LiDAR, which is reported."""
         if self._chosen is not None:
             return
         static = tracks_of_transforms((0, pose) for pose in self._static.values())
-        for frames in self._poses:
+        known = {frames: len(track) for frames, track in self._poses.items() if len(track) >= LEAST_POSES}
+        for frames in sorted(known, key=known.__getitem__, reverse=True):
             child = frames[1]
             child_from_lidar = np.eye(4) if child in ("", lidar) else static_transform(static, child, lidar)
             if child_from_lidar is not None:
                 self._chosen = frames, child_from_lidar
                 return
-        if clock.monotonic() - self._first_received > MOUNTING_WAIT_S and len(self._poses) == 1:
-            (frames,) = self._poses
+        if clock.monotonic() - self._first_received > MOUNTING_WAIT_S and len(known) == 1:
+            (frames,) = known
             self._chosen = frames, np.eye(4)
             consequence = f"the poses are used as those of {lidar}"
             self._report("mounting", f"/tf_static: expected {frames[1]} and {lidar}, found no path; {consequence}")
@@ -141,6 +161,15 @@ def _with_frame_names(pose: StampedPose) -> tuple[FrameNames, StampedPose]:
     """Return the frames of a pose, without slashes at the ends of their names, and the pose with these names."""
     pose = pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
     return (pose.frame, pose.child), pose
+
+
+def _can_follow(last: StampedPose, pose: StampedPose) -> bool:
+    """Whether a vehicle can get from one pose to another, and neither clock nor odometry has restarted between them."""
+    passed_s = pose.time - last.time
+    moved_m = float(np.linalg.norm(pose.numbers[:3] - last.numbers[:3]))
+    turned_deg = 2 * math.degrees(math.acos(min(abs(float(pose.numbers[3:] @ last.numbers[3:])), 1.0)))
+    is_near = moved_m <= SLACK_M + FASTEST_M_PER_S * abs(passed_s)
+    return -RESET_S <= passed_s <= PAUSE_S and is_near and turned_deg <= SLACK_DEG + FASTEST_DEG_PER_S * abs(passed_s)
 
 
 def _interpolate(poses: list[StampedPose], time: float) -> Float[np.ndarray, "4 4"] | None:

@@ -9,7 +9,10 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
+from sglpr_jax.data.formats.ros_messages import Header
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import WAIT_S, FrameStatus, LatestScan, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
@@ -34,6 +37,8 @@ TAKEOVER_S = 2.0
 """Time without scans of a publisher after which those of another one are used, in seconds."""
 POSE_QUEUE = 100
 """Maximum number of messages with poses that wait for the thread of the connection."""
+SCAN_QUEUE = 3
+"""Maximum number of messages with scans that wait for the thread of the connection, which leaves out invalid ones."""
 EDGE_HISTORY = 1000
 """Maximum number of past edges that a late subscriber receives."""
 MAX_DRAWN_LOOPS = 500
@@ -71,11 +76,16 @@ class RosSource:
         """Subscribe to the topics. After `MISSING_S` seconds without scans, the existing topics are reported."""
         self.topic = absolute_topic(options.topic or DEFAULT_CLOUD_TOPIC)
         self._transport, self._report = transport, report
-        self._latest: LatestScan[Received] = LatestScan()
-        self._publisher = None  # of the last scan
+        self._latest: LatestScan[tuple[Header, Scan, float]] = LatestScan()
+        self._publisher, self._taken = None, -np.inf
+        """Publisher of the last valid scan, and time of its arrival by `time.monotonic()`, in seconds."""
         self._received = self._reported = time.monotonic()
         self._closed = threading.Event()
-        transport.subscribe(self.topic, CLOUD_TYPES, self._receive, depth=1, reliable=options.reliable, latched=False)
+        transport.subscribe(
+            self.topic, CLOUD_TYPES, self._receive, depth=SCAN_QUEUE, reliable=options.reliable, latched=False
+        )
+        self._last, self._late = -np.inf, None
+        """Header time of the last scan with a pose, and of the last scan if it was before that, in seconds."""
         self._odometry = None
         if options.odometry_topic is not None:
             odometry = self._odometry = LiveOdometry(absolute_topic(options.odometry_topic), report)
@@ -87,11 +97,11 @@ class RosSource:
 
     def frames(self) -> Iterator[LiveFrame | None]:
         while not self._closed.is_set():
-            message = self._latest.take(WAIT_S)
-            if message is None:
+            scan = self._latest.take(WAIT_S)
+            if scan is None:
                 self._report_silence()
             try:
-                frame = None if message is None else self._frame(message)
+                frame = None if scan is None else self._frame(*scan)
             except Exception as error:  # whatever a message holds, the source lives on
                 frame = self._report("message", f"{self.topic}: a scan is left out: {in_short(error, most=300)}")
             yield frame
@@ -105,25 +115,35 @@ class RosSource:
         return self._latest.dropped
 
     def _receive(self, message: Received) -> None:
-        """Keep a scan for `frames`, unless another publisher than the one in use sent it."""
-        if message.publisher != self._publisher:
-            if self._publisher is not None and message.at - self._received < TAKEOVER_S:
-                expected = f"{self.topic}: expected one publisher"
-                return self._report("publishers", f"{expected}, found several; the scans of the first are used")
-            self._publisher = message.publisher
+        """Keep a valid scan for `frames`, unless another publisher than the one in use sent it. Invalid ones are left
+        out here, so that they neither replace a valid one that waits nor keep other publishers out."""
+        if message.publisher != self._publisher and message.at - self._taken < TAKEOVER_S:
+            expected = f"{self.topic}: expected one publisher"
+            return self._report("publishers", f"{expected}, found several; the scans of the first are used")
         self._received = message.at
-        self._latest.put(message)
-
-    def _frame(self, message: Received) -> LiveFrame | None:
-        """Decode a scan and find its pose. Returns None, with a report, for an invalid scan."""
         try:
             header, scan = decode_cloud(message.raw, message.kind)
         except ValueError as error:
             return self._report("cloud", f"{self.topic}: {error}")
-        pose = None
-        if self._odometry is not None:
-            pose = self._odometry.pose(header.time, header.frame.strip("/"), wait_s=WAIT_S)
-        return LiveFrame(dataclasses.replace(scan, time=header.time), header.time, pose, message.at)
+        self._publisher, self._taken = message.publisher, message.at
+        self._latest.put((header, scan, message.at))
+
+    def _frame(self, header: Header, scan: Scan, received: float) -> LiveFrame:
+        """Find the pose of a scan that arrived at the time `received`."""
+        pose = None if self._odometry is None else self._pose(header, self._odometry)
+        return LiveFrame(dataclasses.replace(scan, time=header.time), header.time, pose, received)
+
+    def _pose(self, header: Header, odometry: LiveOdometry) -> Float[np.ndarray, "4 4"] | None:
+        """Find the pose of a scan. A single scan with a time before that of the last one has none: its time is wrong.
+        A second one shows that the clock has changed."""
+        late, self._late = self._late, None
+        if header.time < self._last and (late is None or header.time < late):
+            self._late = header.time
+            found = f"found one {self._last - header.time:.1f} s before the last one; its pose is unknown"
+            return self._report("order", f"{self.topic}: expected scans in order, {found}")
+        pose = odometry.pose(header.time, header.frame.strip("/"), wait_s=WAIT_S)
+        self._last = self._last if pose is None else header.time
+        return pose
 
     def _report_silence(self) -> None:
         """Report existing topics and types if no scan arrived, and nothing was reported, for `MISSING_S` seconds."""

@@ -174,6 +174,20 @@ class CandidateSearch:
         moved_m, rotation = self.motion.moved(len(self) - 1, pose)
         return bool(moved_m >= self.spacing_m or rotation >= np.radians(KEYFRAME_DEG))
 
+    def pose_by_image(self, keyframe: Keyframe, *, time: float) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of the LiDAR at the next scan by registration with the last frames, in the frame of the odometry.
+
+        None if the images do not show it. The scan is not added.
+        """
+        if not len(self) or np.count_nonzero(keyframe.image) < MIN_CELLS:
+            return None
+        image = self.background.without(np.asarray(within_reach(keyframe.image, self.verification)))
+        link = self._register_with_reference(Query(len(self), keyframe.descriptor, image, self.verification), time)
+        if link is None:
+            return None
+        reference_from_scan = transform(float(link.x), float(link.y), float(link.yaw))
+        return self.motion.poses[self.motion.reference] @ reference_from_scan @ upright_from_lidar(keyframe.mounting)
+
     def skip(self) -> None:
         """Count a scan that is not a frame."""
         self.scans += 1

@@ -18,7 +18,7 @@ from cyclonedds.util import duration
 
 from sglpr_jax.live.dds import DdsTransport
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros_encoding import EDGE, TRANSFORMS
+from sglpr_jax.live.ros_encoding import EDGE, TRANSFORMS, edge_message
 from sglpr_jax.live.sources_and_sinks import open_sink, open_source
 from tests.live.messages import decoded, transforms
 from tests.live.test_ros_encoding import edge
@@ -146,6 +146,35 @@ def test_edges_reach_a_subscriber_that_comes_later(domain, peer, said):
     sink.close()
     until(lambda: "/sglpr/loops" not in peer.published())  # the end of a publisher is no message
     assert len(found) == 1 and not said
+
+
+def test_two_types_are_published_on_one_topic(domain, peer, said):
+    other, found = DdsTransport(int(domain), said), []
+    other.subscribe("/both", [EDGE, TRANSFORMS], found.append, depth=10, reliable=True, latched=True)
+    messages = {EDGE: edge_message(edge()), TRANSFORMS: transforms(0, [("odom", "base", (0, 0, 0), STILL)])}
+    publish = {kind: peer.advertise("/both", kind, depth=1, latched=True) for kind in messages}
+    for kind, raw in messages.items():
+        publish[kind](raw)
+    until(lambda: {message.kind for message in found} == set(messages))
+    other.close()
+    assert not said
+
+
+def test_an_invalid_message_costs_no_other_one(domain, peer, said):
+    other, found = DdsTransport(int(domain), said), []
+    publish = other.advertise("/tf", TRANSFORMS, depth=3, latched=True)
+    for seconds in range(3):
+        publish(transforms(seconds, []))
+
+    def receive(message) -> None:
+        found.append(message)
+        if len(found) == 1:
+            raise ValueError("expected something else")
+
+    peer.subscribe("/tf", [TRANSFORMS], receive, depth=3, reliable=True, latched=True)
+    until(lambda: len(found) == 3)
+    other.close()
+    assert said.kinds == [f"message {TRANSFORMS}"]
 
 
 def test_a_subscriber_with_another_qos_is_reported(domain, peer, said):

@@ -18,9 +18,19 @@ def times(clock: ScanClock, stamps, received=None) -> list[float]:
 
 @pytest.mark.parametrize("other", [1e9 - 3600, 1e9 + 365 * 86400])
 def test_a_clock_that_jumps_is_followed(said, other):
-    stamps = [1e9, 1e9 + 0.1, other, other + 0.1, other + 0.2, 1e9 + 0.5]
-    np.testing.assert_allclose(np.diff(times(ScanClock(said), stamps)), 0.1, atol=1e-6)
-    assert said.kinds == ["clock", "clock"]
+    clock, start = ScanClock(said), 1e9
+    stamps = [start, start + 0.1, other, other + 0.1, other + 0.2, start + 0.5]
+    np.testing.assert_allclose(np.diff(times(clock, stamps)), 0.1, atol=1e-6)
+    assert said.kinds == ["time", "clock", "time"]
+    assert clock.time(1e9 + 0.6, 50.6) == pytest.approx(start + 0.6) and said.kinds[-1] == "clock"
+
+
+@pytest.mark.parametrize("wrong_s", [-3600.0, -1.0, 3600.0])
+def test_a_single_wrong_time_does_not_change_the_clock(said, wrong_s):
+    clock = ScanClock(said)
+    found = times(clock, [1e9, 1e9 + 0.1 + wrong_s, 1e9 + 0.2, 1e9 + 0.3], received=[50.0, 50.07, 50.2, 50.4])
+    np.testing.assert_allclose(found, [1e9, 1e9 + 0.07, 1e9 + 0.2, 1e9 + 0.3], atol=1e-6)
+    assert said.kinds == ["time"]
 
 
 @pytest.mark.parametrize("missing", [0.0, np.nan])
@@ -49,16 +59,14 @@ def test_odometry_that_jumps_or_is_reset_begins_anew(said):
     assert said.kinds == ["jump"] * 3
 
 
-def test_odometry_that_stops_holds_scans_back_for_a_while(said):
-    given = [(0.0, at(0)), (HOLD_S - 0.1, None), (HOLD_S, None), (HOLD_S + 0.1, None), (HOLD_S + 0.2, at(1))]
+def test_odometry_that_is_missing_is_told_and_a_scan_may_be_left_out_for_a_while(said):
+    given = [(0.0, at(0)), (HOLD_S - 0.1, None), (HOLD_S + 0.1, None), (HOLD_S + 0.2, at(1)), (30.0, None)]
     continuity = OdometryContinuity(said, expected=True)
-    assert placed(continuity, given) == [True, None, False, False, False]
-    assert placed(continuity, [(HOLD_S + 0.3, at(1.1)), (HOLD_S + 0.5, None), (HOLD_S + 0.6, at(1.2))]) == [
-        True,
-        None,
-        True,
-    ]
-    assert said.kinds == ["hold", "stopped", "stopped", "jump", "hold"]
+    found = [continuity.add(pose, time) for time, pose in given]
+    assert [one.pose is None for one in found] == [False, True, True, False, True]
+    assert all(one.continues for one in found)
+    assert [one.may_be_left_out for one in found] == [False, True, False, False, True]
+    assert said.kinds == ["missing"] * 3
 
 
 def test_the_first_scans_wait_for_odometry(said):

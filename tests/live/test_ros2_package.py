@@ -16,7 +16,7 @@ import yaml
 from sglpr_jax.cli.live import LiveCommand
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_encoding import CLOUD, EDGE, TRANSFORMS
-from sglpr_jax.live.ros_topics import RosSource, Transport
+from sglpr_jax.live.ros_topics import SCAN_QUEUE, RosSource, Transport
 from tests.live.messages import ODOMETRY, POINTS, cloud, odometry, received
 from tests.live.test_ros_topics import Memory
 
@@ -140,7 +140,7 @@ def test_messages_stay_encoded(package, said):
         node.subscribed["/odom", ODOMETRY][0](odometry(seconds, (seconds, 0, 0), child="lidar"))
     take, qos = node.subscribed["/points", CLOUD]
     take(cloud(12.5))
-    assert (qos["depth"], qos["reliability"], qos["durability"]) == (1, "best", 0)
+    assert (qos["depth"], qos["reliability"], qos["durability"]) == (SCAN_QUEUE, "best", 0)
     assert node.subscribed["/tf_static", TRANSFORMS][1]["durability"] == 1
     frame = next(source.frames())
     np.testing.assert_array_equal(frame.scan.points, POINTS)

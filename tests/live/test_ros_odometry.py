@@ -59,6 +59,55 @@ def test_a_pose_that_cannot_be_is_left_out(live, said, position, rotation):
     np.testing.assert_allclose(live.pose(10.15, "lidar", wait_s=0.0)[:3, 3], [20.3, 0, 0])
 
 
+@pytest.mark.parametrize(
+    ("seconds", "position", "rotation"),
+    [
+        (10.15, (320.0, 0, 0), (0, 0, 0, 1)),
+        (10.15, (20.3, 0, 0), (0, 0, 1, 0)),
+        (0.0, (20.3, 0, 0), (0, 0, 0, 1)),
+        (1e9, (20.3, 0, 0), (0, 0, 0, 1)),
+    ],
+)
+def test_a_single_pose_that_cannot_follow_is_left_out(live, said, seconds, position, rotation):
+    drive(live, 10.0, 10.1)
+    live.receive(received(ODOMETRY, odometry(seconds, position, rotation, child="lidar")))
+    drive(live, 10.2, 10.3)
+    np.testing.assert_allclose(live.pose(10.15, "lidar", wait_s=0.0)[:3, 3], [20.3, 0, 0])
+    np.testing.assert_allclose(live.pose(10.05, "lidar", wait_s=0.0)[:3, 3], [20.1, 0, 0])
+    assert said.kinds == ["step"]
+
+
+def test_a_pose_may_be_repeated(live):
+    drive(live, 10.0, 10.1, 10.1)
+    np.testing.assert_allclose(live.pose(10.1, "lidar", wait_s=0.0)[:3, 3], [20.2, 0, 0])
+
+
+def test_odometry_that_begins_anew_is_taken_from_its_second_pose(live, said):
+    drive(live, 10.0, 10.1)
+    for seconds in (10.2, 10.3):
+        live.receive(received(ODOMETRY, odometry(seconds, (500 + seconds, 0, 0), child="lidar")))
+    np.testing.assert_allclose(live.pose(10.25, "lidar", wait_s=0.0)[:3, 3], [510.25, 0, 0])
+    assert live.pose(9.1, "lidar", wait_s=0.0) is None
+    assert said.kinds == ["step", "odometry"]
+
+
+@pytest.mark.parametrize("child", ["", "lidar", "garbage"])
+def test_frames_of_a_single_pose_are_not_chosen(live, child):
+    damaged = [("garbage", child, (0, 0, 0), (0, 0, 0, 1))]
+    live.receive(received(TRANSFORMS, transforms(10.0, damaged), at=clock.monotonic()))
+    assert live.pose(10.0, "lidar", wait_s=0.0) is None
+    drive(live, 10.0, 10.1, child="base")
+    live._first_received -= MOUNTING_WAIT_S
+    np.testing.assert_allclose(live.pose(10.1, "lidar", wait_s=0.0)[:3, 3], [20.2, 0, 0])
+
+
+def test_a_scan_of_a_time_far_ahead_does_not_wait(live):
+    drive(live, 10.0, 10.1)
+    began = clock.monotonic()
+    assert live.pose(100.0, "lidar", wait_s=5.0) is None
+    assert clock.monotonic() - began < 1
+
+
 def test_poses_of_another_clock_are_reported(live, said):
     drive(live, 10.0, 10.1)
     assert live.pose(1e9, "lidar", wait_s=0.01) is None

@@ -90,6 +90,27 @@ def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(tran
     assert said.of("publishers") == ["/points: expected one publisher, found several; the scans of the first are used"]
 
 
+def test_an_invalid_scan_costs_no_other_one(transport, source, said):
+    """Neither one that waits, nor those of the publisher that sends valid ones."""
+    transport.receive["/points"](received(LIVOX, b"", publisher="b", at=0.9))
+    transport.receive["/points"](received(CLOUD, cloud(), publisher="a", at=1.0))
+    transport.receive["/points"](received(CLOUD, cloud()[:50], publisher="a", at=1.1))
+    assert next(source.frames()).received == 1.0
+    assert (said.kinds.count("cloud"), source.dropped) == (2, 0)
+
+
+def test_a_single_scan_of_an_earlier_time_has_no_pose(transport, source, said):
+    for seconds in (12.0, 12.5, 13.0):
+        message = odometry(seconds, (seconds, 0, 0), child="lidar")
+        transport.receive["/odom"](received(ODOMETRY, message, at=clock.monotonic()))
+    frames, found = source.frames(), []
+    for seconds in (12.8, 12.2, 12.9, 12.3, 12.4, 12.5):  # the last ones by another clock
+        transport.receive["/points"](received(CLOUD, cloud(seconds)))
+        found.append(next(frames).odometry is not None)
+    assert found == [True, False, True, False, True, True]
+    assert said.kinds == ["order", "order"]
+
+
 @pytest.mark.parametrize(
     "topics, kind, found",
     [
