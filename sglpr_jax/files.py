@@ -218,6 +218,14 @@ def check_writable(path: Path) -> None:
         _remove(trial)
 
 
+def check_remain(*paths: Path) -> None:
+    """Raise FileNotFoundError if a written file does not exist any more, as after its folder was removed: `replacing`
+    then creates the folder again, for the later files only."""
+    for path in paths:
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: expected this file, which was written before, found it removed")
+
+
 def half_written(folder: Path) -> list[Path]:
     """Return the unfinished files and folders that killed processes left in `folder` and below (see `replacing`)."""
     # `Path.rglob` would raise FileNotFoundError if another process removes a folder meanwhile.

@@ -12,6 +12,7 @@ from sglpr_jax.files import (
     MOST_SHOWN,
     WriteError,
     append_whole,
+    check_remain,
     check_writable,
     exclusive_lock,
     file_name,
@@ -188,3 +189,10 @@ def test_names_and_values_in_messages_are_short_lines():
     assert len(printable("x" * 2**20)) == MOST_SHOWN
     assert json_in_short({"kind": "noise", "strength": None}) == '{"kind": "noise", "strength": null}'
     assert len(json_in_short(list(range(100)))) == 80
+
+
+def test_a_written_file_that_was_removed_is_named(tmp_path):
+    write_json(tmp_path / "first.json", {})
+    check_remain(tmp_path / "first.json")
+    with pytest.raises(FileNotFoundError, match=r"second\.json: .*found it removed"):
+        check_remain(tmp_path / "first.json", tmp_path / "second.json")

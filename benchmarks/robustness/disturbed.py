@@ -1,12 +1,13 @@
-"""Tests of commands that write files: killed, started twice at once, on a full disk, without rights, with bad input.
+"""Tests of commands that write files: killed, started twice at once, with troubles of disk and input.
 
 Inputs are small, so that a command takes a second. A command runs in a process that is forked from this one, which has
 imported the command's module but not started JAX. The command therefore starts quickly, and a kill hits its work.
+
+Small file systems are mounted in a mount namespace of this process, which ends with it. This needs root.
 """
 
 import contextlib
 import ctypes
-import dataclasses
 import fnmatch
 import functools
 import importlib
@@ -17,6 +18,7 @@ import random
 import resource
 import shutil
 import struct
+import subprocess
 import sys
 import tempfile
 import time
@@ -25,62 +27,18 @@ from multiprocessing.context import ForkProcess as Process
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.robustness.writers import BAG, INPUT_LINES, INPUTS, OUT, SCANS, WRITERS, write_bag_of
 from benchmarks.table import Table
 from benchmarks.timing import about
 from sglpr_jax.files import half_written
 
-INPUTS, OUT, ERRORS = "inputs", "out", "stderr"
-"""Folder of the input files, and output folder and file for stderr within the folder of a command."""
+ERRORS = "stderr"
+"""File for stderr in the folder of a command."""
 TIMEOUT_S = 900
-DRIVE = "--azimuth-steps 60 --sensor vlp16"
-TOWN = f"../{INPUTS}/town"
-SCANS = f"{TOWN}/sequences/08/velodyne"
-POSES = f"--poses {TOWN}/sequences/%s/poses.txt --pose-format kitti"
-TRAINED = f"--seq 08 --data {TOWN} --preset tiny --steps 8 --method solid"
-RUN_FILES = ("*/checkpoints/*", "*/environment.json", "*/metrics.jsonl", "*/learning-curves.png", "*/mining/*")
-
-
-@dataclasses.dataclass(frozen=True)
-class Writer:
-    """A command that writes into `OUT`."""
-
-    line: str
-    """Arguments."""
-    varies: tuple[str, ...] = ()
-    """Patterns of files below `OUT` that may differ between runs, for example because they contain times."""
-    resumed_by: str = ""
-    """File below `OUT`. If it exists, the command is started with --resume."""
-    refuses: str = ""
-    """Part of the error of a command that refuses to run again after it has finished. Empty: it can run again."""
-
-
-WRITERS = {
-    "embed": Writer(f"--weights sglpr-small --data {TOWN} --seq 08 --out {OUT}/08.npz"),
-    "evaluate": Writer(f"../{INPUTS}/08.npz --data {TOWN} --seq 08 --out {OUT}/08"),
-    "simulate": Writer(f"--out {OUT}/town {DRIVE} --seq 08 --scans 12"),
-    "simulate images": Writer(f"--out {OUT}/town {DRIVE} --seq 08 --scans 12 --images"),
-    "export": Writer(f"--weights sglpr-small --out {OUT}/mine", refuses="not exist yet"),
-    "export stablehlo": Writer(f"--weights sglpr-small --format stablehlo --out {OUT}/mine", refuses="not exist yet"),
-    "map": Writer(f"{TOWN} --seq 08 {POSES % '08'} --out {OUT}/town.safetensors", varies=("town.unfinished/*",)),
-    "map more": Writer(
-        f"{TOWN} --seq 05 {POSES % '05'} --add-to ../{INPUTS}/town.safetensors --out {OUT}/town.safetensors",
-        varies=("town.unfinished/*",),
-    ),
-    "relocalize": Writer(f"{SCANS}/000003.bin --map ../{INPUTS}/town.safetensors --out {OUT}/pose.json"),
-    "loops": Writer(
-        f"{TOWN} --seq 08 --odometry {TOWN}/sequences/08/poses.txt --odometry-format kitti --out {OUT}/found",
-        varies=("found/unfinished/*",),
-    ),
-    "segment": Writer(f"--weights sglpr --data {TOWN} --seq 08 --out {OUT}/maps"),
-    "train": Writer(f"{TRAINED} --out {OUT}/run --cache {OUT}/packs", varies=RUN_FILES, resumed_by="run/config.json"),
-    "reproduce": Writer(f"table1 {TRAINED} --out {OUT}/paper", varies=RUN_FILES),
-}
-"""Commands by name. The first word is the command in `bin/`."""
-INPUT_LINES = (
-    f"simulate --out town {DRIVE} --seq 05 08 --scans 24 --rate-hz 1",
-    "embed --method solid --data town --seq 08 --out 08.npz",
-    "map town --seq 08 --poses town/sequences/08/poses.txt --pose-format kitti --out town.safetensors",
-)
+PAGE = 4096
+"""Bytes of the smallest part of a file system in memory."""
+CLONE_NEWNS = 0x20000
+"""Flag of unshare(2) for mounts of its own."""
 
 
 def start(
@@ -170,6 +128,14 @@ class Trial:
             if not any(part.startswith(".") for part in Path(name).parts)
         }
 
+    def keep_files(self) -> None:
+        """Unmounts the file system at the output folder, whose files stay."""
+        kept = self.folder / "kept"
+        shutil.copytree(self.out, kept)
+        subprocess.run(("umount", self.out), check=True)
+        self.out.rmdir()
+        kept.rename(self.out)
+
     def changes(self, process: Process) -> Iterator[None]:
         """Yields at each change in the output folder while the process runs. Polls 1000 times a second."""
         previous_sizes: list[tuple[str, int]] = []
@@ -179,18 +145,36 @@ class Trial:
                 yield
             time.sleep(1e-3)
 
+    def wait(self, process: Process, undisturbed: Undisturbed, draw: random.Random, *, near_change: bool) -> None:
+        """Wait for a random moment of the run, or for one within 5 ms of a change in the output folder."""
+        if near_change:
+            for _ in itertools.islice(self.changes(process), draw.randint(1, undisturbed.changes)):
+                pass
+            time.sleep(draw.uniform(0, 5e-3))
+        else:
+            time.sleep(draw.uniform(0, undisturbed.seconds))
+
     def count_differing(self, undisturbed: dict[str, bytes], what: str, *, complete: bool = False) -> int:
         """Prints and counts the files that differ from an undisturbed run, except those in `Writer.varies`.
 
-        With `complete`, missing files count too.
+        With `complete`, missing files and missing last lines of `Writer.grows` count too.
         """
         files = self.files()
         names = {**files, **undisturbed} if complete else files
         differing = [name for name in names if files.get(name) != undisturbed.get(name)]
-        wrong = [name for name in differing if not any(fnmatch.fnmatch(name, one) for one in self.writer.varies)]
+        allowed = [name for name in differing if _matches(name, self.writer.varies)]
+        if not complete:
+            growing = [name for name in differing if _matches(name, self.writer.grows)]
+            allowed += [name for name in growing if undisturbed[name].startswith(files[name])]
+        wrong = [name for name in differing if name not in allowed]
         for name in wrong:
             print(f"{self.name}: {name} {what}", file=sys.stderr)
         return len(wrong)
+
+
+def _matches(name: str, patterns: Sequence[str]) -> bool:
+    """Whether a path matches one of some patterns."""
+    return any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
 
 
 def _sizes(folder: Path) -> list[tuple[str, int]]:
@@ -227,6 +211,7 @@ def _disturb(commands: Sequence[str], rows_of: Callable[[str, Path, Undisturbed]
             command, *arguments = line.split()
             assert status_of(start(command, arguments, inputs)) == 0, (inputs / ERRORS).read_text()
         (inputs / ERRORS).unlink()
+        write_bag_of(inputs / "town", inputs / BAG)
         for name in commands:
             for row in rows_of(name, Path(folder), _undisturbed(name, Path(folder))):
                 table = table or Table("command", *row)
@@ -258,12 +243,7 @@ def _killed(name: str, root: Path, undisturbed: Undisturbed, *, times: int, seed
             break
         trial = Trial(name, root)
         process = trial.start()
-        if attempt % 2:
-            for _ in itertools.islice(trial.changes(process), draw.randint(1, undisturbed.changes)):
-                pass
-            time.sleep(draw.uniform(0, 5e-3))
-        else:
-            time.sleep(draw.uniform(0, undisturbed.seconds))
+        trial.wait(process, undisturbed, draw, near_change=bool(attempt % 2))
         process.kill()
         if status_of(process) >= 0:
             continue  # the command had finished before
@@ -293,7 +273,7 @@ def together(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 5) -> N
 
 def _doubled(name: str, root: Path, undisturbed: Undisturbed, *, times: int) -> Iterator[dict[str, Any]]:
     """Start a command twice at once, this many times."""
-    counts = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
+    counts: dict[str, Any] = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
     for _ in range(times):
         trial, errors = Trial(name, root), (f"{ERRORS}-0", f"{ERRORS}-1")
         statuses = [status_of(process) for process in [trial.start(errors=one) for one in errors]]
@@ -306,37 +286,10 @@ def _doubled(name: str, root: Path, undisturbed: Undisturbed, *, times: int) -> 
     yield counts
 
 
-def disk(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 4, seed: int = 0) -> None:
-    """No room, no right to write, files that are read vanish or are half there: one line, and nothing half-written.
-
-    Args:
-        commands: names in `WRITERS`.
-        times: how often each trouble is made.
-        seed: seed of sizes and moments.
-    """
-    _disturb(commands, functools.partial(_troubled, times=times, seed=seed))
-
-
-def _troubled(name: str, root: Path, undisturbed: Undisturbed, *, times: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Run a command with each of `TROUBLES`, this many times."""
-    draw = random.Random(f"{seed} {name}")
-    for trouble, run in TROUBLES.items():
-        counts = dict.fromkeys(("refused in one line", "ends well", "anything else", "half-written"), 0)
-        for _ in range(times):
-            trial = Trial(name, root)
-            status = run(trial, undisturbed, draw)
-            refused = status == 1 and _is_one_line(trial.error())
-            kind = "ends well" if status == 0 else "refused in one line" if refused else "anything else"
-            if kind == "anything else":
-                print(f"{name}, {trouble}: status {status}: {trial.error()[-2000:]}", file=sys.stderr)
-            counts[kind] += 1
-            counts["half-written"] += trial.count_differing(undisturbed.files, f"is not whole: {trouble}")
-        yield {"trouble": trouble, **counts}
-
-
-def _is_one_line(error: str) -> bool:
-    """Whether stderr ends with one line "error: ...", without a traceback."""
-    return "Traceback" not in error and error.rstrip("\n").split("\n")[-1].startswith("error: ")
+def _is_one_line(error: str, *, named: str = "") -> bool:
+    """Whether stderr ends with one line "error: ..." that names a path with this part, without a traceback."""
+    last = error.rstrip("\n").split("\n")[-1]
+    return "Traceback" not in error and last.startswith("error: ") and named in last
 
 
 def _without_room(trial: Trial, undisturbed: Undisturbed, draw: random.Random) -> int:
@@ -352,6 +305,46 @@ def _without_rights(trial: Trial, undisturbed: Undisturbed, draw: random.Random)
     return status
 
 
+def _on_small_disk(trial: Trial, undisturbed: Undisturbed, draw: random.Random) -> int:
+    """Runs a command whose output folder has less room than its files need, because another file takes some."""
+    pages = sum(-(-len(content) // PAGE) for content in undisturbed.files.values())
+    return _mounted(trial, f"size={PAGE * pages}", taken=PAGE * draw.randint(1, pages))
+
+
+def _on_few_inodes(trial: Trial, undisturbed: Undisturbed, draw: random.Random) -> int:
+    """Runs a command whose output folder takes fewer files and folders than it writes."""
+    written = {part for name in undisturbed.files for part in (Path(name), *Path(name).parents)}
+    return _mounted(trial, f"nr_inodes={draw.randint(1, len(written) - 1)}")
+
+
+def _mounted(trial: Trial, options: str, *, taken: int = 0) -> int:
+    """Runs a command whose output folder is a file system in memory, with a hidden file of `taken` bytes."""
+    subprocess.run(("mount", "-t", "tmpfs", "-o", options, "tmpfs", trial.out), check=True)
+    if taken:
+        (trial.out / ".taken").write_bytes(bytes(taken))
+    status = trial.run()
+    trial.keep_files()
+    return status
+
+
+def _without_folder(trial: Trial, undisturbed: Undisturbed, draw: random.Random) -> int:
+    """Runs a command whose output folder is removed at a random moment, mostly near a change in it.
+
+    If everything had been written before, the folder comes back.
+    """
+    process = trial.start()
+    trial.wait(process, undisturbed, draw, near_change=draw.random() < 0.75)
+    removed, copied = trial.folder / "removed", trial.folder / "copied"
+    with contextlib.suppress(FileNotFoundError):  # the command has removed the folder
+        trial.out.rename(removed)  # at once, because the command goes on
+        shutil.copytree(removed, copied)
+        shutil.rmtree(removed)
+    status = status_of(process)
+    if status == 0 and copied.exists() and not trial.files():
+        shutil.copytree(copied, trial.out, dirs_exist_ok=True)
+    return status
+
+
 def _meanwhile(trial: Trial, undisturbed: Undisturbed, draw: random.Random, change: Callable[[Path], None]) -> int:
     """Changes an input file of the command, or a scan of its input recording, at a random time of its run."""
     root = trial.folder.parent
@@ -359,7 +352,8 @@ def _meanwhile(trial: Trial, undisturbed: Undisturbed, draw: random.Random, chan
     shutil.copytree(inputs, before)
     try:
         scans = sorted((trial.folder / SCANS).iterdir())
-        named = [trial.folder / word for word in trial.writer.line.split() if word.startswith(f"../{INPUTS}/")]
+        words = [word.removeprefix("bag:") for word in trial.writer.line.split()]
+        named = [trial.folder / word for word in words if word.startswith(f"../{INPUTS}/")]
         process = trial.start()
         time.sleep(draw.uniform(0, undisturbed.seconds))
         change(draw.choice([*scans[-len(named) :], *(one for one in named if one.is_file())]))
@@ -374,9 +368,72 @@ def _cut(path: Path) -> None:
     os.truncate(path, path.stat().st_size // 2 | 1)
 
 
-TROUBLES: dict[str, Callable[[Trial, Undisturbed, random.Random], int]] = {
-    "full disk": _without_room,
-    "read-only folder": _without_rights,
-    "a file vanishes": functools.partial(_meanwhile, change=Path.unlink),
-    "a file is half there": functools.partial(_meanwhile, change=_cut),
+class Trouble(NamedTuple):
+    """A trouble of a command."""
+
+    run: Callable[[Trial, Undisturbed, random.Random], int]
+    """Runs the command with the trouble, and returns its exit status."""
+    of_output: bool = True
+    """Whether the output is disturbed, not the input."""
+    is_mounted: bool = False
+    """Whether a file system is mounted, which needs root."""
+
+
+TROUBLES = {
+    "full disk": Trouble(_without_room),
+    "no space left": Trouble(_on_small_disk, is_mounted=True),
+    "no more files": Trouble(_on_few_inodes, is_mounted=True),
+    "read-only folder": Trouble(_without_rights),
+    "the folder vanishes": Trouble(_without_folder),
+    "a file vanishes": Trouble(functools.partial(_meanwhile, change=Path.unlink), of_output=False),
+    "a file is half there": Trouble(functools.partial(_meanwhile, change=_cut), of_output=False),
 }
+
+
+def disk(
+    *,
+    commands: tuple[str, ...] = tuple(WRITERS),
+    troubles: tuple[str, ...] = tuple(TROUBLES),
+    times: int = 4,
+    seed: int = 0,
+) -> None:
+    """No room, no right to write, files or folders vanish, input is half there: one line, and nothing half-written.
+
+    Args:
+        commands: names in `WRITERS`.
+        troubles: names in `TROUBLES`. Those that mount a small file system need root.
+        times: how often each trouble is made.
+        seed: seed of sizes and moments.
+    """
+    if mounted := [name for name in troubles if TROUBLES[name].is_mounted]:
+        _mount_privately(mounted)
+    _disturb(commands, functools.partial(_troubled, troubles=troubles, times=times, seed=seed))
+
+
+def _mount_privately(names: Sequence[str]) -> None:
+    """Give this process mounts of its own, which end with it."""
+    if ctypes.CDLL(None).unshare(CLONE_NEWNS):
+        raise SystemExit(f"error: {', '.join(names)}: expected root, which may mount; choose other --troubles")
+    subprocess.run(("mount", "--make-rprivate", "/"), check=True)
+
+
+def _troubled(
+    name: str, root: Path, undisturbed: Undisturbed, *, troubles: Sequence[str], times: int, seed: int
+) -> Iterator[dict[str, Any]]:
+    """Run a command with each trouble, this many times. If it ends well, all its files must be there."""
+    for trouble in troubles:
+        draw = random.Random(f"{seed} {name} {trouble}")
+        counts = dict.fromkeys(("refused in one line", "ends well", "anything else", "half-written"), 0)
+        for _ in range(times):
+            trial = Trial(name, root)
+            status = TROUBLES[trouble].run(trial, undisturbed, draw)
+            place = OUT if TROUBLES[trouble].of_output else INPUTS
+            refused = status == 1 and _is_one_line(trial.error(), named=f"{place}/")
+            kind = "ends well" if status == 0 else "refused in one line" if refused else "anything else"
+            if kind == "anything else":
+                print(f"{name}, {trouble}: status {status}: {trial.error()[-2000:]}", file=sys.stderr)
+            counts[kind] += 1
+            if TROUBLES[trouble].of_output or status:  # otherwise it may be the result of fewer scans
+                what = f"is not whole: {trouble}, status {status}"
+                counts["half-written"] += trial.count_differing(undisturbed.files, what, complete=status == 0)
+        yield {"trouble": trouble, **counts}

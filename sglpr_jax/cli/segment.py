@@ -46,7 +46,7 @@ class SegmentCommand:
 
 def segment(command: SegmentCommand) -> None:
     from sglpr_jax.evaluation.segmentation import segment_recording  # slow imports, not needed for --help
-    from sglpr_jax.files import check_writable, file_name, write_json
+    from sglpr_jax.files import check_remain, check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.image_maps import save_map
 
@@ -55,7 +55,7 @@ def segment(command: SegmentCommand) -> None:
     if not params.config.segments:
         raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none")
     recording = command.source.open(command.data)
-    command.out.mkdir(parents=True, exist_ok=True)
+    recorded = record_command(command, command.out)
     labelled_cells = occupied_cells = 0
 
     def write_semantic_map(row: int, scan: "Scan", semantic_map: "SemanticMap") -> None:
@@ -72,4 +72,4 @@ def segment(command: SegmentCommand) -> None:
     if scores is not None:
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())
-    record_command(command, command.out)
+    check_remain(recorded)

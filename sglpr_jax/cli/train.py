@@ -11,7 +11,7 @@ import tyro
 from sglpr_jax.cli.recording import report_bad_scan
 from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
-from sglpr_jax.files import file_name
+from sglpr_jax.files import check_remain, file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.stop_request import StopRequest, stop_on_signal
@@ -93,6 +93,7 @@ def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with -
     """Run the command. If a signal stops the training, print `stop_advice` and exit."""
     from sglpr_jax.evaluation.final_test import final_test  # slow imports, not needed for --help
     from sglpr_jax.training.devices import connected, is_first_host
+    from sglpr_jax.training.run_folder import CONFIG_FILE
 
     folder = run_folder(command)
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
@@ -101,6 +102,7 @@ def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with -
     if is_first_host():
         out, seed = folder / "test", command.config.seed
         console().print(final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar))
+        check_remain(folder / CONFIG_FILE)
         print(f"written to {out}")
     print(f"run: {folder}")
 

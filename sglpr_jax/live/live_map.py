@@ -127,7 +127,7 @@ class LiveMap:
     @property
     def loops(self) -> list[LoopClosure]:
         """All loops: those of the file and, if it cannot be written any more, those of the detector that it lacks."""
-        written = read_loops_jsonl(self._loops_path, skip_damaged=True)
+        written = self._written_loops()
         return [*written, *_missing(self.detector.loops, written)]
 
     @property
@@ -176,10 +176,14 @@ class LiveMap:
             self._report("recall", f"the map continues after {len(self)} scans and {len(loops)} loops")
         return [self._loop_edge(loop, time.monotonic()) for loop in self._rewrite_loops(loops)]
 
+    def _written_loops(self) -> list[LoopClosure]:
+        """Return the loops of the file, or none if there is no file: in a new folder, and after it was removed."""
+        return read_loops_jsonl(self._loops_path, skip_damaged=True) if self._loops_path.is_file() else []
+
     def _rewrite_loops(self, loops: list[LoopClosure]) -> list[LoopClosure]:
         """Write the loops to a new file and open it for appending. Returns loops that the old file lacks."""
         path = self._loops_path
-        written = read_loops_jsonl(path, skip_damaged=True) if path.is_file() else []
+        written = self._written_loops()
         missed = _missing(loops, written)
         if missed and written:
             self._report("log", f"{path}: {len(missed)} loops were added that the last process missed")
@@ -282,8 +286,10 @@ class LiveMap:
             about = {name: getattr(scan, name) for name in ABOUT}
             self._log.append(len(self) - 1, frame_bytes(scan.keyframe, compared, pose=scan.pose, **about))
             with raising_write_error(self._loops_path):
-                size = os.fstat(self._loops_file).st_size
-                append_whole(self._loops_file, loop_lines(loops).encode(), size=size)
+                status = os.fstat(self._loops_file)
+                if not status.st_nlink:
+                    raise FileNotFoundError("the file was removed")
+                append_whole(self._loops_file, loop_lines(loops).encode(), size=status.st_size)
             if time.monotonic() - self._synced_at > SYNC_S:
                 self._log.sync()
                 os.fsync(self._loops_file)

@@ -3,6 +3,7 @@
 import functools
 import importlib
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -29,8 +30,10 @@ RUN = (
     f"speed profile --preset {TINY} --steps 1",
     "speed loops --frames 40 --repeats 1 --azimuth-steps 90 --weights sglpr-small",
     "speed stages --scans 4 --rates 10 --weights sglpr-small",
+    "robustness hostile --source dds:93 --minutes 0.1 --rate 5 --scans 12 --weights sglpr-small",
     "fleet index --drives drawn.npz --places 2000 --queries 3",
-    f"learned data --out learned --only test/town-601 {SMALL}",
+    f"learned data --out learned --only test/town-601 train-images/vlp16-61 {SMALL}",
+    f"learned sampler --data learned {LIGHT}",
     "learned score ring --data learned --only town-601-00 --out learned/scores",
     "learned cost rinet@random:0 --data learned --scans 1 --out learned/cost.json",
     "learned leaderboard --build learned --kept kept.json --page page.md --figure figure.svg",
@@ -47,7 +50,7 @@ PARSED = (
     "realism semantics --weights sglpr --out out --prior towns",
     "fuzz --hours 0.5 --seed 3",
     "loops fit drives --out model.json",
-    "robustness disk --times 1",
+    "robustness disk --commands embed --troubles 'full disk' 'the folder vanishes' --times 1",
     "robustness kills --commands embed --times 1",
     "robustness mutations --tree elsewhere",
     "robustness platforms --extras slam",
@@ -114,7 +117,7 @@ def test_flags_are_parsed(line, benchmarks, monkeypatch):
     monkeypatch.setattr(
         benchmarks.Program, "load", lambda one: functools.wraps(load(one))(lambda *args, **flags: called.append(flags))
     )
-    benchmarks.main(line.split())
+    benchmarks.main(shlex.split(line))
     assert len(called) == 1
 
 

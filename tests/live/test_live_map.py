@@ -179,3 +179,12 @@ def test_a_full_disk_is_reported_and_the_map_lives_on(drive, params, tmp_path, s
             assert live.add(live_frame(drive, i)) == []
     assert len(live) == 2 and said.kinds == ["disk"] and "No space left" in said[0][1]
     live.close()
+
+
+def test_a_removed_folder_is_reported_and_the_results_are_written(drive, params, tmp_path, said):
+    live = opened(params, tmp_path / "map", said)
+    live.restore()
+    shutil.rmtree(tmp_path / "map")
+    assert live.add(live_frame(drive, 0)) == [] and said.kinds == ["disk"] and "was removed" in said[0][1]
+    assert "loops.jsonl" in {path.name for path in write_results(live, tmp_path / "map")}
+    live.close()

@@ -220,3 +220,14 @@ def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path, chan
     with pytest.raises(ValueError, match=error):
         write(tmp_path / "town", **changes, on_start=told.append)
     assert not told and not (tmp_path / "town").exists()
+
+
+def test_a_folder_that_is_removed_meanwhile_is_named(tmp_path):
+    """After the last scan, and before the poses of the drive."""
+
+    def remove(done: int) -> None:
+        if done == SCANS:
+            shutil.rmtree(tmp_path / "town")
+
+    with pytest.raises(FileNotFoundError, match=r"simulation\.json"):
+        write(tmp_path / "town", routes=("00",), on_progress=remove)
