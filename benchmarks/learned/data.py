@@ -3,6 +3,7 @@
 `train` has towns of the card of `sglpr` and car parks and garages, whose places repeat. The learning rates are chosen
 on `held-out`. `test` has towns that no weights have seen, with several sensors and sceneries, and one town on two days.
 `train-images` has the images of the scans of `train`, for the presets of `bin/train`, which rotate images.
+`train-worlds` has images of two towns, each driven by three sensors.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +26,7 @@ from sglpr_jax.labels import to_raw
 from sglpr_jax.retrieval.image_maps import semantic_map
 from sglpr_jax.sim.dataset import simulate
 
-TRAIN, TRAIN_IMAGES, HELD_OUT, TEST = "train", "train-images", "held-out", "test"
+TRAIN, TRAIN_IMAGES, TRAIN_WORLDS, HELD_OUT, TEST = "train", "train-images", "train-worlds", "held-out", "test"
 BUILDING = 50
 """The label of all points without labels: raw id of SemanticKITTI."""
 LINKED = ("velodyne", "poses.txt", "times.txt", "calib.txt")
@@ -58,6 +59,11 @@ _TRAIN = (
 DATASETS = (
     *_TRAIN,
     *(Dataset(TRAIN_IMAGES, one.name, {**one.options, "images": True}) for one in _TRAIN),
+    *(
+        _town(TRAIN_WORLDS, seed, "00", "02", "05", "06", "08", sensor=sensor, images=True)
+        for seed in (10, 11)
+        for sensor in ("hdl64e", "vlp16", "os1-64")
+    ),
     _town(HELD_OUT, 37, "00", "08"),
     _town(TEST, 601, "00", "08"),
     *(_town(TEST, 602, "08", scenery=scenery) for scenery in ("outskirts", "lanes", "car_park")),

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import sglpr_jax
-from benchmarks.learned.data import TRAIN_IMAGES, folders, recordings_of
+from benchmarks.learned.data import TRAIN_WORLDS, folders, recordings_of
 from benchmarks.table import Table
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -21,6 +21,7 @@ HARDEST = 10
 def sampler(
     *,
     data: Path = Path("build/learned"),
+    part: str = TRAIN_WORLDS,
     only: tuple[str, ...] = (),
     weights: str = DEFAULT_WEIGHTS,
     places: int = 200,
@@ -30,12 +31,13 @@ def sampler(
 
     Args:
         data: folder of the recordings of `learned data`.
-        only: datasets of the training, by name; all if omitted.
+        part: part of the recordings.
+        only: datasets of the part, by name; all if omitted.
         weights: weights that describe the images.
         places: number of random anchors whose hardest negatives are looked at.
         seed: seed of the anchors.
     """
-    chosen = [folder for folder in folders(data, TRAIN_IMAGES) if not only or folder.name in only]
+    chosen = [folder for folder in folders(data, part) if not only or folder.name in only]
     recordings = [one for folder in chosen for one in recordings_of(folder)]
     positions, worlds = [positions_of(recording) for recording in recordings], worlds_of(recordings)
     params = sglpr_jax.load(weights)
