@@ -112,7 +112,7 @@ class Test(NamedTuple):
     name: str
     recording: Recording
     database: Recording | None = None
-    """Earlier session of the same town. None: the recording's own earlier scans."""
+    """Earlier session, or recording of another sensor, of the same town. None: the recording's own earlier scans."""
     rotated: bool = False
 
 
@@ -154,13 +154,18 @@ def score(
 
 
 def _simulated(data: Path, part: str) -> Iterator[Test]:
+    by_world: dict[str, tuple[str, Recording]] = {}
     for folder in folders(data, part):
         recordings = recordings_of(folder)
         if folder.name.startswith("days"):
             yield Test(folder.name, recordings[1], recordings[0])
             continue
         for recording in recordings:
-            yield from _raw_and_rotated(f"{folder.name}-{recording.name}", recording)
+            name = f"{folder.name}-{recording.name}"
+            yield from _raw_and_rotated(name, recording)
+            other, database = by_world.setdefault(recording.world, (name, recording))
+            if other != name:
+                yield Test(f"{name}-in-{other}", recording, database)  # another sensor on the same route
 
 
 def _kitti(root: Path | None) -> Iterator[Test]:
