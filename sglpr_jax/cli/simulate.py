@@ -44,6 +44,9 @@ class SimulateCommand:
     carrier: str = "vehicle"
     """Carrier of the sensor: `vehicle`, `backpack`, `handheld`, `cart`, or `stop-and-reverse`, a car that sometimes
     stands or reverses. In towns, only height and sway are those of the carrier. Not with --sessions."""
+    aside_m: float = 0.0
+    """Distance of the drive to the left of its usual line, in metres, as on another lane. The town stays the same, so
+    that two datasets show its places from both lines. Not with --sessions."""
     submap_m: float = 0.0
     """Travelled distance of submaps, in metres. 0 writes scans."""
     images: bool = False

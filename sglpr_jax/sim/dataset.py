@@ -78,6 +78,7 @@ def simulate(
     rate_hz: float | None = None,
     scenery: str = "town",
     carrier: str = "vehicle",
+    aside_m: float = 0.0,
     submap_m: float = 0.0,
     images: bool = False,
     vary: bool = False,
@@ -102,6 +103,7 @@ def simulate(
       rate_hz: Scans per second of a route. None is 4 in towns, elsewhere the rate of the carrier or of the scenery.
       scenery: Name from `SCENERIES` (towns), or from `REPEATING`, where routes only give the direction of revisits.
       carrier: Name from `CARRIERS`. In towns, only its height and sway are used. `sessions` need a vehicle.
+      aside_m: Distance of the drive to the left of its usual line through the same town, in metres.
       submap_m: Travelled distance of submaps, in metres. 0 writes scans.
       images: Whether to write density images with label images instead of scans.
       vary: Whether the images show scans that are rotated about z, some of them with lost points. See `layouts.vary`.
@@ -120,7 +122,8 @@ def simulate(
       print(sglpr_jax.simulate("towns", routes=["08"], scans=400))
     """
     lidar = _find_sensor(sensor or ("hdl32e-nclt" if sessions else "hdl64e"), azimuth_steps)
-    _check_arguments(routes, along, sessions, scenery, carrier, submap_m=submap_m, images=images, vary=vary)
+    of_drives = {"aside_m": aside_m, "submap_m": submap_m}
+    _check_arguments(routes, along, sessions, scenery, carrier, **of_drives, images=images, vary=vary)
     is_repeating = scenery in REPEATING
     if routes is None:
         default_routes = REVISITED if is_repeating else ROUTES
@@ -148,9 +151,9 @@ def simulate(
     else:
         check_rate_and_seed(rate_hz, seed)
         pose_files = _pose_files(routes, along, scans)
-        options |= {"sensor": lidar, "carrier": CARRIERS[carrier]}
+        options |= {"sensor": lidar, "carrier": CARRIERS[carrier], "aside_m": aside_m}
         plans = [_plan(name, file, scenery, submap_m, **options) for name, file in pose_files.items()]
-        settings |= {"submap_m": submap_m} if submap_m else {}
+        settings |= {name: metres for name, metres in of_drives.items() if metres}
     out = Path(out)
     _claim(out, settings, {f"drive {name}": _fingerprint(file) for name, file in pose_files.items()})
     dataset = Simulated(out, tuple(plan.name for plan in plans), scans, layout, lidar)
@@ -188,6 +191,7 @@ def _check_arguments(
     scenery: str,
     carrier: str,
     *,
+    aside_m: float,
     submap_m: float,
     images: bool,
     vary: bool,
@@ -207,6 +211,8 @@ def _check_arguments(
         (carrier in CARRIERS, f"expected a carrier among {', '.join(CARRIERS)}", repr(carrier)),
         (not sessions or carrier == "vehicle", "with sessions, expected the carrier vehicle", repr(carrier)),
         (not sessions or not submap_m, "with sessions, expected no submaps", f"submaps of {submap_m:g} m"),
+        (not sessions or not aside_m, "with sessions, expected drives on their usual line", f"{aside_m:g} m aside"),
+        (math.isfinite(aside_m), "aside_m: expected metres", f"{aside_m}"),
         (0 <= submap_m < math.inf, "submap_m: expected metres, at least 0", f"{submap_m}"),
         (images or not vary, "vary: expected images", "scans; vary changes scans before they are converted to images"),
         (

@@ -77,6 +77,7 @@ def simulate_recording(
     rate_hz: float = RATE_HZ,
     scenery: Scenery = TOWN,
     carrier: Carrier = VEHICLE,
+    aside_m: float = 0.0,
 ) -> SimulatedRecording:
     """Builds the town around a drive and returns the recording. `simulate` writes the same scans for equal arguments.
 
@@ -90,6 +91,7 @@ def simulate_recording(
       scenery: Scenery of the town.
       carrier: Carrier of the sensor. Only its height and sway are used: speed and rate are those of the route, and the
         carrier does not halt.
+      aside_m: Distance to the left of the drive around which the town was built, in metres, as on another lane.
 
     Raises:
       ValueError: The route is unknown, `rate_hz` is not positive, `seed` is negative, or the pose file is malformed.
@@ -104,7 +106,8 @@ def simulate_recording(
         path = read_path(along)
     world = build_world(seeds, path.xy, path.times, scenery=scenery)
     rows = scan_rows(path, scans)
-    return drive_through(world, path, rows, name=name, sensor=sensor, carrier=carrier, **_key_and_rng(seeds))
+    options = {"name": name, "sensor": sensor, "carrier": carrier, "aside_m": aside_m}
+    return drive_through(world, path, rows, **options, **_key_and_rng(seeds))
 
 
 def simulate_repeating(
@@ -116,6 +119,7 @@ def simulate_repeating(
     revisit: Revisit = "none",
     rate_hz: float | None = None,
     carrier: Carrier = VEHICLE,
+    aside_m: float = 0.0,
 ) -> SimulatedRecording:
     """Returns the recording of a drive through a scenery where different places look alike.
 
@@ -128,6 +132,7 @@ def simulate_repeating(
         same path. "same": drives one and a half laps along a closed path.
       rate_hz: Scans per second. None uses the rate of the carrier or of the scenery.
       carrier: Carrier of the sensor, such as one of `CARRIERS`. Slow ones and halts bring frames 30 s apart closer.
+      aside_m: Distance to the left of the usual line, in metres.
 
     Raises:
       ValueError: The name or `revisit` is unknown, `rate_hz` is not positive, or `seed` is negative.
@@ -147,7 +152,7 @@ def simulate_repeating(
     height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
     if height_m is not None:
         sensor = dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))
-    options = {"name": f"{name}-{revisit}", "sensor": sensor, "carrier": carrier}
+    options = {"name": f"{name}-{revisit}", "sensor": sensor, "carrier": carrier, "aside_m": aside_m}
     return drive_through(world, path, scan_rows(path, scans), **options, **_key_and_rng(seeds))
 
 
@@ -261,16 +266,17 @@ def drive_through(
     key: PRNGKeyArray,
     rng: np.random.Generator,
     carrier: Carrier = VEHICLE,
+    aside_m: float = 0.0,
 ) -> SimulatedRecording:
     """Returns the recording of a drive through a town along `path`, with scans at the poses in `rows`.
 
     By default, `ids` numbers the scans, and `times` (seconds) are those of the path. `key` draws the measurements, and
-    `rng` the sway. The carrier determines height and sway, not the speed.
+    `rng` the sway. The carrier determines height and sway, not the speed. The drive is `aside_m` to the left of `path`.
     """
     path_times, yaw = path.times[rows], path.yaw[rows]
     ids, times = ids or numbered_ids(len(rows)), path_times if times is None else times
     tilt, height, left_m = carrier.motion(rng, path_times, height_m=sensor.height_m)
-    sway = np.reshape(left_m, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    sway = np.reshape(left_m + aside_m, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
     true_poses = poses_on(world.ground.relief, path.xy[rows] + sway, yaw, height_m=height, tilt=tilt)
     rendered_poses = true_poses
     if world.levels is not None:  # storeys above one another are simulated side by side

@@ -296,7 +296,7 @@ def test_simulated_drives_of_one_route_have_one_world_by_any_sensor(tree):
         return open_recording(root).world
 
     first = world()
-    assert first and first == world(sensor={"height_m": 0.7}) == world(carrier={"height_m": 2.0})
+    assert first and first == world(sensor={"height_m": 0.7}) == world(carrier={"height_m": 2.0}) == world(aside_m=3.0)
     indoors = {"scenery": {"repeating": "indoors"}}
     others = [world(seed=2), world(scans=10), world(**{"drive 08": "ab"}), world(**indoors)]
     others += [world(**indoors, carrier={"height_m": 2.0}), world(sessions=["2012-01-15"])]

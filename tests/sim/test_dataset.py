@@ -190,6 +190,15 @@ def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp
     assert content(write(tmp_path / "full")) == whole
 
 
+def test_a_drive_aside_shows_the_same_town_from_another_lane(dataset, drive, tmp_path):
+    aside = open_recording(write(tmp_path / "aside", aside_m=3.0), "08")
+    usual = open_recording(dataset, "08")
+    assert aside.world == usual.world != ""
+    offset = (aside.positions - usual.positions)[:, :2]
+    np.testing.assert_allclose(offset, 3.0 * drive.poses.world_from_lidar[:, :2, 1], atol=0.05)  # to the left
+    assert len(aside.points(0)) != len(usual.points(0))
+
+
 def test_submaps_of_a_carrier_in_a_scenery_where_places_repeat(tmp_path):
     options = {"routes": ["08"], "scans": 4, "sensor": "vlp16", "azimuth_steps": 40, "scenery": "tunnel"}
     found = simulate(tmp_path, **options, submap_m=1000.0, carrier="cart")
@@ -212,6 +221,8 @@ def test_submaps_of_a_carrier_in_a_scenery_where_places_repeat(tmp_path):
         ({"vary": True}, "vary: expected images, found scans"),
         ({"sensor": "vlp17"}, "expected a sensor among hdl64e, .* found 'vlp17'"),
         ({"sessions": ["2012-01-15"], "submap_m": 5.0, "routes": None}, "expected no submaps"),
+        ({"sessions": ["2012-01-15"], "aside_m": 5.0, "routes": None}, "usual line, found 5 m aside"),
+        ({"aside_m": float("nan")}, "aside_m: expected metres, found nan"),
         ({"scenery": "forest", "routes": ["00", "05"]}, "different revisits"),
     ],
 )

@@ -10,7 +10,7 @@ from sglpr_jax.files import naming, read_json
 
 SIMULATION = "simulation.json"
 """File with the settings."""
-OF_THE_SENSOR = ("version", "layout", "sensor", "submap_m")
+OF_THE_DRIVE = ("version", "layout", "sensor", "submap_m", "aside_m")
 """Settings on which a town does not depend."""
 
 
@@ -32,8 +32,8 @@ def simulated_mounting(root: Path) -> Mounting | None:
 def simulated_world(root: Path, name: str) -> str:
     """Return the name of the world of a simulated recording, or an empty text for another recording.
 
-    Drives along the same route of the same town have the same world, also those by other sensors and carriers and on
-    other days. Where places repeat, the scenery depends on the carrier, too.
+    Drives along the same route of the same town have the same world, also those by other sensors and carriers, on other
+    days and on another lane. Where places repeat, the scenery depends on the carrier, too.
     """
     path = root / SIMULATION
     if not path.is_file():
@@ -42,7 +42,7 @@ def simulated_world(root: Path, name: str) -> str:
     if not isinstance(settings, dict):
         raise ValueError(f"{path}: expected the settings of a simulated dataset, found {type(settings).__name__}")
     drives = {key: value for key, value in settings.items() if key.startswith("drive ")}
-    town = {key: value for key, value in settings.items() if key not in (*OF_THE_SENSOR, *drives)}
+    town = {key: value for key, value in settings.items() if key not in (*OF_THE_DRIVE, *drives)}
     if "repeating" not in settings.get("scenery", {}):
         town.pop("carrier", None)
     if "sessions" not in settings:
