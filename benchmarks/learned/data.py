@@ -3,7 +3,7 @@
 `train` has towns of the card of `sglpr` and car parks and garages, whose places repeat. The learning rates are chosen
 on `held-out`. `test` has towns that no weights have seen, with several sensors and sceneries, and one town on two days.
 `train-images` has the images of the scans of `train`, for the presets of `bin/train`, which rotate images.
-`train-worlds` has images of two towns, each driven by three sensors.
+`train-worlds` has images of two towns, each driven by three sensors and on three lines.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,7 +47,8 @@ class Dataset(NamedTuple):
 
 
 def _town(part: str, seed: int, *routes: str, **options: Any) -> Dataset:
-    kind = options.get("scenery", options.get("sensor", "town"))
+    aside = f"aside-{options['aside_m']:g}" if "aside_m" in options else "town"
+    kind = options.get("scenery", options.get("sensor", aside))
     return Dataset(part, f"{kind}-{seed}", {"seed": seed, "routes": routes, **options})
 
 
@@ -64,8 +65,14 @@ DATASETS = (
         for seed in (10, 11)
         for sensor in ("hdl64e", "vlp16", "os1-64")
     ),
+    *(
+        _town(TRAIN_WORLDS, seed, "00", "02", "05", "06", "08", aside_m=aside_m, images=True)
+        for seed in (10, 11)
+        for aside_m in (2.0, 3.5)
+    ),
     _town(HELD_OUT, 37, "00", "08"),
     _town(TEST, 601, "00", "08"),
+    _town(TEST, 601, "00", "08", aside_m=3.0),
     *(_town(TEST, 602, "08", scenery=scenery) for scenery in ("outskirts", "lanes", "car_park")),
     *(_town(TEST, 603, "08", sensor=sensor) for sensor in ("vlp16", "os1-64")),
     Dataset(TEST, "days-604", {"seed": 604, "sessions": ("2012-01-15", "2012-02-04")}),
