@@ -36,8 +36,9 @@ def warn(message: str) -> None:
 def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
     """Write `path`, a file or a folder, completely or not at all. Missing parent folders are created.
 
-    The block receives a hidden path in the same folder and writes to it. After the block, the hidden path replaces
-    `path`, or after an error it is removed. With `keep`, a folder that another process has put at `path` stays.
+    The block receives a hidden path in the same folder and writes to it. It must not use `replacing` for parts of that,
+    which would hide that the folder was removed. After the block, the hidden path replaces `path`, or after an error it
+    is removed. With `keep`, a folder that another process has put at `path` stays.
 
     Raises WriteError if `path` cannot be written.
 

@@ -16,7 +16,7 @@ import numpy as np
 from sglpr_jax.data.density_image import CEILING_M, EDGE_STEP_M, FIRST_EDGE_M, FLOOR_M, MAX_VOXELS, REACH_M
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.fields import check_value
-from sglpr_jax.files import check_holds_only, replacing, write_json
+from sglpr_jax.files import check_holds_only, json_text, replacing
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, Grid
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.sglpr import describe
@@ -61,9 +61,9 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
     with replacing(folder) as new:
         new.mkdir()
         (new / f"describe.{format}").write_bytes(program)
-        write_json(new / CONFIG_FILE, dataclasses.asdict(params.config))
+        (new / CONFIG_FILE).write_text(json_text(dataclasses.asdict(params.config)))
         checksum = {"sha256": hashlib.sha256(program).hexdigest()}  # for users: runtimes do not check it
-        write_json(new / INPUT_FILE, input_description(params.config) | checksum)
+        (new / INPUT_FILE).write_text(json_text(input_description(params.config) | checksum))
     return folder
 
 

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from sglpr_jax.files import in_short, read_json, replacing, write_json
+from sglpr_jax.files import in_short, json_text, read_json, replacing
 from sglpr_jax.models.weights_file import check_arrays
 from sglpr_jax.training.devices import is_first_host, on_all_hosts
 from sglpr_jax.training.run_folder import checkpoint_steps
@@ -66,7 +66,8 @@ class Checkpoints:
         arrays = {name: np.array(leaf) for name, leaf in _arrays_by_name(state).items()}
         with replacing(self._path(int(state.step))) as temporary, _shortened_errors(temporary), _orbax() as orbax:
             orbax.save(temporary / _STATE, args=ocp.args.StandardSave(arrays))
-            write_json(temporary / _ABOUT, {"about": about, "sha256": _checksums(temporary, about)})
+            content = {"about": about, "sha256": _checksums(temporary, about)}
+            (temporary / _ABOUT).write_text(json_text(content))
         for step in checkpoint_steps(self._folder)[:-_KEPT_CHECKPOINTS]:
             # renamed first, because a partly deleted checkpoint would seem damaged
             shutil.rmtree(self._path(step).rename(self._folder / f".{step}.old"))
