@@ -36,9 +36,9 @@ def warn(message: str) -> None:
 def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
     """Write `path`, a file or a folder, completely or not at all. Missing parent folders are created.
 
-    The block receives a hidden path in the same folder and writes to it. It must not use `replacing` for parts of that,
-    which would hide that the folder was removed. After the block, the hidden path replaces `path`, or after an error it
-    is removed. With `keep`, a folder that another process has put at `path` stays.
+    The block receives a hidden path in the same folder and writes to it. It must not call `replacing` below the hidden
+    path, because `replacing` would create a removed folder again. After the block, the hidden path replaces `path`, or
+    after an error it is removed. With `keep`, a folder that another process has put at `path` stays.
 
     Raises WriteError if `path` cannot be written.
 
@@ -219,7 +219,7 @@ def check_writable(path: Path) -> None:
         _remove(trial)
 
 
-def check_remain(*paths: Path) -> None:
+def check_still_there(*paths: Path) -> None:
     """Raise FileNotFoundError if a written file does not exist any more, as after its folder was removed: `replacing`
     then creates the folder again, for the later files only."""
     for path in paths:

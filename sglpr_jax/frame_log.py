@@ -38,9 +38,8 @@ class FrameLog:
 
     Example:
       with FrameLog(path, settings) as log:
-          for frame in range(log.end):       # frames of an earlier process
-              record = log.record(frame)     # None if it is damaged
-          log.append(log.end, record)
+          records = [log.record(frame) for frame in range(log.end)]    # of an earlier process; None if damaged
+          log.append(len(records), record)
     """
 
     def __init__(self, path: Path | None, settings: Mapping[str, Any], *, restarts: bool = False):
@@ -61,23 +60,12 @@ class FrameLog:
         self._settings: dict[str, Any] = json.loads(json.dumps(settings))  # as parsed: tuples are lists
         self._file, self._size, self._copies = -1, 0, 0
         self._places: dict[int, _Place] = {}
-        if path is None:
-            return
-        with raising_write_error(path, *path.parents):
-            path.parent.mkdir(parents=True, exist_ok=True)
-        self._open(path)
-        try:
-            problem = self._problem(path)
-            if problem is not None and not restarts:
-                raise ValueError(f"{problem}; use the settings of the log, or another folder")
-        except ValueError:
-            os.close(self._file)
-            raise
-        if problem is not None:
-            warn(f"{problem}; restarting")
-            self._restart(path)
-        if not self._copies:
-            self._append_settings()
+        if path is not None:
+            try:
+                self._open(path, restarts=restarts)
+            except BaseException:
+                self._close_file()
+                raise
 
     def __enter__(self) -> "FrameLog":
         return self
@@ -87,11 +75,11 @@ class FrameLog:
 
     @property
     def end(self) -> int:
-        """Number of frames up to the last whole one."""
+        """Number of frames of earlier processes, up to the last whole one."""
         return max(self._places, default=-1) + 1
 
     def record(self, frame: int) -> bytes | None:
-        """Return the record of a frame that an earlier process appended last, or None if there is no whole one."""
+        """Return the latest whole record of a frame by an earlier process, or None."""
         place = self._places.get(frame)
         if place is None:
             return None
@@ -119,55 +107,72 @@ class FrameLog:
 
     def close(self) -> None:
         """Write everything to the disk and close the file."""
-        if self.path is not None:
-            try:
-                self.sync()
-            finally:
-                os.close(self._file)
+        try:
+            self.sync()
+        finally:
+            self._close_file()
 
-    def _open(self, path: Path) -> None:
-        """Open the file and find its whole records."""
-        with raising_write_error(path, path):
+    def _open(self, path: Path, *, restarts: bool) -> None:
+        """Open the file, find its frames, and check or write the settings."""
+        with raising_write_error(path, *path.parents):
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
-        self._size = self.damaged_bytes = os.fstat(self._file).st_size
-        self._copies, self._places = 0, {}
+        self._size = os.fstat(self._file).st_size
+        stored = self._find_frames(path) if self._size else self._settings
+        if stored != self._settings:
+            found = "damaged ones" if stored is None else f"another {self._changed(stored)}"
+            problem = f"{path}: expected a log with the same settings, found {found}"
+            if not restarts:
+                raise ValueError(f"{problem}; use the settings of the log, or another folder")
+            warn(f"{problem}; restarting")
+            self._restart(path, keep=stored is None)
+        if not self._copies:
+            self._append_settings()
 
-    def _problem(self, path: Path) -> str | None:
-        """Find the frames of the file. Return why they cannot be used with the settings, or None.
+    def _find_frames(self, path: Path) -> dict[str, Any] | None:
+        """Find the whole records of the file. Return the settings of the file, or None if they are damaged.
 
-        Raises ValueError if the file is no log.
+        A file that was killed or lost power before its first frame has those of this run. Raises ValueError if the file
+        is no log.
         """
-        if not self._size:
-            return None
-        stored = None
+        stored, self.damaged_bytes = None, self._size
         with mmap.mmap(self._file, 0, access=mmap.ACCESS_READ) as content:
             for number, place in _whole_records(content):
                 self.damaged_bytes -= HEAD.size + place.length
-                if number != SETTINGS:
+                if number == SETTINGS:
+                    self._copies += 1
+                    stored = parse_json(content[place.begin : place.begin + place.length], source=path)
+                else:
                     self._places[number - 1] = place
-                    continue
-                self._copies += 1
-                stored = parse_json(content[place.begin : place.begin + place.length], source=path)
-            if stored is None and not self._places:
-                if MARK.startswith(content[: len(MARK)]):
-                    return None  # killed while it wrote its first record
+            beginning = content[: len(MARK)]
+        if stored is None and not self._places:
+            is_unfinished = MARK.startswith(beginning) and self._size < HEAD.size + len(json.dumps(self._settings))
+            if is_unfinished or not any(beginning):  # after a power failure, a file may hold zeros
+                return self._settings
+            if beginning != MARK:
                 raise ValueError(f"{path}: expected a log of frames, found another file")
-        if stored == self._settings:
-            return None
-        if not isinstance(stored, dict):
-            return f"{path}: expected a log with its settings, found damaged ones"
-        changed = ", ".join(name for name, value in self._settings.items() if stored.get(name) != value) or "version"
-        return f"{path}: expected a log with the same settings, found another {changed}"
+        return stored
 
-    def _restart(self, path: Path) -> None:
-        """Begin the file anew. A file with damaged settings is kept."""
-        os.close(self._file)
+    def _changed(self, stored: dict[str, Any]) -> str:
+        """Return the names of the settings that differ from those of the file."""
+        return ", ".join(name for name, value in self._settings.items() if stored.get(name) != value) or "version"
+
+    def _restart(self, path: Path, *, keep: bool) -> None:
+        """Begin the file anew. With `keep`, the old one is renamed."""
+        self._close_file()
         with raising_write_error(path, path):
-            if self._copies:
-                path.unlink()
-            else:
+            if keep:
                 path.replace(path.with_name(f"{path.name}.damaged"))
-        self._open(path)
+            else:
+                path.unlink()
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
+        self._size, self.damaged_bytes, self._copies, self._places = 0, 0, 0, {}
+
+    def _close_file(self) -> None:
+        """Close the file, if it is open."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1
 
     def _append_settings(self) -> None:
         self._append(SETTINGS, json.dumps(self._settings).encode())
@@ -190,8 +195,8 @@ def _whole_records(content: mmap.mmap) -> Iterator[tuple[int, _Place]]:
         if begin > len(content):
             return
         _, number, length, checksum = HEAD.unpack_from(content, position)
-        record = content[begin : begin + length]
-        if len(record) == length and _checksum(number, record) == checksum:
+        is_inside = begin + length <= len(content)
+        if is_inside and _checksum(number, content[begin : begin + length]) == checksum:
             yield number, _Place(begin, length)
             position = begin + length
         else:

@@ -12,7 +12,7 @@ from sglpr_jax.files import (
     MOST_SHOWN,
     WriteError,
     append_whole,
-    check_remain,
+    check_still_there,
     check_writable,
     exclusive_lock,
     file_name,
@@ -193,6 +193,6 @@ def test_names_and_values_in_messages_are_short_lines():
 
 def test_a_written_file_that_was_removed_is_named(tmp_path):
     write_json(tmp_path / "first.json", {})
-    check_remain(tmp_path / "first.json")
+    check_still_there(tmp_path / "first.json")
     with pytest.raises(FileNotFoundError, match=r"second\.json: .*found it removed"):
-        check_remain(tmp_path / "first.json", tmp_path / "second.json")
+        check_still_there(tmp_path / "first.json", tmp_path / "second.json")

@@ -82,6 +82,19 @@ def test_another_file_is_refused_and_unchanged(path):
     assert path.read_bytes() == b"something else"
 
 
+def test_a_file_of_zeros_after_a_power_failure_is_begun_anew(path):
+    path.write_bytes(bytes(5000))
+    assert read(path) == ([], 5000)
+
+
+def test_a_log_whose_records_are_all_damaged_is_kept_aside(path):
+    content = path.read_bytes().replace(b"\x93FR1", b"\x93FR1\1")
+    path.write_bytes(content)
+    with pytest.warns(DataWarning, match="found damaged ones; restarting"):
+        assert read(path, restarts=True) == ([], 0)
+    assert path.with_name("frames.log.damaged").read_bytes() == content
+
+
 def test_an_unwritable_log_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(WriteError, match="file"):
@@ -111,7 +124,7 @@ def test_a_log_with_damaged_settings_is_refused_or_kept_aside(path):
     assert path.read_bytes().count(b'"weights"') == 2  # the copy that was missing follows
     content[content.index(MARK, ENDS[0] + 1) + HEAD.size + 1] ^= 1
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{path}: expected a log with its settings, found damaged ones; use"):
+    with pytest.raises(ValueError, match=rf"{path}: expected a log with the same settings, found damaged ones; use"):
         read(path)
     with pytest.warns(DataWarning, match="found damaged ones; restarting"):
         assert read(path, restarts=True) == ([], 0)

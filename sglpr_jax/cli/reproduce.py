@@ -11,7 +11,7 @@ from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.runtime import console
 from sglpr_jax.cli.train import exit_unless_finished
 from sglpr_jax.data.choices import PoseChoice
-from sglpr_jax.files import check_remain
+from sglpr_jax.files import check_still_there
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.reproduce.experiments import EXPERIMENTS
 from sglpr_jax.stop_request import stop_on_signal
@@ -100,7 +100,7 @@ def reproduce(command: ReproduceCommand) -> None:
         _train_missing(reproduction, plan)
     recorded = record_command(command, command.out)
     _write_results(reproduction, names)
-    check_remain(recorded)
+    check_still_there(recorded)
 
 
 def _train_missing(reproduction: "Reproduction", plan: "Plan") -> None:

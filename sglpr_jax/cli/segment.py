@@ -46,7 +46,7 @@ class SegmentCommand:
 
 def segment(command: SegmentCommand) -> None:
     from sglpr_jax.evaluation.segmentation import segment_recording  # slow imports, not needed for --help
-    from sglpr_jax.files import check_remain, check_writable, file_name, write_json
+    from sglpr_jax.files import check_still_there, check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.image_maps import save_map
 
@@ -72,4 +72,4 @@ def segment(command: SegmentCommand) -> None:
     if scores is not None:
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())
-    check_remain(recorded)
+    check_still_there(recorded)

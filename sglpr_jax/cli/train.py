@@ -11,7 +11,7 @@ import tyro
 from sglpr_jax.cli.recording import report_bad_scan
 from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
-from sglpr_jax.files import check_remain, file_name
+from sglpr_jax.files import check_still_there, file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.stop_request import StopRequest, stop_on_signal
@@ -102,7 +102,7 @@ def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with -
     if is_first_host():
         out, seed = folder / "test", command.config.seed
         console().print(final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar))
-        check_remain(folder / CONFIG_FILE)
+        check_still_there(folder / CONFIG_FILE)
         print(f"written to {out}")
     print(f"run: {folder}")
 

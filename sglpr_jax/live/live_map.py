@@ -16,8 +16,9 @@ from sglpr_jax.files import append_whole, raising_write_error
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
-from sglpr_jax.live.odometry_input import FixedMounting, OdometryContinuity, OdometryState, ScanClock, agree
+from sglpr_jax.live.odometry_input import FixedMounting, OdometryContinuity, OdometryState, ScanClock
 from sglpr_jax.loops.arguments import as_pose
+from sglpr_jax.loops.candidates import agree
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.comparison import NO_FITS, Fits
@@ -33,7 +34,7 @@ SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""
 MAX_PAUSE_S = 1e8
 """Maximum time between two processes, in seconds. If clocks state a longer one, this value is used."""
-ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int, "is_keyframe": bool}
+ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "part": int, "is_keyframe": bool, "by_scans": bool}
 """Fields of `LiveScan` that are JSON values of each scan in the log."""
 
 
@@ -45,7 +46,9 @@ class LiveScan(NamedTuple):
     compared: Fits | None
     """Comparisons with earlier scans. None if they must be computed."""
     pose: Float[np.ndarray, "4 4"] | None
-    """Pose of the LiDAR by odometry."""
+    """Pose of the LiDAR by odometry or, while that is missing, by the scans."""
+    by_scans: bool
+    """Whether the scans showed the pose, because odometry was missing."""
     part: int
     """Number of the scan's part of the drive. A new part begins where the motion since the last scan is unknown."""
     is_keyframe: bool
@@ -103,7 +106,7 @@ class LiveMap:
         self._stamps = GrowingArray(np.empty(0))
         self._poses = GrowingArray(np.empty((0, 4, 4)))
         self._part = 0  # `LiveScan.part` of the last scan
-        self._is_by_scans = False  # whether the pose of the last scan is not by odometry, which is missing
+        self._is_by_scans = False  # `LiveScan.by_scans` of the last scan
         self._clock = ScanClock(report)
         self._continuity = OdometryContinuity(report, expected=expects_odometry)
         self._mounting = FixedMounting(sensor_height)
@@ -172,6 +175,7 @@ class LiveMap:
             pause_s = min(max(time.time() - scan.wall, 0.0), MAX_PAUSE_S)
             self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - pause_s)
             self._continuity.resume(scan.pose, scan.time, known=motion_is_known)
+            self._is_by_scans = scan.by_scans
             self._mounting.resume(self.detector.finder.mountings[-1])
             self._report("recall", f"the map continues after {len(self)} scans and {len(loops)} loops")
         return [self._loop_edge(loop, time.monotonic()) for loop in self._rewrite_loops(loops)]
@@ -206,7 +210,7 @@ class LiveMap:
         if state is None:
             return None
         keyframe = None
-        if finder.has_odometry and (state.pose is None or self._is_by_scans):
+        if self._continuity.has_odometry and (state.pose is None or self._is_by_scans):
             keyframe = finder.keyframe(scan)
             state = self._state_by_scans(state, keyframe, scan_time)
             if state is None:
@@ -221,6 +225,7 @@ class LiveMap:
             is_keyframe=is_keyframe,
             compared=None,
             pose=state.pose,
+            by_scans=self._is_by_scans,
             part=self._part if state.continues else self._part + 1,
             name=scan.name,
             stamp=float(frame.time) if np.isfinite(frame.time) else 0.0,
@@ -234,18 +239,25 @@ class LiveMap:
         return [self._loop_edge(loop, frame.received) for loop in loops]
 
     def _state_by_scans(self, state: OdometryState, keyframe: Keyframe, time: float) -> OdometryState | None:
-        """Return the state of a scan while odometry is missing, by the motion that the scans show, or of the first one
-        after that. If they show none, the scan is left out (None) or has the last pose with unknown motion."""
+        """Return the state of a scan while odometry is missing: its motion is that which the scans show. If they show
+        none, the scan is left out (None) or has the last pose with unknown motion. The first odometry after that
+        continues only if it agrees with the scans."""
         shown = self.detector.finder.pose_by_image(keyframe, time=time) if state.continues else None
         if state.pose is not None:
             self._is_by_scans, continues = False, shown is not None and agree(shown, state.pose)
             if state.continues and not continues:
-                self._report("jump", "the odometry contradicts the scans while it was missing; it begins anew")
+                reason = "the scans did not show the motion" if shown is None else "it contradicts the scans"
+                self._report("jump", f"the odometry is back and begins in a frame of its own: {reason}")
             return OdometryState(state.pose, continues)
-        if shown is None and state.may_be_left_out and not self._is_by_scans:
-            return self._report("hold", "expected odometry or scans that show the motion, found none; left out")
+        if shown is not None:
+            self._is_by_scans = True
+            return OdometryState(shown, True)
+        found = "expected odometry or scans that show the motion, found none"
+        if not len(self.odometry) or (state.may_be_left_out and not self._is_by_scans):
+            return self._report("hold", f"{found}; the scan is left out")
         self._is_by_scans = True
-        return OdometryState(self.odometry[-1], False) if shown is None else OdometryState(shown, True)
+        self._report("unknown", f"{found}; the scan is at an unknown place")
+        return OdometryState(self.odometry[-1], False)
 
     def _add(self, scan: LiveScan) -> list[LoopClosure]:
         """Add a scan to the detector and the trajectory, and return the loops that it closes."""

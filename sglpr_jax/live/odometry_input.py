@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.mounting import Mounting, common_mounting, estimate_mounting
 from sglpr_jax.live.data_types import Report
-from sglpr_jax.se3 import inverse, yaw_of
+from sglpr_jax.se3 import inverse
 
 JUMP_S = 60.0
 """Maximum lead of a header's time over the time since the last scan, in seconds. Beyond it, the clock changed."""
@@ -22,10 +22,8 @@ RESTART_S = 60.0
 RESET_M = 0.2
 """Radius about the origin, in metres. Odometry that jumps into it by more than five times this distance was reset."""
 HOLD_S = 2.0
-"""Time without odometry for which scans that do not show their motion are left out, in seconds, at least one."""
-AGREE_M, AGREE_DEG = 0.8, 6.0
-"""Maximum distance and angle between odometry after a pause and the motion that the scans show, in metres and degrees.
-"""
+"""Maximum time without odometry, in seconds, for which scans that show no motion are left out. The first such scan is
+always left out."""
 WAIT_S = 10.0
 """Time for which the first scans wait for odometry that was asked for, in seconds."""
 
@@ -47,7 +45,8 @@ class OdometryContinuity:
     def __init__(self, report: Report, *, expected: bool):
         """Begin a map. `expected` says that odometry was asked for, so that the first scans wait for it."""
         self._report, self._expected = report, expected
-        self._has_odometry: bool | None = None  # None until the first scan decides
+        self.has_odometry: bool | None = None
+        """Whether the map has odometry. None until the first scan decides."""
         self._began: float | None = None  # time of the first scan, in seconds
         self._last: Float[np.ndarray, "4 4"] | None = None  # last pose by odometry
         self._last_time = 0.0  # time of `_last`, in seconds
@@ -58,15 +57,15 @@ class OdometryContinuity:
     def resume(self, pose: Float[np.ndarray, "4 4"] | None, time: float, *, known: bool = True) -> None:
         """Continue a map of an earlier process, whose last scan had this pose at this time. With `known=False`, the
         motion up to that scan was unknown, and its pose may be that of an earlier scan."""
-        self._has_odometry, self._last, self._last_time = pose is not None, pose, time
+        self.has_odometry, self._last, self._last_time = pose is not None, pose, time
         self._is_known, self._resumed = known, True
 
     def add(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> OdometryState | None:
         """Return the odometry of the next scan, or None if the scan must be skipped. Times must not decrease."""
-        if self._has_odometry is None and self._awaits_odometry(pose, time):
+        if self.has_odometry is None and self._awaits_odometry(pose, time):
             return None
         resumed, self._resumed = self._resumed, False
-        if not self._has_odometry:
+        if not self.has_odometry:
             if pose is not None:
                 self._report("odometry", "expected no odometry, because the map began without it; it is not used")
             if resumed:
@@ -75,7 +74,9 @@ class OdometryContinuity:
         if pose is None:
             passed_s, is_first = time - self._last_time, not self._misses_pose
             self._misses_pose = True
-            self._report("missing", f"expected odometry, found none for {passed_s:.1f} s; the scans show the motion")
+            self._report(
+                "missing", f"expected odometry, found none for {passed_s:.1f} s; the motion is taken from the scans"
+            )
             return OdometryState(None, not resumed, not resumed and (is_first or passed_s < HOLD_S))
         continues = self._last is None or (self._is_known and self._is_plausible(pose, time, resumed))
         if not continues or resumed:
@@ -94,8 +95,8 @@ class OdometryContinuity:
         if pose is None and self._expected and time - self._began < WAIT_S:
             self._report("wait", "expected odometry, found none yet; scans are left out until it comes")
             return True
-        self._has_odometry = pose is not None
-        if self._expected and not self._has_odometry:
+        self.has_odometry = pose is not None
+        if self._expected and not self.has_odometry:
             self._report("wait over", f"expected odometry, found none for {WAIT_S:.0f} s; the map is made without it")
         return False
 
@@ -107,12 +108,6 @@ class OdometryContinuity:
         is_reset = float(np.linalg.norm(pose[:3, 3])) < RESET_M and moved > 5 * RESET_M
         is_near = moved <= SLACK_M + FASTEST_M_PER_S * passed_s
         return is_near and not is_reset and (not resumed or passed_s <= RESTART_S)
-
-
-def agree(pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether two poses of a scan are at most `AGREE_M` and `AGREE_DEG` apart in the plane: scans show no height."""
-    apart = inverse(pose) @ other
-    return bool(np.linalg.norm(apart[:2, 3]) <= AGREE_M and abs(np.degrees(yaw_of(apart))) <= AGREE_DEG)
 
 
 class ScanClock:

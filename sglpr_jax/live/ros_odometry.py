@@ -31,11 +31,11 @@ SILENCE_S = 1.0
 MOUNTING_WAIT_S = 3.0
 """Time from the first pose for which the mounting of the LiDAR is awaited on /tf_static, in seconds."""
 RESET_S, PAUSE_S = 1.0, 2.0
-"""Steps back and forth in the times of poses, in seconds, beyond which the odometry has restarted."""
+"""Step back and step ahead in the times of poses, in seconds, beyond which the odometry has restarted."""
 FASTEST_DEG_PER_S, SLACK_DEG = 360.0, 45.0
 """Maximum rate of rotation, and an additional rotation between two poses, in degrees."""
 LEAST_POSES = 2
-"""Number of poses of a pair of frames from which on it may be the odometry. A single one may be a damaged name."""
+"""Minimum number of poses of a pair of frames that is used. A single pose may have a damaged name."""
 
 
 FrameNames = tuple[str, str]
@@ -88,7 +88,10 @@ class LiveOdometry:
             track.extend((doubtful, pose))
         else:
             self._doubtful[frames] = pose
-            self._report("step", f"{self.topic}: expected a pose near the last one, found a jump; the next one decides")
+            self._report(
+                "step",
+                f"{self.topic}: expected a pose that can follow the last one, found another; the next one decides",
+            )
 
     def receive_static(self, message: Received) -> None:
         """Add the transforms of a message of /tf_static."""

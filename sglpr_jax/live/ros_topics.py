@@ -44,7 +44,7 @@ EDGE_HISTORY = 1000
 MAX_DRAWN_LOOPS = 500
 """Maximum number of loops that are drawn, the latest ones."""
 Receive = Callable[[Received], None]
-"""Function that is called with each message, in a thread of the connection. It must return at once."""
+"""Function that is called with each message, in a thread of the connection. It must return before the next scan."""
 
 
 @runtime_checkable

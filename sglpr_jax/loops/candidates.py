@@ -36,6 +36,12 @@ AGREE_M, AGREE_DEG = 0.8, 6.0
 """Maximum distance and angle between two estimates of a pose that agree, in metres and degrees."""
 
 
+def agree(pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether two poses in a level frame are at most `AGREE_M` and `AGREE_DEG` apart, without their heights."""
+    apart_m, turned = np.linalg.norm((other - pose)[:2, 3]), yaw_of(other @ inverse(pose))
+    return bool(apart_m <= AGREE_M and abs(np.degrees(turned)) <= AGREE_DEG)
+
+
 class CandidateSearch:
     """Finds candidates in a stream of scans, and stores descriptor and compressed image of the scans.
 

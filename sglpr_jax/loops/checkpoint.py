@@ -30,11 +30,11 @@ from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT = "sglpr-jax unfinished loops 8"
+FORMAT = "sglpr-jax unfinished loops 9"
 LOG = "checkpoint.log"
 OLD = "settings.json"
 """File of checkpoints of earlier versions, which are not read."""
-FRAME_FORMAT = "sglpr-jax live 5"
+FRAME_FORMAT = "sglpr-jax live 6"
 LINK = ("x", "y", "yaw", "correlation", "peak_ratio", "along_m")
 """Stored fields of the registration that shows the motion (`Fits.link`)."""
 COLUMNS = {
@@ -169,12 +169,13 @@ def add_scans(
             while True:
                 before = len(finder)
                 while (content := log.record(len(finder))) is not None:
-                    keyframe, fits, *_ = read_frame(content, len(finder), {}, source=path)
-                    if keyframe is None and on_bad_scan is None:
+                    keyframe, fits, _, about = read_frame(content, len(finder), {"missing": int}, source=path)
+                    is_other = about["missing"] != len(finder.missing)  # other scans before it could be read
+                    if is_other or (keyframe is None and on_bad_scan is None):
                         break
                     add(keyframe, fits)
                 if len(finder) > before:
-                    on_progress(len(finder))
+                    on_progress(finder.scans)
                 row = next(rows, None)
                 if row is None:
                     return
@@ -183,6 +184,7 @@ def add_scans(
         options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
         options["rows"] = rows_to_read()
         for _, keyframe in scan_stream(recording, lambda row, scan: finder.keyframe(scan), **options):
+            missing = len(finder.missing)
             add(keyframe, None)
             if path is not None:
-                log.append(len(finder) - 1, frame_bytes(keyframe, finder.fits))
+                log.append(len(finder) - 1, frame_bytes(keyframe, finder.fits, missing=missing))

@@ -87,8 +87,8 @@ def scan_odometry(
     check_installed()
     path = None if kept_in is None else Path(kept_in)
     with FrameLog(path, {} if path is None else _settings(recording, config, scale), restarts=True) as log:
-        records = {row: record for row in range(log.end) if (record := log.record(row)) is not None}
-        logged = {row: np.frombuffer(record) for row, record in records.items()}
+        rows = range(log.end)
+        logged = {row: np.frombuffer(record) for row in rows if (record := log.record(row)) is not None}
         if len(logged) < len(recording):
             options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
             results = _register_scans(recording, log, logged, _FrontEnd(config), scale, **options)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from sglpr_jax.files import check_remain, read_json, replacing
+from sglpr_jax.files import check_still_there, read_json, replacing
 from sglpr_jax.sim import RATE_HZ, SCANS
 from sglpr_jax.sim.drive import CARRIERS, check_rate_and_seed, name_of_path, read_path, scan_rows
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
@@ -164,7 +164,7 @@ def simulate(
             on_progress(k * scans + done * scans // count)
 
         _write_drive(out, plan, LAYOUTS[layout], on_scan)
-    check_remain(out / SETTINGS_FILE)
+    check_still_there(out / SETTINGS_FILE)
     return dataset
 
 

@@ -102,11 +102,11 @@ class OcclusionConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ValidationConfig:
-    """Held-out part of every training recording."""
+    """Held-out part of every world of the training (`Recording.world`)."""
 
     share: Annotated[float, Bounds(0, 0.5)] = 0.0
-    """Length of the held-out stretch of consecutive frames, as a fraction of the recording; 0: none, as in the
-    paper."""
+    """Length of the held-out stretch of consecutive frames, as a fraction of the first recording of a world. 0: none,
+    as in the paper."""
 
     def __post_init__(self):
         check_fields(self)

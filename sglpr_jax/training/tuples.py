@@ -1,7 +1,6 @@
 """Training tuples: an anchor, k_p positives near it and k_n negatives far from it. Held-out parts of recordings."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -66,6 +65,8 @@ class TuplePool:
         self.recording_of = np.repeat(np.arange(len(positions)), [len(rows) for rows in frames])
         self.frame_of = np.concatenate(frames)
         self.world_of = self.recording_of if worlds is None else np.asarray(worlds)[self.recording_of]
+        self.separated = np.column_stack([self.positions[:, :2], WORLDS_APART_M * self.world_of])
+        """Horizontal position of each place (n, 2), and a third coordinate that puts worlds `WORLDS_APART_M` apart."""
         pairs = close_pairs(self.separated, closer_than_m=config.positive_m)
         pairs = np.concatenate([pairs, pairs[:, ::-1]])  # (anchor, positive), in both orders
         same_visit = self.are_of_one_visit(pairs[:, 0], pairs[:, 1], gap=config.revisit_gap)
@@ -147,11 +148,6 @@ class TuplePool:
         """Return the horizontal distance of each place from its anchor, in metres. Infinite between worlds."""
         distances_m = self._distances(places, places[:, :1])
         return np.where(distances_m < WORLDS_APART_M / 2, distances_m, np.inf).astype(np.float32)
-
-    @functools.cached_property
-    def separated(self) -> Float[np.ndarray, "n 3"]:
-        """Horizontal position of each place, and a third coordinate that puts worlds `WORLDS_APART_M` apart."""
-        return np.column_stack([self.positions[:, :2], WORLDS_APART_M * self.world_of])
 
     def _distances(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the horizontal distances of places a and b in metres, or `WORLDS_APART_M` and more between worlds."""

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.live.odometry_input import HOLD_S, MOUNTING_SCANS, WAIT_S, FixedMounting, OdometryContinuity, ScanClock
+from sglpr_jax.live.odometry_input import (
+    HOLD_S,
+    MOUNTING_SCANS,
+    WAIT_S,
+    FixedMounting,
+    OdometryContinuity,
+    ScanClock,
+)
 from sglpr_jax.se3 import transform
 
 

@@ -251,7 +251,7 @@ def parse_pcd(content: Content) -> PointTable:
 
 def posed_scan(path: Path) -> Scan:
     """Read a .pcd file, and move its points from the frame of the sensor by the pose that it states (VIEWPOINT)."""
-    scan, words = table_scan(path, parse=parse_pcd), _viewpoint(path)
+    scan, words = table_scan(path, parse=parse_pcd), _viewpoint(path) or ["0", "0", "0", "1", "0", "0", "0"]
     x, y, z, qw, *vector = parse_numbers(words, columns=7, where="VIEWPOINT")
     (world_from_sensor,) = quaternion_poses(path, np.array([[x, y, z]]), np.array([[*vector, qw]]))
     points = transformed(world_from_sensor, scan.cloud.astype(np.float64))
@@ -267,7 +267,7 @@ def warn_of_viewpoint(path: Path) -> None:
 
 
 def _viewpoint(path: Path) -> list[str]:
-    """Return the words of the VIEWPOINT of a .pcd file, without a VIEWPOINT none."""
+    """Return the words of the VIEWPOINT of a .pcd file, or an empty list."""
     with path.open("rb") as stream:
         beginning = stream.read(_LONGEST_HEADER)
     viewpoint = re.search(rb"^VIEWPOINT +(.*)$", beginning.partition(b"\nDATA")[0], re.MULTILINE)

@@ -10,8 +10,8 @@ from sglpr_jax.files import naming, read_json
 
 SIMULATION = "simulation.json"
 """File with the settings."""
-OF_THE_DRIVE = ("version", "layout", "sensor", "submap_m", "aside_m")
-"""Settings on which a town does not depend."""
+OF_THE_DRIVE = ("layout", "sensor", "submap_m", "aside_m")
+"""Settings on which a town does not depend. It depends on the number and the rate of the scans."""
 
 
 def simulated_mounting(root: Path) -> Mounting | None:
@@ -43,7 +43,8 @@ def simulated_world(root: Path, name: str) -> str:
         raise ValueError(f"{path}: expected the settings of a simulated dataset, found {type(settings).__name__}")
     drives = {key: value for key, value in settings.items() if key.startswith("drive ")}
     town = {key: value for key, value in settings.items() if key not in (*OF_THE_DRIVE, *drives)}
-    if "repeating" not in settings.get("scenery", {}):
+    scenery = settings.get("scenery")
+    if not isinstance(scenery, dict) or "repeating" not in scenery:
         town.pop("carrier", None)
     if "sessions" not in settings:
         town["drive"] = [name, drives.get(f"drive {name}")]
