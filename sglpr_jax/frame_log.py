@@ -51,8 +51,8 @@ class FrameLog:
           restarts: Whether a log with other settings is begun anew, with a `DataWarning`. If the settings are damaged,
             the old file is kept as `NAME.damaged`.
 
-        Raises ValueError if the file is no log, if the settings are damaged or, without `restarts`, if they are others.
-        Raises WriteError if the file cannot be written.
+        Raises ValueError if the file is no log or, without `restarts`, if its settings are others or damaged. Raises
+        WriteError if the file cannot be written.
         """
         self.path = path
         self.damaged_bytes = 0
