@@ -239,7 +239,7 @@ class LiveMap:
         return [self._loop_edge(loop, frame.received) for loop in loops]
 
     def _state_by_scans(self, state: OdometryState, keyframe: Keyframe, time: float) -> OdometryState | None:
-        """Return the state of a scan while odometry is missing: its motion is that which the scans show. If they show
+        """Return the state of a scan while odometry is missing, with the motion that the scans show. If they show
         none, the scan is left out (None) or has the last pose with unknown motion. The first odometry after that
         continues only if it agrees with the scans."""
         shown = self.detector.finder.pose_by_image(keyframe, time=time) if state.continues else None
