@@ -112,7 +112,7 @@ class Test(NamedTuple):
     name: str
     recording: Recording
     database: Recording | None = None
-    """Earlier session, or recording of another sensor, of the same town. None: the recording's own earlier scans."""
+    """Another session, sensor or lane of the same town. None: the recording's own earlier scans."""
     rotated: bool = False
 
 
@@ -163,9 +163,9 @@ def _simulated(data: Path, part: str) -> Iterator[Test]:
         for recording in recordings:
             name = f"{folder.name}-{recording.name}"
             yield from _raw_and_rotated(name, recording)
-            other, database = by_world.setdefault(recording.world, (name, recording))
+            other, database = by_world.setdefault(recording.world or name, (name, recording))
             if other != name:
-                yield Test(f"{name}-in-{other}", recording, database)  # another sensor on the same route
+                yield Test(f"{name}-in-{other}", recording, database)  # another sensor or lane
 
 
 def _kitti(root: Path | None) -> Iterator[Test]:

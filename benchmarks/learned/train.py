@@ -158,7 +158,7 @@ class Settings:
     @property
     def folder(self) -> Path:
         """Folder of the run."""
-        variants = {"no-labels": not self.labels, "by-sensors": self.part != TRAIN_IMAGES, "no-worlds": not self.worlds}
+        variants = {"no-labels": not self.labels, self.part: self.part != TRAIN_IMAGES, "no-worlds": not self.worlds}
         return self.out / "-".join(
             [Path(self.preset).stem, *(name for name, is_set in variants.items() if is_set), str(self.seed)]
         )

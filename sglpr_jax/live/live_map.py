@@ -140,7 +140,7 @@ class LiveMap:
 
     @property
     def odometry(self) -> Float[np.ndarray, "n 4 4"]:
-        """Pose of the LiDAR at each scan by odometry. Empty without odometry."""
+        """Pose of the LiDAR at each scan by odometry or, while it is missing, by the scans. Empty without odometry."""
         return self._poses.rows
 
     @property

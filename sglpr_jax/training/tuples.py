@@ -66,7 +66,7 @@ class TuplePool:
         self.frame_of = np.concatenate(frames)
         self.world_of = self.recording_of if worlds is None else np.asarray(worlds)[self.recording_of]
         self.separated = np.column_stack([self.positions[:, :2], WORLDS_APART_M * self.world_of])
-        """Horizontal position of each place (n, 2), and a third coordinate that puts worlds `WORLDS_APART_M` apart."""
+        """Coordinates (n, 3) in metres: horizontal position, and one that puts worlds `WORLDS_APART_M` apart."""
         pairs = close_pairs(self.separated, closer_than_m=config.positive_m)
         pairs = np.concatenate([pairs, pairs[:, ::-1]])  # (anchor, positive), in both orders
         same_visit = self.are_of_one_visit(pairs[:, 0], pairs[:, 1], gap=config.revisit_gap)

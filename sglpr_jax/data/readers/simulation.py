@@ -14,12 +14,22 @@ OF_THE_DRIVE = ("layout", "sensor", "submap_m", "aside_m")
 """Settings on which a town does not depend. It depends on the number and the rate of the scans."""
 
 
-def simulated_mounting(root: Path) -> Mounting | None:
-    """Return the mounting of the sensor of a simulated dataset, or None for a height of 1.73 m (KITTI)."""
+def _settings(root: Path) -> dict[str, Any] | None:
+    """Return the settings of a simulated dataset, or None for another dataset."""
     path = root / SIMULATION
     if not path.is_file():
         return None
     settings = read_json(path)
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path}: expected the settings of a simulated dataset, found {type(settings).__name__}")
+    return settings
+
+
+def simulated_mounting(root: Path) -> Mounting | None:
+    """Return the mounting of the sensor of a simulated dataset, or None for a height of 1.73 m (KITTI)."""
+    path, settings = root / SIMULATION, _settings(root)
+    if settings is None:
+        return None
     try:
         height_m = float(settings["sensor"]["height_m"])
     except (TypeError, KeyError, ValueError) as error:
@@ -35,12 +45,9 @@ def simulated_world(root: Path, name: str) -> str:
     Drives along the same route of the same town have the same world, also those by other sensors and carriers, on other
     days and on another lane. Where places repeat, the scenery depends on the carrier, too.
     """
-    path = root / SIMULATION
-    if not path.is_file():
+    settings = _settings(root)
+    if settings is None:
         return ""
-    settings: dict[str, Any] = read_json(path)
-    if not isinstance(settings, dict):
-        raise ValueError(f"{path}: expected the settings of a simulated dataset, found {type(settings).__name__}")
     drives = {key: value for key, value in settings.items() if key.startswith("drive ")}
     town = {key: value for key, value in settings.items() if key not in (*OF_THE_DRIVE, *drives)}
     scenery = settings.get("scenery")
