@@ -67,8 +67,11 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam with exponential decay of the learning rate."""
+    """Adam or Muon with exponential decay of the learning rate."""
 
+    algorithm: Literal["adam", "muon"] = "adam"
+    """`adam`, as in the paper. `muon` gives the update of a matrix equal singular values, so that one learning rate
+    suits layers of any width (Muon, Jordan 2024). Adam updates the vectors with a tenth of the learning rate."""
     learning_rate: NotNegative = 1e-5
     """Learning rate after the warm-up."""
     warmup_steps: CountOrNone = 0
@@ -127,6 +130,8 @@ class TrainConfig:
     """Tuples per step."""
     share_negatives: bool = False
     """Use the places of all tuples of a step as negatives, if they are far enough away."""
+    symmetric: bool = False
+    """Use the positives of an anchor as anchors, too."""
     also_tuples: CountOrNone = 0
     """Tuples per step from the second dataset, included in `tuples`."""
     also_triplets: bool = False

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+import optax.contrib
 from jaxtyping import Array, Bool, Float
 
 from sglpr_jax.grid import Grid
@@ -20,6 +21,9 @@ from sglpr_jax.training.config import LossConfig, OcclusionConfig, TrainConfig
 from sglpr_jax.training.devices import keep_sharding, per_device
 from sglpr_jax.training.loss_terms import Summary, joint_loss, segmentation_sums
 from sglpr_jax.training.step import Gradient, Metrics, TrainState
+
+VECTOR_RATE = 1 / 10
+"""Learning rate of vectors, as a fraction of that of matrices."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +42,7 @@ class ImageNetwork:
 
     @property
     def optimizer(self) -> optax.GradientTransformation:
-        """Adam with linear warm-up and exponential decay of the learning rate (section 5.1.2)."""
+        """Adam (section 5.1.2) or Muon, with linear warm-up and exponential decay of the learning rate."""
         config = self.config.optimizer
         schedule = optax.warmup_exponential_decay_schedule(
             init_value=config.learning_rate if config.warmup_steps == 0 else 0.0,
@@ -49,7 +53,16 @@ class ImageNetwork:
             staircase=config.staircase,
         )
         clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
-        return optax.chain(clip, optax.adamw(schedule, weight_decay=config.weight_decay))
+        if config.algorithm == "adam":
+            return optax.chain(clip, optax.adamw(schedule, weight_decay=config.weight_decay))
+        muon = optax.contrib.muon(
+            schedule,
+            weight_decay=config.weight_decay,
+            adam_weight_decay=config.weight_decay,
+            adam_learning_rate=lambda step: VECTOR_RATE * schedule(step),
+            muon_weight_dimension_numbers=_matrices,
+        )
+        return optax.chain(clip, muon)
 
     def new_state(self, params: Params | None = None) -> TrainState:
         """Return the state before the first step, with these weights or random ones."""
@@ -66,6 +79,16 @@ class ImageNetwork:
             batch = dataclasses.replace(batch, teacher=_teacher_descriptors(batch, chunks, self.config.loss))
         gradient, metrics = gradients(state.params, chunks, batch, self.config.loss)
         return Gradient(dataclasses.replace(state.params, weights=gradient), {}, metrics)
+
+
+def _matrices(weights: Any) -> Any:
+    """Return the axes of each weight as a matrix for Muon: all inputs, and the outputs. None for a vector."""
+
+    def axes(weight: Array) -> optax.contrib.MuonDimensionNumbers | None:
+        *inputs, output = range(weight.ndim)
+        return optax.contrib.MuonDimensionNumbers(tuple(inputs), output) if inputs else None
+
+    return jax.tree.map(axes, weights)
 
 
 class Chunk(NamedTuple):

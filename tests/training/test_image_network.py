@@ -7,6 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from sglpr_jax.grid import Grid
@@ -15,7 +16,7 @@ from sglpr_jax.models.sglpr import describe, forward, init
 from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.models.weights_file import save
 from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
-from sglpr_jax.training.config import LossConfig, OcclusionConfig, without_untrained_head
+from sglpr_jax.training.config import LossConfig, OcclusionConfig, OptimizerConfig, without_untrained_head
 from sglpr_jax.training.image_network import (
     ImageNetwork,
     _network_input,
@@ -151,6 +152,28 @@ def test_a_teacher_replaces_the_triplet_loss(config, random_params, make_batch, 
     assert float(same.metrics["loss"]) < 1e-6
     with pytest.raises(ValueError, match=r"expected no loss.teacher, found sglpr"):
         LossConfig(teacher="sglpr", segmentation_alone=True)
+
+
+def test_muon_updates_matrices_by_equal_singular_values_and_vectors_by_adam(config):
+    optimizer = OptimizerConfig(algorithm="muon", learning_rate=0.02)
+    network = ImageNetwork(dataclasses.replace(config, optimizer=optimizer))
+    rng = np.random.default_rng(0)
+    weights = {
+        "convolution": rng.normal(size=(3, 3, 4, 8)),
+        "layer": rng.normal(size=(6, 24)) * 1e-3,
+        "bias": rng.normal(size=7),
+    }
+    weights = jax.tree.map(lambda array: jnp.asarray(array, jnp.float32), weights)
+    updates, _ = network.optimizer.update(weights, network.optimizer.init(weights), weights)
+    for name, inputs, outputs in (("convolution", 36, 8), ("layer", 6, 24)):
+        matrix = np.asarray(updates[name], np.float64).reshape(inputs, outputs)
+        expected = 0.02 * max(1, outputs / inputs) ** 0.5
+        singular = np.linalg.svd(matrix, compute_uv=False) / expected
+        assert singular.min() > 0.6 and singular.max() < 1.3  # Newton-Schulz iterations are not exact
+        assert (matrix * weights[name].reshape(inputs, outputs)).sum() < 0  # against the gradient
+    adam = optax.nadamw(0.002, weight_decay=0.0)
+    expected, _ = adam.update(weights["bias"], adam.init(weights["bias"]), weights["bias"])
+    np.testing.assert_allclose(updates["bias"], expected, rtol=1e-6)
 
 
 def test_segmentation_alone_needs_a_segmentation_loss_and_no_weight_decay(config):
