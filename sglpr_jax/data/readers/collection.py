@@ -1,0 +1,24 @@
+"""Reader of a folder of simulated datasets, such as the training set of `bin/simulate --training-set`."""
+
+import dataclasses
+from pathlib import Path
+
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.readers.reader import Reader, ReadOptions
+from sglpr_jax.data.readers.simulation import SIMULATION
+from sglpr_jax.data.recording import Recording
+
+
+def _names(root: Path) -> tuple[str, ...]:
+    """Return DATASET/NAME for each recording of each simulated dataset in the folder."""
+    datasets = sorted(path.parent for path in root.glob(f"*/{SIMULATION}"))
+    return tuple(f"{dataset.name}/{name}" for dataset in datasets for name in recording_names(dataset))
+
+
+def _open(root: Path, name: str, options: ReadOptions) -> Recording:
+    dataset, _, inner_name = name.partition("/")
+    recording = open_recording(root / dataset, inner_name, pose_source=options.pose_source, format=options.format)
+    return dataclasses.replace(recording, name=name)
+
+
+READER = Reader(f"DATASET/{SIMULATION} (datasets of bin/simulate)", _names, _open)
