@@ -121,7 +121,6 @@ def training_batches(
         read_batch,
         max_points=config.max_points,
         share_negatives=config.share_negatives,
-        symmetric=config.symmetric,
         categories=config.model.categories,
         image=config.model.image,
     )

@@ -28,12 +28,9 @@ class Batch:
     labelled: Any
     """Whether each place has labels (b,), including the places of `second`."""
     negatives: Any
-    """Whether each place is a negative of each anchor (t `anchors`, b). Includes the places of `second`, unless the
-    triplet loss ignores them."""
+    """Whether each place is a negative of each anchor (t, b). Covers `second`, unless the triplet loss ignores it."""
     positives: int = flax.struct.field(pytree_node=False)
-    """Number of positives of each anchor: the other ones of the first 1 + k_p places of its tuple."""
-    anchors: int = flax.struct.field(pytree_node=False, default=1)
-    """Number of anchors of each tuple, its first places."""
+    """Number of positives of each anchor. They follow the anchor in its tuple."""
     images: Any = None
     """Images (b, h, w)."""
     maps: Any = None
@@ -62,7 +59,6 @@ def read_batch(
     *,
     max_points: int,
     share_negatives: bool,
-    symmetric: bool = False,
     categories: int = 20,
     image: ImageKind = "points",
     part: slice = slice(None),
@@ -76,7 +72,6 @@ def read_batch(
       max_points: Maximum number of points of a scan. Larger scans are thinned evenly.
       share_negatives: Whether every place of the batch that is far enough from an anchor is its negative. Otherwise
         only the negatives of its own tuple count.
-      symmetric: Whether the positives of an anchor are anchors, too.
       categories: Number of classes; with 0 no labels are read.
       image: Kind of image. "density" computes density images from all points of a scan.
       part: Tuples to read. Their negatives come from the whole batch.
@@ -84,12 +79,10 @@ def read_batch(
     Raises ValueError if the batch mixes scans and images, images differ in size, or a scan has no usable points.
     """
     tuples, tuple_size = places.shape
-    anchors = 1 + pool.config.positives if symmetric else 1
-    negatives = pool.far_apart(places[:, :anchors, None], places.reshape(-1))  # (tuple, anchor, place)
+    negatives = pool.far_apart(places[:, :1], places.reshape(1, -1))
     if not share_negatives:
         is_own_tuple, is_negative = np.eye(tuples, dtype=bool), np.arange(tuple_size) > pool.config.positives
-        negatives &= np.kron(is_own_tuple, is_negative)[:, None]
-    negatives = negatives[part].reshape(-1, places.size)
+        negatives &= np.kron(is_own_tuple, is_negative)
     has_labels = categories > 0 and any(recording.has_labels for recording in recordings)
     has_images = recordings[0].has_images
     gives_images = has_images or image == "density"
@@ -111,7 +104,7 @@ def read_batch(
         clouds_or_images.append(cloud_or_image)
         classes.append(place_classes)
     labelled = np.array([place_classes is not None for place_classes in classes])
-    batch = Batch(labelled=labelled, negatives=negatives, positives=pool.config.positives, anchors=anchors)
+    batch = Batch(labelled=labelled, negatives=negatives[part], positives=pool.config.positives)
     if not gives_images:
         points, count, point_classes = _pad_clouds(clouds_or_images, classes, max_points)
         return dataclasses.replace(batch, points=points, count=count, classes=point_classes if has_labels else None)

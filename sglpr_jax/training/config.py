@@ -130,8 +130,6 @@ class TrainConfig:
     """Tuples per step."""
     share_negatives: bool = False
     """Use the places of all tuples of a step as negatives, if they are far enough away."""
-    symmetric: bool = False
-    """Use the positives of an anchor as anchors, too."""
     also_tuples: CountOrNone = 0
     """Tuples per step from the second dataset, included in `tuples`."""
     also_triplets: bool = False

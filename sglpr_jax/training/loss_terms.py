@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax import losses
@@ -44,7 +43,7 @@ class Summary(NamedTuple):
 
 
 def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
-    """Return the triplet loss (equation 5), averaged over the anchors that the rows of `batch.negatives` stand for.
+    """Return the triplet loss (equation 5), averaged over the tuples that the rows of `batch.negatives` stand for.
 
     The fraction `config.one_threshold` of it is the loss in which every anchor has the negatives of all anchors.
     """
@@ -58,7 +57,7 @@ def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) 
 
 
 def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
-    """Return the fraction of anchors that violate the margin: those whose loss without a temperature is above 0."""
+    """Return the fraction of tuples that violate the margin: those whose loss without a temperature is above 0."""
     to_positives, to_places = _anchor_distances(descriptors, batch, config)
     return (losses.lazy_triplet(to_positives, to_places, **_triplet_options(batch, config)) > 0).mean()
 
@@ -122,18 +121,15 @@ def _weighted(terms: dict[str, Any], config: LossConfig) -> dict[str, Any]:
 
 def _anchor_distances(
     descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig
-) -> tuple[Float[Array, "anchors p"], Float[Array, "anchors places"]]:
+) -> tuple[Float[Array, "t p"], Float[Array, "t places"]]:
     """Return the distances of each anchor to its positives, and to each descriptor of the batch.
 
     `batch.negatives` has the same shape as the second result, and tells which of these descriptors are negatives.
     """
-    rows, places = batch.negatives.shape
+    tuples, places = batch.negatives.shape
     descriptors = descriptors[:places]  # without those of a second batch that the triplet loss ignores
-    by_tuple = descriptors.reshape(rows // batch.anchors, -1, descriptors.shape[-1])
-    near = np.arange(1 + batch.positives)
-    positives = by_tuple[:, np.array([np.delete(near, anchor) for anchor in range(batch.anchors)])]  # (t, anchor, p, d)
-    anchors = by_tuple[:, : batch.anchors].reshape(rows, 1, -1)
-    positives = positives.reshape(rows, batch.positives, -1)
+    by_tuple = descriptors.reshape(tuples, -1, descriptors.shape[-1])
+    anchors, positives = by_tuple[:, :1], by_tuple[:, 1 : 1 + batch.positives]
     to_positives = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, positives), squared=config.squared)
     to_places = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, descriptors[None]), squared=config.squared)
     return to_positives, to_places

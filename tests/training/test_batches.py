@@ -69,8 +69,8 @@ def pool(recordings) -> TuplePool:
 FRAMES = np.array([[0, 1, 12, 20], [18, 17, 5, 31]])
 
 
-def read(recordings, pool, frames=FRAMES, *, max_points=9, **options):
-    return read_batch(recordings, pool, frames, max_points=max_points, **{"share_negatives": False, **options})
+def read(recordings, pool, frames=FRAMES, *, max_points=9, share_negatives=False):
+    return read_batch(recordings, pool, frames, max_points=max_points, share_negatives=share_negatives)
 
 
 def test_clouds_are_padded_and_the_valid_points_counted(recordings, pool):
@@ -95,32 +95,29 @@ def test_large_clouds_are_thinned_evenly_with_their_labels(recordings, pool):
     np.testing.assert_array_equal(batch.classes[1], to_classes(labels_of(clouds(0)[1]).astype(np.int32))[kept])
 
 
-@pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("share_negatives", [False, True])
-def test_the_negatives_of_each_anchor_are_those_of_brute_force(recordings, pool, share_negatives, symmetric):
+def test_the_negatives_of_each_anchor_are_those_of_brute_force(recordings, pool, share_negatives):
     frames = np.array([[0, 1, 12, 5], [3, 4, 15, 31], [18, 17, 5, 30]])  # frame 5 is too near to the first anchor
-    batch = read(recordings, pool, frames, share_negatives=share_negatives, symmetric=symmetric)
-    anchors = frames[:, : 2 if symmetric else 1]
-    expected = np.zeros((anchors.size, 12), bool)
+    batch = read(recordings, pool, frames, share_negatives=share_negatives)
+    expected = np.zeros((3, 12), bool)
     every = np.concatenate([positions(), positions()])
-    for row, anchor in enumerate(anchors.reshape(-1)):
+    for t, anchor in enumerate(frames[:, 0]):
         for place, frame in enumerate(frames.reshape(-1)):
             other_drive = (anchor < len(SIZES)) != (frame < len(SIZES))
             far = other_drive or np.linalg.norm(every[anchor] - every[frame]) > 20
-            own = place // 4 == row // anchors.shape[1] and place % 4 >= 2
-            expected[row, place] = far and (own or share_negatives)
+            own = place // 4 == t and place % 4 >= 2
+            expected[t, place] = far and (own or share_negatives)
     np.testing.assert_array_equal(batch.negatives, expected)
-    assert batch.negatives[:: anchors.shape[1]].sum() == (21 if share_negatives else 5)
+    assert batch.negatives.sum() == (21 if share_negatives else 5)
     assert batch.positives == 1
 
 
-@pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("share_negatives", [False, True])
-def test_the_parts_of_two_hosts_are_the_whole_batch(recordings, pool, share_negatives, symmetric):
-    options = {"max_points": 9, "share_negatives": share_negatives, "symmetric": symmetric}
+def test_the_parts_of_two_hosts_are_the_whole_batch(recordings, pool, share_negatives):
+    options = {"max_points": 9, "share_negatives": share_negatives}
     whole = read_batch(recordings, pool, FRAMES, **options)
     parts = [read_batch(recordings, pool, FRAMES, **options, part=slice(i, i + 1)) for i in range(2)]
-    assert parts[0].negatives.shape == (1 + symmetric, 8) and parts[0].points.shape == (4, 9, 3)
+    assert parts[0].negatives.shape == (1, 8) and parts[0].points.shape == (4, 9, 3)
     assert parts[1].classes is not None  # the second host reads the second recording alone, which has no labels
     joined = jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
     jax.tree.map(np.testing.assert_array_equal, joined, whole)
