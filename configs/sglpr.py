@@ -16,7 +16,9 @@ from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(
     model=model_preset("sglpr"),
-    sampling=TupleConfig(negatives=0, cluster=5, positive_m=4.0),  # the batch's other places are the negatives
+    sampling=TupleConfig(  # the other places of a step are the negatives
+        negatives=0, cluster=5, positive_m=4.0, mining="hardest", refresh_steps=50, mined_places=1000
+    ),
     loss=LossConfig(
         margin=0.3,
         squared=True,
@@ -26,8 +28,10 @@ CONFIG = TrainConfig(
         ignore_unlabelled=True,
         class_balance=0.5,
     ),
-    optimizer=OptimizerConfig(learning_rate=8e-4, warmup_steps=150, decay_rate=0.5, decay_steps=650, clip_norm=1.0),
-    steps=4000,
+    optimizer=OptimizerConfig(
+        algorithm="muon", learning_rate=0.02, warmup_steps=20, decay_rate=0.5, decay_steps=700, clip_norm=1.0
+    ),
+    steps=5000,
     tuples=20,
     share_negatives=True,
     max_points=131072,

@@ -1,9 +1,9 @@
 """Simulated recordings on which the networks of other publications are trained, chosen and scored.
 
-`train` has towns of the card of `sglpr` and car parks and garages, whose places repeat. The learning rates are chosen
-on `held-out`. `test` has towns that no weights have seen, with several sensors and sceneries, and one town on two days.
+`train` has towns, two of them seen by three sensors and from two lines, and a car park and a garage, whose places
+repeat. The learning rates are chosen on `held-out`. `test` has towns that no weights have seen, with several sensors and
+sceneries, one town from two lines, one on two days, and two walks.
 `train-images` has the images of the scans of `train`, for the presets of `bin/train`, which rotate images.
-`train-worlds` has images of two towns, each driven by three sensors and on three lines.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ from sglpr_jax.labels import to_raw
 from sglpr_jax.retrieval.image_maps import semantic_map
 from sglpr_jax.sim.dataset import simulate
 
-TRAIN, TRAIN_IMAGES, TRAIN_WORLDS, HELD_OUT, TEST = "train", "train-images", "train-worlds", "held-out", "test"
+TRAIN, TRAIN_IMAGES, HELD_OUT, TEST = "train", "train-images", "held-out", "test"
 BUILDING = 50
 """The label of all points without labels: raw id of SemanticKITTI."""
 LINKED = ("velodyne", "poses.txt", "times.txt", "calib.txt")
@@ -54,27 +54,19 @@ def _town(part: str, seed: int, *routes: str, **options: Any) -> Dataset:
 
 _TRAIN = (
     *(_town(TRAIN, seed, "00", "02", "05", "06", "08") for seed in (10, 11, 12, 13)),
-    *(_town(TRAIN, 61, "00", "08", sensor=sensor) for sensor in ("vlp16", "os1-64")),
+    *(_town(TRAIN, seed, "00", "08", sensor=sensor) for seed in (10, 11, 61) for sensor in ("vlp16", "os1-64")),
+    *(_town(TRAIN, seed, "00", "08", aside_m=2.5) for seed in (10, 11)),
     *(_town(TRAIN, 11, "00", "08", scenery=scenery) for scenery in ("car_park", "garage")),
 )
 DATASETS = (
     *_TRAIN,
     *(Dataset(TRAIN_IMAGES, one.name, {**one.options, "images": True}) for one in _TRAIN),
-    *(
-        _town(TRAIN_WORLDS, seed, "00", "02", "05", "06", "08", sensor=sensor, images=True)
-        for seed in (10, 11)
-        for sensor in ("hdl64e", "vlp16", "os1-64")
-    ),
-    *(
-        _town(TRAIN_WORLDS, seed, "00", "02", "05", "06", "08", aside_m=aside_m, images=True)
-        for seed in (10, 11)
-        for aside_m in (2.0, 3.5)
-    ),
     _town(HELD_OUT, 37, "00", "08"),
     _town(TEST, 601, "00", "08"),
     _town(TEST, 601, "00", "08", aside_m=3.0),
     *(_town(TEST, 602, "08", scenery=scenery) for scenery in ("outskirts", "lanes", "car_park")),
-    *(_town(TEST, 603, "08", sensor=sensor) for sensor in ("vlp16", "os1-64")),
+    *(_town(TEST, 603, "08", sensor=sensor) for sensor in ("vlp16", "os1-64", "xt32")),
+    *(_town(TEST, 605, "08", scenery=scenery, carrier="backpack", sensor="os1-64") for scenery in ("campus", "yard")),
     Dataset(TEST, "days-604", {"seed": 604, "sessions": ("2012-01-15", "2012-02-04")}),
 )
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import sglpr_jax
-from benchmarks.learned.data import TRAIN_WORLDS, folders, recordings_of
+from benchmarks.learned.data import TRAIN_IMAGES, folders, recordings_of
 from benchmarks.table import Table
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -21,7 +21,7 @@ HARDEST = 10
 def sampler(
     *,
     data: Path = Path("build/learned"),
-    part: str = TRAIN_WORLDS,
+    part: str = TRAIN_IMAGES,
     only: tuple[str, ...] = (),
     weights: str = DEFAULT_WEIGHTS,
     places: int = 200,

@@ -13,7 +13,6 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import jax
 import numpy as np
@@ -148,28 +147,19 @@ class Settings:
     """Learning rate. None: the best of the search."""
     labels: bool = True
     """Train the semantic branch."""
-    part: Literal["train-images", "train-worlds"] = TRAIN_IMAGES
-    """Part of the data to train on."""
-    worlds: bool = True
-    """Let recordings of one world have positives in each other."""
     compile_cache: Path = Path("build/learned/compiled")
     """Folder of compiled programs, which all stages share."""
 
     @property
     def folder(self) -> Path:
         """Folder of the run."""
-        variants = {"no-labels": not self.labels, self.part: self.part != TRAIN_IMAGES, "no-worlds": not self.worlds}
-        return self.out / "-".join(
-            [Path(self.preset).stem, *(name for name, is_set in variants.items() if is_set), str(self.seed)]
-        )
+        return self.out / f"{Path(self.preset).stem}{'' if self.labels else '-no-labels'}-{self.seed}"
 
 
 def train_preset(settings: tyro.conf.OmitArgPrefixes[Settings]) -> None:
     """Train, or continue a run."""
     jax.config.update("jax_compilation_cache_dir", str(settings.compile_cache.absolute()))
-    recordings = [one for folder in folders(settings.data, settings.part) for one in recordings_of(folder)]
-    if not settings.worlds:
-        recordings = [dataclasses.replace(recording, world="") for recording in recordings]
+    recordings = [one for folder in folders(settings.data, TRAIN_IMAGES) for one in recordings_of(folder)]
     held_out = [one for folder in folders(settings.data, HELD_OUT) for one in recordings_of(folder)]
     rate = settings.learning_rate or _best_rate(settings, recordings, held_out)
     _train(_config(settings, rate), recordings, settings.folder, settings, held_out)

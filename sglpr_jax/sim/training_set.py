@@ -21,12 +21,17 @@ ALIKE = {"car_park": {}, "garage": {}, "forest": {"carrier": "backpack", "sensor
 """Sceneries where places look alike, for hard negatives, with options."""
 
 
+HELD_OUT = "held-out"
+"""Name of the dataset on which `bin/train --seq held-out/08` tests, with a town of its own."""
+
+
 def training_set() -> dict[str, dict[str, Any]]:
     """Return the options of `simulate` for each dataset, by the name of its folder."""
     return {name: {"images": True, **options} for name, options in _datasets()}
 
 
 def _datasets() -> Iterator[tuple[str, dict[str, Any]]]:
+    yield HELD_OUT, {"seed": 37, "routes": ("08",)}
     for seed in TOWNS:
         yield f"town-{seed}", {"seed": seed, "routes": ALL_KINDS}
     for seed in SEEN_OFTEN:
