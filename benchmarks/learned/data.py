@@ -1,8 +1,8 @@
 """Simulated recordings on which the networks of other publications are trained, chosen and scored.
 
 `train` has towns, two of them seen by three sensors and from two lines, and a car park and a garage, whose places
-repeat. The learning rates are chosen on `held-out`. `test` has towns that no weights have seen, with several sensors and
-sceneries, one town from two lines, one on two days, and two walks.
+repeat. The learning rates are chosen on `held-out`. `test` has towns that no weights have seen, with several sensors
+and sceneries, one town from two lines, one on two days, and two walks.
 `train-images` has the images of the scans of `train`, for the presets of `bin/train`, which rotate images.
 """
 
