@@ -6,7 +6,7 @@ from pathlib import Path
 from sglpr_jax.sim import SCANS
 from sglpr_jax.sim.training_set import training_set
 
-WITH_TRAINING_SET = ("out", "training_set", "scans", "azimuth_steps")
+WITH_TRAINING_SET = ("out", "training_set", "scans")
 """Flags that may accompany --training-set."""
 
 
@@ -17,14 +17,14 @@ class SimulateCommand:
     Example:
       bin/simulate --out towns --seq 08 --scans 400 --sensor hdl64e --seed 0
       bin/simulate --out days --sessions 2012-01-15 2012-02-04 2012-03-17 --scans 400
-      bin/simulate --out TOWNS --training-set --azimuth-steps 900
+      bin/simulate --out TOWNS --training-set
     """
 
     out: Path
     """Folder of the dataset. An interrupted dataset is completed, and recordings can be added."""
     training_set: bool = False
     """Write the datasets with which the shipped weights were trained, each in its own folder of --out. The
-    recordings are called DATASET/NN. Only with --scans and --azimuth-steps."""
+    recordings are called DATASET/NN. --scans is the only other flag."""
     seq: tuple[str, ...] | None = None
     """Routes, from 00 to 10. Their revisits resemble KITTI's: same direction in 00, 02, 05, 06, 07 and 09, opposite
     direction in 08, no revisits in the others. None: 00 05 08, or no routes with --along."""
@@ -74,7 +74,7 @@ def write_simulation(command: SimulateCommand) -> None:
     if options.pop("training_set"):
         _require_defaults(command)
         for name, dataset in training_set().items():
-            print(simulate(out / name, scans=command.scans, azimuth_steps=command.azimuth_steps, **dataset))
+            print(simulate(out / name, scans=command.scans, **dataset))
     else:
         print(simulate(out, routes=options.pop("seq"), **options))
 
@@ -84,4 +84,4 @@ def _require_defaults(command: SimulateCommand) -> None:
     fields = (field for field in dataclasses.fields(command) if field.name not in WITH_TRAINING_SET)
     found = [field.name.replace("_", "-") for field in fields if getattr(command, field.name) != field.default]
     if found:
-        raise ValueError(f"with --training-set, expected --scans and --azimuth-steps alone, found --{found[0]}")
+        raise ValueError(f"with --training-set, expected no other flag than --scans, found --{found[0]}")

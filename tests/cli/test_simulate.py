@@ -31,14 +31,14 @@ def test_drives_are_written_and_an_interrupted_dataset_is_completed(command, tmp
 
 
 def test_the_training_set_is_one_dataset_with_places_by_two_sensors(command, tmp_path, monkeypatch):
-    town = {"seed": 5, "routes": ("08",), "images": True}
+    town = {"seed": 5, "routes": ("08",), "images": True, "azimuth_steps": 40}
     datasets = {"town": town, "town-vlp16": {**town, "sensor": "vlp16"}}
     monkeypatch.setattr("sglpr_jax.cli.simulate.training_set", lambda: datasets)
-    written = command("simulate", "--out", tmp_path, "--training-set", "--scans", 3, "--azimuth-steps", 40)
+    written = command("simulate", "--out", tmp_path, "--training-set", "--scans", 3)
     assert written.status == 0 and recording_names(tmp_path) == ("town/08", "town-vlp16/08")
     drives = [open_recording(tmp_path, name) for name in recording_names(tmp_path)]
     assert [drive.name for drive in drives] == ["town/08", "town-vlp16/08"]
     assert drives[0].world == drives[1].world != "" and drives[0].has_labels
     assert drives[0].image(0).any() and (drives[0].image(0) != drives[1].image(0)).any()
     wrong = command("simulate", "--out", tmp_path, "--training-set", "--sensor", "vlp16")
-    assert_one_line_error(wrong, "--training-set, expected --scans and --azimuth-steps alone, found --sensor")
+    assert_one_line_error(wrong, "--training-set, expected no other flag than --scans, found --sensor")

@@ -18,7 +18,7 @@ def test_the_simulator_accepts_every_dataset_and_towns_are_seen_from_several_lin
     worlds = collections.Counter()
     for name, options in training_set().items():
         try:
-            simulate(tmp_path / name, scans=2, azimuth_steps=900, on_start=stop, **options)
+            simulate(tmp_path / name, scans=2, on_start=stop, **options)
         except Checked:
             worlds.update(simulated_world(tmp_path / name, route) for route in options["routes"])
     assert sum(worlds.values()) == sum(len(options["routes"]) for options in training_set().values())
