@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 
 from sglpr_jax.sim import SCANS
-from sglpr_jax.sim.training_set import training_set
 
 WITH_TRAINING_SET = ("out", "training_set", "scans")
 """Flags that may accompany --training-set."""
@@ -67,7 +66,8 @@ class SimulateCommand:
 
 
 def write_simulation(command: SimulateCommand) -> None:
-    from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
+    from sglpr_jax.cli.datasets import simulate  # slow imports, not needed for --help
+    from sglpr_jax.sim.training_set import training_set
 
     options = {field.name: getattr(command, field.name) for field in dataclasses.fields(command)}
     out = options.pop("out")

@@ -33,7 +33,7 @@ def test_drives_are_written_and_an_interrupted_dataset_is_completed(command, tmp
 def test_the_training_set_is_one_dataset_with_places_by_two_sensors(command, tmp_path, monkeypatch):
     town = {"seed": 5, "routes": ("08",), "images": True, "azimuth_steps": 40}
     datasets = {"town": town, "town-vlp16": {**town, "sensor": "vlp16"}}
-    monkeypatch.setattr("sglpr_jax.cli.simulate.training_set", lambda: datasets)
+    monkeypatch.setattr("sglpr_jax.sim.training_set.training_set", lambda: datasets)
     written = command("simulate", "--out", tmp_path, "--training-set", "--scans", 3)
     assert written.status == 0 and recording_names(tmp_path) == ("town/08", "town-vlp16/08")
     drives = [open_recording(tmp_path, name) for name in recording_names(tmp_path)]
