@@ -4,10 +4,9 @@ Reproduces the network and the losses of the paper (figure 2, equations 5 to 8),
 and circular convolutions make the tokens. CBAM and the convolutions of the head are circular, too
 (docs/decisions.md).
 
-Expect: on the KITTI BEV images, after training on simulated towns only, the numbers of
-sglpr_jax/weights/sglpr/README.md.
+Expect: no measured numbers yet. An earlier form of this preset trained the weights of sglpr_jax/weights/sglpr.
 
-Command: bin/train --seq 08 --data TOWNS --preset sglpr
+Command: bin/train --seq held-out/08 --data TOWNS --preset sglpr, with the TOWNS of bin/simulate --training-set
 """
 
 from sglpr_jax.methods.recipe import TupleConfig

@@ -75,14 +75,14 @@ TRAINED_TOWN = ("town-10-00", "town-10-08")
 """Revisits in the same and in the opposite direction in a town of the training."""
 SCENERIES = Column("other sceneries", ("outskirts-602-08", "lanes-602-08", "car_park-602-08"))
 SENSORS = Column("other sensors", ("vlp16-603-08", "os1-64-603-08"))
-NEW_SENSOR = Column("unseen sensor", ("xt32-603-08",))
+UNSEEN_SENSOR = Column("unseen sensor", ("xt32-603-08",))
 LANE = Column("other lane", ("aside-3-601-00-in-town-601-00", "aside-3-601-08-in-town-601-08"))
 WALKS = Column("walks", ("campus-605-08", "yard-605-08"))
 DAY = Column("another day", ("days-604",))
 PLACES = (TOWN, SCENERIES, SENSORS)
 LABELLED = (TOWN, TOWN.rotated, SCENERIES, SENSORS)
 """The columns of which all methods have scores."""
-SIMULATED = (*LABELLED, NEW_SENSOR, LANE, WALKS, DAY)
+SIMULATED = (*LABELLED, UNSEEN_SENSOR, LANE, WALKS, DAY)
 SEQS = tuple(Column(seq, (f"kitti-{seq}",)) for seq in ("00", "02", "06"))
 KITTI = Column("KITTI", tuple(test for column in SEQS for test in column.tests))
 

@@ -1,4 +1,4 @@
-"""The training set of the shipped weights: images of towns and other sceneries, by many sensors.
+"""Training set of the preset `sglpr`: images of towns and other sceneries, by many sensors.
 
 Datasets of one town have equal seeds, so its places have positives by another sensor, from another lane and of another
 carrier (`Recording.world`).
@@ -22,7 +22,7 @@ ASIDE_M = (2.0, 3.5)
 HELD_OUT = "held-out"
 """Dataset with a town of its own, for `bin/train --seq held-out/08`."""
 FIRINGS = 900
-"""Azimuth steps of all sensors. More show hardly more in cells of 0.4 m."""
+"""Azimuth steps of all sensors. At 25 m, the end of the image, rays are 0.17 m apart, less than a cell of 0.4 m."""
 
 
 def training_set() -> dict[str, dict[str, Any]]:
