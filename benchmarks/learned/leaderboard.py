@@ -14,7 +14,6 @@ from benchmarks.learned import tables
 from benchmarks.learned.train import stages
 from sglpr_jax.cli.peers import RATES
 from sglpr_jax.files import replacing, write_json, write_text
-from sglpr_jax.methods.learned.trained import RANDOM
 from sglpr_jax.training.peers import RATES_FILE
 from sglpr_jax.training.trainer import SCORES_FILE
 
@@ -51,7 +50,10 @@ def leaderboard(
     for folder, labels in ((build, ""), (predicted, ", predicted labels"), (none, ", no labels")):
         for path in sorted((folder / "scores").glob("*/*.json")):
             one = json.loads(path.read_text())
-            results["scores"].setdefault(one["entry"] + labels, {})[one["test"]] = one
+            kept_scores = results["scores"].setdefault(one["entry"] + labels, {})
+            if any(other["weights"] != one["weights"] for other in kept_scores.values()):
+                kept_scores.clear()  # of an earlier training
+            kept_scores[one["test"]] = one
     if (build / "cost.json").is_file():
         results["costs"] |= json.loads((build / "cost.json").read_text())
     for path in sorted((build / "runs").glob(f"*/{SCORES_FILE}")):
@@ -84,11 +86,11 @@ def _draw(results: Mapping[str, Any], path: Path) -> None:
         left.plot([one["images"] for one in curve], [one["recall_at_1"] for one in curve], "o-", label=name)
     left.set(xscale="log", ylim=(0, 1.04), xlabel="images seen", ylabel="Recall@1", title="held-out town")
     left.legend(fontsize="x-small")
-    for name in (one for one in tables.finals(results["scores"]) if RANDOM not in one):
-        recall = tables.mean(results["scores"][name], tables.TOWN)
-        if tables.method_of(name) in times and recall is not None:
-            right.plot(times[tables.method_of(name)], recall, "o")
-            right.annotate(name, (times[tables.method_of(name)], recall), fontsize="x-small", **LABEL)
+    for row in tables.rows(results["scores"]):
+        name, _, kind = row.title.replace("`", "").partition(", ")
+        if name in times and kind in ("", "trained") and (recalls := row.means(tables.TOWN)):
+            right.plot(times[name], np.mean(recalls), "o")
+            right.annotate(row.title.replace("`", ""), (times[name], np.mean(recalls)), fontsize="x-small", **LABEL)
     right.set(xscale="log", xlabel="milliseconds per descriptor", title="unseen town")
     with matplotlib.rc_context({"svg.hashsalt": "leaderboard", "svg.fonttype": "none"}), replacing(path) as temporary:
         figure.savefig(temporary, format="svg", metadata={"Date": None})

@@ -4,7 +4,6 @@ The name of a contender is a handcrafted method (`scan-context`), shipped weight
 (`rinet@random:0`), or a folder of weights (`rinet-0`, `rinet-0/weights-4000`) in the folder of the runs.
 """
 
-import functools
 import json
 import math
 import sys
@@ -15,15 +14,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import tyro
-from jaxtyping import Float32
 
 import sglpr_jax
 from benchmarks.learned.data import TEST, folders, recordings_of
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.views import view
 from sglpr_jax.evaluation.protocols.pairs import PAIRS_F1MAX
-from sglpr_jax.evaluation.protocols.protocol import Source, TopK, nearest_frames
 from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL, BEVPLACE_RECALL_AT_1
 from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.files import write_json
@@ -36,9 +32,6 @@ from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights_file import LAST_WEIGHTS
-from sglpr_jax.registration.bev_alignment import refine
-from sglpr_jax.registration.bev_search import search
-from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
 from sglpr_jax.reproduce.reproduction import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
@@ -47,10 +40,8 @@ from sglpr_jax.training.trainer import SCORES_FILE
 from sglpr_jax.training.validation import FOUND_M
 
 GRID = model_preset("sglpr").grid
-"""Grid of handcrafted methods on images, and of the images for verification."""
+"""Grid of handcrafted methods on images."""
 ROTATION_SEED = 0
-CANDIDATES = 5
-"""Number of places that are verified for each query."""
 SPLIT = ("00", "02", "05", "06")
 """Sequences of KITTI with a published split into map and queries."""
 
@@ -125,7 +116,6 @@ def score(
     kitti: Path | None = None,
     part: str = TEST,
     only: str = "",
-    verify: bool = False,
 ) -> None:
     """Score contenders and print a line for each recording.
 
@@ -141,14 +131,13 @@ def score(
         part: part of `data` to score on. Scores on "train" distinguish networks that did not learn from those that do
             not generalise.
         only: beginning of the names of the test recordings to score on.
-        verify: also score after verification of the nearest places.
     """
     tests = [test for test in [*_simulated(data, part), *_kitti(kitti)] if test.name.startswith(only)]
     for name in entries:
         contender = entry(name, runs)
         for test in tests:
             if _fits(contender, test):
-                result = _result(contender, test, out / name.replace("/", "_").replace(":", "-"), verify=verify)
+                result = _result(contender, test, out / name.replace("/", "_").replace(":", "-"))
                 scores = (f"{key} {value:.3f}" for key, value in result["scores"].items())
                 print(f"{name}, {test.name}: {', '.join(scores)}", flush=True)
 
@@ -184,21 +173,17 @@ def _fits(contender: Entry, test: Test) -> bool:
     return contender.takes == "images" or not test.recording.has_images
 
 
-def _result(contender: Entry, test: Test, folder: Path, *, verify: bool) -> Mapping[str, Any]:
+def _result(contender: Entry, test: Test, folder: Path) -> Mapping[str, Any]:
     """Returns the stored scores of a contender on a recording, or computes and stores them."""
     path = folder / f"{test.name}.json"
     stored = json.loads(path.read_text()) if path.is_file() else None
-    verifies = verify and test.database is None and not test.rotated
-    if stored is not None and (not verifies or "verified top1" in stored["scores"]):
+    if stored is not None:
         return stored
     file = _described(contender, test.recording, rotated=test.rotated)
     if test.database is not None:
         scores = {"recall": BEVPLACE_NCLT_RECALL(_described(contender, test.database), file).score}
     else:
         scores = _scores(file, split=test.name.startswith("kitti-") and test.name.split("-")[1] in SPLIT)
-    if verifies:
-        images = _images(test.recording)
-        scores |= {f"verified {name}": score for name, score in _scores(_verified(file, images)).items()}
     about = {"images": contender.images, "seconds": contender.seconds, "numbers": file.descriptors.shape[1]}
     result = {"entry": contender.name, "test": test.name, **about, "weights": file.weights_hash, "scores": scores}
     folder.mkdir(parents=True, exist_ok=True)
@@ -211,62 +196,24 @@ def _described(contender: Entry, recording: Recording, *, rotated: bool = False)
     return embed(contender.method(recording), recording, rotation_seed=ROTATION_SEED if rotated else None, batch=16)
 
 
-@functools.lru_cache(maxsize=4)
-def _images(recording: Recording) -> Float32[np.ndarray, "n h w"]:
-    """The density images of scans or images of a recording, in the window of `sglpr`."""
-    scans = (recording.scan(row, labels=False) for row in range(len(recording)))
-    return np.stack([np.asarray(view(scan, GRID, image="density").image, np.float32) for scan in scans])
-
-
-def _scores(source: Source, *, split: bool = False) -> dict[str, float]:
+def _scores(file: DescriptorFile, *, split: bool) -> dict[str, float]:
     """Return top-1 F1max, F1max of pairs, Recall@1 within 5 m and, for a split sequence, that of BEVPlace++."""
-    top1 = TOP1_F1MAX(source)
-    scores = {"top1": top1.score}
-    if not isinstance(source, TopK):
-        scores["pairs"] = PAIRS_F1MAX(source).score
-    scores["recall"] = _recall(source, top1.answers)
-    if split and not isinstance(source, TopK):
-        scores["split recall"] = BEVPLACE_RECALL_AT_1(source).score
-    return scores
+    top1 = TOP1_F1MAX(file)
+    scores = {"top1": top1.score, "pairs": PAIRS_F1MAX(file).score, "recall": _recall(file, top1.answers)}
+    return scores | ({"split recall": BEVPLACE_RECALL_AT_1(file).score} if split else {})
 
 
-def _recall(source: Source, answers: np.ndarray | None) -> float:
+def _recall(file: DescriptorFile, answers: np.ndarray | None) -> float:
     """Fraction of the revisits whose answer is within FOUND_M (5 m) in x and y, or NaN without revisits.
 
     `answers` are frames, or -1 for no answer.
     """
-    assert source.positions is not None and answers is not None
-    xy = source.positions[:, :2]
-    ends = database_end(len(xy), times=source.times)  # frame i is compared with the frames before ends[i]
+    assert file.positions is not None and answers is not None
+    xy = file.positions[:, :2]
+    ends = database_end(len(xy), times=file.times)  # frame i is compared with the frames before ends[i]
     queries = np.flatnonzero(ends)
     revisits = queries[has_near(xy[queries], xy, ends[queries], lambda metres: metres <= FOUND_M)]
     if not len(revisits):
         return math.nan
     distance = np.linalg.norm(xy[revisits] - xy[answers[revisits]], axis=1)
     return float(np.mean((distance <= FOUND_M) & (answers[revisits] >= 0)))
-
-
-def _verified(file: DescriptorFile, images: Float32[np.ndarray, "n h w"]) -> TopK:
-    """The CANDIDATES frames with the nearest descriptors of each frame, ordered by the correlation of their images."""
-    ends = database_end(len(file), times=file.times)
-    queries = np.flatnonzero(ends)
-    nearest, _ = nearest_frames(file, queries, ends[queries], k=CANDIDATES)
-    correlations = np.stack([_correlations(images, int(q), row) for q, row in zip(queries, nearest, strict=True)])
-    order = np.argsort(-correlations, axis=1, kind="stable")
-    assert file.positions is not None
-    return TopK(
-        sequence=file.sequence,
-        positions=file.positions,
-        times=file.times,
-        pose_source=file.pose_source,
-        queries=queries,
-        nearest=np.take_along_axis(nearest, order, axis=1),
-        scores=np.take_along_axis(correlations, order, axis=1),
-    )
-
-
-def _correlations(images: np.ndarray, query: int, nearest: np.ndarray) -> np.ndarray:
-    """Correlation of the image of `query` with those of the frames `nearest`, or -1 where `nearest` is negative."""
-    peaks = search(query_spectra(images[query]), match_spectra(images[nearest]))
-    alignments = (refine(images[query], images[frame], peaks.at(k)) for k, frame in enumerate(nearest))
-    return np.where(nearest >= 0, [float(alignment.correlation) for alignment in alignments], -1.0)
