@@ -4,14 +4,14 @@ import collections
 
 from sglpr_jax.data.readers.simulation import simulated_world
 from sglpr_jax.sim.dataset import Simulated, simulate
-from sglpr_jax.sim.training_set import training_set
+from sglpr_jax.sim.training_set import SEEDS, training_set
 
 
 class Checked(Exception):
     """The simulator has checked the options of a dataset, and would now write its scans."""
 
 
-def test_the_simulator_accepts_every_dataset_and_towns_are_seen_from_several_lines_and_by_several_sensors(tmp_path):
+def test_the_simulator_accepts_every_dataset_and_sees_each_place_in_both_directions_three_times(tmp_path):
     def stop(dataset: Simulated) -> None:
         raise Checked
 
@@ -22,5 +22,5 @@ def test_the_simulator_accepts_every_dataset_and_towns_are_seen_from_several_lin
         except Checked:
             worlds.update(simulated_world(tmp_path / name, route) for route in options["routes"])
     assert sum(worlds.values()) == sum(len(options["routes"]) for options in training_set().values())
-    four_towns_two_routes = 8
-    assert sum(times == 8 for times in worlds.values()) == four_towns_two_routes
+    seeds, both_directions = sum(map(len, SEEDS.values())), 2
+    assert sum(times == 3 for times in worlds.values()) == both_directions * seeds
