@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import tyro
 
-from benchmarks.learned.data import TEST, folders
+from benchmarks.learned.data import TEST, TOWN, folders
 from benchmarks.learned.score import Entry, entry
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
@@ -20,8 +20,6 @@ from sglpr_jax.files import write_json
 from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.trained import apply_network, example_inputs, random_variables
 from sglpr_jax.models.sglpr import describe
-
-TOWN = "town-601"
 
 
 def cost(

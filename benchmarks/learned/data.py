@@ -27,6 +27,8 @@ from sglpr_jax.retrieval.image_maps import semantic_map
 from sglpr_jax.sim.dataset import simulate
 
 TRAIN, TRAIN_IMAGES, HELD_OUT, TEST = "train", "train-images", "held-out", "test"
+TOWN = "town-601"
+"""Test recordings that are also scored with rotated scans, and on which times are measured."""
 BUILDING = 50
 """The label of all points without labels: raw id of SemanticKITTI."""
 LINKED = ("velodyne", "poses.txt", "times.txt", "calib.txt")

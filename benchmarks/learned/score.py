@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 import sglpr_jax
-from benchmarks.learned.data import TEST, folders, recordings_of
+from benchmarks.learned.data import TEST, TOWN, folders, recordings_of
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.protocols.pairs import PAIRS_F1MAX
@@ -119,8 +119,9 @@ def score(
 ) -> None:
     """Score contenders and print a line for each recording.
 
-    Every contender describes the test recordings of `data`, raw and with every scan rotated, and the images of KITTI if
-    it takes images. A result is a JSON file of one contender and one recording. Existing results are kept.
+    Every contender describes the test recordings of `data`, and the images of KITTI if it takes images. The town and
+    KITTI are also described with every scan rotated. A result is a JSON file of one contender and one recording.
+    Existing results are kept.
 
     Args:
         entries: contenders, see the head of this file.
@@ -151,7 +152,9 @@ def _simulated(data: Path, part: str) -> Iterator[Test]:
             continue
         for recording in recordings:
             name = f"{folder.name}-{recording.name}"
-            yield from _raw_and_rotated(name, recording)
+            yield Test(name, recording)
+            if folder.name == TOWN:
+                yield Test(f"{name}-rotated", recording, rotated=True)
             other, database = by_world.setdefault(recording.world or name, (name, recording))
             if other != name:
                 yield Test(f"{name}-in-{other}", recording, database)  # another sensor or lane
@@ -159,11 +162,8 @@ def _simulated(data: Path, part: str) -> Iterator[Test]:
 
 def _kitti(root: Path | None) -> Iterator[Test]:
     for seq in () if root is None else ("00", "02", "06"):
-        yield from _raw_and_rotated(f"kitti-{seq}", open_recording(root, seq))
-
-
-def _raw_and_rotated(name: str, recording: Recording) -> tuple[Test, Test]:
-    return Test(name, recording), Test(f"{name}-rotated", recording, rotated=True)
+        for rotated in (False, True):
+            yield Test(f"kitti-{seq}{'-rotated' if rotated else ''}", open_recording(root, seq), rotated=rotated)
 
 
 def _fits(contender: Entry, test: Test) -> bool:

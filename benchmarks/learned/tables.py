@@ -32,6 +32,7 @@ COLUMNS = (
     Column("other sceneries", ("outskirts-602-08", "lanes-602-08", "car_park-602-08")),
     Column("other sensors", ("vlp16-603-08", "os1-64-603-08")),
     Column("unseen sensor", ("xt32-603-08",)),
+    Column("other sensor's map", ("os1-64-603-08-in-vlp16-603-08", "xt32-603-08-in-vlp16-603-08")),
     Column("other lane", ("aside-3-601-00-in-town-601-00", "aside-3-601-08-in-town-601-08")),
     Column("another day", ("days-604",)),
     Column("walks", ("campus-605-08", "yard-605-08")),
