@@ -1,7 +1,7 @@
-"""Time of a descriptor, its size, and the size of the network, for all contenders.
+"""Time and size of a descriptor, for all contenders.
 
 Contenders take turns, so that other programs slow all of them. The time is that from a scan in memory to its
-descriptor, one scan at a time: the image or graph is part of it. A product and a sum are two operations.
+descriptor, one scan at a time: the image or graph is part of it.
 """
 
 import json
@@ -13,13 +13,10 @@ import numpy as np
 import tyro
 
 from benchmarks.learned.data import TEST, TOWN, folders
-from benchmarks.learned.score import Entry, entry
+from benchmarks.learned.score import entry
 from benchmarks.timing import clocked, in_turn
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.files import write_json
-from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.learned.trained import apply_network, example_inputs, random_variables
-from sglpr_jax.models.sglpr import describe
 
 
 def cost(
@@ -55,21 +52,6 @@ def cost(
     ]
     seconds = np.median(in_turn(jobs, repeats=scans), axis=0).tolist()
     for contender, method, taken in zip(contenders, methods, seconds, strict=True):
-        numbers = describe_row(method, 0).size
-        costs[contender.name] = {"ms": 1e3 * taken, "numbers": numbers, "bytes": 4 * numbers, **_network(contender)}
+        costs[contender.name] = {"ms": 1e3 * taken, "bytes": 4 * describe_row(method, 0).size}
         print(contender.name, json.dumps(costs[contender.name]), flush=True)
     write_json(out, costs)
-
-
-def _network(contender: Entry) -> dict[str, Any]:
-    """Return the number of weights and the operations of one image, in GFLOP; nothing for a handcrafted method."""
-    network = contender.network
-    if network is None:
-        return {}
-    if isinstance(network, LearnedMethod):
-        variables, inputs = random_variables(network, seed=0), example_inputs(network)
-        lowered, weights = apply_network.lower(variables, inputs, method=network), network.weights
-    else:
-        grid, weights = network.config.grid, sum(leaf.size for leaf in jax.tree.leaves(network))
-        lowered = jax.jit(describe).lower(network, np.zeros((1, grid.height, grid.width), np.float32))
-    return {"weights": weights, "gflop": float(lowered.cost_analysis()["flops"]) / 1e9}

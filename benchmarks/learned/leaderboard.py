@@ -11,10 +11,7 @@ from jinja2 import Template
 from matplotlib.figure import Figure
 
 from benchmarks.learned import tables
-from benchmarks.learned.train import stages
-from sglpr_jax.cli.peers import RATES
 from sglpr_jax.files import replacing, write_json, write_text
-from sglpr_jax.training.peers import RATES_FILE
 from sglpr_jax.training.trainer import SCORES_FILE
 
 KEPT = Path(__file__).with_name("results.json")
@@ -57,23 +54,17 @@ def leaderboard(
     if (build / "cost.json").is_file():
         results["costs"] |= json.loads((build / "cost.json").read_text())
     for path in sorted((build / "runs").glob(f"*/{SCORES_FILE}")):
-        results["runs"][path.parent.name] = _run(path.parent)
+        results["curves"][path.parent.name] = _curve(path)
     write_json(kept, results)
     write_text(page, Template(TEMPLATE.read_text()).render(tables.tables(results)) + "\n")
     _draw(results, figure)
     print(f"{page}, {figure}")
 
 
-def _run(folder: Path) -> dict[str, Any]:
-    """Return the learning curve of a run, its losses in all stages, and the search of its learning rate."""
-    lines = [json.loads(line) for line in (folder / SCORES_FILE).read_text().splitlines()]
-    curve = [{name: line[name] for name in ("images", "seconds", "recall_at_1")} for line in lines]
-    logged = [json.loads(line) for path in stages(folder) for line in path.read_text().splitlines()]
-    losses = [line["loss"] for line in logged if "loss" in line]
-    quarters = [float(np.mean(part)) for part in np.array_split(losses, 4)] if len(losses) >= 4 else None
-    rates = folder / RATES / RATES_FILE
-    found = json.loads(rates.read_text()) if rates.is_file() else None
-    return {"curve": curve, "losses": quarters, "rates": found}
+def _curve(path: Path) -> list[dict[str, float]]:
+    """Return the learning curve of a run."""
+    lines = map(json.loads, path.read_text().splitlines())
+    return [{name: line[name] for name in ("images", "seconds", "recall_at_1")} for line in lines]
 
 
 def _draw(results: Mapping[str, Any], path: Path) -> None:
@@ -81,16 +72,15 @@ def _draw(results: Mapping[str, Any], path: Path) -> None:
     figure = Figure(figsize=(10, 4), layout="constrained")
     times = {tables.method_of(name): cost["ms"] for name, cost in results["costs"].items()}
     left, right = figure.subplots(1, 2, sharey=True)
-    for name, run in results["runs"].items():
-        curve = run["curve"]
+    for name, curve in results["curves"].items():
         left.plot([one["images"] for one in curve], [one["recall_at_1"] for one in curve], "o-", label=name)
     left.set(xscale="log", ylim=(0, 1.04), xlabel="images seen", ylabel="Recall@1", title="held-out town")
     left.legend(fontsize="x-small")
     for row in tables.rows(results["scores"]):
-        name, _, kind = row.title.replace("`", "").partition(", ")
-        if name in times and kind in ("", "trained") and (recalls := row.means(tables.TOWN)):
-            right.plot(times[name], np.mean(recalls), "o")
-            right.annotate(row.title.replace("`", ""), (times[name], np.mean(recalls)), fontsize="x-small", **LABEL)
+        if row.method in times and row.kind in ("", "trained") and (recalls := row.means(tables.TOWN)):
+            point = times[row.method], np.mean(recalls)
+            right.plot(*point, "o")
+            right.annotate(row.title.replace("`", ""), point, fontsize="x-small", **LABEL)
     right.set(xscale="log", xlabel="milliseconds per descriptor", title="unseen town")
     with matplotlib.rc_context({"svg.hashsalt": "leaderboard", "svg.fonttype": "none"}), replacing(path) as temporary:
         figure.savefig(temporary, format="svg", metadata={"Date": None})

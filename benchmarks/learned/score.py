@@ -25,7 +25,6 @@ from sglpr_jax.evaluation.protocols.top1 import TOP1_F1MAX
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
-from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.trained import RANDOM
 from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
@@ -53,8 +52,6 @@ class Entry(NamedTuple):
     takes: Takes
     method: Callable[[Recording], Method]
     """Returns the method for the scans of a recording."""
-    network: LearnedMethod | sglpr_jax.Params | None = None
-    """Network of another publication, or weights of our own networks."""
     images: int | None = None
     """Number of images that it was trained with. None: not trained here."""
     seconds: float | None = None
@@ -72,13 +69,13 @@ def entry(name: str, runs: Path) -> Entry:
     method, _, weights = name.rpartition("@")  # METHOD@random:SEED is untrained
     if name in sglpr_jax.shipped_weights():
         params = sglpr_jax.load(name)
-        return Entry(name, "images", lambda recording: network(params), params)
+        return Entry(name, "images", lambda recording: network(params))
     if weights.startswith(RANDOM) and method in LEARNED:
         learned = LEARNED[method]
-        return Entry(name, learned.takes, lambda recording: trained_method(learned, weights), learned, 0, 0.0)
+        return Entry(name, learned.takes, lambda recording: trained_method(learned, weights), 0, 0.0)
     if weights.startswith(RANDOM):
         params = init(jax.random.key(int(weights.removeprefix(RANDOM))), preset=method)
-        return Entry(name, "images", lambda recording: network(params), params, 0, 0.0)
+        return Entry(name, "images", lambda recording: network(params), 0, 0.0)
     folder = runs / name
     folder = folder / LAST_WEIGHTS if (folder / LAST_WEIGHTS / "config.json").is_file() else folder
     trained = method_with_weights(str(folder))

@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-NOTHING: Mapping[str, Any] = {"scores": {}}
 Scores = Mapping[str, Mapping[str, Any]]
 """Results of one contender, by test recording."""
 PUBLISHED_RECALL = {
@@ -43,12 +42,20 @@ COLUMNS = (
 class Row(NamedTuple):
     """Contenders that differ in their seeds only."""
 
-    title: str
+    method: str
+    kind: str
+    """Trained or untrained, and the labels; empty for shipped weights and handcrafted methods."""
     results: Sequence[Scores]
+
+    @property
+    def title(self) -> str:
+        """The first cell of the row."""
+        return f"`{self.method}`{', ' if self.kind else ''}{self.kind}"
 
     def means(self, column: Column, score: str = "recall") -> list[float]:
         """The mean of a score over the recordings of a column, of each contender that has all of them."""
-        values = [[one.get(test, NOTHING)["scores"].get(score) for test in column.tests] for one in self.results]
+        empty: Mapping[str, Any] = {"scores": {}}
+        values = [[one.get(test, empty)["scores"].get(score) for test in column.tests] for one in self.results]
         return [sum(one) / len(one) for one in values if None not in one]
 
     def effort(self, name: str) -> float | None:
@@ -59,23 +66,19 @@ class Row(NamedTuple):
 
 def method_of(name: str) -> str:
     """The method of a contender: `rinet` of `rinet-0` and of `rinet@random:0`."""
-    return re.sub(r"-\d$", "", name.split("@")[0].split(",")[0])
+    return re.sub(r"-\d$", "", name.split("@")[0])
 
 
 def rows(scores: Mapping[str, Scores]) -> list[Row]:
     """One row for each method and kind of weights. The highest Recall@1 in the town is first."""
-    seeds: dict[str, list[Scores]] = {}
+    seeds: dict[tuple[str, str], list[Scores]] = {}
     for name, results in scores.items():
-        seeds.setdefault(_title(name), []).append(results)
-    return sorted((Row(*row) for row in seeds.items()), key=lambda row: -sum(row.means(TOWN)) / len(row.results))
-
-
-def _title(name: str) -> str:
-    """What the table calls a contender, without its seed."""
-    _, comma, labels = name.partition(",")
-    if "@" in name:
-        return f"`{method_of(name)}`, untrained"
-    return f"`{method_of(name)}`{', trained' if re.search(r'-[0-9]+(,|$)', name) else ''}{comma}{labels}"
+        contender, comma, labels = name.partition(",")
+        method = method_of(contender)
+        kind = "untrained" if "@" in contender else "trained" if method != contender else ""
+        seeds.setdefault((method, f"{kind}{comma}{labels}"), []).append(results)
+    by_seed = (Row(*names, results) for names, results in seeds.items())
+    return sorted(by_seed, key=lambda row: -sum(row.means(TOWN)) / len(row.results))
 
 
 def tables(results: Mapping[str, Any]) -> dict[str, str]:
@@ -89,7 +92,7 @@ def _recalls(by_recall: Sequence[Row], costs: Mapping[str, Any]) -> str:
     """Recall@1 on all recordings beside what it costs."""
     lines = []
     for row in by_recall:
-        cost = costs.get(method_of(row.title.split("`")[1]), {})
+        cost = costs.get(row.method, {})
         numbers = (_number(row.effort("images")), _number(row.effort("seconds")), _number(cost.get("ms"), 1))
         lines.append([row.title, *(_cell(row.means(one)) for one in COLUMNS), *numbers, _number(cost.get("bytes"))])
     more = ("images seen", "training (s)", "description (ms)", "descriptor (bytes)")

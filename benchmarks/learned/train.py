@@ -145,15 +145,13 @@ class Settings:
     """Training time of each of the three learning rates."""
     learning_rate: float | None = None
     """Learning rate. None: the best of the search."""
-    labels: bool = True
-    """Train the semantic branch."""
     compile_cache: Path = Path("build/learned/compiled")
     """Folder of compiled programs, which all stages share."""
 
     @property
     def folder(self) -> Path:
         """Folder of the run."""
-        return self.out / f"{Path(self.preset).stem}{'' if self.labels else '-no-labels'}-{self.seed}"
+        return self.out / f"{Path(self.preset).stem}-{self.seed}"
 
 
 def train_preset(settings: tyro.conf.OmitArgPrefixes[Settings]) -> None:
@@ -170,10 +168,7 @@ def _config(settings: Settings, rate: float) -> TrainConfig:
     config = sglpr_jax.preset(settings.preset)
     optimizer = dataclasses.replace(config.optimizer, learning_rate=rate)
     changes = {"optimizer": optimizer, "seed": settings.seed, "score_every": ENDLESS}
-    config = dataclasses.replace(config, **changes)
-    if not settings.labels:
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, categories=0))
-    return without_untrained_head(config)
+    return without_untrained_head(dataclasses.replace(config, **changes))
 
 
 def _best_rate(settings: Settings, recordings: list[Recording], held_out: list[Recording]) -> float:

@@ -22,7 +22,7 @@ class SimulateCommand:
     out: Path
     """Folder of the dataset. An interrupted dataset is completed, and recordings can be added."""
     training_set: bool = False
-    """Write the training set of the preset `sglpr`: 78 datasets of images, each in its own folder of --out. The
+    """Write the training set of the preset `sglpr`: datasets of images, each in its own folder of --out. Their
     recordings are called DATASET/NN. --scans is the only other flag."""
     seq: tuple[str, ...] | None = None
     """Routes, from 00 to 10. Their revisits resemble KITTI's: same direction in 00, 02, 05, 06, 07 and 09, opposite

@@ -51,7 +51,7 @@ def _datasets() -> Iterator[tuple[str, dict[str, Any]]]:
             for variant in (VARIANTS[seed % len(VARIANTS)], VARIANTS[(seed + 3) % len(VARIANTS)]):
                 yield f"{scenery}-{seed}-{_name(variant)}", {**world, "routes": BOTH_DIRECTIONS, **variant}
     for seed in REPEATING_SEEDS:
-        for number, scenery in enumerate(REPEATING, start=seed):
+        for number, scenery in enumerate(REPEATING, start=seed):  # the next seed has the next sensor
             drive = {"sensor": SENSORS[number % len(SENSORS)], "vary": number % 2 == 1}
             yield f"{scenery}-{seed}", {"scenery": scenery, "seed": seed, "routes": BOTH_DIRECTIONS, **drive}
 

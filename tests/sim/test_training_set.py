@@ -11,7 +11,7 @@ class Checked(Exception):
     """The simulator has checked the options of a dataset, and would now write its scans."""
 
 
-def test_the_simulator_accepts_every_dataset_and_sees_each_place_in_both_directions_three_times(tmp_path):
+def test_the_simulator_accepts_every_dataset_and_two_routes_of_each_seed_are_seen_three_times(tmp_path):
     def stop(dataset: Simulated) -> None:
         raise Checked
 
