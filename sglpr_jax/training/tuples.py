@@ -1,6 +1,7 @@
 """Training tuples: an anchor, k_p positives near it and k_n negatives far from it. Held-out parts of recordings."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,10 +25,14 @@ class Positives:
     places: Int[np.ndarray, "pairs"]
     starts: Int[np.ndarray, "bounds"]
 
-    @property
+    @functools.cached_property
     def anchors(self) -> Int[np.ndarray, "anchors"]:
         """Places with at least one positive."""
-        return np.flatnonzero(np.diff(self.starts))
+        return self.anchors_among(np.arange(len(self.starts) - 1))
+
+    def anchors_among(self, places: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
+        """Return those of the places that have at least one positive."""
+        return places[self.starts[places] < self.starts[places + 1]]
 
     def draw(self, rng: np.random.Generator, anchor: int, size: int) -> Int[np.ndarray, "size"]:
         """Draw positives of `anchor`, without repetition if there are enough."""
@@ -113,7 +118,7 @@ class TuplePool:
         source = self.revisits if prefers_revisits or not len(self.neighbours.anchors) else self.neighbours
         anchors = source.anchors
         if cache is not None:
-            anchors = _first_unless_empty(np.intersect1d(anchors, cache.places), anchors)
+            anchors = _first_unless_empty(source.anchors_among(cache.places), anchors)
         if cluster and cache is None:
             near_cluster = anchors[self._are_within(cluster[0], anchors, self.config.cluster_m)]
             anchors = _first_unless_empty(near_cluster, anchors)
@@ -128,13 +133,20 @@ class TuplePool:
         self, rng: np.random.Generator, anchor: int, cache: DescriptorCache | None
     ) -> Int[np.ndarray, "{self.config.negatives}"]:
         """Draw places far from the anchor. With a cache, only those whose descriptors are most similar to its own."""
-        candidates = np.flatnonzero(self.far_apart(np.array(anchor), np.arange(len(self))))
         size = self.config.negatives
-        if size and not len(candidates):
-            raise ValueError(f"no frame lies farther than {self.config.negative_m} m from frame {anchor} of the pool")
+        if not size:
+            return np.arange(0)
+        candidates = np.arange(0)
         if cache is not None:
-            candidates = _first_unless_empty(cache.nearest(anchor, candidates, self.config.hardest), candidates)
+            candidates = cache.nearest(anchor, self._far_from(anchor, cache.places), self.config.hardest)
+        if not len(candidates):
+            candidates = self._far_from(anchor, np.arange(len(self)))
+        if not len(candidates):
+            raise ValueError(f"no frame lies farther than {self.config.negative_m} m from frame {anchor} of the pool")
         return rng.choice(candidates, size, replace=len(candidates) < size)
+
+    def _far_from(self, anchor: int, places: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
+        return places[self.far_apart(np.array(anchor), places)]
 
     def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
         """Return whether places a and b are in different worlds or farther apart than the negative distance."""
