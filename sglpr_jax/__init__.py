@@ -11,7 +11,7 @@
 - score retrieval: `evaluate`
 - find loops: `find_loops` of recordings, `LoopDetector` for a stream of scans; `read_odometry`, `optimize_trajectory`,
   `IncrementalTrajectory`; `scan_odometry`, and `slam` for all of it; `map_recording`, `PlaceMap` for scans of another
-  day
+  day; `point_cloud`, `write_cloud` and `occupancy_grid` for other programs
 - train: `preset`, `train`; initialise with `init`, store with `save`, publish with `for_places`, `average`,
   `save_program`
 - simulate recordings with labels: `simulate`, `simulate_recording`, `simulate_repeating`; `SENSORS`, `CARRIERS`

@@ -8,6 +8,7 @@ from .bev import rotate_points as rotate_points
 from .data.density_image import density_bev as density_bev
 from .data.deskew import deskew as deskew
 from .data.deskew import deskewed as deskewed
+from .data.formats.cloud_writers import write_cloud as write_cloud
 from .data.formats.scan_files import read_scan as read_scan
 from .data.gravity import GroundFilter as GroundFilter
 from .data.mounting import Mounting as Mounting
@@ -29,7 +30,11 @@ from .loops.closure import LoopClosure as LoopClosure
 from .loops.detector import LoopDetector as LoopDetector
 from .loops.search import find_loops as find_loops
 from .maps.build import map_recording as map_recording
+from .maps.config import CloudConfig as CloudConfig
+from .maps.config import OccupancyConfig as OccupancyConfig
+from .maps.occupancy import occupancy_grid as occupancy_grid
 from .maps.place_map import PlaceMap as PlaceMap
+from .maps.point_cloud import point_cloud as point_cloud
 from .models.backbone_config import CircularConfig as CircularConfig
 from .models.backbone_config import SglprConfig as SglprConfig
 from .models.backbone_config import SwinConfig as SwinConfig

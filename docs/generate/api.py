@@ -11,6 +11,10 @@ GROUPS = {
     "Finding places again": ["embed", "DescriptorFile", "Index", "FleetIndex"],
     "Scores": ["evaluate", "Evaluation"],
     "Loops": ["find_loops", "LoopDetector", "LoopClosure"],
+    "Maps": [
+        *("map_recording", "PlaceMap", "point_cloud", "write_cloud", "CloudConfig"),
+        *("occupancy_grid", "OccupancyConfig"),
+    ],
     "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],
     "Simulation": ["simulate"],
     "Weights and presets": ["Params", "shipped_weights", "MODELS", "model_preset"],

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from sglpr_jax.cli.cloud import CloudOptions
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import (
     AUTO,
@@ -47,6 +48,7 @@ class LoopsCommand(DetectorFlags):
       bin/loops drive.mcap --odometry drive.mcap --out found
       bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found
       bin/loops my_scans --odometry odometry.tum --optimize --out found
+      bin/loops my_scans --odometry auto --optimize --out found --cloud found/map.ply --grid found/map.yaml
       bin/loops my_scans --odometry odometry.tum --submap-m 10 --out found
       bin/loops monday tuesday --odometry monday.tum tuesday.tum --optimize --out found
     """
@@ -80,6 +82,7 @@ class LoopsCommand(DetectorFlags):
     rerun: Path | None = None
     """Also write trajectories, scans, loops and image pairs of one recording to this .rrd file, for the rerun viewer
     (extra view)."""
+    output: tyro.conf.OmitArgPrefixes[CloudOptions] = CloudOptions()
     degenerate: Degenerate = "keep"
     """Loops whose position has a standard deviation of more than 1 m in one horizontal direction, for example between
     plain walls: `keep` writes these loops with that information matrix, and `drop` rejects them."""
@@ -128,6 +131,9 @@ def _check_flags(command: LoopsCommand) -> None:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
     if command.optimize:
         gtsam_library()
+    command.output.check()
+    if command.output.any and not command.optimize:
+        raise ValueError("--cloud and --grid need a corrected trajectory: expected --optimize, found none")
     for path in (*files, command.source.poses, command.source.times):
         if path is None or path.resolve().parent != command.out.resolve():
             continue
@@ -147,7 +153,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     from sglpr_jax.loops.search import can_register, find_loops
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.pose_graph.folder import write_loop_folder
-    from sglpr_jax.pose_graph.optimize import optimize_trajectory
+    from sglpr_jax.pose_graph.optimize import optimize_trajectory, placements
 
     params, out, checkpoint = load(command.weights), command.out, command.out / UNFINISHED
     detector = command.detector  # raises an error for invalid settings before the recordings are opened
@@ -159,6 +165,7 @@ def _search_and_write(command: LoopsCommand) -> int:
         format=command.odometry_format,
         checkpoint=odometry_checkpoints.__getitem__,
     )
+    command.output.check_recordings(recordings)
     unregistrable = next((recording for recording in recordings if not can_register(recording)), None)
     if command.register and unregistrable is not None:
         missing = "small-gicp is not installed: pip install 'sglpr-jax[slam]'"
@@ -194,6 +201,14 @@ def _search_and_write(command: LoopsCommand) -> int:
     if not result.whole:  # a signal stopped the search
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
+    if optimized is not None:
+        first_frame = [session for session, (group, _) in enumerate(placements(result)) if group == 0]
+        corrected = result.split(optimized.poses)
+        command.output.write(
+            [recordings[session] for session in first_frame],
+            [corrected[session] for session in first_frame],
+            on_bad_scan=report_bad_scan if command.skip_bad else None,
+        )
     if len(recordings) > 1:
         for number in range(len(recordings)):
             delete_checkpoint(checkpoint / f"{number}")

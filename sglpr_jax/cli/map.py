@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sglpr_jax.cli.cloud import CloudOptions
 from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
@@ -40,6 +41,7 @@ class MapCommand:
       bin/map today --poses today.tum --add-to town.safetensors --out town.safetensors
       bin/map other --poses other.tum --add-to town.safetensors --frame align --out town.safetensors
       bin/map my_scans --poses auto --out town.safetensors
+      bin/map my_scans --poses poses.tum --out town.safetensors --cloud town.ply --grid town.yaml
       bin/map town.pcd --poses trajectory.tum --out town.safetensors
     """
 
@@ -72,6 +74,7 @@ class MapCommand:
     """Factor for all lengths before scans are described. 2 or 4 enlarges places that are small in an image, such as
     rooms. The map stores it, and its poses are in metres. `auto` is 4 if most points are less than 8 m away, otherwise
     1."""
+    output: tyro.conf.OmitArgPrefixes[CloudOptions] = CloudOptions()
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
 
@@ -84,6 +87,7 @@ def write_map(command: MapCommand) -> int:
         raise ValueError(f"expected --out to end in .safetensors, found {command.out}")
     if command.out.is_dir():
         raise IsADirectoryError(f"{command.out}: expected a file to write, found a folder")
+    command.output.check()
     params = load(command.weights)
     with exclusive_lock(command.out.with_suffix(UNFINISHED)):  # also protects --add-to if it is the same file as --out
         return _build_and_write(command, params)
@@ -110,6 +114,7 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
         format=command.pose_format,
         checkpoint=lambda number: odometry_checkpoint,
     )
+    command.output.check_recordings([recording])
     if command.poses == AUTO:
         times = recording.numbers.astype(float) if recording.times is None else recording.times
         write_tum(command.out.with_suffix(ODOMETRY), poses, times)
@@ -148,6 +153,7 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     if is_stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
+    command.output.write([recording], [poses], on_bad_scan=report_bad_scan if command.skip_bad else None)
     delete_checkpoint(unfinished)
     odometry_checkpoint.unlink(missing_ok=True)
     return 0

@@ -32,21 +32,40 @@ def on_trail(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """
     if not len(points):
         return np.zeros(0, bool)
+    cell_of_point, neighbours, lowest = _ground_cells(points)
+    ground = lowest[neighbours].min(axis=1)
+    is_ground = (lowest[neighbours] - ground[:, None] < GROUND_M).all(axis=1)
+    height = points[:, 2] - ground[cell_of_point]
+    is_tall = np.zeros(len(lowest), bool)
+    is_tall[cell_of_point[(height > HIGHEST_M) & (height < TALL_M)]] = True
+    has_trail = is_ground & ~is_tall[neighbours].any(axis=1)
+    return has_trail[cell_of_point] & (height > LOWEST_M) & (height < HIGHEST_M)
+
+
+def height_above_ground(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
+    """Return the height of each point above the lowest one in its cell and the neighbouring cells, in metres, z up."""
+    if not len(points):
+        return np.zeros(0, np.float32)
+    cell_of_point, neighbours, lowest = _ground_cells(points)
+    return points[:, 2] - lowest[neighbours].min(axis=1)[cell_of_point]
+
+
+def _ground_cells(
+    points: Float32[np.ndarray, "n 3"],
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, "c 9"], Float32[np.ndarray, " c+1"]]:
+    """Return the cell of each point, the neighbours of each cell with itself, and the lowest z in each cell.
+
+    The last cell is an empty one, for neighbours without points. Its z is infinite.
+    """
     column, row = np.floor(points[:, :2].T / np.float32(CELL_M)).astype(np.int64)
     cells, cell_of_point = np.unique(row * _CELLS_PER_ROW + column, return_inverse=True)
     neighbour_numbers = cells[:, None] + np.array(_NEIGHBOUR_STEPS)
     neighbours = np.searchsorted(cells, neighbour_numbers).clip(max=len(cells) - 1)
     is_occupied = cells[neighbours] == neighbour_numbers
-    neighbours = np.where(is_occupied, neighbours, len(cells))  # the last row of the arrays below is an empty cell
+    neighbours = np.where(is_occupied, neighbours, len(cells))
     lowest = np.full(len(cells) + 1, np.inf, np.float32)
     np.minimum.at(lowest, cell_of_point, points[:, 2])
-    ground = lowest[neighbours].min(axis=1)
-    is_ground = (lowest[neighbours] - ground[:, None] < GROUND_M).all(axis=1)
-    height = points[:, 2] - ground[cell_of_point]
-    is_tall = np.zeros(len(cells) + 1, bool)
-    is_tall[cell_of_point[(height > HIGHEST_M) & (height < TALL_M)]] = True
-    has_trail = is_ground & ~is_tall[neighbours].any(axis=1)
-    return has_trail[cell_of_point] & (height > LOWEST_M) & (height < HIGHEST_M)
+    return cell_of_point, neighbours, lowest
 
 
 NEAREST_M = 1.0

@@ -7,6 +7,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.data.formats.pose_files import read_tum
+from sglpr_jax.data.formats.scan_files import cloud_blocks
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.maps import build
 from sglpr_jax.maps.build import map_recording
@@ -73,6 +74,22 @@ def test_a_scan_of_the_map_finds_itself_in_it(command, scans, poses, run, tmp_pa
     again = (*run, "--add-to", out, "--out", out)
     assert command(*again).out == f"{out}: 8 places, 0 of them from 8 scans of 08\n"  # the same scans are taken once
     assert {path.name for path in tmp_path.iterdir()} == {"08", "town.safetensors", "poses.tum", "pose.json"}
+
+
+@pytest.mark.slow
+def test_a_map_comes_with_a_point_cloud_and_a_grid(command, poses, run, tmp_path):
+    cloud, grid = tmp_path / "town.ply", tmp_path / "nav/town.yaml"
+    ended = command(*run, "--out", tmp_path / "town.safetensors", "--cloud", cloud, "--grid", grid)
+    assert ended.status == 0, ended.error
+    points = np.concatenate(list(cloud_blocks(cloud)))
+    assert f"{cloud}: {len(points)} points" in ended.out and f"{grid}: " in ended.out
+    positions = read_tum(poses)[0][:, :3, 3]
+    assert np.all(np.abs(np.median(points, axis=0) - positions.mean(axis=0)) < 15)
+    assert "image: town.pgm" in grid.read_text() and (tmp_path / "nav/town.pgm").is_file()
+
+    ended = command(*run, "--out", tmp_path / "other.safetensors", "--cloud", tmp_path / "town.txt")
+    assert_one_line_error(ended, "town.txt: expected a name that ends in .ply, .pcd, .las, .laz, found .txt")
+    assert not (tmp_path / "other.safetensors").exists()
 
 
 @pytest.mark.slow

@@ -3,10 +3,13 @@ import shutil
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.data.formats.pose_files import read_tum
+from sglpr_jax.data.formats.scan_files import cloud_blocks
+from sglpr_jax.maps.config import CloudConfig
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import transform
 
@@ -25,8 +28,13 @@ def test_two_recordings_of_one_drive_get_one_frame(command, walk, tmp_path):
         files.append(tmp_path / f"{name}.tum")
         write_tum(files[-1], poses, np.arange(float(WALK)))
     out = tmp_path / "found"
-    ended = command("loops", *paths, "--odometry", *files, "--optimize", "--no-register", "--out", out)
+    maps = ("--cloud", out / "map.pcd", "--grid", out / "map.yaml")
+    ended = command("loops", *paths, "--odometry", *files, "--optimize", "--no-register", "--out", out, *maps)
     assert ended.status == 0, ended.error
+    assert f"{out / 'map.pcd'}: " in ended.out and f"{out / 'map.yaml'}: " in ended.out
+    points = np.concatenate(list(cloud_blocks(out / "map.pcd")))
+    distances_m, _ = KDTree(odometry[:, :2, 3]).query(points[:, :2])
+    assert len(points) and distances_m.max() < CloudConfig().reach_m + 1  # both days are in the frame of monday
     assert "monday and tuesday: " in ended.out and "transform x " in ended.out
     (found,) = json.loads((out / "frames.json").read_text())["transforms"]
     np.testing.assert_allclose(found["match_from_query"] @ shifted, np.eye(4), atol=0.05)

@@ -43,6 +43,15 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
             yield np.stack(_coordinates(block, path), axis=1)
 
 
+def laspy_module() -> ModuleType:
+    """Return the module laspy. Raises ImportError if it is not installed."""
+    try:
+        import laspy
+    except ImportError as error:
+        raise ImportError(".las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
+    return laspy
+
+
 def _coordinates(points: Any, path: Path) -> list[Float64[np.ndarray, " n"]]:
     """Return x, y and z of points in metres. Those at the limit of their integers, which cuts values off, are NaN."""
     limits = np.iinfo(np.int32)
@@ -62,10 +71,7 @@ def _checked_laspy(path: Path, *, one_scan: bool) -> ModuleType:
 
     Raises ValueError if the file is shorter than its header declares or, with `one_scan`, has too many points.
     """
-    try:
-        import laspy
-    except ImportError as error:
-        raise ImportError(".las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
+    laspy = laspy_module()
     size = path.stat().st_size
     with path.open("rb") as stream:
         header = stream.read(_LONGEST_HEADER).ljust(_LONGEST_HEADER, b"\0")
