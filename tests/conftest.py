@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
+from sglpr_jax import progress
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import Params
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+progress.PLAIN_EVERY_S = float("inf")  # a test on a busy machine takes longer than one line of progress
 
 HOME = os.path.expanduser("~")
 if HOME == "~":  # a user without a home folder

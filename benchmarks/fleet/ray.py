@@ -1,6 +1,6 @@
 """Recipes for Ray: places of the recordings of a fleet, and loops between those that may overlap.
 
-    pip install 'sglpr-jax[fleet]' 'ray[data]'
+    pip install '.[fleet]' 'ray[data]'
     python -m benchmarks fleet embed 's3://bucket/recordings/*' --out s3://bucket/places
     python -m benchmarks fleet loops s3://bucket/places s3://bucket/index found
 

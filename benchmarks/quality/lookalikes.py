@@ -79,7 +79,7 @@ def evidence(
         drives: folder of `loops`.
         world: worlds to show; without them all.
         sensor: sensor of the drives.
-        out: picture to write; its suffix is the format (extra viz).
+        out: picture to write; its suffix is the format.
         weights: the model that described the scans.
     """
     params, of_worlds, counts = sglpr_jax.load(weights), dict[str, list[Revisit]](), Counter[str]()

@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.speed.inputs import comparable_model, random_batch, random_images, random_params
 from benchmarks.timing import Contender, Job, check_equal, in_turn, report, warn_if_busy
+from sglpr_jax.extras import install_command
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.sglpr import describe as describe_images
@@ -151,7 +152,7 @@ def _torch_trains(
 def _prepare(threads: int, *, compiled: bool) -> None:
     """Raises SystemExit if PyTorch or, to compile, a C++ compiler is missing; warns on a busy machine."""
     if importlib.util.find_spec("torch") is None:
-        raise SystemExit("this benchmark compares with PyTorch, which is not installed: pip install 'sglpr-jax[torch]'")
+        raise SystemExit(f"this benchmark compares with PyTorch, which is not installed: {install_command('torch')}")
     compiler = os.environ.get("CXX", "g++")  # as torch.compile looks for it
     if compiled and shutil.which(compiler) is None:
         raise SystemExit(f"--compiled: torch.compile needs a C++ compiler, but there is no {compiler}")

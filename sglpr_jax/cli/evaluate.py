@@ -1,7 +1,6 @@
 """bin/evaluate: score the results of any method on a recording or on several sessions."""
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,7 +86,6 @@ def evaluate_file(command: EvaluateCommand) -> None:
 def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures | None]":
     """Score FILE and the files of --compare, and print the table. With --data, also return pictures."""
     from sglpr_jax.data.formats.pose_files import read_trajectory
-    from sglpr_jax.evaluation import figures
     from sglpr_jax.evaluation.evaluation_page import take_pictures
     from sglpr_jax.evaluation.inputs import read_methods, recording_rows, recording_trajectory
     from sglpr_jax.evaluation.scoring import evaluate_methods
@@ -111,8 +109,6 @@ def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures
         recording_rows(recording, first_method)  # raises an error before scoring if the frames differ
     evaluation = evaluate_methods(methods, command.protocol, published=command.published, file=command.file)
     console().print(evaluation)
-    if not figures.can_draw():
-        print("no drawings: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
     if recording is None:
         return evaluation, None
     return evaluation, take_pictures(recording, params, first_method, evaluation.worst_false_positives)

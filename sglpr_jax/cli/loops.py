@@ -18,6 +18,7 @@ from sglpr_jax.cli.recording import (
     report_bad_scan,
 )
 from sglpr_jax.data.choices import ScaleChoice
+from sglpr_jax.extras import install_command
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -168,7 +169,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     command.output.check_recordings(recordings)
     unregistrable = next((recording for recording in recordings if not can_register(recording)), None)
     if command.register and unregistrable is not None:
-        missing = "small-gicp is not installed: pip install 'sglpr-jax[slam]'"
+        missing = f"small-gicp is not installed: {install_command('slam')}"
         reason = "they are ready-made images" if unregistrable.has_images else missing
         print(f"{unregistrable.name}: loops are not registered, because {reason}", file=sys.stderr)
     title = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"

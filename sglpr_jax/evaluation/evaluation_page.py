@@ -31,7 +31,6 @@ NUMBERS = "results.json"
 PAGE = "report.html"
 CURVES = "precision-recall.png"
 TRAJECTORY = "trajectory.png"
-NO_MATPLOTLIB = "Drawings: install the extra viz (pip install 'sglpr-jax[viz]')."
 INTERVALS = (
     "95 %: bootstrap interval over the queries. Published on: poses of the published numbers of the protocol;"
     " scores on other poses differ."
@@ -66,8 +65,6 @@ def take_pictures(
     if params is None:
         advice = "maps: add --weights beside --data."
         return Pictures(images, f"Semantic {advice}", f"Feature heat {advice}")
-    if not figures.can_draw():
-        return Pictures(images)
     config = params.config
     semantic_pictures, heat_pictures = [], []
     for row in sorted({int(fraction * len(recording)) for fraction in SHOWN_SCANS}):
@@ -84,8 +81,8 @@ def take_pictures(
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path, pictures: Pictures | None = None) -> list[Path]:
-    """Write results, plots (with matplotlib) and page to a folder. Return the paths."""
-    plots = draw(evaluation) if figures.can_draw() else {}
+    """Write results, plots and page to a folder. Return the paths."""
+    plots = draw(evaluation)
     page = evaluation_page(evaluation, plots, pictures or Pictures())
     plot_names = {CURVES, TRAJECTORY, *(_curves_name(protocol.title) for protocol in PROTOCOLS.values())}
     # Plots of an earlier evaluation in this folder that the new one does not have are removed.
@@ -162,8 +159,6 @@ def evaluation_page(evaluation: Evaluation, plots: "Mapping[str, matplotlib.figu
 
 def _picture_section(title: str, pictures: Sequence[Picture] | str, *notes: Text) -> Section:
     """Return a section of pictures. A text instead of pictures says why they are missing."""
-    if not figures.can_draw():
-        pictures = NO_MATPLOTLIB
     return Section(title, [missing(pictures)] if isinstance(pictures, str) else [*notes, *pictures])
 
 

@@ -1,6 +1,5 @@
-"""Draws the figures of evaluations and loop searches (extra `viz`), without the global state of matplotlib."""
+"""Draws the figures of evaluations and loop searches, without the global state of matplotlib."""
 
-import importlib.util
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,11 +39,6 @@ DECISIONS = {
 }
 """Name, colour (red, black and blue as in figure 6) and size in square points of the dots of each decision, in drawing
 order: mistakes are on top."""
-
-
-def can_draw() -> bool:
-    """Return whether matplotlib (extra `viz`) is installed."""
-    return importlib.util.find_spec("matplotlib") is not None
 
 
 def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
@@ -296,11 +290,9 @@ def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def new_figure(width: float, height: float) -> "matplotlib.figure.Figure":
-    """Return an empty figure of this size in inches. Raises ImportError if matplotlib is missing."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'sglpr-jax[viz]'") from error
+    """Return an empty figure of this size in inches."""
+    from matplotlib.figure import Figure  # slow import
+
     return Figure(figsize=(width, height), layout="constrained")
 
 

@@ -85,8 +85,7 @@ def final_test(
                 file = embed(method, recording, rotation_seed=rotation_seed, on_progress=show)
             file.save(folder / f"{name}-{scans}.npz")
             results[scans][name] = score(file)
-        if figures.can_draw():
-            _draw_figures(results[scans], recording, folder, scans)
+        _draw_figures(results[scans], recording, folder, scans)
     semantics = None
     if params.config.segments and recording.has_labels:
         semantics = segment_recording(params, recording, folder, progress=progress)

@@ -18,7 +18,7 @@ PANELS = {
 
 
 class LearningCurves(Callback):
-    """Draws the learning curves of the run in `folder` when training ends, if matplotlib (extra `viz`) is installed."""
+    """Draws the learning curves of the run in `folder` when training ends."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -26,7 +26,7 @@ class LearningCurves(Callback):
     def on_end(self, step: int) -> None:
         """Draw loss terms, score and gradient norm of the whole run, including those of earlier processes."""
         measurements = read_metrics(self._folder / METRICS_FILE)
-        if not measurements or not figures.can_draw():
+        if not measurements:
             return
         panels = {title: {} for title in PANELS}
         for title, names in PANELS.items():

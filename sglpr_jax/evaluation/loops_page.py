@@ -24,7 +24,6 @@ SHOWN_PAIRS = 9
 """Maximum number of loops whose images are shown."""
 SHOWN_ROWS = 40
 """Maximum number of rows of the table of loops."""
-NO_MATPLOTLIB = missing("The pictures need matplotlib: pip install 'sglpr-jax[viz]'.")
 
 
 def loops_page(result: LoopSearchResult, *, optimized: OptimizedTrajectory | None = None) -> str:
@@ -76,8 +75,6 @@ def _recording_sections(result: LoopSearchResult, optimized: OptimizedTrajectory
 def _trajectory_pictures(result: LoopSearchResult) -> list[Picture | Text]:
     """Draw the loops on the trajectory (odometry or, without it, known positions), and the match of each query."""
     session = result.sessions[0]
-    if not figures.can_draw():
-        return [NO_MATPLOTLIB]
     if not session.frames:
         return [missing("No scan was processed.")]
     positions, source = session.recording.positions, session.recording.pose_source
@@ -129,8 +126,6 @@ def _correction_picture(result: LoopSearchResult, optimized: OptimizedTrajectory
         errors_m = {name: trajectory_error(poses, true_positions) for name, poses in trajectories.items()}
         errors = ", ".join(f"{name} {error:.2f} m" for name, error in errors_m.items())
         caption += f" Position error (RMSE after alignment with {session.recording.pose_source}): {errors}."
-    if not figures.can_draw():
-        return missing(caption)
     uprights = session.recording.uprights[: session.frames]
     positions = {name: level_odometry(poses, uprights)[:, :3, 3] for name, poses in trajectories.items()}
     return figure_picture(figures.trajectories(positions), "The trajectory before and after", caption=caption)
@@ -155,8 +150,6 @@ def _reliability_blocks(result: LoopSearchResult) -> list[Picture | Text | TextT
         (f"{b.low:g} to {b.high:g}", f"{b.pairs}", f"{b.loops}", f"{b.share:.3f}", f"{b.probability:.3f}") for b in bins
     ]
     table = TextTable(header, rows, header[1:])
-    if not figures.can_draw():
-        return [table]
     caption = (
         f"Share of loops among all candidates, before neighbours and odometry are considered. A loop is a pair up to "
         f"10 m apart by {session.recording.pose_source}; pairs 10 to 20 m apart are ignored. Labels: number of pairs."
@@ -171,8 +164,6 @@ def _overlay_picture(
     """Return the overlaid images of up to 9 loops between two recordings, or the text `without_loops`."""
     if not loops:
         return missing(without_loops)
-    if not figures.can_draw():
-        return NO_MATPLOTLIB
     images = {}
     for row in np.unique(np.linspace(0, len(loops) - 1, SHOWN_PAIRS).astype(int)):
         loop = loops[row]
@@ -255,7 +246,7 @@ def _common_frame_sections(
     result: LoopSearchResult, names: list[str], optimized: OptimizedTrajectory | None
 ) -> list[Section]:
     """Draw each group of recordings with common places in one coordinate frame, if all recordings have odometry."""
-    if not figures.can_draw() or any(session.odometry is None for session in result.sessions):
+    if any(session.odometry is None for session in result.sessions):
         return []
     groups = placements(result)  # of each recording: the first recording of its group, and the transform to its frame
     pictures = []

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from sglpr_jax.evaluation.loops_page import overlaid_scans, wrong_loops
+from sglpr_jax.extras import install_command
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.result import LoopSearchResult, Session
@@ -29,7 +30,7 @@ DARK_GREY = (110, 110, 110)
 def check_installed() -> None:
     """Raise ImportError, with the command that installs rerun, if it is missing."""
     if importlib.util.find_spec("rerun") is None:
-        raise ImportError("--rerun needs rerun-sdk: pip install 'sglpr-jax[view]'")
+        raise ImportError(f"--rerun needs rerun-sdk: {install_command('view')}")
 
 
 def write_rerun(result: LoopSearchResult, path: Path | str, *, optimized: OptimizedTrajectory | None = None) -> None:

@@ -115,8 +115,7 @@ def segment_recording(
         return None
     title = f"segmentation of {len(labelled_rows)} scans of {recording.name}"
     score = score_confusion(confusion, categories=config.categories, title=title)
-    if figures.can_draw():
-        figures.save(draw_map(middle_map, config), folder / PICTURE)
+    figures.save(draw_map(middle_map, config), folder / PICTURE)
     return score
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
+from sglpr_jax.extras import install_command
 from sglpr_jax.live.data_types import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
@@ -90,5 +91,5 @@ def named_module(text: str, known: dict[str, str | None], *, kind: str) -> tuple
         if error.name is not None and error.name.startswith("sglpr_jax"):
             raise
         raise ImportError(
-            f"{name}: expected the package {error.name}, found none; pip install 'sglpr-jax[{known[name]}]'"
+            f"{name}: expected the package {error.name}, found none; {install_command(known[name] or '')}"
         ) from error

@@ -15,6 +15,7 @@ import numpy as np
 
 from sglpr_jax.data.density_image import CEILING_M, EDGE_STEP_M, FIRST_EDGE_M, FLOOR_M, MAX_VOXELS, REACH_M
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
+from sglpr_jax.extras import install_command
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import check_holds_only, json_text, replacing
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, Grid
@@ -27,8 +28,6 @@ ProgramFormat = Literal["stablehlo", "onnx"]
 PLATFORMS = ("cpu", "cuda", "tpu")
 INPUT_FILE = "input.json"
 OPSET = 21
-NEEDS = "pip install 'sglpr-jax[export]'"
-NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
 """jax2onnx is installed without its dependencies, which include an Orbax that is too old for Flax and not needed."""
 
 
@@ -72,7 +71,7 @@ def stablehlo(params: Params) -> bytes:
     try:
         import flatbuffers  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"StableHLO requires the package flatbuffers: {NEEDS}") from error
+        raise ImportError(f"StableHLO requires the package flatbuffers: {install_command('export')}") from error
     grid = params.config.grid
     shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
     program = jax.jit(lambda bev: describe(params, bev))
@@ -101,7 +100,8 @@ def onnx(params: Params) -> bytes:
         if process.returncode:
             last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
             error = ImportError if "ModuleNotFoundError" in last_line else RuntimeError
-            raise error(f"the conversion to ONNX failed ({last_line}); it requires: {NEEDS_ONNX}")
+            packages = f"{install_command('export')} && {sys.executable} -m pip install --no-deps jax2onnx==0.17.1"
+            raise error(f"the conversion to ONNX failed ({last_line}); it requires: {packages}")
         return program.read_bytes()
 
 

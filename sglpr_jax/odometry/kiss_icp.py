@@ -19,6 +19,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
+from sglpr_jax.extras import install_command
 from sglpr_jax.files import warn
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.odometry.config import OdometryConfig
@@ -256,4 +257,4 @@ def _library() -> ModuleType:
     try:
         return importlib.import_module("kiss_icp.kiss_icp")
     except ImportError as error:
-        raise ImportError("odometry from scans needs kiss-icp: pip install 'sglpr-jax[odometry]'") from error
+        raise ImportError(f"odometry from scans needs kiss-icp: {install_command('odometry')}") from error

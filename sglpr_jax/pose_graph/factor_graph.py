@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.extras import install_command
+
 FIRST_POSE = 1e-6
 """Standard deviation of the first pose, which stays fixed, in metres and radians."""
 
@@ -16,7 +18,7 @@ def gtsam_library() -> ModuleType:
     try:
         return importlib.import_module("gtsam")
     except ImportError as error:
-        raise ImportError("optimisation of a trajectory needs gtsam: pip install 'sglpr-jax[gtsam]'") from error
+        raise ImportError(f"optimisation of a trajectory needs gtsam: {install_command('gtsam')}") from error
 
 
 class FactorGraph:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from sglpr_jax.extras import install_command
 from sglpr_jax.se3 import transformed
 
 COARSE_VOXEL_M, VOXEL_M = 1.0, 0.25
@@ -228,6 +229,4 @@ def _library(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise ImportError(
-            f"registration of scans needs {name.replace('_', '-')}: pip install 'sglpr-jax[slam]'"
-        ) from error
+        raise ImportError(f"registration of scans needs {name.replace('_', '-')}: {install_command('slam')}") from error

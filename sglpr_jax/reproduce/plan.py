@@ -9,7 +9,6 @@ import jax
 
 from sglpr_jax.data.readers import recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.evaluation import figures
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.registry import method_with_weights
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
@@ -34,8 +33,6 @@ def check_inputs(reproduction: Reproduction, names: Sequence[str], nclt: Path | 
         raise ValueError(
             f"{data}: expected recordings named as in the paper, found {', '.join(recordings)}; choose yours with --seq"
         )
-    if any(experiment.kind == "figure" for experiment in experiments.values()) and not figures.can_draw():
-        raise ImportError("figures need matplotlib: pip install 'sglpr-jax[viz]'")
     variants_only = [name for name, experiment in experiments.items() if not experiment.beside_handcrafted]
     if not trained and (variants_only or not (reproduction.methods or reproduction.weights)):
         only = ", ".join(variants_only)

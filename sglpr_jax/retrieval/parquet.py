@@ -14,6 +14,7 @@ from jaxtyping import Float
 from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scale_of
+from sglpr_jax.extras import install_command
 from sglpr_jax.fields import Size
 from sglpr_jax.files import file_name, in_short, naming, parse_json, replacing
 from sglpr_jax.methods.method import Method
@@ -119,7 +120,7 @@ def storage_errors(address: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        command = "pip install 'sglpr-jax[fleet]', and s3fs for s3://, gcsfs for gs://"
+        command = f"{install_command('fleet')}, and s3fs for s3://, gcsfs for gs://"
         raise ImportError(f"{address}: expected the extra `fleet` ({command}), found: {in_short(error)}") from error
     except Exception as error:
         reason = in_short(error, most=200)

@@ -10,6 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
+from sglpr_jax.extras import install_command
 from sglpr_jax.files import raising_write_error
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.training.loss_terms import TERM_NAMES
@@ -118,7 +119,7 @@ class EventFiles(Callback):
         try:
             import tensorboardX  # noqa: F401
         except ImportError as error:
-            raise ImportError("event files need the extra tensorboard: pip install 'sglpr-jax[tensorboard]'") from error
+            raise ImportError(f"event files need tensorboardX: {install_command('tensorboard')}") from error
         self._folder = folder
         self._writer: Any = None
 

@@ -80,14 +80,6 @@ def test_every_protocol_is_printed_written_and_drawn_and_the_record_repeats_it(c
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_without_matplotlib_only_the_table_is_written_and_the_extra_is_named(score, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    ended, folder = score("08.npz", "--protocol", "top1-f1max")
-    assert ended.status == 0 and "sglpr-jax[viz]" in ended.error
-    assert sorted(path.name for path in folder.iterdir()) == ["command.json", "report.html", "results.json"]
-    assert "sglpr-jax[viz]" in (folder / "report.html").read_text()
-
-
 def test_a_top_k_list_and_scored_pairs(score, command, laps, tmp_path):
     ended, folder = score("topk.txt", "--poses", laps / "poses.csv")
     assert ended.status == 0, ended.error

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
+from sglpr_jax.extras import install_command
 from sglpr_jax.loops import search
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.config import DetectorConfig
@@ -118,7 +119,7 @@ def test_input_that_the_run_would_overwrite_is_refused(command, town, odometry, 
     ("layout", "installed", "flags", "registered", "said"),
     [
         ("town", True, [], True, None),
-        ("town", False, [], False, "because small-gicp is not installed: pip install 'sglpr-jax[slam]'"),
+        ("town", False, [], False, f"because small-gicp is not installed: {install_command('slam')}"),
         ("images", True, [], False, "because they are ready-made images"),
     ],
 )

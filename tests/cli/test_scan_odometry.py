@@ -8,6 +8,7 @@ import pytest
 from drives import simulated_drive
 
 from sglpr_jax.data.formats.pose_files import read_tum
+from sglpr_jax.extras import install_command
 from sglpr_jax.odometry import kiss_icp
 
 from .conftest import assert_one_line_error
@@ -80,5 +81,5 @@ def test_images_and_a_missing_library_are_one_clear_error(command, images, run, 
     assert_one_line_error(ended, "06: expected scans for odometry, found ready-made images")
     monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", None)
     for given in (("loops", *run, *flags), ("map", *run, "--poses", "auto", "--out", tmp_path / "map.safetensors")):
-        assert_one_line_error(command(*given), "needs kiss-icp: pip install 'sglpr-jax[odometry]'")
+        assert_one_line_error(command(*given), f"needs kiss-icp: {install_command('odometry')}")
     assert not list(tmp_path.iterdir())

@@ -1,7 +1,4 @@
-import sys
-
 import numpy as np
-import pytest
 from PIL import Image
 from scenes import place, relative, seen_from
 
@@ -75,12 +72,6 @@ def test_a_segmentation_panel_has_metres_and_names_and_colours_of_classes(tmp_pa
     middle = picture[: picture.shape[0] // 2]
     assert shows(middle[:, third : 2 * third], road) and not shows(middle[:, third : 2 * third], building)
     assert shows(middle[:, 2 * third :], building) and not shows(middle[:, 2 * third :], road)
-
-
-def test_the_error_without_matplotlib_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[viz\]'"):
-        figures.learning_curves({"loss": {"raw": [(0, 0.1)]}})
 
 
 def test_an_overlay_is_white_with_the_right_pose_and_coloured_with_a_wrong_one():

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 
 from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_scan
 from sglpr_jax.data.scan import Scan, time_field_of
+from sglpr_jax.extras import install_command
 from sglpr_jax.files import warn
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
@@ -37,7 +38,7 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
     """Yield the points of a .las or .laz file in blocks of `BLOCK_POINTS`, in metres. .laz files need lazrs."""
     laspy = _checked_laspy(path, one_scan=False)
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
-        raise ImportError(".laz files need lazrs (pip install 'sglpr-jax[las]')")
+        raise ImportError(f".laz files need lazrs: {install_command('las')}")
     with laspy.open(path) as stream:
         for block in stream.chunk_iterator(BLOCK_POINTS):
             yield np.stack(_coordinates(block, path), axis=1)
@@ -48,7 +49,7 @@ def laspy_module() -> ModuleType:
     try:
         import laspy
     except ImportError as error:
-        raise ImportError(".las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
+        raise ImportError(f".las files need laspy: {install_command('las')}") from error
     return laspy
 
 

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, LIVOX_FIELDS, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.data.scan import Scan
+from sglpr_jax.extras import install_command
 from sglpr_jax.files import in_short
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
@@ -111,7 +112,7 @@ def _open_reader(paths: tuple[Path, ...]) -> Any:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise ImportError(f"{paths[0]}: bags need the extra `ros` (pip install 'sglpr-jax[ros]')") from error
+        raise ImportError(f"{paths[0]}: bags need the extra `ros` ({install_command('ros')})") from error
     if paths[0].name.endswith(COMPRESSED):
         raise ValueError(f"{paths[0]}: expected a file that is not compressed{_metadata_hint(paths[0])}")
     for path in paths:
