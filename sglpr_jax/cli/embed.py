@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions, report_bad_scan, resolved_scale
+from sglpr_jax.cli.recording import (
+    OdometrySubmapOptions,
+    PosedRecordingOptions,
+    beside,
+    report_bad_scan,
+    resolved_scale,
+)
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.methods.names import NETWORK, AnyMethodName
@@ -23,7 +29,7 @@ class EmbedCommand:
 
     Example:
       bin/embed --weights runs/sglpr-08 --data KITTI --seq 08 --out 08.npz
-      bin/embed --data my_scans/ --out mine.npz --skip-bad
+      bin/embed --data my_scans/ --skip-bad
       bin/embed --data my_scans/ --poses odometry.tum --out mine.npz
       bin/embed --data my_scans/ --submap-m 10 --odometry odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
@@ -34,9 +40,10 @@ class EmbedCommand:
 
     data: Path
     """A dataset, a bag or a folder of scans or ready-made images, in any supported layout."""
-    out: str
+    out: str | None = None
     """Descriptor file to write (.npz), or a store of places (extra `fleet`): an address such as s3://bucket/places, or
-    a folder with a / at the end. A store gets a Parquet file for each recording, unless it is there already."""
+    a folder with a / at the end. A store gets a Parquet file for each recording, unless it is there already. None:
+    NAME.npz beside --data NAME."""
     weights: str | None = None
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors. None: the
     shipped weights sglpr. Learned methods need the folder of their training, or random:SEED for a network without
@@ -63,6 +70,11 @@ class EmbedCommand:
     batch: Size = 8
     """Maximum number of images that are described at a time."""
 
+    @property
+    def target(self) -> str:
+        """Descriptor file or store to write."""
+        return self.out or str(beside(self.data, self.source.seq, ".npz"))
+
 
 def embed_recording(command: EmbedCommand) -> None:
     from sglpr_jax.data.corruption import ROTATION, corrupted, corruption_named  # slow imports, not needed for --help
@@ -72,11 +84,11 @@ def embed_recording(command: EmbedCommand) -> None:
     from sglpr_jax.retrieval.parquet import embed_to_store
 
     corruption = None if command.corruption is None else corruption_named(command.corruption)
-    writes_store = "://" in command.out or command.out.endswith("/")
+    writes_store = "://" in command.target or command.target.endswith("/")
     if not writes_store:
         _check_file(command)
     elif corruption is not None:
-        raise ValueError(f"{command.out}: expected a descriptor file with --corruption, found a store")
+        raise ValueError(f"{command.target}: expected a descriptor file with --corruption, found a store")
     learned_method, params = _load_weights(command)
     recording = command.submap.open(command.source, command.data)
     if corruption not in (None, ROTATION):
@@ -92,15 +104,15 @@ def embed_recording(command: EmbedCommand) -> None:
         }
         if writes_store:
             origin = {"site": command.site, "source": str(command.data.absolute())}
-            stored = embed_to_store(command.out, method, recording, **origin, **options)
+            stored = embed_to_store(command.target, method, recording, **origin, **options)
         else:
             file = embed(method, recording, **options)
     if writes_store:
         print(f"{stored.address}: {'already there' if stored.added is None else f'{stored.added} places'}")
         return
-    file.save(Path(command.out))
+    file.save(Path(command.target))
     skipped = len(recording) - len(file)
-    print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
+    print(f"{command.target}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
 
 
 def _load_weights(command: EmbedCommand) -> "tuple[Method | None, Params | None]":
@@ -130,7 +142,7 @@ def _check_file(command: EmbedCommand) -> None:
     """Raise ValueError or OSError before long work if the descriptor file cannot be written."""
     from sglpr_jax.files import check_writable
 
-    out = Path(command.out)
+    out = Path(command.target)
     if out.suffix != ".npz":
         raise ValueError(f"expected --out to end in .npz or /, or an address such as s3://bucket/places, found {out}")
     if command.site:

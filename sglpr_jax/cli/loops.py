@@ -14,6 +14,7 @@ from sglpr_jax.cli.recording import (
     DetectorFlags,
     PosedRecordingOptions,
     SubmapOptions,
+    beside,
     open_with_odometry,
     report_bad_scan,
 )
@@ -43,7 +44,7 @@ class LoopsCommand(DetectorFlags):
     was interrupted or killed.
 
     Example:
-      bin/loops my_scans --out found
+      bin/loops my_scans
       bin/loops my_scans --odometry odometry.tum --out found
       bin/loops my_scans --odometry auto --optimize --out found
       bin/loops drive.mcap --odometry drive.mcap --out found
@@ -56,8 +57,8 @@ class LoopsCommand(DetectorFlags):
 
     recording: Annotated[Path | tuple[Path, ...], tyro.conf.Positional]
     """A dataset, a bag or a folder of scans, in any supported layout, or several of them."""
-    out: Path
-    """Output folder."""
+    out: Path | None = None
+    """Output folder. None: NAME-loops beside the recording NAME."""
     odometry: Literal["auto"] | Path | tuple[Path, ...] | None = None
     """File with a pose for each scan, tum file with poses at other times, which are interpolated, or the bag itself.
     `auto` computes odometry from the scans (extra odometry), and deskews them if their points have times. Without
@@ -91,6 +92,11 @@ class LoopsCommand(DetectorFlags):
     """Report unreadable scans and skip them."""
 
     @property
+    def folder(self) -> Path:
+        """Output folder."""
+        return self.out or beside(self.recordings[0], self.source.seq, "-loops")
+
+    @property
     def recordings(self) -> tuple[Path, ...]:
         """Paths of all recordings."""
         return (self.recording,) if isinstance(self.recording, Path) else self.recording
@@ -106,7 +112,7 @@ class LoopsCommand(DetectorFlags):
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
     _check_flags(command)
-    with exclusive_lock(command.out / UNFINISHED):
+    with exclusive_lock(command.folder / UNFINISHED):
         return _search_and_write(command)
 
 
@@ -136,7 +142,7 @@ def _check_flags(command: LoopsCommand) -> None:
     if command.output.any and not command.optimize:
         raise ValueError("--cloud and --grid need a corrected trajectory: expected --optimize, found none")
     for path in (*files, command.source.poses, command.source.times):
-        if path is None or path.resolve().parent != command.out.resolve():
+        if path is None or path.resolve().parent != command.folder.resolve():
             continue
         if path.name in TRAJECTORIES or path.name.startswith("trajectory-"):
             raise ValueError(
@@ -156,7 +162,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     from sglpr_jax.pose_graph.folder import write_loop_folder
     from sglpr_jax.pose_graph.optimize import optimize_trajectory, placements
 
-    params, out, checkpoint = load(command.weights), command.out, command.out / UNFINISHED
+    params, out, checkpoint = load(command.weights), command.folder, command.folder / UNFINISHED
     detector = command.detector  # raises an error for invalid settings before the recordings are opened
     odometry_checkpoints = [out / f"unfinished-{number}.odometry.log" for number in range(len(command.recordings))]
     effective, recordings, odometry = open_with_odometry(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.cloud import CloudOptions
-from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, open_with_odometry, report_bad_scan
+from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, beside, open_with_odometry, report_bad_scan
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.files import exclusive_lock, naming
@@ -52,8 +52,8 @@ class MapCommand:
     """File with a pose in the world frame for each scan, tum file with poses at other times, which are interpolated, or
     the bag itself. Use a corrected trajectory, not raw odometry. For a point cloud map, the poses of its LiDAR. `auto`
     computes odometry from the scans (extra odometry) and writes it beside the map, for a drive without revisits."""
-    out: Path
-    """Map to write (.safetensors)."""
+    out: Path | None = None
+    """Map to write (.safetensors). None: NAME.safetensors beside the recording NAME."""
     pose_format: OdometryFormat = "auto"
     """Format of --poses. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
     recognises tum and .g2o."""
@@ -78,18 +78,23 @@ class MapCommand:
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
 
+    @property
+    def file(self) -> Path:
+        """Map to write."""
+        return self.out or beside(self.recording, self.source.seq, ".safetensors")
+
 
 def write_map(command: MapCommand) -> int:
     """Run the command. Returns the exit status."""
     from sglpr_jax.models.weights_file import load
 
-    if command.out.suffix != ".safetensors":
-        raise ValueError(f"expected --out to end in .safetensors, found {command.out}")
-    if command.out.is_dir():
-        raise IsADirectoryError(f"{command.out}: expected a file to write, found a folder")
+    if command.file.suffix != ".safetensors":
+        raise ValueError(f"expected --out to end in .safetensors, found {command.file}")
+    if command.file.is_dir():
+        raise IsADirectoryError(f"{command.file}: expected a file to write, found a folder")
     command.output.check()
     params = load(command.weights)
-    with exclusive_lock(command.out.with_suffix(UNFINISHED)):  # also protects --add-to if it is the same file as --out
+    with exclusive_lock(command.file.with_suffix(UNFINISHED)):  # also protects --add-to if it is the same file as --out
         return _build_and_write(command, params)
 
 
@@ -106,7 +111,7 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     if command.add_to is not None:
         existing_map = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     pose_files = AUTO if command.poses == AUTO else (command.poses,)
-    odometry_checkpoint = command.out.with_suffix(ODOMETRY_CHECKPOINT)
+    odometry_checkpoint = command.file.with_suffix(ODOMETRY_CHECKPOINT)
     effective, (recording,), (poses,) = open_with_odometry(
         command,
         (command.recording,),
@@ -117,11 +122,11 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     command.output.check_recordings([recording])
     if command.poses == AUTO:
         times = recording.numbers.astype(float) if recording.times is None else recording.times
-        write_tum(command.out.with_suffix(ODOMETRY), poses, times)
+        write_tum(command.file.with_suffix(ODOMETRY), poses, times)
     if existing_map is not None:
         with naming(f"{command.add_to}"):
             check_made_alike({"scale": effective.scale}, {"scale": existing_map.scale})
-    unfinished = command.out.with_suffix(UNFINISHED)
+    unfinished = command.file.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         new_map, scans, skipped = map_recording(
             recording,
@@ -142,14 +147,14 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
         if existing_map is not None:
             whole_map = _merge_maps(command, existing_map, new_map, poses_by_id(recording, poses))
             new_places = len(whole_map) - len(existing_map)
-        if is_stopped and _has_more_places(command.out, len(whole_map)):
-            print(f"{command.out}: unchanged, because it has more places than the {len(whole_map)} found until now")
+        if is_stopped and _has_more_places(command.file, len(whole_map)):
+            print(f"{command.file}: unchanged, because it has more places than the {len(whole_map)} found until now")
         else:
-            whole_map.save(command.out)
+            whole_map.save(command.file)
             scans_text = f"{scans} of {len(recording)} scans" if is_stopped else f"{scans} scans"
             skipped_text = f", {len(skipped)} scans skipped" if skipped else ""
             source = f"{new_places} of them from {scans_text} of {recording.name}{skipped_text}"
-            print(f"{command.out}: {len(whole_map)} places, {source}")
+            print(f"{command.file}: {len(whole_map)} places, {source}")
     if is_stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status

@@ -70,6 +70,13 @@ class RecordingOptions:
         return recording
 
 
+def beside(recording: Path, seq: str | None, ending: str) -> Path:
+    """Return the default output of a recording: `my_scans-loops` beside the folder my_scans, for the ending -loops."""
+    path = recording.resolve()
+    stem = path.name if path.is_dir() else path.stem
+    return path.with_name("-".join(filter(None, (stem, seq))) + ending)
+
+
 @dataclasses.dataclass(frozen=True)
 class PosedRecordingOptions(RecordingOptions):
     """Selection of a recording in a folder, options for reading it, and the poses of a plain folder of scans."""

@@ -5,6 +5,10 @@ import numpy as np
 import pytest
 
 import sglpr_jax
+from sglpr_jax.cli.embed import EmbedCommand
+from sglpr_jax.cli.loops import LoopsCommand
+from sglpr_jax.cli.map import MapCommand
+from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.retrieval.parquet import read_places, stored_places
 
 from .conftest import assert_one_line_error
@@ -30,6 +34,15 @@ def scans(town, tmp_path):
     for path in sorted(folder.iterdir())[12:]:
         path.unlink()
     return folder
+
+
+def test_without_out_the_file_is_beside_the_recording(command, scans, town):
+    ended = command("embed", "--method", "polar-fft", "--data", scans)
+    assert ended.status == 0, ended.error
+    assert len(load(scans.with_name("my_scans.npz"))) == 12
+    assert EmbedCommand(town, source=PosedRecordingOptions(seq="08")).target == f"{town.resolve()}-08.npz"
+    assert LoopsCommand((Path("/a/drive.mcap"), Path("/b/c"))).folder == Path("/a/drive-loops")
+    assert MapCommand(Path("/a/drive.mcap"), "auto").file == Path("/a/drive.safetensors")
 
 
 def test_a_store_gets_each_recording_once(command, scans, tmp_path):
