@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class RelocalizeCommand:
-    """Find the pose of a scan in a map of bin/map. Each of the most similar places gives a pose with its probability.
+    """Find the pose of a scan in a map of bin/map, with its probability.
 
-    Answers more than 20 m apart share the probability: if several places fit equally well, none of them is probable.
+    Other answers follow only if they are more than 20 m away. They share the probability: if several places fit equally
+    well, none of them is probable.
 
     Example:
       bin/relocalize my_scans/000003.bin --map town.safetensors
@@ -44,10 +45,9 @@ class RelocalizeCommand:
     seq: str | None = None
     """Sequence of the recording. May be omitted if there is only one."""
     out: Path | None = None
-    """JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
+    """JSON file for the answers, the most probable first: place, probability, world_from_query (4 x 4), covariance."""
     candidates: PlaceCount = CANDIDATES
-    """Maximum number of answers. The scan is compared with this many places of the map. Answers more than 20 m apart
-    exclude each other, and their probabilities add up to 1 at most."""
+    """Number of the most similar places of the map that the scan is compared with."""
     weights: str = DEFAULT_WEIGHTS
     """Weights that the map was made with."""
     format: ScanFormat = "auto"
@@ -102,9 +102,7 @@ def relocalize(command: RelocalizeCommand) -> None:
 
 def _answer_table(name: str, answers: "list[Relocalization]") -> Table:
     title = escape(f"{name} in the map")  # rich interprets brackets as styles
-    caption = None
-    if len(answers) > 1:
-        caption = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
+    caption = f"The answers are more than {NEGATIVE_M:g} m apart and exclude each other." if len(answers) > 1 else None
     table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)
     for answer in answers:
         pose = answer.world_from_query

@@ -52,22 +52,20 @@ class Relocalization(NamedTuple):
         return self.loop.probability
 
 
-def with_shared_probability(answers: Sequence[Relocalization], *, apart_m: float = NEGATIVE_M) -> list[Relocalization]:
-    """Sort answers by probability, and divide all probabilities by a common factor.
+def exclusive_answers(answers: Sequence[Relocalization], *, apart_m: float = NEGATIVE_M) -> list[Relocalization]:
+    """Keep the most probable answer of each position, and divide the probabilities so that their sum is at most 1.
 
-    The factor makes the sum over the distinct positions at most 1. A position is not distinct if it is within
-    `apart_m` metres of a distinct one with a higher probability.
+    An answer is left out if it is within `apart_m` metres of one with a higher probability. The most probable is first.
     """
-    answers = sorted(answers, key=lambda answer: -answer.probability)
     distinct: list[Relocalization] = []
-    for answer in answers:
+    for answer in sorted(answers, key=lambda answer: -answer.probability):
         position = answer.world_from_query[:3, 3]
         if all(np.linalg.norm(other.world_from_query[:3, 3] - position) > apart_m for other in distinct):
             distinct.append(answer)
     total = max(1.0, sum(answer.probability for answer in distinct))
     return [
         answer._replace(loop=dataclasses.replace(answer.loop, probability=answer.probability / total))
-        for answer in answers
+        for answer in distinct
     ]
 
 
@@ -177,11 +175,12 @@ class PlaceMap(Keyframes):
           scan: A scan, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that of
             the map (`query_mounting`). For another mounting pass a `Scan`.
           model: Model of the probabilities, by default the one shipped for the weights.
-          candidates: Maximum number of poses, and number of nearest places that the query is compared with. If it fits
-            none of them well, as many of the nearest 25 places are compared, too, chosen by a coarse comparison.
+          candidates: Number of nearest places that the query is compared with. If it fits none of them well, as many of
+            the nearest 25 places are compared, too, chosen by a coarse comparison.
 
         Returns:
-          One pose for each compared place, the most probable first. Empty if the scan is almost empty.
+          The most probable pose, then poses at other positions, more than 20 m away. Their probabilities add up to at
+          most 1. Empty if the scan is almost empty.
 
         Raises:
           ValueError: If other weights made the map, if an array has another shape, or if `candidates` is not from 1 to
@@ -233,7 +232,7 @@ class PlaceMap(Keyframes):
             loop = in_metres(to_lidar(loop, query=mountings[0], match=mountings[1]), self.scale)
             world_from_query = self.world_from_place[place] @ loop.match_from_query
             answers.append(Relocalization(self.index.ids[place], world_from_query, loop))
-        return with_shared_probability(answers, apart_m=NEGATIVE_M / self.scale)
+        return exclusive_answers(answers, apart_m=NEGATIVE_M / self.scale)
 
     @property
     def frames(self) -> Int[np.ndarray, " n"]:
