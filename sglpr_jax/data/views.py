@@ -6,7 +6,6 @@ compiled step applies `image_view` or `cloud_view` to a whole batch.
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int, Int32, Num
@@ -111,7 +110,6 @@ def image_view(
     classes: Int[Array | np.ndarray, "*b h w"] | None,
     grid: Grid | None,
     angle: Float[Array | np.ndarray, "*b"] | None = None,
-    shifts=None,
 ) -> View:
     """Return the view of uncropped images and maps, rotated by `angle` in radians and cropped to `grid`.
 
@@ -123,8 +121,6 @@ def image_view(
         if grid is not None:
             uncropped = even_cells(uncropped)
         rotated = uncropped if angle is None else rotate(jnp.asarray(uncropped), angle)
-        if shifts is not None:
-            rotated = jax.vmap(lambda x, s: jnp.roll(x, s, axis=(0, 1)))(rotated, shifts)
         return rotated if grid is None else centre_crop(rotated, height=grid.height, width=grid.width)
 
     classes = None if classes is None else rotate_and_crop(classes, rotate_labels)

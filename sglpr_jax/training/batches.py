@@ -42,8 +42,6 @@ class Batch:
     classes: Any = None
     """Classes of the points (b, n)."""
     teacher: Any = None
-    same: Any = None
-    apart: Any = None
     """Descriptors of the teacher (b, d), including those of `second`, or None without `loss.teacher`."""
     second: Any = None
     """None, or the batch of a second dataset, such as simulated scans with labels beside real images without labels."""
@@ -106,15 +104,7 @@ def read_batch(
         clouds_or_images.append(cloud_or_image)
         classes.append(place_classes)
     labelled = np.array([place_classes is not None for place_classes in classes])
-    flat = places.reshape(-1)
-    same = pool._are_within(flat[:, None], flat[None], pool.config.positive_m) & ~np.eye(len(flat), dtype=bool)
-    batch = Batch(
-        labelled=labelled,
-        negatives=negatives[part],
-        positives=pool.config.positives,
-        same=same,
-        apart=pool.far_apart(flat[:, None], flat[None]),
-    )
+    batch = Batch(labelled=labelled, negatives=negatives[part], positives=pool.config.positives)
     if not gives_images:
         points, count, point_classes = _pad_clouds(clouds_or_images, classes, max_points)
         return dataclasses.replace(batch, points=points, count=count, classes=point_classes if has_labels else None)
@@ -123,19 +113,19 @@ def read_batch(
     return dataclasses.replace(batch, images=np.stack(clouds_or_images), maps=np.stack(maps) if has_labels else None)
 
 
-def views(batch: Batch, angles: Float[Array, "b"] | None, shifts=None, *, grid: Grid) -> View:
+def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
     """Return the model input of all places, inside jit on the device: images, and maps of classes if there are labels.
 
     `angles` rotate each place, in radians. The places of `batch.second` follow those of the batch itself.
     """
     if batch.second is None and batch.images is not None:
-        return image_view(batch.images, batch.maps, grid, angles, shifts)
+        return image_view(batch.images, batch.maps, grid, angles)
     if batch.second is None:
         return cloud_view(batch.points, batch.classes, batch.count, grid, angles)
     first_angles = None if angles is None else angles[: batch.places]
     second_angles = None if angles is None else angles[batch.places :]
     first = dataclasses.replace(batch, second=None)
-    both = (views(first, first_angles, grid=grid), views(batch.second, second_angles, grid=grid))
+    both = (views(first, first_angles, grid), views(batch.second, second_angles, grid))
     images = jnp.concatenate([view.image for view in both])
     if all(view.classes is None for view in both):
         return View(images)

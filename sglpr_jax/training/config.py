@@ -19,9 +19,6 @@ class LossConfig:
     """Margin of the triplet loss."""
     squared: bool = False
     """Use squared descriptor distances in equation 5."""
-    ranking: Literal["triplet", "pairs", "ap"] = "triplet"
-    ap_temperature: NotNegative = 0.01
-    ap_positives: CountOrNone = 4
     closest_positive: bool = True
     """Compare the anchor with its closest positive. If False, compare it with its farthest positive."""
     reduction: Literal["max", "sum"] = "max"
@@ -141,13 +138,8 @@ class TrainConfig:
     chunk: CountOrNone = 0
     """Images that pass through the network at a time, on all devices together; 0: all. Fewer images need less memory.
     Results differ only by the random branches that stochastic depth drops."""
-    netvlad_images: CountOrNone = 0
-    """Random training images to which NetVLAD is fitted before the first step: centres by k-means, the projection by
-    PCA. 0: random values."""
     rotate: bool = True
     """Rotate every place about z by a random angle at every step."""
-    shift_cells: CountOrNone = 0
-    """Maximum number of cells along each axis by which every place is shifted at random at every step."""
     quarter_turns: Share = 0.0
     """Fraction of the places that are rotated by a multiple of 90 degrees, which blurs no cells. The others are rotated
     by any angle."""

@@ -160,11 +160,7 @@ def _network_input(batch: Batch, angle_key: Array, model_key: Array, config: Tra
     make_views = functools.partial(views, grid=config.model.grid)
     if batch.second is None:  # a batch of two datasets is on one device
         make_views = per_device(make_views)
-    shifts = None
-    if config.shift_cells:
-        n = config.shift_cells
-        shifts = jax.random.randint(jax.random.fold_in(angle_key, 7), (config.images, 2), -n, n + 1)
-    images, maps = make_views(batch, angles, shifts)
+    images, maps = make_views(batch, angles)
     visible_cells = field_of_view(config.model)
     if config.occlusion.share:
         key = jax.random.fold_in(angle_key, 1)

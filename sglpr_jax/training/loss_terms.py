@@ -47,8 +47,6 @@ def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) 
 
     The fraction `config.one_threshold` of it is the loss in which every anchor has the negatives of all anchors.
     """
-    if config.ranking != "triplet":
-        return ranking(descriptors, batch, config)
     to_positives, to_places = _anchor_distances(descriptors, batch, config)
     options: dict[str, Any] = _triplet_options(batch, config) | {"temperature": config.temperature}
     own_negatives = losses.lazy_triplet(to_positives, to_places, **options).mean()
@@ -56,42 +54,6 @@ def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) 
         return own_negatives
     all_negatives = losses.one_threshold(to_positives, to_places, **options).mean()
     return (1 - config.one_threshold) * own_negatives + config.one_threshold * all_negatives
-
-
-def ranking(descriptors, batch, config):
-    import jax
-
-    squares = jnp.square(descriptors[:, None] - descriptors[None]).sum(-1)
-    same, apart = jnp.asarray(batch.same), jnp.asarray(batch.apart)
-    T = config.temperature
-    masked = jnp.where(apart, squares, jnp.inf)
-    pull = config.margin + squares  # i, p
-    own = -T * jax.nn.logsumexp(-masked / T, axis=1)  # soft minimum of the negatives of i
-    everyone = -T * jax.nn.logsumexp(-masked / T)
-    count = jnp.maximum(same.sum(), 1)
-
-    def of_pairs(x):
-        return jnp.where(same, x, 0).sum() / count
-
-    def smooth(v):
-        return T * jax.nn.softplus(v / T)
-
-    one = of_pairs(smooth(pull - everyone))
-    if config.ranking == "pairs":
-        first = of_pairs(smooth(pull - own[:, None]))
-    else:
-        k = min(config.ap_positives, squares.shape[0] - 1)
-        near = -jax.lax.top_k(jnp.where(same, -squares, -1e3), k)[0]  # (b, k) closest positives
-        valid = near < 1e2
-        step = jax.nn.sigmoid((near[:, :, None] - squares[:, None, :]) / 2 / config.ap_temperature)  # b k b
-        is_self = jnp.abs(near[:, :, None] - squares[:, None, :]) < 1e-12
-        pos = jnp.where(same[:, None, :] & ~is_self, step, 0).sum(-1)
-        neg = jnp.where(apart[:, None, :], step, 0).sum(-1)
-        precision = (1 + pos) / (1 + pos + neg)
-        ap = jnp.where(valid, precision, 0).sum(-1) / jnp.maximum(valid.sum(-1), 1)
-        has = valid.any(-1)
-        first = 1 - jnp.where(has, ap, 0).sum() / jnp.maximum(has.sum(), 1)
-    return (1 - config.one_threshold) * first + config.one_threshold * one
 
 
 def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:

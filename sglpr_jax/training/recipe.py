@@ -21,13 +21,12 @@ from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.devices import data_mesh, host_copy, is_first_host, on_all_hosts
 from sglpr_jax.training.image_network import ImageNetwork
-from sglpr_jax.training.initial_head import fit_netvlad
 from sglpr_jax.training.metrics_log import Throughput, read_metrics, throughput
 from sglpr_jax.training.run_folder import CHECKPOINTS, checkpoint_steps, lock_run
 from sglpr_jax.training.step import TrainState
 from sglpr_jax.training.trainer import METRICS_FILE, Schedule, Trained, Trainer
-from sglpr_jax.training.tuples import TuplePool, split_recordings, tuple_pool
-from sglpr_jax.training.validation import describe_places, images_of_places, training_recall, validation_score
+from sglpr_jax.training.tuples import split_recordings, tuple_pool
+from sglpr_jax.training.validation import describe_places, training_recall, validation_score
 
 WEIGHTS = "weights"
 LIMITS = ("config.steps",)
@@ -130,11 +129,9 @@ def train(
         recordings, also = on_all_hosts(
             lambda: [_packed(group, cache, host_callback, stopped) for group in (recordings, also)]
         )
-        splits = split_recordings(recordings, config)
-        pool = tuple_pool(recordings, config.sampling, frames=[training for training, _ in splits])
-        source, score = _batches_and_score(recordings, also, config, folder, splits, pool)
+        source, score = _batches_and_score(recordings, also, config, folder)
         last_step = max(checkpoint_steps(folder / CHECKPOINTS), default=0) if resume else 0
-        start_from = None if last_step else _initial_weights(weights, config, recordings, pool)
+        start_from = None if last_step else _initial_weights(weights, config)
         if config.steps < last_step:
             expected = f"at least the {last_step} steps that are already done"
             raise ValueError(f"{folder}: expected {expected}, found {config.steps}")
@@ -186,14 +183,11 @@ def run_network(
 
 
 def _batches_and_score(
-    recordings: Sequence[Recording],
-    also: Sequence[Recording],
-    config: TrainConfig,
-    folder: Path,
-    splits: Sequence[tuple[np.ndarray, np.ndarray]],
-    pool: TuplePool,
+    recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
 ) -> tuple[TupleBatches, ScoreFn]:
     """Return batches of the training places, and a score, on held-out places or, without them, on training places."""
+    splits = split_recordings(recordings, config)
+    pool = tuple_pool(recordings, config.sampling, frames=[training for training, _ in splits])
 
     def describe(state: TrainState, places: Int[np.ndarray, "n"]) -> Float32[np.ndarray, "n d"]:
         return describe_places(state.params, recordings, pool, places, np.zeros(len(places)), config)
@@ -273,22 +267,14 @@ def _packed(
     return [packed(recording, cache, on_progress=functools.partial(report, recording)) for recording in recordings]
 
 
-def _initial_weights(
-    weights: Params | Path | str | None, config: TrainConfig, recordings: Sequence[Recording], pool: TuplePool
-) -> Params:
+def _initial_weights(weights: Params | Path | str | None, config: TrainConfig) -> Params:
     """Return the weights with random values for missing ones, and with a whitening layer only if the model has one.
 
-    Without weights, the layers that a teacher has in the same form begin with its weights, and NetVLAD may be fitted to
-    images of the pool.
+    Without weights, the layers that a teacher has in the same form begin with its weights.
     """
     random = init(jax.random.key(config.seed), config=config.model)
-    if weights is None and config.netvlad_images:
-        rng = np.random.default_rng(config.seed)
-        places = rng.choice(len(pool), min(config.netvlad_images, len(pool)), replace=False)
-        images = images_of_places(recordings, pool, places, rng.uniform(0, 2 * np.pi, len(places)), config)
-        return fit_netvlad(random, images, seed=config.seed)
     if weights is None:
-        return random
+        return adopt(load(config.loss.teacher), random) if config.loss.teacher else random
     params = weights if isinstance(weights, Params) else load(weights)
     if config.loss.segmentation_alone and params.config.head.whiten and not config.model.head.whiten:
         raise ValueError(

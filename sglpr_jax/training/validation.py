@@ -9,7 +9,6 @@ from jaxtyping import Array, Float, Float32, Int
 from scipy.spatial.distance import cdist
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.views import View
 from sglpr_jax.methods.method import DistanceFn
 from sglpr_jax.metrics import decision_curve
 from sglpr_jax.models.sglpr import describe
@@ -118,32 +117,7 @@ def describe_places(
     config: TrainConfig,
 ) -> Float32[np.ndarray, "n d"]:
     """Describe places of training recordings, given as numbers of the pool, after rotations about z in radians."""
-    return _of_places(_describe_batch, params, recordings, pool, places, angles, config)
-
-
-def images_of_places(
-    recordings: Sequence[Recording],
-    pool: TuplePool,
-    places: Int[np.ndarray, "n"],
-    angles: Float[np.ndarray, "n"],
-    config: TrainConfig,
-) -> Float32[np.ndarray, "n h w"]:
-    """Return the images of places of training recordings, after rotations about z in radians."""
-    params = Params({}, config.model)
-    return _of_places(lambda *given: _view(*given).image, params, recordings, pool, places, angles, config)
-
-
-def _of_places(
-    compute: Callable[[Params, Batch, Float[Array, "b"]], Array],
-    params: Params,
-    recordings: Sequence[Recording],
-    pool: TuplePool,
-    places: Int[np.ndarray, "n"],
-    angles: Float[np.ndarray, "n"],
-    config: TrainConfig,
-) -> Float32[np.ndarray, "n ..."]:
-    """Compute something of places, `CHUNK` at a time."""
-    results = []
+    descriptors = []
     for start in range(0, len(places), CHUNK):
         # The last chunk repeats its last place, so that every chunk has one shape and compiles once.
         rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)
@@ -156,18 +130,13 @@ def _of_places(
             categories=config.model.categories_read,
             image=config.model.image,
         )
-        results.append(np.asarray(compute(params, batch, jnp.asarray(angles[rows], jnp.float32))))
-    return np.concatenate(results)[: len(places)].astype(np.float32)
-
-
-@jax.jit
-def _view(params: Params, batch: Batch, angles: Float[Array, "b"]) -> View:
-    return views(batch, angles, grid=params.config.grid)
+        descriptors.append(np.asarray(_describe_batch(params, batch, jnp.asarray(angles[rows], jnp.float32))))
+    return np.concatenate(descriptors)[: len(places)].astype(np.float32)
 
 
 @jax.jit
 def _describe_batch(params: Params, batch: Batch, angles: Float[Array, "b"]) -> Float[Array, "b d"]:
-    return describe(params, *_view(params, batch, angles))
+    return describe(params, *views(batch, angles, params.config.grid))
 
 
 def require_revisits(recordings: Sequence[Recording]) -> None:
