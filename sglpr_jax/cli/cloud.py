@@ -33,15 +33,23 @@ class CloudOptions:
         """Whether a file is asked for."""
         return self.cloud is not None or self.grid is not None
 
-    def check(self) -> None:
-        """Raise ValueError if a file has the wrong suffix, ImportError if its format needs a missing package."""
+    def check(self, recordings: "Sequence[Path]", *, submap_m: float) -> None:
+        """Raise an error before long work if a file cannot be written, is an input, or if scans are submaps."""
         from sglpr_jax.data.formats.cloud_writers import check_cloud_path  # slow imports, not needed for --help
+        from sglpr_jax.files import check_writable
         from sglpr_jax.maps.occupancy import check_grid_path
 
         if self.cloud is not None:
             check_cloud_path(self.cloud)
         if self.grid is not None:
             check_grid_path(self.grid)
+        if self.any and submap_m:
+            raise ValueError("--cloud and --grid need single scans: expected no --submap-m, found one")
+        inputs = {path.resolve() for path in recordings}
+        for path in filter(None, (self.cloud, self.grid)):
+            check_writable(path)
+            if not inputs.isdisjoint((path.resolve(), path.resolve().parent)):
+                raise ValueError(f"{path}: expected a file that is no input and in no folder of scans, found one")
 
     def check_recordings(self, recordings: "Sequence[Recording]") -> None:
         """Raise ValueError if a file is asked for and a recording has ready-made images."""

@@ -1,6 +1,7 @@
 """bin/loops: find the loop closures of a recording and write them for a pose graph."""
 
 import dataclasses
+import itertools
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -138,7 +139,7 @@ def _check_flags(command: LoopsCommand) -> None:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
     if command.optimize:
         gtsam_library()
-    command.output.check()
+    command.output.check(recordings, submap_m=command.submap.submap_m)
     if command.output.any and not command.optimize:
         raise ValueError("--cloud and --grid need a corrected trajectory: expected --optimize, found none")
     for path in (*files, command.source.poses, command.source.times):
@@ -208,12 +209,14 @@ def _search_and_write(command: LoopsCommand) -> int:
     if not result.whole:  # a signal stopped the search
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
-    if optimized is not None:
-        first_frame = [session for session, (group, _) in enumerate(placements(result)) if group == 0]
-        corrected = result.split(optimized.poses)
+    if optimized is not None and command.output.any:
+        connected = [group == 0 for group, _ in placements(result)]
+        for recording, is_connected in zip(recordings, connected, strict=True):
+            if not is_connected:
+                print(f"{recording.name}: not in the cloud, because it has no common place with {recordings[0].name}")
         command.output.write(
-            [recordings[session] for session in first_frame],
-            [corrected[session] for session in first_frame],
+            list(itertools.compress(recordings, connected)),
+            list(itertools.compress(result.split(optimized.poses), connected)),
             on_bad_scan=report_bad_scan if command.skip_bad else None,
         )
     if len(recordings) > 1:

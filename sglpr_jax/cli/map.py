@@ -92,7 +92,7 @@ def write_map(command: MapCommand) -> int:
         raise ValueError(f"expected --out to end in .safetensors, found {command.file}")
     if command.file.is_dir():
         raise IsADirectoryError(f"{command.file}: expected a file to write, found a folder")
-    command.output.check()
+    command.output.check([command.recording], submap_m=command.submap.submap_m)
     params = load(command.weights)
     with exclusive_lock(command.file.with_suffix(UNFINISHED)):  # also protects --add-to if it is the same file as --out
         return _build_and_write(command, params)
@@ -100,6 +100,8 @@ def write_map(command: MapCommand) -> int:
 
 def _build_and_write(command: MapCommand, params: "Params") -> int:
     """Build the map and write it, unless a stopped run would replace a larger map. Returns the exit status."""
+    import numpy as np  # slow imports, not needed for --help
+
     from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
@@ -139,13 +141,13 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
             should_stop=stop,
             on_progress=show,
         )
-    is_stopped = scans < len(recording)
+    is_stopped, world_from_new = scans < len(recording), np.eye(4)
     if is_stopped and existing_map is not None and command.frame == "align":
         print("the new map is not aligned and added before it is complete")
     elif len(new_map):
         whole_map, new_places = new_map, len(new_map)
         if existing_map is not None:
-            whole_map = _merge_maps(command, existing_map, new_map, poses_by_id(recording, poses))
+            whole_map, world_from_new = _merge_maps(command, existing_map, new_map, poses_by_id(recording, poses))
             new_places = len(whole_map) - len(existing_map)
         if is_stopped and _has_more_places(command.file, len(whole_map)):
             print(f"{command.file}: unchanged, because it has more places than the {len(whole_map)} found until now")
@@ -158,7 +160,9 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     if is_stopped:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
-    command.output.write([recording], [poses], on_bad_scan=report_bad_scan if command.skip_bad else None)
+    command.output.write(
+        [recording], [world_from_new @ poses], on_bad_scan=report_bad_scan if command.skip_bad else None
+    )
     delete_checkpoint(unfinished)
     odometry_checkpoint.unlink(missing_ok=True)
     return 0
@@ -166,18 +170,23 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
 
 def _merge_maps(
     command: MapCommand, existing: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]
-) -> "PlaceMap":
-    """Return the existing map with the places of the new one. `drive` has the pose of every new scan, by its id."""
+) -> "tuple[PlaceMap, np.ndarray]":
+    """Return the existing map with the places of the new one, and the transform from the new frame to the existing one.
+
+    `drive` has the pose of every new scan, by its id.
+    """
+    import numpy as np
+
     from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
 
     print("comparing up to 300 of the new places with the existing map", file=sys.stderr)
     if command.frame == "check":
         check_one_frame(existing, new)
-        return existing.merged(new, drive=drive)
-    new = without_known_places(existing, new)
-    if not len(new):
-        return existing
-    alignment = align_maps(existing, new)
+        return existing.merged(new, drive=drive), np.eye(4)
+    added = without_known_places(existing, new)
+    if not len(added) and not command.output.any:
+        return existing, np.eye(4)
+    alignment = align_maps(existing, added if len(added) else new)
     if alignment is None:
         raise ValueError(
             f"{command.add_to}: expected places in common with {command.recording} to align the two world frames, "
@@ -186,7 +195,7 @@ def _merge_maps(
     print(f"{command.recording}: {alignment}")
     world_from_new = alignment.old_from_new
     moved_drive = {scan_id: world_from_new @ pose for scan_id, pose in drive.items()}
-    return existing.merged(new.moved(world_from_new), drive=moved_drive)
+    return existing.merged(added.moved(world_from_new), drive=moved_drive), world_from_new
 
 
 def _has_more_places(path: Path, places: int) -> bool:

@@ -1,6 +1,7 @@
 """Flags that several commands share: recordings and how they are opened, their odometry, the loop detector."""
 
 import dataclasses
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,6 +17,7 @@ from sglpr_jax.data.choices import (
     TimeUnit,
 )
 from sglpr_jax.fields import NotNegative
+from sglpr_jax.files import file_name
 from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorConfig
 from sglpr_jax.odometry.config import OdometryFormat
 from sglpr_jax.odometry.drift_model import DRIFT_DEG_PER_100M, DRIFT_PERCENT, DriftModel
@@ -72,9 +74,9 @@ class RecordingOptions:
 
 def beside(recording: Path, seq: str | None, ending: str) -> Path:
     """Return the default output of a recording: `my_scans-loops` beside the folder my_scans, for the ending -loops."""
-    path = recording.resolve()
+    path = Path(os.path.abspath(recording))  # a link stays where it is
     stem = path.name if path.is_dir() else path.stem
-    return path.with_name("-".join(filter(None, (stem, seq))) + ending)
+    return path.with_name("-".join(filter(None, (stem, seq and file_name(seq)))) + ending)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 class RelocalizeCommand:
     """Find the pose of a scan in a map of bin/map, with its probability.
 
-    Other answers follow only if they are more than 20 m away. They share the probability: if several places fit equally
-    well, none of them is probable.
+    Other answers follow only if they are more than 20 m (divided by the scale of the map) from every more probable one.
+    They share the probability: if several places fit equally well, none of them is probable.
 
     Example:
       bin/relocalize my_scans/000003.bin --map town.safetensors
@@ -97,12 +97,12 @@ def relocalize(command: RelocalizeCommand) -> None:
             for answer in answers
         ]
         write_json(command.out, values)
-    console().print(_answer_table(name, answers))
+    console().print(_answer_table(name, answers, apart_m=NEGATIVE_M / place_map.scale))
 
 
-def _answer_table(name: str, answers: "list[Relocalization]") -> Table:
+def _answer_table(name: str, answers: "list[Relocalization]", *, apart_m: float) -> Table:
     title = escape(f"{name} in the map")  # rich interprets brackets as styles
-    caption = f"The answers are more than {NEGATIVE_M:g} m apart and exclude each other." if len(answers) > 1 else None
+    caption = f"The answers are more than {apart_m:g} m apart and exclude each other." if len(answers) > 1 else None
     table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)
     for answer in answers:
         pose = answer.world_from_query

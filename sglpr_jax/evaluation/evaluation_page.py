@@ -55,7 +55,7 @@ class Pictures:
 def take_pictures(
     recording: Recording, params: Params | None, source: Input, worst: Sequence[FalsePositive]
 ) -> Pictures:
-    """Return images of the false positives and, with `params` and matplotlib, maps of two scans of the recording."""
+    """Return images of the false positives and, with `params`, maps of two scans of the recording."""
     row_of_frame = recording_rows(recording, source)  # raises ValueError if the frames differ
     grid = None if recording.has_images else model_preset("sglpr").grid  # ready-made images are not cropped
     frames = sorted({frame for false_positive in worst for frame in (false_positive.query, false_positive.answer)})

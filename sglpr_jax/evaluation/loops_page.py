@@ -114,7 +114,7 @@ def _frame_pairs(loops: Iterable[LoopClosure]) -> list[tuple[int, int]]:
     return [(loop.query, loop.match) for loop in loops]
 
 
-def _correction_picture(result: LoopSearchResult, optimized: OptimizedTrajectory) -> Picture | Text:
+def _correction_picture(result: LoopSearchResult, optimized: OptimizedTrajectory) -> Picture:
     """Draw the trajectory before and after the correction, with the position errors if true positions are known."""
     session = result.sessions[0]
     assert session.odometry is not None

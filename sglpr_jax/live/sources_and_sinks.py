@@ -90,6 +90,6 @@ def named_module(text: str, known: dict[str, str | None], *, kind: str) -> tuple
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.startswith("sglpr_jax"):
             raise
-        raise ImportError(
-            f"{name}: expected the package {error.name}, found none; {install_command(known[name] or '')}"
-        ) from error
+        extra = known[name]
+        advice = f"; {install_command(extra)}" if extra else ""
+        raise ImportError(f"{name}: expected the package {error.name}, found none{advice}") from error

@@ -1,5 +1,6 @@
 """Occupancy grid of a point cloud, for planners that drive on the ground. Files of ROS's map server."""
 
+import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,8 @@ from PIL import Image
 from scipy.ndimage import binary_closing
 
 from sglpr_jax.data.cloud_map import height_above_ground
-from sglpr_jax.files import write_all
+from sglpr_jax.data.formats.cloud_writers import as_cloud
+from sglpr_jax.files import text_bytes, write_all
 from sglpr_jax.maps.config import OccupancyConfig
 
 FREE, UNKNOWN, OCCUPIED = 254, 205, 0
@@ -38,15 +40,15 @@ class OccupancyGrid:
         """
         path = Path(path)
         check_grid_path(path)
-        x, y = self.corner
+        (x, y), image_name = self.corner, f"{path.stem}.pgm"
         description = (
-            f"image: {path.stem}.pgm\nmode: trinary\nresolution: {self.config.cell_m:g}\n"
+            f"image: {json.dumps(image_name, ensure_ascii=False)}\nmode: trinary\nresolution: {self.config.cell_m:g}\n"
             f"origin: [{x:.3f}, {y:.3f}, 0]\nnegate: 0\noccupied_thresh: {OCCUPIED_SHARE}\nfree_thresh: {FREE_SHARE}\n"
         )
         image = Image.fromarray(self.cells)
         files = {
-            f"{path.stem}.pgm": partial(image.save, format="ppm"),
-            path.name: partial(Path.write_text, data=description),
+            image_name: partial(image.save, format="ppm"),
+            path.name: partial(Path.write_bytes, data=text_bytes(description)),
         }
         return write_all(path.parent, files)
 
@@ -64,17 +66,16 @@ def occupancy_grid(points: Float[np.ndarray, "n 3"], *, config: OccupancyConfig 
     height of the robot are occupied, other cells with ground are free, and so are gaps of a cell between free cells.
     The points show one storey only.
 
-    Raises ValueError without points, or if the grid has too many cells.
+    Raises ValueError without points or for other arrays, or if the grid has too many cells.
     """
-    if not len(points):
-        raise ValueError("expected points, found none")
+    points = as_cloud(points)
     corner = np.floor(points[:, :2].min(axis=0) / config.cell_m) * config.cell_m
     columns, rows = np.floor((points[:, :2].max(axis=0) - corner) / config.cell_m).astype(int) + 1
     if int(rows) * int(columns) > MOST_CELLS:
         raise ValueError(f"expected a grid of at most {MOST_CELLS} cells, found {rows} x {columns}; use larger cells")
     relative = (points - [*corner, 0.0]).astype(np.float32)
     column, row = np.floor(relative[:, :2].T / config.cell_m).astype(np.int64)
-    cell = row.clip(max=rows - 1) * columns + column.clip(max=columns - 1)
+    cell = row.clip(0, rows - 1) * columns + column.clip(0, columns - 1)
     height = height_above_ground(relative)
     occupied, free = np.zeros((2, rows * columns), bool)
     occupied[cell[(height > config.step_m) & (height < config.robot_height_m)]] = True

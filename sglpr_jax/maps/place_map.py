@@ -179,8 +179,8 @@ class PlaceMap(Keyframes):
             the nearest 25 places are compared, too, chosen by a coarse comparison.
 
         Returns:
-          The most probable pose, then poses at other positions, more than 20 m away. Their probabilities add up to at
-          most 1. Empty if the scan is almost empty.
+          The most probable pose, then poses that are more than 20 m, divided by the scale, from every more probable
+          one. Their probabilities add up to at most 1. Empty if the scan is almost empty.
 
         Raises:
           ValueError: If other weights made the map, if an array has another shape, or if `candidates` is not from 1 to

@@ -14,6 +14,7 @@ from sglpr_jax.data.cloud_map import height_above_ground
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, scan_stream
+from sglpr_jax.files import warn
 from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.maps.config import CloudConfig
 from sglpr_jax.se3 import transformed
@@ -32,6 +33,8 @@ LEAST_SEEN = 2
 """Minimum number of scans that see through a block of a moving object."""
 LAYERS = 5
 """Number of blocks above a moving one that belong to it if no more scans have a point in them."""
+STEEPEST_DEG = 15.0
+"""Maximum angle between up and the z axis of the poses, in degrees."""
 TILE_M = 10.0
 """Edge of the tiles in which blocks are found, in metres."""
 PosedPoints = tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "_ 3"]]
@@ -48,7 +51,7 @@ def point_cloud(
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the points of recordings in the frame of their poses, in metres.
+    """Return the points of recordings in the frame of their poses, in metres, without moving objects. z is up.
 
     Arguments:
       recordings: The scans.
@@ -61,22 +64,25 @@ def point_cloud(
       ValueError: If a recording has images or another number of poses, or if no scan has points.
       TypeError: If an argument is not a recording or an array.
     """
+    if not len(recordings) or isinstance(recordings, Recording) or len(recordings) != len(poses):
+        raise ValueError("expected a list of recordings and a list with the poses of each, found other arguments")
     poses = [as_poses(recording_poses, of="poses") for recording_poses in poses]
     for recording, recording_poses in zip(recordings, poses, strict=True):
         check_is(recording, Recording, by="open_recording")
         require_points(recording)
         if len(recording) != len(recording_poses):
             raise ValueError(f"{recording.name}: expected {len(recording)} poses, found {len(recording_poses)}")
+        _warn_of_tilt(recording, recording_poses)
     done = 0
 
-    def scans() -> Iterator[PosedPoints]:
+    def scans(report: OnBadScan | None) -> Iterator[PosedPoints]:
         """Yield the pose of each used scan, relative to the origin, and its points in the LiDAR frame."""
         nonlocal done
         for recording, world_from_lidar in zip(recordings, poses, strict=True):
             rows = _spaced(world_from_lidar[:, :3, 3], config.spacing_m)
             before = done
             for row, points in scan_stream(
-                recording, lambda row, scan: _near(scan, config.reach_m), rows=rows, ahead=2, on_bad_scan=on_bad_scan
+                recording, lambda row, scan: _near(scan, config.reach_m), rows=rows, ahead=2, on_bad_scan=report
             ):
                 if points is not None and len(points):
                     yield shift @ world_from_lidar[row], points
@@ -88,7 +94,7 @@ def point_cloud(
     shift[:3, 3] = -origin
     stored, pending = np.zeros((0, 3), np.float32), list[np.ndarray]()
     blocks = _Blocks()
-    for origin_from_lidar, points in scans():
+    for origin_from_lidar, points in scans(on_bad_scan):
         moved = transformed(origin_from_lidar, points).astype(np.float32)
         blocks.add(moved)
         pending.append(_one_per_voxel(moved, config.voxel_m))
@@ -98,7 +104,8 @@ def point_cloud(
     if not len(stored):
         raise ValueError(f"{recordings[0].name}: expected scans with points, found none")
     if not config.keep_moving:
-        stored = stored[~blocks.are_moving(stored, scans()) | (height_above_ground(stored) < GROUND_M)]
+        again = scans(on_bad_scan and (lambda scan, error: None))  # bad scans have been reported
+        stored = stored[~blocks.are_moving(stored, again) | (height_above_ground(stored) < GROUND_M)]
     return stored + origin
 
 
@@ -106,6 +113,16 @@ def require_points(recording: Recording) -> None:
     """Raise ValueError if the recording has ready-made images instead of scans."""
     if recording.has_images:
         raise ValueError(f"{recording.name}: expected scans, found ready-made images, which have no points")
+
+
+def _warn_of_tilt(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> None:
+    """Issue a `DataWarning` if up is not nearly the z axis of the poses, on which ground and grid rest."""
+    ups = np.einsum("nij,nkj->nik", world_from_lidar[:, :3, :3], recording.uprights[:, :3, :3])[:, :, 2]
+    x, y, z = ups.mean(axis=0) if len(ups) else (0.0, 0.0, 1.0)
+    tilt_deg = np.degrees(np.arctan2(np.hypot(x, y), z))
+    if tilt_deg > STEEPEST_DEG:
+        found = f"found up tilted by {tilt_deg:.0f} degrees; its ground is not recognised"
+        warn(f"{recording.name}: expected poses with z up, {found}")
 
 
 def _near(scan: Scan, reach_m: float) -> Float[np.ndarray, "m 3"]:
@@ -162,11 +179,12 @@ class _Blocks:
     def are_moving(self, points: Float[np.ndarray, "n 3"], scans: Iterable[PosedPoints]) -> Bool[np.ndarray, " n"]:
         """Return whether each point of the cloud is in a block that more scans see through than have a point in.
 
-        `scans` yields poses and points in the LiDAR frame.
+        At least `LEAST_SEEN` scans must see through it. Up to `LAYERS` blocks above it move, too, if no more scans have
+        a point in them. `scans` yields poses and points in the LiDAR frame.
         """
         self._merge()
         block_of_point = np.searchsorted(self._numbers, _voxel_numbers(points, BLOCK_M))
-        size = np.bincount(block_of_point, minlength=len(self._numbers))
+        size = np.bincount(block_of_point, minlength=len(self._numbers))  # 0 if other blocks have the voxels' points
         sums = [np.bincount(block_of_point, weights=axis, minlength=len(size)) for axis in points.T]
         centres = np.stack(sums, axis=1) / size.clip(1)[:, None]  # of the points: a surface fills a part of its block
         tile_of_block = _tile_numbers(centres)
@@ -181,10 +199,10 @@ class _Blocks:
             near = [rows_of_tile.get(tile, order[:0]) for tile in _tile_numbers(position + around).tolist()]
             rows = np.concatenate(near)
             seen[rows[_seen_through(scan_points, (centres[rows] - position) @ origin_from_lidar[:3, :3])]] += 1
-        is_moving = (seen >= LEAST_SEEN) & (seen > self._hits)
+        is_moving = (size > 0) & (seen >= LEAST_SEEN) & (seen > self._hits)
         below = np.searchsorted(self._numbers, self._numbers - _ROW**2)
         has_below = self._numbers[below] == self._numbers - _ROW**2
-        for _ in range(LAYERS):  # upper parts have only the sky behind them, of which no points tell
+        for _ in range(LAYERS):  # the sky returns no points, so no scan sees through upper parts
             is_moving |= has_below & is_moving[below] & (self._hits <= self._hits[below])
         return is_moving[block_of_point]
 

@@ -28,7 +28,6 @@ ProgramFormat = Literal["stablehlo", "onnx"]
 PLATFORMS = ("cpu", "cuda", "tpu")
 INPUT_FILE = "input.json"
 OPSET = 21
-"""jax2onnx is installed without its dependencies, which include an Orbax that is too old for Flax and not needed."""
 
 
 def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -> Path:
@@ -100,6 +99,7 @@ def onnx(params: Params) -> bytes:
         if process.returncode:
             last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
             error = ImportError if "ModuleNotFoundError" in last_line else RuntimeError
+            # without dependencies: those of jax2onnx include an Orbax that is too old for Flax and not needed
             packages = f"{install_command('export')} && {sys.executable} -m pip install --no-deps jax2onnx==0.17.1"
             raise error(f"the conversion to ONNX failed ({last_line}); it requires: {packages}")
         return program.read_bytes()

@@ -23,7 +23,7 @@ TIMED_STEPS = 3
 
 
 def check_inputs(reproduction: Reproduction, names: Sequence[str], nclt: Path | None = None) -> None:
-    """Raise ValueError, FileNotFoundError or ImportError (matplotlib) if the named tables or figures lack an input."""
+    """Raise ValueError or FileNotFoundError if the named tables or figures lack an input."""
     if not names:
         raise ValueError(f"expected tables or figures, found none; choose from all, {', '.join(EXPERIMENTS)}")
     data, trained = reproduction.data, reproduction.trained

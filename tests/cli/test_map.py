@@ -88,7 +88,7 @@ def test_a_map_comes_with_a_point_cloud_and_a_grid(command, poses, run, tmp_path
     assert f"{cloud}: {len(points)} points" in ended.out and f"{grid}: " in ended.out
     positions = read_tum(poses)[0][:, :3, 3]
     assert np.all(np.abs(np.median(points, axis=0) - positions.mean(axis=0)) < 15)
-    assert "image: town.pgm" in grid.read_text() and (tmp_path / "nav/town.pgm").is_file()
+    assert 'image: "town.pgm"' in grid.read_text() and (tmp_path / "nav/town.pgm").is_file()
 
     ended = command(*run, "--out", tmp_path / "other.safetensors", "--cloud", tmp_path / "town.txt")
     assert_one_line_error(ended, "town.txt: expected a name that ends in .ply, .pcd, .las, .laz, found .txt")

@@ -1,15 +1,18 @@
 """Point clouds and occupancy grids of a road beside a wall, on which a box drives or stands."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from recordings import of_images, of_scans
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.cloud_writers import write_cloud
 from sglpr_jax.data.formats.scan_files import cloud_blocks, read_scan
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import DataWarning
 from sglpr_jax.maps.config import CloudConfig, OccupancyConfig
 from sglpr_jax.maps.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
 from sglpr_jax.maps.point_cloud import point_cloud
@@ -102,7 +105,22 @@ def test_a_box_that_stands_is_kept():
     assert len(parts(point_cloud([recording], [poses]))["box"]) > 0.98 * len(with_box) > 0
 
 
+def test_large_voxels_of_a_scene_at_rest_keep_all_points():
+    recording, poses = drive(speed=0.0)
+    kept = point_cloud([recording], [poses], config=CloudConfig(voxel_m=0.5))
+    assert len(kept) > 0.99 * len(point_cloud([recording], [poses], config=CloudConfig(voxel_m=0.5, keep_moving=True)))
+
+
+def test_tilted_poses_are_told(moving):
+    tilted = np.eye(4)
+    tilted[:3, :3] = Rotation.from_euler("x", 30, degrees=True).as_matrix()
+    with pytest.warns(DataWarning, match="08: expected poses with z up, found up tilted by 30 degrees"):
+        point_cloud([moving[0]], [tilted @ moving[1]])
+
+
 def test_scans_without_a_pose_or_without_points_are_errors(moving):
+    with pytest.raises(ValueError, match="expected a list of recordings"):
+        point_cloud([moving[0]], [])
     with pytest.raises(ValueError, match="08: expected 18 poses, found 17"):
         point_cloud([moving[0]], [moving[1][1:]])
     images = of_images({Path("0.png"): np.zeros((128, 128), np.float32)})
@@ -134,6 +152,7 @@ def test_another_suffix_is_an_error(tmp_path):
 def occupancy_of(path: Path, x: float, y: float) -> int:
     """Occupancy of a position by the documented rules of the map server: 100 occupied, 0 free, -1 unknown."""
     lines = dict(line.split(": ", 1) for line in path.read_text().splitlines())
+    lines["image"] = json.loads(lines["image"])
     magic, size, most, pixels = (path.parent / lines["image"]).read_bytes().split(b"\n", 3)
     assert (magic, most, lines["mode"], lines["negate"]) == (b"P5", b"255", "trinary", "0")
     width, height = map(int, size.split())
@@ -150,12 +169,12 @@ def test_a_grid_has_walls_roads_and_unknown_land_and_its_files_say_where(moving,
     world_from_drive = transform(20.0, -5.0, np.pi / 2)  # the wall is at x = 20 - WALL_Y
     cloud = point_cloud([recording], [world_from_drive @ poses])
     cloud = np.concatenate([cloud, cloud[:50] * [1, 1, 0] + [0, 0, 2.6]])  # branches above the road
-    path = tmp_path / "grid.yaml"
+    path = tmp_path / "grid #2.yaml"
     occupancy_grid(cloud, config=OccupancyConfig(cell_m=0.2)).save(path)
     assert occupancy_of(path, 20.0 - WALL_Y, 5.0) == 100
     assert occupancy_of(path, 20.0, 5.0) == 0
     assert occupancy_of(path, 20.0 - BOX_Y - 0.5, 9.0) == 0  # where the box drove
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["grid.pgm", "grid.yaml"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["grid #2.pgm", "grid #2.yaml"]
 
 
 def test_a_robot_drives_over_low_steps_and_beneath_high_points():
@@ -175,7 +194,7 @@ def test_a_robot_drives_over_low_steps_and_beneath_high_points():
 
 
 def test_a_grid_needs_points_and_the_right_name(tmp_path):
-    with pytest.raises(ValueError, match="expected points, found none"):
+    with pytest.raises(ValueError, match=r"expected finite points \(n, 3\), found none"):
         occupancy_grid(np.zeros((0, 3)))
     with pytest.raises(ValueError, match=r"expected a grid of at most \d+ cells, found"):
         occupancy_grid(np.array([[0.0, 0, 0], [1e5, 1e5, 0]]))

@@ -36,20 +36,21 @@ def las_scan(path: Path) -> Scan:
 
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
     """Yield the points of a .las or .laz file in blocks of `BLOCK_POINTS`, in metres. .laz files need lazrs."""
+    laspy_module(compressed=path.suffix.lower() == ".laz")
     laspy = _checked_laspy(path, one_scan=False)
-    if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
-        raise ImportError(f".laz files need lazrs: {install_command('las')}")
     with laspy.open(path) as stream:
         for block in stream.chunk_iterator(BLOCK_POINTS):
             yield np.stack(_coordinates(block, path), axis=1)
 
 
-def laspy_module() -> ModuleType:
-    """Return the module laspy. Raises ImportError if it is not installed."""
+def laspy_module(*, compressed: bool = False) -> ModuleType:
+    """Return the module laspy. Raises ImportError if it is not installed, or lazrs, which `compressed` files need."""
     try:
         import laspy
     except ImportError as error:
         raise ImportError(f".las files need laspy: {install_command('las')}") from error
+    if compressed and not laspy.LazBackend.detect_available():
+        raise ImportError(f".laz files need lazrs: {install_command('las')}")
     return laspy
 
 
