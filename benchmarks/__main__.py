@@ -30,6 +30,7 @@ PROGRAMS = {
     "poses pairs": Program("quality.poses", "pairs", "errors of pairs of revisits against their covariances"),
     "poses search": Program("quality.poses", "search", "roll, pitch and height of loops of whole drives"),
     "maps cloud": Program("quality.maps", "cloud", "relocalisation in a point cloud map"),
+    "maps moving": Program("quality.maps", "moving", "moving objects in a point cloud"),
     "maps sensors": Program("quality.maps", "sensors", "map of one sensor, queries of another"),
     "maps submaps": Program("quality.submaps", "recall", "recall of single scans and of submaps"),
     "sensors imu": Program("quality.sensors", "imu", "gravity of a sensor in a hand by IMU and ground"),

@@ -1,11 +1,12 @@
-"""Relocalisation in maps of another sensor: a map that is a point cloud, and maps of scans."""
+"""Maps: relocalisation of another sensor in a point cloud or a map of scans, and moving objects in a point cloud."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
 import sglpr_jax
 from benchmarks.drives import lidar, on_disk
@@ -16,10 +17,13 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.keyframes import Keyframe, describe_scan
+from sglpr_jax.maps.config import CloudConfig
+from sglpr_jax.maps.point_cloud import point_cloud
 from sglpr_jax.odometry.kiss_icp import scan_odometry
 from sglpr_jax.pose_graph.files import write_tum
-from sglpr_jax.se3 import distances, inverse, yaw_of
-from sglpr_jax.sim.recording import plan_sessions
+from sglpr_jax.se3 import distances, inverse, transformed, yaw_of
+from sglpr_jax.sim.labels import MOVING
+from sglpr_jax.sim.recording import SimulatedRecording, plan_sessions, simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 
 WELL_M, WELL_DEG, SURE = 0.5, 2.0, 0.99
@@ -230,3 +234,57 @@ def _locate(mapped: MappedDrive, queried: MappedDrive) -> Bool[np.ndarray, "3 n"
             results[1, i] = is_right(pose, true_pose)
             results[2, i] = np.hypot(*(pose - true_pose)[:2, 3]) > RIGHT_M and answers[0].probability >= SURE
     return results
+
+
+def moving(
+    *,
+    seeds: tuple[int, ...] = (61, 62),
+    sensors: tuple[str, ...] = ("hdl64e", "vlp16"),
+    scans: int = 100,
+    azimuth_steps: int | None = None,
+) -> None:
+    """Make point clouds of simulated drives with traffic, and count what is left of moving and of standing objects.
+
+    A voxel of the cloud moves if most points in it have a label of a moving object, and stands if none has.
+
+    Args:
+        seeds: one town for each.
+        sensors: names of the sensors.
+        scans: scans of each drive, four a second.
+        azimuth_steps: firings of a sensor per turn. None: its own number.
+    """
+    table = Table("sensor", "seed", "moving voxels", "removed", "standing voxels", "kept")
+    for sensor in sensors:
+        for seed in seeds:
+            drive = simulate_recording("08", scans=scans, seed=seed, sensor=lidar(sensor, azimuth_steps))
+            poses = drive.poses.world_from_lidar
+            every, kept = (
+                point_cloud([drive], [poses], config=CloudConfig(keep_moving=keep_moving))
+                for keep_moving in (True, False)
+            )
+            share_of = _moving_share(drive, poses)
+            before, after = share_of(every), share_of(kept)
+            removed = 1 - (after > 0.5).sum() / max((before > 0.5).sum(), 1)
+            table.add(
+                *(sensor, seed, (before > 0.5).sum(), f"{removed:.3f}"),
+                *((before == 0).sum(), f"{(after == 0).sum() / (before == 0).sum():.4f}"),
+            )
+
+
+def _moving_share(
+    drive: SimulatedRecording, poses: Float[np.ndarray, "n 4 4"]
+) -> Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m"]]:
+    """Function of points: the share of the drive's points in their voxels that have a label of a moving object."""
+
+    def voxels(points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
+        return np.floor(points / CloudConfig().voxel_m).astype(np.int64) @ [1, 1 << 20, 1 << 40]
+
+    numbers, moves = [], []
+    for row, pose in enumerate(poses):
+        scan = drive.scan(row, labels=True)
+        assert scan.points is not None and scan.labels is not None
+        numbers.append(voxels(transformed(pose, scan.points)))
+        moves.append(np.isin(scan.labels & 0xFFFF, list(MOVING.values())))
+    found, rows = np.unique(np.concatenate(numbers), return_inverse=True)
+    share = np.bincount(rows, weights=np.concatenate(moves)) / np.bincount(rows)
+    return lambda points: share[np.searchsorted(found, voxels(points)).clip(max=len(found) - 1)]

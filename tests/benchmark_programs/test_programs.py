@@ -30,6 +30,7 @@ RUN = (
     f"speed profile --preset {TINY} --steps 1",
     "speed loops --frames 40 --repeats 1 --azimuth-steps 90 --weights sglpr-small",
     "speed stages --scans 4 --rates 10 --weights sglpr-small",
+    "maps moving --seeds 1 --sensors vlp16 --scans 6 --azimuth-steps 90",
     "robustness hostile --source dds:93 --minutes 0.1 --rate 5 --scans 12 --weights sglpr-small",
     "fleet index --drives drawn.npz --places 2000 --queries 3",
     f"learned data --out learned --only test/town-601 train-images/vlp16-61 {SMALL}",
