@@ -15,7 +15,7 @@ def test_unknown_names_missing_folders_and_extras_are_named(tmp_path, said, monk
         open_source(f"folder:{tmp_path}/none", LiveOptions(), said)
     monkeypatch.setattr("sglpr_jax.live.sources_and_sinks.importlib.import_module", missing)
     with pytest.raises(
-        ImportError, match=r"dds: expected the package cyclonedds, found none; .* -m pip install .*cyclonedds"
+        ImportError, match=r"dds: expected the package cyclonedds, found none; .* install .*cyclonedds"
     ):
         open_source("dds", LiveOptions(), said)
 

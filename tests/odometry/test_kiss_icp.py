@@ -142,7 +142,7 @@ def test_images_and_a_missing_library_are_clear_errors(start, tmp_path, monkeypa
     with pytest.raises(ValueError, match=r"expected min_range_m < max_range_m = 5, found 6"):
         OdometryConfig(max_range_m=5.0, min_range_m=6.0)
     monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", None)
-    with pytest.raises(ImportError, match="kiss-icp: .* -m pip install .*kiss-icp"):
+    with pytest.raises(ImportError, match=r"kiss-icp: .* -m pip install .*kiss-icp"):
         kiss_icp.scan_odometry(start)
 
 

@@ -102,7 +102,7 @@ def test_of_a_recording_the_searched_frames_are_corrected(two_laps_odometry, sec
     np.testing.assert_array_equal(none.poses, two_laps_odometry[:90])
     assert none.inliers.shape == (0,)
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(ImportError, match="gtsam: .* -m pip install .*gtsam"):
+    with pytest.raises(ImportError, match=r"gtsam: .* -m pip install .*gtsam"):
         optimize_trajectory(found)
 
 

@@ -88,5 +88,5 @@ def test_without_the_extra_the_error_says_how_to_install_it(tmp_path, monkeypatc
     for name in [name for name in sys.modules if name.startswith("tensorboardX")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(ImportError, match="-m pip install .*tensorboard"):
+    with pytest.raises(ImportError, match=r"-m pip install .*tensorboard"):
         EventFiles(tmp_path / "tensorboard")
