@@ -14,9 +14,7 @@ def test_unknown_names_missing_folders_and_extras_are_named(tmp_path, said, monk
     with pytest.raises(FileNotFoundError, match=r"folder:.*: expected a folder"):
         open_source(f"folder:{tmp_path}/none", LiveOptions(), said)
     monkeypatch.setattr("sglpr_jax.live.sources_and_sinks.importlib.import_module", missing)
-    with pytest.raises(
-        ImportError, match=r"dds: expected the package cyclonedds, found none; .* install .*cyclonedds"
-    ):
+    with pytest.raises(ImportError, match=r"dds: expected the package cyclonedds, found none; .* install .*cyclonedds"):
         open_source("dds", LiveOptions(), said)
 
 
