@@ -8,7 +8,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[1] / "sglpr_jax"
 GROUND = "bev categories extras fields files frame_log grid growing labels losses metrics numpy_files progress revisits"
 FLOORS = (
-    (*GROUND.split(), "same_place", "schema", "se3", "stop_request"),
+    (*GROUND.split(), "same_place", "schema", "se3", "stop_request", "voxels"),
     ("data",),
     ("models", "sim"),
     ("methods",),

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.cloud import CloudOptions
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import (
     AUTO,
+    CloudOptions,
     DetectorFlags,
     PosedRecordingOptions,
     SubmapOptions,

@@ -7,8 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.cloud import CloudOptions
-from sglpr_jax.cli.recording import AUTO, RecordingOptions, SubmapOptions, beside, open_with_odometry, report_bad_scan
+from sglpr_jax.cli.recording import (
+    AUTO,
+    CloudOptions,
+    RecordingOptions,
+    SubmapOptions,
+    beside,
+    open_with_odometry,
+    report_bad_scan,
+)
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.files import exclusive_lock, naming

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, Num
 
+from sglpr_jax.voxels import one_per_voxel
+
 CELL_M = 0.4
 """Edge of a cell of the ground, in metres."""
 GROUND_M = 0.25
@@ -162,8 +164,8 @@ SAMPLED_TILES, SAMPLED_POINTS = 9, 500
 """Number of tiles in which the spacing is measured, and maximum number of points of each."""
 NEIGHBOURS = 4
 """Number of neighbours of a point in a regular grid of points on a surface."""
-_TILES, _VOXELS = 1 << 24, 1 << 21
-"""Number of tiles and of voxels in a row, for numbering them: more than any cloud has."""
+_TILES = 1 << 24
+"""Number of tiles in a row, for numbering them: more than any cloud has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +221,7 @@ def tiled_cloud(
         highest = np.maximum(highest, points.max(axis=0, initial=-np.inf))
         points -= origin
         near_points = points[np.isin(_tile_numbers(points[:, :2]), near_tiles)].astype(np.float32)
-        pending.append(_one_per_voxel(near_points))
+        pending.append(one_per_voxel(near_points, VOXEL_M))
         if sum(map(len, pending)) > len(stored):  # not for each block: this sorts all points
             stored, pending = _merged([stored, *pending], source), []
     stored = _merged([stored, *pending], source)
@@ -237,7 +239,7 @@ def tiled_cloud(
 
 def _merged(clouds: list[Float32[np.ndarray, "_ 3"]], source: Path) -> Float32[np.ndarray, "m 3"]:
     """Join clouds and keep one point per voxel. Raises ValueError for more than `MOST_POINTS` points."""
-    points = _one_per_voxel(np.concatenate(clouds))
+    points = one_per_voxel(np.concatenate(clouds), VOXEL_M)
     if len(points) > MOST_POINTS:
         raise ValueError(
             f"{source}: expected at most {MOST_POINTS} points in voxels of {VOXEL_M:g} m near the trajectory, found"
@@ -258,13 +260,6 @@ def _tiles_around(xy: Float[np.ndarray, "n 2"], reach_m: float) -> Int64[np.ndar
     steps_m = (np.arange(-reach_tiles, reach_tiles + 1) * TILE_M).clip(-reach_m, reach_m)
     offsets_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)  # every tile has at least one
     return np.unique(_tile_numbers((np.unique(xy, axis=0)[:, None] + offsets_m).reshape(-1, 2)))
-
-
-def _one_per_voxel(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
-    """Return the first point of each voxel, in their order."""
-    x, y, z = np.floor(points.T.astype(np.float64) / VOXEL_M).astype(np.int64) % _VOXELS
-    _, first_rows = np.unique((z * _VOXELS + y) * _VOXELS + x, return_index=True)
-    return points[np.sort(first_rows)]
 
 
 def _spacing_m(points: Float32[np.ndarray, "n 3"], starts: Int64[np.ndarray, " t"]) -> float:

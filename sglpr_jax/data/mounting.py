@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from sglpr_jax.data.choices import Scale
+from sglpr_jax.voxels import one_per_voxel
 
 MODEL_HEIGHT_M = 1.73
 """Sensor height that all shipped weights assume, in metres: that of KITTI's Velodyne and of the simulator."""
@@ -129,7 +130,7 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"], *, near: Mounting | No
     Example:
       mounting = estimate_mounting(recording.points(0))
     """
-    cloud = _one_per_voxel(points)
+    cloud = _near_points(points)
     cloud = cloud[:: len(cloud) // MOST_POINTS + 1]
     sample = cloud if near is None else cloud[:: len(cloud) // NEAR_POINTS + 1]
     if len(sample) < LEAST_POINTS:
@@ -170,15 +171,13 @@ def common_mounting(mountings: Iterable[Mounting | None]) -> Mounting | None:
     return common
 
 
-def _one_per_voxel(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+def _near_points(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Return the first point of each voxel, of the points 0.8 to 25 m from the sensor."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = points.T.astype(np.float64)
         distance = np.sqrt(x * x + y * y + z * z)  # NaN and infinity fail the next test.
         near = points[(distance > NEAR_M[0]) & (distance < NEAR_M[1])].astype(np.float64)
-    x, y, z = np.floor(near.T / VOXEL_M).astype(np.int64) + 128  # from 0 to 255, because points are within 25 m
-    _, first_rows = np.unique((z * 256 + y) * 256 + x, return_index=True)
-    return near[np.sort(first_rows)]
+    return one_per_voxel(near, VOXEL_M)
 
 
 def _sampled_planes(

@@ -15,6 +15,7 @@ from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
 from sglpr_jax.se3 import transformed, travelled
+from sglpr_jax.voxels import one_per_voxel
 
 KEYFRAME_M = 5.0
 """Travelled distance between two scans in the file, in metres."""
@@ -105,8 +106,7 @@ def _log_map(
 def _thinned_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
     """Return the first finite point in each voxel."""
     finite = points[np.isfinite(points).all(axis=1)]
-    _, first_rows = np.unique(np.floor(finite / VOXEL_M).astype(np.int64), axis=0, return_index=True)
-    return finite[first_rows]
+    return one_per_voxel(finite, VOXEL_M)
 
 
 def _log_loops(rerun: Any, stream: Any, result: LoopSearchResult, poses: Float[np.ndarray, "n 4 4"] | None) -> None:

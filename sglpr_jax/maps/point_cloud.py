@@ -18,6 +18,7 @@ from sglpr_jax.files import warn
 from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.maps.config import CloudConfig
 from sglpr_jax.se3 import transformed
+from sglpr_jax.voxels import ABOVE, one_per_voxel, voxel_numbers
 
 BLOCK_M = 0.3
 """Edge of the blocks of space that are seen through or not, in metres."""
@@ -39,8 +40,6 @@ TILE_M = 10.0
 """Edge of the tiles in which blocks are found, in metres."""
 PosedPoints = tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "_ 3"]]
 """Pose of a scan, and its points in the LiDAR frame."""
-_ROW = 1 << 21
-"""Number of voxels in a row, for numbering them."""
 
 
 def point_cloud(
@@ -97,10 +96,10 @@ def point_cloud(
     for origin_from_lidar, points in scans(on_bad_scan):
         moved = transformed(origin_from_lidar, points).astype(np.float32)
         blocks.add(moved)
-        pending.append(_one_per_voxel(moved, config.voxel_m))
+        pending.append(one_per_voxel(moved, config.voxel_m))
         if sum(map(len, pending)) > len(stored):  # not for each scan: this sorts all points
-            stored, pending = _one_per_voxel(np.concatenate([stored, *pending]), config.voxel_m), []
-    stored = _one_per_voxel(np.concatenate([stored, *pending]), config.voxel_m)
+            stored, pending = one_per_voxel(np.concatenate([stored, *pending]), config.voxel_m), []
+    stored = one_per_voxel(np.concatenate([stored, *pending]), config.voxel_m)
     if not len(stored):
         raise ValueError(f"{recordings[0].name}: expected scans with points, found none")
     if not config.keep_moving:
@@ -117,7 +116,7 @@ def require_points(recording: Recording) -> None:
 
 def _warn_of_tilt(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> None:
     """Issue a `DataWarning` if up is not nearly the z axis of the poses, on which ground and grid rest."""
-    ups = np.einsum("nij,nkj->nik", world_from_lidar[:, :3, :3], recording.uprights[:, :3, :3])[:, :, 2]
+    ups = np.einsum("nij,nj->ni", world_from_lidar[:, :3, :3], recording.uprights[:, 2, :3])
     x, y, z = ups.mean(axis=0) if len(ups) else (0.0, 0.0, 1.0)
     tilt_deg = np.degrees(np.arctan2(np.hypot(x, y), z))
     if tilt_deg > STEEPEST_DEG:
@@ -141,19 +140,9 @@ def _spaced(positions: Float[np.ndarray, "n 3"], spacing_m: float) -> list[int]:
     return rows
 
 
-def _voxel_numbers(points: Float[np.ndarray, "n 3"], edge_m: float) -> Int64[np.ndarray, " n"]:
-    x, y, z = np.floor(points.T / edge_m).astype(np.int64) + _ROW // 2
-    return (z * _ROW + y) * _ROW + x
-
-
 def _tile_numbers(points: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    column, row = np.floor(points[:, :2].T / TILE_M).astype(np.int64) + _ROW // 2
-    return row * _ROW + column
-
-
-def _one_per_voxel(points: Float[np.ndarray, "n 3"], edge_m: float) -> Float[np.ndarray, "m 3"]:
-    """Return the first point of each voxel."""
-    return points[np.unique(_voxel_numbers(points, edge_m), return_index=True)[1]]
+    """Return the number of the tile of each point. A tile has all heights."""
+    return voxel_numbers(points * [1, 1, 0], TILE_M)
 
 
 class _Blocks:
@@ -165,7 +154,7 @@ class _Blocks:
 
     def add(self, points: Float[np.ndarray, "n 3"]) -> None:
         """Count the blocks of a scan, given its points in the world."""
-        self._pending.append(np.unique(_voxel_numbers(points, BLOCK_M)))
+        self._pending.append(np.unique(voxel_numbers(points, BLOCK_M)))
         if sum(map(len, self._pending)) > len(self._numbers):
             self._merge()
 
@@ -183,7 +172,7 @@ class _Blocks:
         a point in them. `scans` yields poses and points in the LiDAR frame.
         """
         self._merge()
-        block_of_point = np.searchsorted(self._numbers, _voxel_numbers(points, BLOCK_M))
+        block_of_point = np.searchsorted(self._numbers, voxel_numbers(points, BLOCK_M))
         size = np.bincount(block_of_point, minlength=len(self._numbers))  # 0 if other blocks have the voxels' points
         sums = [np.bincount(block_of_point, weights=axis, minlength=len(size)) for axis in points.T]
         centres = np.stack(sums, axis=1) / size.clip(1)[:, None]  # of the points: a surface fills a part of its block
@@ -200,8 +189,8 @@ class _Blocks:
             rows = np.concatenate(near)
             seen[rows[_seen_through(scan_points, (centres[rows] - position) @ origin_from_lidar[:3, :3])]] += 1
         is_moving = (size > 0) & (seen >= LEAST_SEEN) & (seen > self._hits)
-        below = np.searchsorted(self._numbers, self._numbers - _ROW**2)
-        has_below = self._numbers[below] == self._numbers - _ROW**2
+        below = np.searchsorted(self._numbers, self._numbers - ABOVE)
+        has_below = self._numbers[below] == self._numbers - ABOVE
         for _ in range(LAYERS):  # the sky returns no points, so no scan sees through upper parts
             is_moving |= has_below & is_moving[below] & (self._hits <= self._hits[below])
         return is_moving[block_of_point]
