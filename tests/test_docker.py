@@ -27,7 +27,7 @@ def test_copied_files_exist_and_are_not_ignored():
     ignored = (ROOT / "docker" / "Dockerfile.dockerignore").read_text().splitlines()
     copies = re.findall(r"^COPY (?!--from)(?:--\S+ )?(.+) \S+$", DOCKERFILE, re.MULTILINE)
     names = " ".join(copies).split()
-    assert len(names) == 6
+    assert len(names) == 7
     for name in names:
         assert (ROOT / name).exists() and f"!{name.partition('/')[0]}" in ignored
 

@@ -14,7 +14,7 @@ setup(
         ("share/sglpr_ros/launch", ["launch/sglpr.launch.py"]),
         ("share/sglpr_ros/config", ["config/sglpr.yaml"]),
     ],
-    install_requires=["setuptools", "sglpr-jax[live]"],
+    install_requires=["setuptools"],  # sglpr-jax is on no index: README.md installs it
     entry_points={"console_scripts": ["sglpr = sglpr_ros.node:main"]},
     zip_safe=True,
 )

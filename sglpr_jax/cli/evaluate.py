@@ -8,7 +8,7 @@ import tyro
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
-from sglpr_jax.cli.runtime import console
+from sglpr_jax.cli.runtime import console, open_page
 from sglpr_jax.data.choices import PoseFormat
 
 if TYPE_CHECKING:
@@ -63,10 +63,13 @@ class EvaluateCommand:
     weights: str | None = None
     """Name of shipped weights or folder of a training run. With --data, the page then shows semantic maps and feature
     heat maps."""
+    open: bool = False
+    """Open the page in a browser."""
 
 
 def evaluate_file(command: EvaluateCommand) -> None:
-    from sglpr_jax.evaluation.evaluation_page import NUMBERS, write_evaluation  # slow imports, not needed for --help
+    # Slow imports, not needed for --help.
+    from sglpr_jax.evaluation.evaluation_page import NUMBERS, PAGE, write_evaluation
     from sglpr_jax.evaluation.sessions import evaluate_sessions
     from sglpr_jax.files import check_writable
 
@@ -81,6 +84,8 @@ def evaluate_file(command: EvaluateCommand) -> None:
         evaluation, pictures = _evaluate_recording(command)
     for path in (*write_evaluation(evaluation, folder, pictures), record_command(command, folder)):
         print(f"written: {path}")
+    if command.open:
+        open_page(folder / PAGE)
 
 
 def _evaluate_recording(command: EvaluateCommand) -> "tuple[Evaluation, Pictures | None]":

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -19,6 +19,7 @@ from sglpr_jax.cli.recording import (
     open_with_odometry,
     report_bad_scan,
 )
+from sglpr_jax.cli.runtime import open_page, with_installed_names
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.extras import install_command
 from sglpr_jax.files import exclusive_lock
@@ -27,6 +28,9 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.stop_request import stop_on_signal
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 UNFINISHED = "unfinished"
 """Folder of the checkpoint of a running command, inside the output folder."""
@@ -91,6 +95,8 @@ class LoopsCommand(DetectorFlags):
     plain walls: `keep` writes these loops with that information matrix, and `drop` rejects them."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
+    open: bool = False
+    """Open the page in a browser."""
 
     @property
     def folder(self) -> Path:
@@ -112,13 +118,14 @@ class LoopsCommand(DetectorFlags):
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
-    _check_flags(command)
+    check_flags(command)
     with exclusive_lock(command.folder / UNFINISHED):
         return _search_and_write(command)
 
 
-def _check_flags(command: LoopsCommand) -> None:
+def check_flags(command: LoopsCommand) -> None:
     """Raise ValueError if flags are inconsistent or an input would be overwritten, ImportError without an extra."""
+    from sglpr_jax.odometry import kiss_icp  # slow imports, not needed for --help
     from sglpr_jax.pose_graph.factor_graph import gtsam_library
     from sglpr_jax.pose_graph.folder import TRAJECTORIES
 
@@ -137,6 +144,8 @@ def _check_flags(command: LoopsCommand) -> None:
         raise ValueError("--poses and --times are those of one recording, found several recordings")
     if command.odometry is None and command.optimize:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
+    if command.odometry == AUTO:
+        kiss_icp.check_installed()
     if command.optimize:
         gtsam_library()
     command.output.check(recordings, submap_m=command.submap.submap_m)
@@ -161,7 +170,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     from sglpr_jax.loops.search import can_register, find_loops
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.pose_graph.folder import write_loop_folder
-    from sglpr_jax.pose_graph.optimize import optimize_trajectory, placements
+    from sglpr_jax.pose_graph.optimize import describe_errors, optimize_trajectory, placements
 
     params, out, checkpoint = load(command.weights), command.folder, command.folder / UNFINISHED
     detector = command.detector  # raises an error for invalid settings before the recordings are opened
@@ -204,9 +213,9 @@ def _search_and_write(command: LoopsCommand) -> int:
         write_rerun(result, command.rerun, optimized=optimized)
     print(result, *diagnose_no_loops(result), *why_rejected(result.rejected), sep="\n")
     if optimized is not None:
-        print(optimized)
-    print(f"{out}: {', '.join(path.name for path in paths)}")
+        print(optimized, *describe_errors(result, optimized), sep="\n")
     if not result.whole:  # a signal stopped the search
+        _print_files(out / PAGE, paths)
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     if optimized is not None and command.output.any:
@@ -225,4 +234,30 @@ def _search_and_write(command: LoopsCommand) -> int:
     delete_checkpoint(checkpoint)
     for path in odometry_checkpoints:
         path.unlink(missing_ok=True)
+    if command.rerun is not None:
+        print(f"{command.rerun}: for the viewer, rerun {command.rerun}")
+    _print_files(out / PAGE, paths)
+    if next_step := _next_step(command):
+        print(with_installed_names(f"next: {next_step}"), file=sys.stderr)
+    if command.open:
+        open_page(out / PAGE)
     return 0
+
+
+def _print_files(page: Path, paths: "Sequence[Path]") -> None:
+    """Print the names of the written files of a folder, and then the path of its page."""
+    print(f"{page.parent}: {', '.join(path.name for path in paths if path != page)}\npage: {page}")
+
+
+def _next_step(command: LoopsCommand) -> str:
+    """Return what the user may do after this command, or an empty text."""
+    if command.odometry is None:
+        return "--odometry auto --optimize computes odometry from the scans and corrects it"
+    if not command.optimize:
+        return "--optimize corrects the odometry"
+    if not command.output.any:
+        return "--cloud map.ply --grid map.yaml writes the scans in one frame, along the corrected trajectory"
+    if len(command.recordings) > 1:
+        return ""
+    trajectory = command.folder / "trajectory-optimized.tum"
+    return f"bin/map {command.recordings[0]} --poses {trajectory} makes a map in which bin/relocalize finds scans"

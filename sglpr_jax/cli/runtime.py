@@ -13,6 +13,7 @@ import re
 import sys
 import tempfile
 import warnings
+import webbrowser
 from collections.abc import Callable
 from importlib.metadata import distribution
 from pathlib import Path
@@ -202,6 +203,16 @@ def print_error(text: str) -> None:
     """Print a line on stderr at once. A closed terminal does not end the command."""
     with contextlib.suppress(OSError):
         print(text, file=sys.stderr, flush=True)
+
+
+def open_page(page: Path) -> None:
+    """Open a page in the user's browser. Without a desktop, as over ssh, do nothing: the command has printed its path.
+
+    Browsers of the terminal are not used, because they would take it over.
+    """
+    if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        return
+    webbrowser.open(page.resolve().as_uri())
 
 
 def console() -> Console:

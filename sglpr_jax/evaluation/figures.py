@@ -30,15 +30,15 @@ LEGEND_INSIDE: Mapping[str, Any] = {"loc": "best", "framealpha": 0.95}
 BLUE, RED = "#2b5fc4", "#d62728"
 
 DECISIONS = {
-    Decision.NOT_A_QUERY: ("not a query", "#c8c8c8", 4),
-    Decision.TRUE_NEGATIVE: ("true negative", BLUE, 5),
+    Decision.NOT_A_QUERY: ("not a query", "#d4d4d4", 4),
+    Decision.TRUE_NEGATIVE: ("true negative", "#a9a9a9", 5),
     Decision.UNCOUNTED: ("not counted", "#8ab6e8", 5),
-    Decision.TRUE_POSITIVE: ("true positive", RED, 12),
+    Decision.TRUE_POSITIVE: ("true positive", BLUE, 12),
     Decision.FALSE_NEGATIVE: ("false negative", "#000000", 12),
-    Decision.FALSE_POSITIVE: ("false positive", "#f0a000", 12),
+    Decision.FALSE_POSITIVE: ("false positive", RED, 12),
 }
-"""Name, colour (red, black and blue as in figure 6) and size in square points of the dots of each decision, in drawing
-order: mistakes are on top."""
+"""Name, colour and size in square points of the dots of each decision, in drawing order: mistakes are on top. Red is
+the colour of wrong matches in all figures. In figure 6 of the paper it is that of true positives."""
 
 
 def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
@@ -84,8 +84,9 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str =
 def trajectory(
     positions: Float[np.ndarray, "n 3"], decisions: Int[np.ndarray, " n"], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
-    """Draw the position of every frame from above, coloured by its `Decision` (figure 6)."""
-    figure, axes = axes_from_above(positions, title=title)
+    """Draw the position of every frame from above, coloured by its `Decision`, as figure 6 does."""
+    figure, (axes,) = axes_from_above(positions)
+    axes.set_title(title)
     for decision, (name, colour, size) in DECISIONS.items():
         x, y = positions[decisions == decision, :2].T
         if len(x):
@@ -179,30 +180,29 @@ def _show_image(axes: "matplotlib.axes.Axes", title: str, image: Float[np.ndarra
 
 
 def loops(
-    positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]], *, wrong: Sequence[tuple[int, int]] = ()
+    trajectories: Mapping[str, Float[np.ndarray, "n 3"]],
+    pairs: Sequence[tuple[int, int]],
+    *,
+    wrong: Sequence[tuple[int, int]] = (),
 ) -> "matplotlib.figure.Figure":
-    """Draw a trajectory and a line for each loop (query, match), from above. `wrong` loops are red and on top."""
-    figure, axes = axes_from_above(positions)
-    axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
-    groups = [("loops", pairs, BLUE, 3)]
-    if wrong:
-        groups.append(("wrong", wrong, RED, 4))
-    for name, loop_frames, colour, layer in groups:
-        for query, match in loop_frames:
-            axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
-        queries = positions[[query for query, _ in loop_frames], :2]
-        axes.scatter(*queries.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(loop_frames)})", zorder=layer)
-    axes.legend(**LEGEND_INSIDE)
-    return figure
+    """Draw a drive from above, as each of the named trajectories side by side, with a line for each loop.
 
-
-def trajectories(positions_by_name: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
-    """Draw up to three trajectories from above. The first one is grey. A dot marks the end of each trajectory."""
-    figure, axes = axes_from_above(np.concatenate(list(positions_by_name.values())))
-    for (name, positions), colour in zip(positions_by_name.items(), ("0.6", BLUE, RED), strict=False):
-        axes.plot(*positions[:, :2].T, color=colour, linewidth=1.2, label=name)
-        axes.plot(*positions[-1, :2], "o", color=colour, markersize=4)
-    axes.legend(**LEGEND_INSIDE)
+    `pairs` and `wrong` loops are (query, match). `wrong` loops are red and on top.
+    """
+    figure, panels = axes_from_above(np.concatenate(list(trajectories.values())), panels=len(trajectories))
+    for axes, (title, positions) in zip(panels, trajectories.items(), strict=True):
+        axes.set_title(title)
+        axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
+        groups = [("loops", pairs, BLUE, 3)]
+        if wrong:
+            groups.append(("wrong", wrong, RED, 4))
+        for name, loop_frames, colour, layer in groups:
+            for query, match in loop_frames:
+                axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
+            queries = positions[[query for query, _ in loop_frames], :2]
+            label = f"{name} ({len(loop_frames)})"
+            axes.scatter(*queries.T, s=9, color=colour, linewidths=0, label=label, zorder=layer)
+    panels[-1].legend(**LEGEND_INSIDE)
     return figure
 
 
@@ -210,7 +210,7 @@ def loops_between(
     positions_by_name: Mapping[str, Float[np.ndarray, "_ 3"]], pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> "matplotlib.figure.Figure":
     """Draw the trajectories of several recordings from above. A line connects the two positions of each of `pairs`."""
-    figure, axes = axes_from_above(np.concatenate(list(positions_by_name.values())))
+    figure, (axes,) = axes_from_above(np.concatenate(list(positions_by_name.values())))
     for name, positions in positions_by_name.items():
         axes.plot(*positions[:, :2].T, linewidth=1.2, label=name)
     for query_and_match in pairs:
@@ -271,7 +271,7 @@ def overlaid(
 ) -> Float[np.ndarray, "n n 3"]:
     """Overlay the density images of a query and its match, as RGB colours from 0 to 1.
 
-    The match is red. The query, transformed to the frame of the match, is cyan. Cells occupied in both are white.
+    The match is green. The query, transformed to the frame of the match, is magenta. Cells occupied in both are white.
     """
     centre, pixels_per_m = (len(match) - 1) / 2, 1 / resolution_m
     # From (x, y, 1) in metres to (row, column, 1) in pixels. Rows run towards -y, columns towards x.
@@ -279,9 +279,9 @@ def overlaid(
     in_plane = inverse(match_from_query)[np.ix_([0, 1, 3], [0, 1, 3])]  # without z
     query_from_match = pixel_from_metres @ in_plane @ np.linalg.inv(pixel_from_metres)
     moved_query = affine_transform(np.asarray(query, np.float64), query_from_match, order=1, mode="grid-constant")
-    red = np.sqrt(np.asarray(match, np.float64) / max(float(match.max()), 1e-9))
-    cyan = np.sqrt(moved_query / max(float(moved_query.max()), 1e-9))
-    return np.stack([red, cyan, cyan], axis=-1)
+    green = np.sqrt(np.asarray(match, np.float64) / max(float(match.max()), 1e-9))
+    magenta = np.sqrt(moved_query / max(float(moved_query.max()), 1e-9))
+    return np.stack([magenta, green, magenta], axis=-1)
 
 
 def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -297,13 +297,18 @@ def new_figure(width: float, height: float) -> "matplotlib.figure.Figure":
 
 
 def axes_from_above(
-    positions: Float[np.ndarray, "n 3"], *, title: str = ""
-) -> "tuple[matplotlib.figure.Figure, matplotlib.axes.Axes]":
+    positions: Float[np.ndarray, "n 3"], *, panels: int = 1
+) -> "tuple[matplotlib.figure.Figure, list[matplotlib.axes.Axes]]":
     """Return an empty figure for a drive seen from above, and its axes in metres. A flat drive gets a flat figure."""
     extent_x_m, extent_y_m = np.ptp(positions[:, :2], axis=0)
-    figure = new_figure(7.0, float(np.clip(1.8 + 5.6 * extent_y_m / max(extent_x_m, 1e-9), 3.0, 5.6)))
-    axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
-    return figure, axes
+    width = 7.0 if panels == 1 else 5.0
+    height = float(np.clip(1.8 + 0.8 * width * extent_y_m / max(extent_x_m, 1e-9), 3.0, 5.6))
+    figure = new_figure(panels * width, height)
+    all_axes = list(figure.subplots(1, panels, sharex=True, sharey=True, squeeze=False)[0])
+    for axes in all_axes:
+        axes.set(xlabel="x [m]")
+        axes.set_aspect("equal", adjustable="datalim" if panels == 1 else "box")  # shared axes need a box
+        axes.grid(color="0.92")
+        axes.set_axisbelow(True)
+    all_axes[0].set_ylabel("y [m]")
+    return figure, all_axes

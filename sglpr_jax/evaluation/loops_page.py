@@ -1,4 +1,4 @@
-"""HTML page of the loops within and between recordings: trajectories, matched images, probabilities, rejected pairs."""
+"""HTML page of the loops within and between recordings: trajectories, rejected pairs, probabilities, matched images."""
 
 from collections.abc import Iterable, Sequence
 
@@ -15,7 +15,7 @@ from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.loops.result import LoopSearchResult, diagnose_no_loops
 from sglpr_jax.odometry.path import level_odometry
-from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements, trajectory_error
+from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, describe_errors, placements
 from sglpr_jax.same_place import NEGATIVE_M
 from sglpr_jax.se3 import yaw_of
 
@@ -57,24 +57,24 @@ def _summary(result: LoopSearchResult) -> str:
 
 
 def _recording_sections(result: LoopSearchResult, optimized: OptimizedTrajectory | None) -> list[Section]:
-    """Return the sections about one recording. With an `optimized` trajectory, one section is about the correction."""
+    """Return the sections about one recording. With an `optimized` trajectory, the first one shows the correction."""
     session = result.sessions[0]
     overlays = _overlay_picture(session.recording, session.recording, result.loops, without_loops="No loops.")
     sections = [
         Section("Why no loops", [Text(reason) for reason in diagnose_no_loops(result)]),
-        Section("Trajectory", _trajectory_pictures(result)),
-        Section("Corrected", [_correction_picture(result, optimized)] if optimized and session.frames else []),
-        Section("Pairs", [overlays]),
-        Section("Loops", [_loop_table(result)]),
+        Section("Trajectory", _trajectory_blocks(result, optimized)),
         Section("Rejected", _rejection_blocks(result.rejected)),
+        Section("Loops", [*_time_pictures(result), _loop_table(result)]),
+        Section("Pairs", [overlays]),
         Section("Reliability", _reliability_blocks(result)),
     ]
     return [section for section in sections if section.blocks]
 
 
-def _trajectory_pictures(result: LoopSearchResult) -> list[Picture | Text]:
-    """Draw the loops on the trajectory (odometry or, without it, known positions), and the match of each query."""
-    session = result.sessions[0]
+def _trajectory_blocks(result: LoopSearchResult, optimized: OptimizedTrajectory | None) -> list[Picture | Text]:
+    """Draw the loops on the trajectory: odometry, also the corrected one, or known positions if there is no odometry.
+    Texts above give the size and the error of the correction."""
+    session, texts = result.sessions[0], []
     if not session.frames:
         return [missing("No scan was processed.")]
     positions, source = session.recording.positions, session.recording.pose_source
@@ -83,19 +83,32 @@ def _trajectory_pictures(result: LoopSearchResult) -> list[Picture | Text]:
     if positions is not None and result.loops:
         wrong_share = f"{len(wrong)} of {len(result.loops)} loops are wrong{' (red)' if wrong else ''}"
         quality = f"{wrong_share}: more than {NEGATIVE_M:g} m apart by {source}."
+    trajectories = {} if positions is None else {"positions": positions[: session.frames]}
     if session.odometry is not None:
-        positions, source = level_odometry(session.odometry, session.recording.uprights)[:, :3, 3], "the odometry"
-    pictures = []
-    if positions is not None:
-        caption = f"The trajectory from {source}. A line connects the two frames of each loop. {quality}"
-        not_wrong = [pair for pair in _frame_pairs(result.loops) if pair not in set(wrong)]
-        plot = figures.loops(positions[: session.frames], not_wrong, wrong=wrong)
-        pictures.append(figure_picture(plot, "The loops on the trajectory", caption=caption))
+        uprights, source = session.recording.uprights[: session.frames], "the odometry"
+        paths = {"odometry": session.odometry[: session.frames]}
+        if optimized is not None:
+            texts = [Text(_as_sentence(text)) for text in (str(optimized), *describe_errors(result, optimized))]
+            paths["corrected"] = optimized.poses
+        trajectories = {name: level_odometry(poses, uprights)[:, :3, 3] for name, poses in paths.items()}
+    if not trajectories:
+        return []
+    caption = f"The trajectory from {source}. A line connects the two frames of each loop. {quality}"
+    not_wrong = [pair for pair in _frame_pairs(result.loops) if pair not in set(wrong)]
+    plot = figures.loops(trajectories, not_wrong, wrong=wrong)
+    return [*texts, figure_picture(plot, "The loops on the trajectory", caption=caption)]
+
+
+def _time_pictures(result: LoopSearchResult) -> list[Picture]:
+    """Plot the match of each query, also of the rejected pairs."""
+    if not result.loops and not result.rejected:
+        return []
+    wrong = _frame_pairs(wrong_loops(result))
     probabilities = [(loop.query, loop.match, loop.probability) for loop in result.loops]
     rejected = _frame_pairs(rejection.loop for rejection in result.rejected)
-    plot = figures.loops_in_time(probabilities, session.frames, wrong=wrong, rejected=rejected)
+    plot = figures.loops_in_time(probabilities, result.sessions[0].frames, wrong=wrong, rejected=rejected)
     caption = "The match of each query. Rejected pairs are grey." if rejected else "The match of each query."
-    return [*pictures, figure_picture(plot, "The loops in time", caption=caption)]
+    return [figure_picture(plot, "The loops in time", caption=caption)]
 
 
 def wrong_loops(result: LoopSearchResult) -> list[LoopClosure]:
@@ -114,27 +127,9 @@ def _frame_pairs(loops: Iterable[LoopClosure]) -> list[tuple[int, int]]:
     return [(loop.query, loop.match) for loop in loops]
 
 
-def _correction_picture(result: LoopSearchResult, optimized: OptimizedTrajectory) -> Picture:
-    """Draw the trajectory before and after the correction, with the position errors if true positions are known."""
-    session = result.sessions[0]
-    assert session.odometry is not None
-    trajectories = {"odometry": session.odometry[: session.frames], "optimized": optimized.poses}
-    caption = _as_sentence(optimized)
-    true_positions = session.recording.positions
-    if true_positions is not None and session.frames > 2:
-        true_positions = true_positions[: session.frames]
-        errors_m = {name: trajectory_error(poses, true_positions) for name, poses in trajectories.items()}
-        errors = ", ".join(f"{name} {error:.2f} m" for name, error in errors_m.items())
-        caption += f" Position error (RMSE after alignment with {session.recording.pose_source}): {errors}."
-    uprights = session.recording.uprights[: session.frames]
-    positions = {name: level_odometry(poses, uprights)[:, :3, 3] for name, poses in trajectories.items()}
-    return figure_picture(figures.trajectories(positions), "The trajectory before and after", caption=caption)
-
-
-def _as_sentence(optimized: OptimizedTrajectory) -> str:
-    """Return the summary of the correction with a capital and a full stop."""
-    summary = str(optimized)
-    return f"{summary[0].upper()}{summary[1:]}."
+def _as_sentence(line: str) -> str:
+    """Return a line of a summary with a capital and a full stop."""
+    return f"{line[0].upper()}{line[1:]}."
 
 
 def _reliability_blocks(result: LoopSearchResult) -> list[Picture | Text | TextTable]:
@@ -169,7 +164,7 @@ def _overlay_picture(
         loop = loops[row]
         title = f"query {query.numbers[loop.query]}, match {match.numbers[loop.match]}"
         images[title] = overlaid_scans(query, match, loop)
-    caption = "Match in red, query in cyan; cells with points of both are white. Pairs are spread over the recording."
+    caption = "Match in green, query in magenta, points of both in white. The pairs are spread over the recording."
     return figure_picture(figures.overlays(images), "Pairs of images", caption=caption)
 
 
@@ -266,7 +261,7 @@ def _common_frame_sections(
             if loop.match_session != loop.query_session and {loop.match_session, loop.query_session} <= set(positions)
         ]
         caption = f"The odometry in the frame of {names[first]}. A line connects the two scans of each loop."
-        caption = caption if optimized is None else f"{_as_sentence(optimized)} Frame of {names[first]}."
+        caption = caption if optimized is None else f"{_as_sentence(str(optimized))} Frame of {names[first]}."
         plot = figures.loops_between({names[session]: path for session, path in positions.items()}, pairs)
         pictures.append(figure_picture(plot, "Trajectories in one frame", caption=caption))
     return [Section("Together", pictures)] if pictures else []

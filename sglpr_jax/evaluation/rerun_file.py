@@ -73,7 +73,7 @@ def _map_poses(result: LoopSearchResult, optimized: OptimizedTrajectory | None) 
 def _viewer_layout(*, with_map: bool) -> Any:
     """Return a blueprint of the viewer: on the left the map, if there is one; on the right images, plots and texts."""
     views = importlib.import_module("rerun.blueprint")
-    images = views.Spatial2DView(origin="pair", name="Query (cyan) on match (red)")
+    images = views.Spatial2DView(origin="pair", name="Query (magenta) on match (green)")
     plots = views.TimeSeriesView(origin="evidence", name="Evidence")
     texts = views.TextLogView(origin="evidence/loop", name="Loops")
     maps = [views.Spatial3DView(origin="map", name="Map")] if with_map else []

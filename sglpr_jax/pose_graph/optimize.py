@@ -284,6 +284,22 @@ def _deviations_at_loops(
     return np.array(largest)
 
 
+def describe_errors(result: LoopSearchResult, optimized: OptimizedTrajectory) -> list[str]:
+    """Return a line with the position errors before and after the correction for each session with true positions."""
+    lines = []
+    for session, corrected in zip(result.sessions, result.split(optimized.poses), strict=True):
+        positions = session.recording.positions
+        if positions is None or session.odometry is None or session.frames < 3:  # fewer points define no alignment
+            continue
+        true = positions[: session.frames]
+        before_m, after_m = (trajectory_error(poses[: session.frames], true) for poses in (session.odometry, corrected))
+        lines.append(
+            f"position error of {session.recording.name}: {before_m:.2f} m before the correction, {after_m:.2f} m "
+            f"after it (RMSE, aligned with {session.recording.pose_source})"
+        )
+    return lines
+
+
 def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndarray, "n 3"]) -> float:
     """Root mean square distance of a trajectory from true positions, in metres, after rigid alignment."""
     estimated, true = (points - points.mean(axis=0) for points in (poses[:, :3, 3], positions))

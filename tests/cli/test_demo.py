@@ -1,38 +1,26 @@
-from pathlib import Path
-
 import pytest
 
-from sglpr_jax.cli import datasets, demo
+from sglpr_jax.odometry import kiss_icp
 
-
-@pytest.fixture
-def tiny_demo(monkeypatch, town, preset):
-    """bin/demo on the tests' dataset, with the cheaper weights and the tests' preset."""
-    asked = {}
-
-    def simulate(root, **options):
-        asked.update(options)
-        root.parent.mkdir(parents=True, exist_ok=True)
-        if not root.exists():
-            root.symlink_to(town)
-
-    monkeypatch.setattr(datasets, "simulate", simulate)
-    monkeypatch.setattr(demo, "WEIGHTS", "sglpr-small")
-    monkeypatch.setattr(demo, "PRESET", str(preset))
-    monkeypatch.setattr(demo, "STEPS", 2)
-    return asked
+from .conftest import assert_one_line_error
 
 
 @pytest.mark.slow
-def test_the_demo_finds_loops_scores_descriptors_and_trains(command, tiny_demo, tmp_path):
+def test_the_demo_makes_a_trajectory_a_map_and_a_page_of_scans(command, tmp_path):
     out = tmp_path / "demo"
-    ended = command("demo", "--out", out, "--scans", 40)
+    ended = command("demo", "--out", out, "--scans", 40, "--no-open")
     assert ended.status == 0, ended.error
-    assert tiny_demo["scans"] == 40
-    for words in ("frames of 00", "top-1 F1max", "untrained", "shipped", "rotated", "sequence 00, 40 scans"):
-        assert words in ended.out
-    assert "2 steps of training, to show the command" in ended.error
-    pages = [Path(page) for page in ended.out.split("pages: ")[1].strip().split(", ")]
-    assert pages == [out / "loops" / "index.html", out / "00" / "report.html"]
-    assert all(page.stat().st_size > 50_000 for page in pages)
-    assert (out / "run" / "checkpoints" / "2").is_dir()
+    assert "in 40 of 40 frames of 00" in ended.out and "position error of 00: " in ended.out
+    assert ended.out.splitlines()[-1] == f"page: {out / 'found' / 'index.html'}"
+    made = {path.name for path in (out / "found").iterdir()}
+    assert made >= {"trajectory-optimized.tum", "map.ply", "map.pgm", "map.yaml", "drive.rrd", "index.html"}
+    assert ended.error.splitlines()[-1] == "With your own scans: bin/loops my_scans --odometry auto --optimize"
+
+
+def test_a_missing_package_is_reported_before_the_simulation(command, tmp_path, monkeypatch):
+    def missing():
+        raise ImportError("odometry from scans needs kiss-icp")
+
+    monkeypatch.setattr(kiss_icp, "_library", missing)
+    assert_one_line_error(command("demo", "--out", tmp_path / "demo"), "needs kiss-icp")
+    assert not (tmp_path / "demo").exists()

@@ -52,7 +52,7 @@ def test_bin_loops_writes_the_files_and_page_of_the_library(command, walk, tmp_p
         np.testing.assert_allclose(clock, times, atol=1e-5)
     assert "trajectory corrected by " in ended.out and f" of {len(loops)} loops" in ended.out
     page = (out / "index.html").read_text()
-    assert "<h2>Corrected</h2>" in page and "<h2>Trajectory</h2>" in page
+    assert "Trajectory corrected by " in page and "<h2>Trajectory</h2>" in page
     assert page.count("data:image/png;base64,") >= 2
 
 

@@ -1,6 +1,7 @@
 """The package for ROS 2, with a stand-in for rclpy: its files agree, and its node has the core of bin/live."""
 
 import ast
+import runpy
 import signal
 import sys
 import time
@@ -16,7 +17,7 @@ import yaml
 from sglpr_jax.cli.live import LiveCommand
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.ros_encoding import CLOUD, EDGE, TRANSFORMS
-from sglpr_jax.live.ros_topics import SCAN_QUEUE, RosSource, Transport
+from sglpr_jax.live.ros_topics import SCAN_QUEUE, RosSink, RosSource, Transport
 from tests.live.messages import ODOMETRY, POINTS, cloud, odometry, received
 from tests.live.test_ros_topics import Memory
 
@@ -28,7 +29,7 @@ class Standing:
     """A node of rclpy that keeps what was asked of it."""
 
     def __init__(self):
-        self.subscribed, self.sent, self.destroyed = {}, [], []
+        self.subscribed, self.advertised, self.sent, self.destroyed = {}, [], [], []
 
     def create_subscription(self, of, topic, take, qos, *, raw):
         assert raw
@@ -36,6 +37,7 @@ class Standing:
         return topic
 
     def create_publisher(self, of, topic, qos):
+        self.advertised.append((topic, of))
         return types.SimpleNamespace(publish=lambda cdr: self.sent.append((topic, of, cdr)))
 
     def destroy_subscription(self, one):
@@ -115,6 +117,46 @@ def test_the_metadata_agree(package):
     assert all((PACKAGE / path).is_file() for paths in files.values() for path in paths)
     (script,) = built["entry_points"]["console_scripts"]
     assert script == "sglpr = sglpr_ros.node:main" and callable(package.node.main)
+
+
+def test_the_packages_of_all_messages_are_dependencies(package, said):
+    node = Standing()
+    transport = package.transport.RclpyTransport(node, said)
+    RosSource(transport, LiveOptions(odometry_topic="odom"), said)
+    RosSink(transport, LiveOptions())
+    kinds = {kind for _, kind in [*node.subscribed, *node.advertised]}
+    assert {CLOUD, EDGE, TRANSFORMS} <= kinds
+    parts_of_each = {"std_msgs", "builtin_interfaces"}  # header and stamp
+    depends = {depend.text for depend in xml.parse(PACKAGE / "package.xml").getroot().iter("exec_depend")}
+    assert {kind.split("/")[0] for kind in kinds} | parts_of_each <= depends
+
+
+def test_the_launch_file_starts_the_node_with_the_usual_parameters(monkeypatch):
+    """With a stand-in for the packages of launch: each call is kept as (name, positional arguments, options)."""
+
+    def keeping(name):
+        return lambda *words, **options: (name, words, options)
+
+    for module, names in {
+        "launch": ["LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument"],
+        "launch.substitutions": ["LaunchConfiguration"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+        "ament_index_python": [],
+    }.items():
+        made = types.ModuleType(module)
+        vars(made).update({name: keeping(name) for name in names})
+        monkeypatch.setitem(sys.modules, module, made)
+    packages = types.ModuleType("ament_index_python.packages")
+    vars(packages)["get_package_share_directory"] = lambda name: str(PACKAGE) if name == PACKAGE.name else ""
+    monkeypatch.setitem(sys.modules, "ament_index_python.packages", packages)
+    launched = runpy.run_path(str(PACKAGE / "launch" / "sglpr.launch.py"))["generate_launch_description"]()
+    (argument, node) = launched[1][0]
+    assert argument[1] == ("parameters",) and Path(argument[2]["default_value"]).is_file()
+    (script,) = setup_arguments()["entry_points"]["console_scripts"]
+    assert node[2]["package"] == PACKAGE.name and script.startswith(f"{node[2]['executable']} = ")
+    assert node[2]["parameters"] == [("LaunchConfiguration", ("parameters",), {})]
 
 
 def test_parameters_are_flags_of_bin_live(package):
