@@ -21,7 +21,7 @@
 
 import lazy_loader
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 # Importing JAX takes most of a second, so each name is imported when it is first used; `__init__.pyi` lists them.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

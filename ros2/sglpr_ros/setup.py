@@ -4,7 +4,7 @@ from setuptools import setup
 
 setup(
     name="sglpr_ros",
-    version="0.2.0",
+    version="0.3.0",
     description="ROS 2 node of sglpr-jax: loop closures from LiDAR scans while the robot drives.",
     license="Apache-2.0",
     packages=["sglpr_ros"],

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.recording import DetectorFlags
+from sglpr_jax.cli.recording import CloudOptions, DetectorFlags
 from sglpr_jax.cli.runtime import print_error
 from sglpr_jax.files import exclusive_lock
 from sglpr_jax.live.options import LiveOptions
@@ -31,12 +31,13 @@ class LiveCommand(LiveOptions, DetectorFlags):
     `zenoh`, `rerun`.
 
     The output folder holds the map. A command with the same --out continues it, also after a crash. Ctrl-C or SIGTERM
-    ends the command and writes loops.g2o, loops.csv, rejected.jsonl, trajectory.tum and trajectory-optimized.tum.
+    ends the command and writes loops.g2o, loops.csv, rejected.jsonl, trajectory.tum and trajectory-optimized.tum. With
+    --cloud or --grid, scans are also stored while the robot drives, in the folder `scans`.
 
     Example:
       bin/live dds --topic /points --odometry-topic /odom --sinks dds json:loops.txt --out map
       bin/live folder:incoming --poses incoming/poses.tum --out map
-      bin/live bag:drive.mcap --odometry-topic /odom --rate 2 --out map
+      bin/live bag:drive.mcap --odometry-topic /odom --rate 2 --out map --cloud map/cloud.ply --grid map/grid.yaml
     """
 
     source: Annotated[str, tyro.conf.Positional]
@@ -47,6 +48,7 @@ class LiveCommand(LiveOptions, DetectorFlags):
     """Receivers of loops and of the status after each scan."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
+    output: tyro.conf.OmitArgPrefixes[CloudOptions] = CloudOptions()
 
     @property
     def expects_odometry(self) -> bool:
@@ -92,18 +94,22 @@ def run_node(
     """
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.result_files import write_results
+    from sglpr_jax.live.stored_scans import StoredScans
 
     with exclusive_lock(command.out), contextlib.ExitStack() as exit_stack:
         live_map = _open_map(command, report)
         exit_stack.callback(live_map.close)
-        unpublished = live_map.restore()
+        unpublished, stored = live_map.restore(), None
+        if command.output.any:
+            config = command.output.cloud_settings
+            stored = StoredScans(command.out / "scans", live_map, config=config, report=report)
         sinks = []
         for sink in open_sinks():
             exit_stack.callback(_close_sink, sink, report)
             sinks.append(sink)
         source = open_source(live_map)
         exit_stack.callback(source.close)
-        node = Node(live_map, sinks, report=report, say=say)
+        node = Node(live_map, sinks, report=report, say=say, stored=stored)
         node.publish(unpublished)
         say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
         try:
@@ -112,10 +118,13 @@ def run_node(
             say(str(node))
             paths = [*write_results(live_map, command.out), record_command(command, command.out)]
             say(f"{command.out}: {', '.join(path.name for path in paths)}")
+        if stored is not None:
+            recording, poses = stored.recording(command.sensor_height)
+            command.output.write([recording], [poses])
 
 
 def _check_endpoints(command: LiveCommand) -> None:
-    """Raise ValueError before any work if --poses would be overwritten, and the errors of `named_module`."""
+    """Raise an error before any work if an endpoint is unknown, --poses would be overwritten or --cloud fails."""
     from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
     from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, named_module
 
@@ -128,6 +137,13 @@ def _check_endpoints(command: LiveCommand) -> None:
             f"{command.poses}: expected odometry that this run does not overwrite, found an output file; "
             "choose another --out"
         )
+    if command.output.any:
+        from sglpr_jax.pose_graph.factor_graph import gtsam_library
+
+        command.output.check([], submap_m=0.0)
+        if not command.expects_odometry:
+            raise ValueError("--cloud and --grid need odometry: expected --odometry-topic or --poses, found neither")
+        gtsam_library()  # an error before the drive if it is missing
 
 
 def _open_map(command: LiveCommand, report: "Report") -> "LiveMap":

@@ -257,7 +257,8 @@ def _next_step(command: LoopsCommand) -> str:
         return "--optimize corrects the odometry"
     if not command.output.any:
         return "--cloud map.ply --grid map.yaml writes the scans in one frame, along the corrected trajectory"
-    if len(command.recordings) > 1:
+    first, *others = command.recordings
+    if others:
         return ""
     trajectory = command.folder / "trajectory-optimized.tum"
-    return f"bin/map {command.recordings[0]} --poses {trajectory} makes a map in which bin/relocalize finds scans"
+    return f"bin/map {first} --poses {trajectory} makes a map in which bin/relocalize finds scans"

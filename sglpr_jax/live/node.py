@@ -12,6 +12,7 @@ from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.sources_and_sinks import Sink, Source
+from sglpr_jax.live.stored_scans import StoredScans
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.models.weights import Params
@@ -28,9 +29,18 @@ WARM_UP_SCANS = 12
 class Node:
     """Takes scans from a source until it ends or `should_stop` is true, and hands the results to the sinks."""
 
-    def __init__(self, live: LiveMap, sinks: Sequence[Sink], *, report: Report, say: Callable[[str], object]):
-        """Connect a map to sinks. `say` prints lines about the progress."""
+    def __init__(
+        self,
+        live: LiveMap,
+        sinks: Sequence[Sink],
+        *,
+        report: Report,
+        say: Callable[[str], object],
+        stored: StoredScans | None = None,
+    ):
+        """Connect a map to sinks and, if points are kept, to their folder. `say` prints lines about the progress."""
         self._live, self._sinks, self._report, self._say = live, list(sinks), report, say
+        self._stored = stored
         self._scan_seconds: deque[float] = deque(maxlen=TIMED_SCANS)
         """Times for processing the latest scans, in seconds."""
         self.scans = self.left_out = self.dropped = self.loops = 0
@@ -69,6 +79,8 @@ class Node:
         begin = time.monotonic()
         try:
             edges = self._live.add(frame)
+            if edges is not None and self._stored is not None:
+                self._stored.add(frame.scan)
         except Exception as error:  # whatever a scan holds, the node lives on
             self._report("scan", f"a scan is left out: {in_short(error, most=300)}")
             edges = None

@@ -8,9 +8,10 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
-from sglpr_jax import read_odometry
+from sglpr_jax import read_odometry, read_scan
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.extras import install_command
 from sglpr_jax.files import half_written
@@ -29,6 +30,7 @@ def test_a_stopped_node_continues_its_map(town, tmp_path):
     scans.mkdir()
     flags = ("--poses", tmp_path / "poses.tum", "--sinks", f"json:{lines}", "--min-probability", "0.01")
     command = ("live", f"folder:{scans}", "--out", tmp_path / "map", "--weights", "sglpr-small", *flags)
+    outputs = ("--cloud", tmp_path / "map" / "cloud.ply", "--grid", tmp_path / "map" / "grid.yaml")
 
     def found() -> list[dict]:
         text = lines.read_text() if lines.exists() else ""
@@ -46,7 +48,7 @@ def test_a_stopped_node_continues_its_map(town, tmp_path):
             shutil.copy(source, scans / f"{times[row]:.6f}.bin")
         stopping = threading.Thread(target=stop_after, args=(last - 1,))
         stopping.start()
-        ended = run_command(*command)
+        ended = run_command(*command, *outputs)
         stopping.join()
         assert ended.status == 0, ended.error
     assert f"the map continues after {HALF} scans" in ended.error
@@ -54,6 +56,17 @@ def test_a_stopped_node_continues_its_map(town, tmp_path):
     out = tmp_path / "map"
     assert len(read_loops_jsonl(out / "loops.jsonl")) == sum(one["type"] == "loop" for one in found())
     assert len(read_g2o(out / "loops.g2o").poses) == SCANS and not half_written(out)
+    assert [int(path.stem) for path in sorted((out / "scans").iterdir())] == list(range(SCANS))
+    cloud = read_scan(out / "cloud.ply")
+    expected = recording.positions - recording.positions[0]
+    assert len(cloud) > 1000 and np.linalg.norm(np.ptp(cloud, axis=0)) > np.linalg.norm(np.ptp(expected, axis=0))
+    assert (out / "grid.pgm").exists()
+
+
+def test_a_cloud_needs_odometry(tmp_path):
+    ended = run_command("live", f"folder:{tmp_path}", "--out", tmp_path / "map", "--cloud", tmp_path / "cloud.ply")
+    assert ended.status == 1 and "expected --odometry-topic or --poses, found neither" in ended.error
+    assert not (tmp_path / "map").exists()
 
 
 def test_a_missing_package_is_told_before_anything_is_loaded(tmp_path, monkeypatch):

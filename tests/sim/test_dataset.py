@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.density_image import density_image, density_label_image
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.submap import submaps
 from sglpr_jax.se3 import positions_from_camera
@@ -205,12 +206,32 @@ def test_submaps_of_a_carrier_in_a_scenery_where_places_repeat(tmp_path):
     sensor = dataclasses.replace(SENSORS["vlp16"], azimuth_steps=40)
     drive = simulate_repeating("tunnel", scans=4, sensor=sensor, revisit="opposite", carrier=CARRIERS["cart"])
     expected = submaps(drive, drive.poses.world_from_lidar, length_m=1000.0)
-    written = open_recording(found.root, "08", sensor_height=0.6)
+    written = open_recording(found.root, "08")
+    assert written.mounting == drive.mounting == Mounting(0.6)  # of the cart
     assert written.positions == pytest.approx(drive.positions, abs=1e-5)
     for i in range(4):
         np.testing.assert_array_equal(written.points(i), expected.points(i))
         np.testing.assert_array_equal(written.scan(i).labels, expected.scan(i).labels)
     assert len(written.points(3)) > len(drive.points(3))
+
+
+@pytest.mark.parametrize(("scenery", "height_m"), [("rooms", 0.5), ("forest", 1.6)])
+def test_the_sensor_has_the_height_of_the_scenery(tmp_path, scenery, height_m):
+    options = {"routes": ["08"], "scans": 2, "sensor": "vlp16", "azimuth_steps": 200, "scenery": scenery}
+    found = simulate(tmp_path, **options)
+    assert open_recording(found.root, "08").mounting == Mounting(height_m)
+    settings = json.loads((tmp_path / "simulation.json").read_text())
+    del settings["height_m"]  # as older datasets
+    (tmp_path / "simulation.json").write_text(json.dumps(settings))
+    simulate(tmp_path, **options)
+    assert open_recording(found.root, "08").mounting == Mounting(height_m)
+
+
+def test_the_tilt_of_a_sensor_in_a_hand_is_seen_in_its_scans(tmp_path):
+    options = {"routes": ["08"], "scans": 12, "sensor": "vlp16", "azimuth_steps": 400, "carrier": "handheld"}
+    walk = open_recording(simulate(tmp_path, **options).root, "08")
+    assert walk.mountings is not None and "tilts" in " ".join(walk.found)
+    assert "as simulated" not in " ".join(walk.found)
 
 
 @pytest.mark.parametrize(

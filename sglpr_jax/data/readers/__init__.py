@@ -14,7 +14,7 @@ from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.readers.listing import describe_contents
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.readers.simulation import simulated_world
+from sglpr_jax.data.readers.simulation import is_in_a_hand, simulated_world
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import check_jumps, check_order
 
@@ -109,7 +109,8 @@ def open_recording(
     if recording.times is not None:
         check_order(recording.times, source=f"{root}, sequence {name}")
         check_jumps(recording.times, source=f"{root}, sequence {name}")
-    return mounted(recording, sensor_height, gravity=gravity, known=reader.knows_mounting)
+    is_known = reader.knows_mounting and not is_in_a_hand(root)
+    return mounted(recording, sensor_height, gravity=gravity, known=is_known)
 
 
 def _find_reader(root: Path) -> tuple[Reader, tuple[str, ...]]:

@@ -10,7 +10,7 @@ from sglpr_jax.files import naming, read_json
 
 SIMULATION = "simulation.json"
 """File with the settings."""
-OF_THE_DRIVE = ("layout", "sensor", "submap_m", "aside_m")
+OF_THE_DRIVE = ("layout", "sensor", "height_m", "submap_m", "aside_m")
 """Settings on which a town does not depend. It depends on the number and the rate of the scans."""
 
 
@@ -26,17 +26,24 @@ def _settings(root: Path) -> dict[str, Any] | None:
 
 
 def simulated_mounting(root: Path) -> Mounting | None:
-    """Return the mounting of the sensor of a simulated dataset, or None for a height of 1.73 m (KITTI)."""
+    """Return the mounting of the sensor of a simulated dataset, or None for a height of 1.73 m (KITTI), and for a
+    sensor in a hand, whose scans show it."""
     path, settings = root / SIMULATION, _settings(root)
-    if settings is None:
+    if settings is None or is_in_a_hand(root):
         return None
     try:
-        height_m = float(settings["sensor"]["height_m"])
+        height_m = float(settings.get("height_m", settings["sensor"]["height_m"]))
     except (TypeError, KeyError, ValueError) as error:
         expected = "the settings of a simulated dataset with sensor.height_m"
         raise ValueError(f"{path}: expected {expected}, found none") from error
     with naming(path):  # `Mounting` raises ValueError for implausible heights
         return None if height_m == MODEL_HEIGHT_M else Mounting(height_m)
+
+
+def is_in_a_hand(root: Path) -> bool:
+    """Return whether a simulated sensor tilts with the steps of a person, so that no mounting fits all scans."""
+    carrier = (_settings(root) or {}).get("carrier")
+    return isinstance(carrier, dict) and bool(carrier.get("walks"))
 
 
 def simulated_world(root: Path, name: str) -> str:
