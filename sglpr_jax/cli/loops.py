@@ -206,7 +206,8 @@ def _search_and_write(command: LoopsCommand) -> int:
         )
     if command.degenerate == "drop":
         result = result.without_degenerate()
-    optimized = optimize_trajectory(result) if command.optimize else None
+    unused = [session.recording.name for session in result.sessions if session.odometry is None]
+    optimized = optimize_trajectory(result) if command.optimize and not unused else None
     paths = write_loop_folder(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
     paths.append(record_command(effective, out))
     if command.rerun is not None:
@@ -214,6 +215,8 @@ def _search_and_write(command: LoopsCommand) -> int:
     print(result, *diagnose_no_loops(result), *why_rejected(result.rejected), sep="\n")
     if optimized is not None:
         print(optimized, *describe_errors(result, optimized), sep="\n")
+    elif command.optimize:
+        print(f"trajectory not corrected: the odometry of {', '.join(unused)} contradicts the scans and is not used")
     if not result.whole:  # a signal stopped the search
         _print_files(out / PAGE, paths)
         print("run the same command again to continue", file=sys.stderr)

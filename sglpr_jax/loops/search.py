@@ -270,9 +270,11 @@ def _search_session(
                 f"{recording.name}: expected at least one scan that is not empty, found {len(finder)} empty ones"
             )
     if odometry is not None and finder.odometry_check.is_unusable:
+        length, degrees = finder.odometry_check.errors  # per metre of the scaled drive
         warn(
-            f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored; check "
-            f"that the poses belong to these scans and use these axes: {AXES}"
+            f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored: it "
+            f"differs by {100 * length:.0f} % of the travelled distance and {100 * scale * degrees:.0f} degrees per "
+            f"100 m; check that the poses belong to these scans and use these axes: {AXES}"
         )
         new_detector = LoopDetector(finder.params, model=detector.model, config=config)
         options = {"registered": registered, "scale": scale, "kept_in": None, **stream}

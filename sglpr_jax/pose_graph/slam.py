@@ -49,7 +49,7 @@ def slam(
     """Compute the odometry of a recording from its scans, find loops and correct the trajectory.
 
     If scans and points have times, the motion within scans is removed. `bin/loops --odometry auto --optimize` does the
-    same and writes files.
+    same and writes files. If the scans contradict the odometry, it is not corrected, and a warning says so.
 
     Arguments:
       recording: The scans, about 10 a second, or a folder or bag with one recording.
@@ -89,4 +89,6 @@ def slam(
         on_bad_scan=on_bad_scan,
         kept_in=None if folder is None else folder / "loops",
     )
+    if loops.sessions[0].odometry is None:  # the scans contradict it, as a warning has said
+        return Slam(poses, loops, OptimizedTrajectory(poses, np.zeros(len(loops.loops), bool)))
     return Slam(poses, loops, optimize_trajectory(loops))

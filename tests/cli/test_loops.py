@@ -8,6 +8,7 @@ from sglpr_jax.extras import install_command
 from sglpr_jax.loops import search
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl, write_tum
 
@@ -54,6 +55,18 @@ def test_bin_loops_writes_the_files_and_page_of_the_library(command, walk, tmp_p
     page = (out / "index.html").read_text()
     assert "Trajectory corrected by " in page and "<h2>Trajectory</h2>" in page
     assert page.count("data:image/png;base64,") >= 2
+
+
+@pytest.mark.slow
+def test_loops_are_written_if_the_scans_contradict_the_odometry(command, town, odometry, tmp_path, monkeypatch):
+    monkeypatch.setattr(OdometryCheck, "errors", (0.5, 0.02))
+    write_tum(tmp_path / "odometry.tum", odometry, np.arange(float(SCANS)))
+    out = tmp_path / "found"
+    options = ("--odometry", tmp_path / "odometry.tum", "--odometry-format", "tum", "--optimize", "--out", out)
+    ended = command("loops", town, "--seq", "08", *options)
+    assert ended.status == 0 and "differs by 50 % of the travelled distance" in ended.error, ended.error
+    assert "trajectory not corrected: the odometry of 08 contradicts the scans and is not used" in ended.out
+    assert {path.name for path in out.iterdir()} == FILES
 
 
 @pytest.mark.slow

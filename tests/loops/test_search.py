@@ -26,6 +26,7 @@ from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
 from sglpr_jax.loops.result import LoopSearchResult, Session, diagnose_no_loops
 from sglpr_jax.loops.search import find_loops
+from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 N = 40
@@ -89,6 +90,14 @@ def test_odometry_in_other_axes_is_told(found):
     words = r"08: the odometry contradicts the loops of \d\d of \d\d frames, .* use these axes: x forward"
     with pytest.warns(DataWarning, match=words):
         assert len(found(forward_is_y).loops) < N / 2
+
+
+@pytest.mark.slow
+def test_odometry_that_the_images_contradict_is_told_with_the_difference_and_not_used(found, monkeypatch):
+    monkeypatch.setattr(OdometryCheck, "errors", (0.5, 0.02))  # the images of this drive are made up
+    words = r"08: the odometry contradicts the motion .* differs by 50 % .* and 2 degrees per 100 m"
+    with pytest.warns(DataWarning, match=words):
+        assert found(there_and_back()).sessions[0].odometry is None
 
 
 def test_odometry_in_the_cameras_axes_is_told_by_its_way_too():
