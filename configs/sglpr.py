@@ -28,7 +28,7 @@ CONFIG = TrainConfig(
         class_balance=0.5,
     ),
     optimizer=OptimizerConfig(
-        algorithm="muon", learning_rate=0.02, warmup_steps=20, decay_rate=0.5, decay_steps=700, clip_norm=1.0
+        algorithm="muon", learning_rate=0.02, warmup_steps=20, decay_rate=0.5, decay_steps=900, clip_norm=1.0
     ),
     steps=5000,
     tuples=20,
