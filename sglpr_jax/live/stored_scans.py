@@ -55,7 +55,7 @@ class StoredScans:
     def recording(self, sensor_height: SensorHeight) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
         """Return the stored scans with their corrected poses. Scans that no loop connects with the first are left out.
 
-        Raises ValueError if there are none.
+        Raises ValueError if no scan is stored.
         """
         numbers, trajectory = self._numbers(), self._live.trajectory
         if not numbers or trajectory is None:

@@ -140,7 +140,7 @@ class LoopSearchResult:
 
     def _describe_pair(self, match: int, query: int) -> str:
         """Describe the loops between two sessions, which must be those of `between`."""
-        names = f"{self.sessions[match].recording.name} and {self.sessions[query].recording.name}"
+        names = f"{self.unique_names[match]} and {self.unique_names[query]}"
         if not self.transforms:
             return f"{names}: no common place found{self._reason_counts()}"
         transforms = "; ".join(map(str, self.transforms))

@@ -287,14 +287,15 @@ def _deviations_at_loops(
 def describe_errors(result: LoopSearchResult, optimized: OptimizedTrajectory) -> list[str]:
     """Return a line with the position errors before and after the correction for each session with true positions."""
     lines = []
-    for session, corrected in zip(result.sessions, result.split(optimized.poses), strict=True):
+    trajectories = zip(result.sessions, result.unique_names, result.split(optimized.poses), strict=True)
+    for session, name, corrected in trajectories:
         positions = session.recording.positions
         if positions is None or session.odometry is None or session.frames < 3:  # fewer points define no alignment
             continue
         true = positions[: session.frames]
         before_m, after_m = (trajectory_error(poses[: session.frames], true) for poses in (session.odometry, corrected))
         lines.append(
-            f"position error of {session.recording.name}: {before_m:.2f} m before the correction, {after_m:.2f} m "
+            f"position error of {name}: {before_m:.2f} m before the correction, {after_m:.2f} m "
             f"after it (RMSE, aligned with {session.recording.pose_source})"
         )
     return lines
