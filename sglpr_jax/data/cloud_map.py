@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, Num
 
-from sglpr_jax.voxels import one_per_voxel
+from sglpr_jax.voxels import VoxelCloud
 
 CELL_M = 0.4
 """Edge of a cell of the ground, in metres."""
@@ -213,18 +213,17 @@ def tiled_cloud(
     near_tiles = _tiles_around(positions[:, :2] - origin[:2], reach_m)
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     total = 0
-    stored, pending = np.zeros((0, 3), np.float32), []
+    cloud = VoxelCloud(VOXEL_M)
     for block in blocks:
         points = block[np.isfinite(block).all(axis=1)].astype(np.float64)
         total += len(points)
         lowest = np.minimum(lowest, points.min(axis=0, initial=np.inf))
         highest = np.maximum(highest, points.max(axis=0, initial=-np.inf))
         points -= origin
-        near_points = points[np.isin(_tile_numbers(points[:, :2]), near_tiles)].astype(np.float32)
-        pending.append(one_per_voxel(near_points, VOXEL_M))
-        if sum(map(len, pending)) > len(stored):  # not for each block: this sorts all points
-            stored, pending = _merged([stored, *pending], source), []
-    stored = _merged([stored, *pending], source)
+        cloud.add(points[np.isin(_tile_numbers(points[:, :2]), near_tiles)])
+        _check_size(len(cloud), source)
+    stored = cloud.points
+    _check_size(len(stored), source)
     stored = stored[~on_trail(stored)]
     if not total:
         raise ValueError(f"{source}: expected finite points, found none")
@@ -237,15 +236,13 @@ def tiled_cloud(
     return TiledCloud(origin, points, tiles, starts, spacing_m, lowest, highest, total)
 
 
-def _merged(clouds: list[Float32[np.ndarray, "_ 3"]], source: Path) -> Float32[np.ndarray, "m 3"]:
-    """Join clouds and keep one point per voxel. Raises ValueError for more than `MOST_POINTS` points."""
-    points = one_per_voxel(np.concatenate(clouds), VOXEL_M)
-    if len(points) > MOST_POINTS:
+def _check_size(points: int, source: Path) -> None:
+    """Raise ValueError for more than `MOST_POINTS` points."""
+    if points > MOST_POINTS:
         raise ValueError(
             f"{source}: expected at most {MOST_POINTS} points in voxels of {VOXEL_M:g} m near the trajectory, found"
             " more; cut the cloud and its trajectory into parts, or keep one point in voxels of 0.2 m"
         )
-    return points
 
 
 def _tile_numbers(xy: Num[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:

@@ -18,7 +18,7 @@ from sglpr_jax.files import warn
 from sglpr_jax.loops.arguments import as_poses, check_is
 from sglpr_jax.maps.config import CloudConfig
 from sglpr_jax.se3 import transformed
-from sglpr_jax.voxels import ABOVE, one_per_voxel, voxel_numbers
+from sglpr_jax.voxels import ABOVE, VoxelCloud, voxel_numbers
 
 BLOCK_M = 0.3
 """Edge of the blocks of space that are seen through or not, in metres."""
@@ -91,15 +91,12 @@ def point_cloud(
     origin = np.round(poses[0][0, :3, 3]) if len(poses[0]) else np.zeros(3)
     shift = np.eye(4)
     shift[:3, 3] = -origin
-    stored, pending = np.zeros((0, 3), np.float32), list[np.ndarray]()
-    blocks = _Blocks()
+    cloud, blocks = VoxelCloud(config.voxel_m), _Blocks()
     for origin_from_lidar, points in scans(on_bad_scan):
         moved = transformed(origin_from_lidar, points).astype(np.float32)
         blocks.add(moved)
-        pending.append(one_per_voxel(moved, config.voxel_m))
-        if sum(map(len, pending)) > len(stored):  # not for each scan: this sorts all points
-            stored, pending = one_per_voxel(np.concatenate([stored, *pending]), config.voxel_m), []
-    stored = one_per_voxel(np.concatenate([stored, *pending]), config.voxel_m)
+        cloud.add(moved)
+    stored = cloud.points
     if not len(stored):
         raise ValueError(f"{recordings[0].name}: expected scans with points, found none")
     if not config.keep_moving:
