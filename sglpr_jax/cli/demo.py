@@ -39,10 +39,13 @@ def demo(command: DemoCommand) -> int:
     )
     check_flags(loops)  # an error before the simulation if a package is missing
     simulate(drive, routes=(ROUTE,), scans=command.scans, **DRIVE)
-    _print_title(f"bin/loops {drive} --odometry auto --optimize")
+    outputs = f"--out {out} --cloud {out}/map.ply --grid {out}/map.yaml --rerun {out}/drive.rrd"
+    _print_title(f"bin/loops {drive} --odometry auto --optimize {outputs}")
     status = loops_of_recording(loops)
     if not status:
-        _print_title("With your own scans: bin/loops my_scans --odometry auto --optimize")
+        _print_title(
+            "With your own scans: bin/loops my_scans --odometry auto --optimize --cloud map.ply --grid map.yaml"
+        )
     return status
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -143,7 +144,7 @@ def check_flags(command: LoopsCommand) -> None:
     if len(recordings) > 1 and (command.source.poses or command.source.times):
         raise ValueError("--poses and --times are those of one recording, found several recordings")
     if command.odometry is None and command.optimize:
-        raise ValueError("--optimize corrects odometry: expected --odometry, found none")
+        raise ValueError("--optimize corrects odometry: expected --odometry auto, a file or the bag itself, found none")
     if command.odometry == AUTO:
         kiss_icp.check_installed()
     if command.optimize:
@@ -238,7 +239,8 @@ def _search_and_write(command: LoopsCommand) -> int:
     for path in odometry_checkpoints:
         path.unlink(missing_ok=True)
     if command.rerun is not None:
-        print(f"{command.rerun}: for the viewer, rerun {command.rerun}")
+        viewer = Path(sys.executable).with_name("rerun")
+        print(f"{command.rerun}: shown by {os.path.relpath(viewer)} {command.rerun}")
     _print_files(out / PAGE, paths)
     if next_step := _next_step(command):
         print(with_installed_names(f"next: {next_step}"), file=sys.stderr)

@@ -199,7 +199,7 @@ class CloudOptions:
             write_cloud(self.cloud, points)
             print(f"{self.cloud}: {len(points)} points")
         if self.grid is not None:
-            grid = occupancy_grid(points, config=self.grid_settings)
+            grid = occupancy_grid(points, driven=poses, config=self.grid_settings)
             grid.save(self.grid)
             rows, columns = grid.cells.shape
             print(f"{self.grid}: {columns} x {rows} cells of {self.grid_settings.cell_m:g} m")

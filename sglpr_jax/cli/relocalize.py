@@ -13,7 +13,7 @@ from sglpr_jax.cli.recording import OdometrySubmapOptions, RecordingOptions
 from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import Scale, ScanFormat, SensorHeight
 from sglpr_jax.fields import CountOrNone
-from sglpr_jax.loops.config import CANDIDATES, PlaceCount
+from sglpr_jax.loops.config import CANDIDATES, MIN_PROBABILITY, PlaceCount
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.same_place import NEGATIVE_M
 
@@ -102,7 +102,10 @@ def relocalize(command: RelocalizeCommand) -> None:
 
 def _answer_table(name: str, answers: "list[Relocalization]", *, apart_m: float) -> Table:
     title = escape(f"{name} in the map")  # rich interprets brackets as styles
-    caption = f"The answers are more than {apart_m:g} m apart and exclude each other." if len(answers) > 1 else None
+    notes = [f"The answers are more than {apart_m:g} m apart and exclude each other."] if len(answers) > 1 else []
+    if answers[0].probability < MIN_PROBABILITY:
+        notes.append(f"Uncertain, because no answer has a probability of {MIN_PROBABILITY:g} or more.")
+    caption = " ".join(notes) or None
     table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)
     for answer in answers:
         pose = answer.world_from_query

@@ -136,7 +136,7 @@ def _reliability_blocks(result: LoopSearchResult) -> list[Picture | Text | TextT
     """Return plot and table of the true share of loops by predicted probability, or a text without true positions."""
     session = result.sessions[0]
     if session.recording.positions is None or result.model is None:
-        return [missing("The share of loops among the pairs is not known: the recording has no poses.")]
+        return [missing("How reliable the probabilities are is not known: the recording has no true poses.")]
     bins = reliability_of(session.candidates, result.model, session.recording.positions)
     if not bins:
         return [missing("No pair was compared.")]

@@ -32,6 +32,8 @@ class OccupancyConfig:
     """Maximum height of a step that a robot drives over, in metres. Higher points are obstacles."""
     robot_height_m: Positive = 2.0
     """Height of the robot, in metres. It drives beneath points that are higher above the ground."""
+    robot_radius_m: NotNegative = 0.3
+    """Radius of the robot, in metres. Where it drove, cells within this distance are free."""
 
     def __post_init__(self):
         check_fields(self)

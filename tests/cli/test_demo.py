@@ -14,7 +14,9 @@ def test_the_demo_makes_a_trajectory_a_map_and_a_page_of_scans(command, tmp_path
     assert ended.out.splitlines()[-1] == f"page: {out / 'found' / 'index.html'}"
     made = {path.name for path in (out / "found").iterdir()}
     assert made >= {"trajectory-optimized.tum", "map.ply", "map.pgm", "map.yaml", "drive.rrd", "index.html"}
-    assert ended.error.splitlines()[-1] == "With your own scans: bin/loops my_scans --odometry auto --optimize"
+    assert ended.error.splitlines()[-1] == (
+        "With your own scans: bin/loops my_scans --odometry auto --optimize --cloud map.ply --grid map.yaml"
+    )
 
 
 def test_a_missing_package_is_reported_before_the_simulation(command, tmp_path, monkeypatch):

@@ -80,7 +80,7 @@ def test_from_an_mcap_to_a_graph_and_a_corrected_trajectory(command, street, mca
     assert trajectory_error(corrected, street.positions) < trajectory_error(odometry, street.positions)
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") >= 3
-    assert "is not known: the recording has no poses" in page  # those of the bag are the odometry itself
+    assert "is not known: the recording has no true poses" in page  # those of the bag are the odometry itself
 
 
 def test_a_map_takes_the_poses_of_its_bag(command, mcap, odometry, tmp_path):

@@ -193,6 +193,20 @@ def test_a_robot_drives_over_low_steps_and_beneath_high_points():
     assert occupancy_grid(gap).cells[-11, 30] == UNKNOWN
 
 
+def test_cells_are_free_where_the_robot_drove():
+    ground = np.stack([*map(np.ravel, np.mgrid[0:6:0.09, 0:6:0.09]), np.zeros(67 * 67)], axis=1)
+    hole = ground[np.abs(ground[:, 0] - 3) > 1]  # the sensor did not see the ground beneath it
+    post = np.array([[1.0, 3.0, 1.0]])  # a person who walked beside the robot
+    cloud = np.concatenate([hole, post])
+    poses = np.stack([transform(x, 3.0, 0.0) for x in (0.5, 2.0, 5.5)])
+    before, after = occupancy_grid(cloud).cells, occupancy_grid(cloud, driven=[poses]).cells
+    row = -1 - 30
+    assert before[row, 10] == OCCUPIED and before[row, 30] == UNKNOWN
+    assert (after[row, 5:56] == FREE).all() and after[row - 3, 30] == FREE and after[row - 4, 30] == UNKNOWN
+    jump = np.stack([transform(x, 3.0, 0.0) for x in (-3.0, 5.5)])  # where it was between these is not known
+    assert occupancy_grid(cloud, driven=[jump]).cells[row, 30] == UNKNOWN
+
+
 def test_a_grid_needs_points_and_the_right_name(tmp_path):
     with pytest.raises(ValueError, match=r"expected finite points \(n, 3\), found none"):
         occupancy_grid(np.zeros((0, 3)))
