@@ -144,7 +144,7 @@ def check_flags(command: LoopsCommand) -> None:
     if len(recordings) > 1 and (command.source.poses or command.source.times):
         raise ValueError("--poses and --times are those of one recording, found several recordings")
     if command.odometry is None and command.optimize:
-        raise ValueError("--optimize corrects odometry: expected --odometry auto, a file or the bag itself, found none")
+        raise ValueError("--optimize corrects odometry: expected --odometry, found none; give auto, a file or a bag")
     if command.odometry == AUTO:
         kiss_icp.check_installed()
     if command.optimize:

@@ -331,9 +331,8 @@ def _read_index_file(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]
             metadata = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except Exception as error:  # also numpy's, for types that it lacks
-        raise ValueError(
-            f"{path}: expected an index or a map of places, found no safetensors file ({in_short(error)})"
-        ) from error
+        expected = "expected an index or a map of places"
+        raise ValueError(f"{path}: {expected}, found an invalid safetensors file ({in_short(error)})") from error
     text = metadata.get("about", "")
     if metadata.get("sha256") != _checksum(text, arrays):
         raise ValueError(f"{path}: expected an index with a valid checksum, found a damaged one")

@@ -67,14 +67,16 @@ def test_nothing_else_is_unknown():
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
 def test_python_runs(page, in_examples, monkeypatch):
-    """All blocks of a page, one after another, in a folder with a small dataset, with the cheaper weights; loops
-    are not registered, drives are short, and what is trained is a tiny model."""
+    """All blocks of a page, one after another, in a folder with a small dataset, with the cheaper weights.
+
+    Loops of `find_loops` are not registered, drives are short, and what is trained is a tiny model.
+    """
     short_drive = functools.partial(sglpr_jax.simulate_recording, scans=80)
     monkeypatch.setattr(sglpr_jax, "simulate_recording", short_drive)
     model, load, preset, find = model_preset("tiny"), sglpr_jax.load, sglpr_jax.preset, sglpr_jax.find_loops
     monkeypatch.setattr(sglpr_jax, "load", lambda name: load("sglpr-small"))
     monkeypatch.setattr(sglpr_jax, "find_loops", functools.partial(find, registered=False))
-    cheaper_slam = functools.partial(sglpr_jax.slam, params="sglpr-small", registered=False)
+    cheaper_slam = functools.partial(sglpr_jax.slam, params="sglpr-small")
     monkeypatch.setattr(sglpr_jax, "slam", cheaper_slam)
     monkeypatch.setattr(sglpr_jax, "preset", lambda name: dataclasses.replace(preset(name), model=model))
     found = {"__name__": "page"}
