@@ -47,5 +47,7 @@ class VoxelCloud:
         return self._merged
 
     def _merge(self) -> None:
+        if not self._pending:
+            return
         self._merged = one_per_voxel(np.concatenate([self._merged, *self._pending]), self._edge_m)
         self._pending = []

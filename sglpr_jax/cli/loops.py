@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -240,7 +239,7 @@ def _search_and_write(command: LoopsCommand) -> int:
         path.unlink(missing_ok=True)
     if command.rerun is not None:
         viewer = Path(sys.executable).with_name("rerun")
-        print(f"{command.rerun}: shown by {os.path.relpath(viewer)} {command.rerun}")
+        print(f"{command.rerun}: shown by {viewer} {command.rerun}")
     _print_files(out / PAGE, paths)
     if next_step := _next_step(command):
         print(with_installed_names(f"next: {next_step}"), file=sys.stderr)

@@ -190,12 +190,12 @@ def loops(
     `pairs` and `wrong` loops are (query, match). `wrong` loops are red and on top.
     """
     figure, panels = axes_from_above(np.concatenate(list(trajectories.values())), panels=len(trajectories))
+    groups = [("loops", pairs, BLUE, 3)]
+    if wrong:
+        groups.append(("wrong", wrong, RED, 4))
     for axes, (title, positions) in zip(panels, trajectories.items(), strict=True):
         axes.set_title(title)
         axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
-        groups = [("loops", pairs, BLUE, 3)]
-        if wrong:
-            groups.append(("wrong", wrong, RED, 4))
         for name, loop_frames, colour, layer in groups:
             for query, match in loop_frames:
                 axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)

@@ -79,8 +79,6 @@ class Node:
         begin = time.monotonic()
         try:
             edges = self._live.add(frame)
-            if edges is not None and self._stored is not None:
-                self._stored.add(frame.scan)
         except Exception as error:  # whatever a scan holds, the node lives on
             self._report("scan", f"a scan is left out: {in_short(error, most=300)}")
             edges = None
@@ -102,6 +100,8 @@ class Node:
             map_from_world=self._live.map_from_world,
         )
         self._send_to_sinks("frame", status)
+        if self._stored is not None:  # after the loops are published, because it writes to the disk
+            self._stored.add(frame.scan)
 
     def _send_to_sinks(self, method: Literal["frame", "loop"], message: FrameStatus | LoopEdge) -> None:
         """Call `method` of every sink with a message. A sink that fails is reported and not used again."""

@@ -15,6 +15,7 @@ from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import (
     PlannedRecording,
     SimulatedRecording,
+    carried_height_m,
     numbered_ids,
     plan_sessions,
     simulate_recording,
@@ -144,11 +145,9 @@ def simulate(
         "carrier": dataclasses.asdict(CARRIERS[carrier]),
         **options,
     }
-    carried_m = CARRIERS[carrier].height_m
-    if carried_m is None and is_repeating:
-        carried_m = REPEATING[scenery].height_m
-    if carried_m is not None:
-        settings["height_m"] = carried_m  # instead of the sensor's
+    height_m = carried_height_m(CARRIERS[carrier], REPEATING.get(scenery))
+    if height_m is not None:
+        settings["height_m"] = height_m  # instead of the sensor's
     if sessions:
         route, pose_files = next(iter(routes), "00"), {}
         plans = plan_sessions(sessions, route=route, sensor=lidar, scenery=SCENERIES[scenery], **options)
@@ -276,8 +275,8 @@ def _claim(root: Path, settings: dict, fingerprints: dict[str, str]) -> None:
         raise ValueError(f"{root} holds files that were not simulated (no {SETTINGS_FILE}); choose another folder")
     stored = _read_settings(path) if path.exists() else {}
     expected = json.loads(json.dumps({**settings, **fingerprints}))  # as read from JSON: tuples become lists
-    carried_m = {"height_m": expected["height_m"]} if "height_m" in expected else {}  # older datasets do not state it
-    merged = {**fingerprints, **carried_m, **(stored or expected)}
+    not_in_older = {name: expected[name] for name in ("height_m",) if name in expected}
+    merged = {**fingerprints, **not_in_older, **(stored or expected)}
     different = [key for key, value in expected.items() if merged.get(key) != value]
     if different:
         described = ", ".join(f"{key} {expected[key]} (found {stored.get(key)})" for key in different)

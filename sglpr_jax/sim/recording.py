@@ -149,11 +149,18 @@ def simulate_repeating(
     check_rate_and_seed(rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
     world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
-    height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
+    height_m = carried_height_m(carrier, scenery)
     if height_m is not None:
         sensor = dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))
     options = {"name": f"{name}-{revisit}", "sensor": sensor, "carrier": carrier, "aside_m": aside_m}
     return drive_through(world, path, scan_rows(path, scans), **options, **_key_and_rng(seeds))
+
+
+def carried_height_m(carrier: Carrier, scenery: Repeating | None = None) -> float | None:
+    """Height of the sensor above the ground that the carrier or else the scenery gives, or None: that of the sensor."""
+    if carrier.height_m is None and scenery is not None:
+        return scenery.height_m
+    return carrier.height_m
 
 
 def plan_drive(

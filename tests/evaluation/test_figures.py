@@ -51,7 +51,7 @@ def test_a_trajectory_shows_each_decision_in_its_colour(tmp_path, two_laps):
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
     picture = pixels(figure, tmp_path / "trajectory.png")
     assert shows(picture, (0x2B, 0x5F, 0xC4)) and not shows(picture, (0xD6, 0x27, 0x28))  # nothing is wrong, so no red
-    assert shows(picture, (0x2B, 0x5F, 0xC4))
+    assert shows(picture, (0xA9, 0xA9, 0xA9))
 
 
 def test_a_segmentation_panel_has_metres_and_names_and_colours_of_classes(tmp_path):
