@@ -129,7 +129,7 @@ def train(flags: Flags, stopped: Stopped) -> tuple[str, bool]:
     """
     changes = {name: getattr(flags, name) for name in ("chunk", "steps") if getattr(flags, name) is not None}
     config = dataclasses.replace(configured(load_preset(flags.preset), flags.compute), **changes)
-    recordings, test = leave_one_out(flags.data, flags.test)
+    recordings, test = leave_one_out([flags.data], flags.test)
     settings = {"data": str(flags.data), "preset": flags.preset, "test": flags.test}
     try:
         result = train_network(

@@ -60,10 +60,10 @@ def simulate(root: Path, **options: Any) -> "Simulated":
 
 
 def leave_one_out(
-    root: Path, seq: str, *, train_seqs: Sequence[str] = (), **options: Any
+    roots: Sequence[Path], seq: str, *, train_seqs: Sequence[str] = (), **options: Any
 ) -> tuple[list[Recording], Recording]:
-    """Return the training recordings of a dataset and the held-out recording `seq`, and describe them on stderr."""
-    recordings, test = training_recordings.leave_one_out(root, seq, train=train_seqs, **options)
+    """Return the training recordings of datasets and the held-out recording `seq`, and describe them on stderr."""
+    recordings, test = training_recordings.leave_one_out(roots, seq, train=train_seqs, **options)
     names = ", ".join(recording.name for recording in recordings)
     print(f"training on {names}; testing on {seq}, which is held out", file=sys.stderr)
     _print_descriptions([*recordings, test])

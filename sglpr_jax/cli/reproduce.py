@@ -94,7 +94,11 @@ def reproduce(command: ReproduceCommand) -> None:
     check_inputs(reproduction, names, command.nclt)
     if command.train or command.plan:
         plan = make_plan(reproduction, names if command.train else [])
-        print(plan.text(time_a_step(reproduction, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
+        seconds_per_step = None
+        if plan.missing:
+            print("measuring the duration of a training step, after its compilation", file=sys.stderr)
+            seconds_per_step = time_a_step(reproduction, *plan.missing[0])
+        print(plan.text(seconds_per_step), file=sys.stderr)
         if command.plan:
             return
         _train_missing(reproduction, plan)

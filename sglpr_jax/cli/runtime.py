@@ -87,7 +87,7 @@ def parse_command(command: type[T], name: str, arguments: list[str] | None = Non
     if hasattr(defaults, "config"):
         from sglpr_jax.training.presets import preset_names  # slow import, not needed by most commands
 
-        description += f"\nPresets: {', '.join(preset_names())}"
+        description += f"\n\nPresets: {', '.join(preset_names())}"
     hide_nested(defaults)
     parsed = tyro.cli(
         command_line_type,

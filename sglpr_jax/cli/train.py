@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.recording import report_bad_scan
-from sglpr_jax.cli.runtime import console
+from sglpr_jax.cli.runtime import console, with_installed_names
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.files import check_still_there, file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
@@ -29,12 +29,13 @@ NEWER_SETTINGS = ("format", "sensor_height", "skip_bad")
 
 @dataclasses.dataclass(frozen=True)
 class TrainCommand:
-    """Train a model on all recordings of a dataset but one, and test it on that one (leave-one-out).
+    """Train a model on all recordings but one, and test it on that one (leave-one-out).
 
     Example:
       bin/train --seq 08                                  on the simulated recordings, preset sglpr
       bin/train --seq 08 --data KITTI --preset paper
       bin/train --seq 08 --data KITTI --resume            resumes a stopped run
+      bin/train --seq friday --data monday tuesday.bag friday    own scans with poses
       bin/train --seq 06 --data IMAGES --also SIMULATED --also-tuples 4     semantics from a second, labelled dataset
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
       bin/train --seq 08 --model.head.cbam False          an ablation; docs/guides/ablations.md lists all
@@ -43,8 +44,8 @@ class TrainCommand:
 
     seq: str = "08"
     """Recording to test on. It is never trained on."""
-    data: Path | None = None
-    """Folder of the dataset: KITTI's layout, or ready-made BEV images. None: the simulated recordings."""
+    data: Path | tuple[Path, ...] | None = None
+    """Dataset, bag or folder of scans, or several of them, in any supported layout. None: the simulated recordings."""
     also: tuple[Path, ...] = ()
     """Further datasets, which provide --also-tuples tuples of each step. All their recordings are trained on. They
     can add labelled simulated images to real images without labels."""
@@ -105,6 +106,7 @@ def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with -
         check_still_there(folder / CONFIG_FILE)
         print(f"written to {out}")
     print(f"run: {folder}")
+    print(with_installed_names(f"next: bin/loops my_scans --weights {folder}"))
 
 
 def run_folder(command: TrainCommand) -> Path:
@@ -164,13 +166,16 @@ def _open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Seque
     """Open the training recordings, those of --also, and the test recording. Raises ValueError if --also is --data."""
     from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
 
-    root = dataset_root(command.data)
+    roots = command.data if isinstance(command.data, tuple) else (dataset_root(command.data),)
+    if not roots:
+        raise ValueError("--data: expected a dataset, found none")
     options = {name: getattr(command, name) for name in ("pose_source", "format", "sensor_height")}
-    recordings, test = leave_one_out(root, command.seq, train_seqs=command.train_seq, **options)
+    recordings, test = leave_one_out(roots, command.seq, train_seqs=command.train_seq, **options)
     also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
-    if any(folder.resolve() == root.resolve() for folder in command.also):
+    resolved = {root.resolve() for root in roots}
+    if same := [folder for folder in command.also if folder.resolve() in resolved]:
         raise ValueError(
-            f"--also {root}: expected a dataset other than --data, whose recording {command.seq} is tested"
+            f"--also {same[0]}: expected a dataset other than --data, whose recording {command.seq} is tested"
         )
     if command.skip_bad:
         *readable, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)

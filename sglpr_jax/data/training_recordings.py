@@ -11,41 +11,50 @@ from sglpr_jax.files import file_name
 
 
 def leave_one_out(
-    root: Path, test: str, *, train: Sequence[str] = (), **options: Any
+    roots: Sequence[Path], test: str, *, train: Sequence[str] = (), **options: Any
 ) -> tuple[list[Recording], Recording]:
-    """Open the training recordings and the test recording of a dataset. All must have positions.
+    """Open the training recordings and the test recording of datasets. All must have positions.
 
     Arguments:
-      root: Folder of the dataset.
+      roots: Folders of the datasets, or bags. The names of their recordings must differ.
       test: Name of the test recording.
       train: Names of the training recordings, by default all except `test`.
       options: Options of `open_recording`.
 
-    Raises FileNotFoundError, or ValueError if `test` is among the training recordings or no training recording remains.
+    Raises FileNotFoundError if a named recording is missing, and ValueError if two recordings have the same name,
+    `test` is among the training recordings or no training recording remains.
     """
-    test_recording = open_recording(root, test, **options)
-    names = tuple(train) or tuple(name for name in recording_names(root) if name != test)
+    root_of = dict[str, Path]()
+    for root in roots:
+        for name in recording_names(root):
+            if name in root_of:
+                raise ValueError(
+                    f"{root}: expected a new name, found a second recording {name!r}, as in {root_of[name]}"
+                )
+            root_of[name] = root
+    names = tuple(train) or tuple(name for name in root_of if name != test)
+    where = ", ".join(map(str, roots))
+    if missing := [name for name in (test, *names) if name not in root_of]:
+        raise FileNotFoundError(f"{where}: expected sequence {missing[0]!r}, found {', '.join(root_of)}")
     if not names or test in names:
         raise ValueError(
-            f"{root}: expected training recordings other than {test!r}, found {', '.join(names) or 'none'}"
+            f"{where}: expected training recordings other than {test!r}, found {', '.join(names) or 'none'}"
         )
-    recordings = [open_recording(root, name, **options) for name in names]
-    _check_positions(root, [*recordings, test_recording])
+    test_recording, *recordings = (_with_positions(root_of[name], name, **options) for name in (test, *names))
     return recordings, test_recording
 
 
 def all_recordings(root: Path, **options: Any) -> list[Recording]:
     """Open every recording of a dataset with the options of `open_recording`. All must have positions."""
-    recordings = [open_recording(root, name, **options) for name in recording_names(root)]
-    _check_positions(root, recordings)
-    return recordings
+    return [_with_positions(root, name, **options) for name in recording_names(root)]
 
 
-def _check_positions(root: Path, recordings: Sequence[Recording]) -> None:
-    """Raise ValueError if a recording has no positions."""
-    for recording in recordings:
-        if recording.positions is None:
-            raise ValueError(f"{root}: sequence {recording.name} has no poses; training and testing need them")
+def _with_positions(root: Path, name: str, **options: Any) -> Recording:
+    """Open a recording. Raises ValueError if it has no positions."""
+    recording = open_recording(root, name, **options)
+    if recording.positions is None:
+        raise ValueError(f"{root}: sequence {name} has no poses; training and testing need them")
+    return recording
 
 
 def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:

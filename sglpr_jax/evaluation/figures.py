@@ -249,7 +249,7 @@ def loops_in_time(
     axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))
     axes.plot([0, frames], [0, frames], color="0.8", linewidth=1)
     if rejected:
-        axes.scatter(*np.array(rejected).T, s=5, color="0.7", linewidths=0, label=f"rejected ({len(rejected)})")
+        axes.scatter(*np.array(rejected).T, s=9, color="0.55", linewidths=0, label=f"rejected ({len(rejected)})")
     if loops:
         query, match, probability = np.array(loops).T
         dots = axes.scatter(query, match, s=8, c=probability, cmap="viridis", vmin=0.9, vmax=1, linewidths=0)

@@ -64,7 +64,7 @@ def _recording_sections(result: LoopSearchResult, optimized: OptimizedTrajectory
         Section("Why no loops", [Text(reason) for reason in diagnose_no_loops(result)]),
         Section("Trajectory", _trajectory_blocks(result, optimized)),
         Section("Rejected", _rejection_blocks(result.rejected)),
-        Section("Loops", [*_time_pictures(result), _loop_table(result)]),
+        Section("Loops", [*_time_pictures(result), *_loop_table(result)]),
         Section("Pairs", [overlays]),
         Section("Reliability", _reliability_blocks(result)),
     ]
@@ -89,7 +89,7 @@ def _trajectory_blocks(result: LoopSearchResult, optimized: OptimizedTrajectory 
         paths = {"odometry": session.odometry[: session.frames]}
         if optimized is not None:
             texts = [Text(_as_sentence(text)) for text in (str(optimized), *describe_errors(result, optimized))]
-            paths["corrected"] = optimized.poses
+            paths["corrected"], source = optimized.poses, "the odometry, and its correction"
         trajectories = {name: level_odometry(poses, uprights)[:, :3, 3] for name, poses in paths.items()}
     if not trajectories:
         return []
@@ -185,12 +185,15 @@ def _rejection_blocks(rejected: Sequence[RejectedClosure]) -> list[Text | TextTa
     return [Text(about), TextTable(("reason", "pairs", "meaning"), rows, ("pairs",))]
 
 
-def _loop_table(result: LoopSearchResult) -> Text | TextTable:
+def _loop_table(result: LoopSearchResult) -> list[Text | TextTable]:
     """Return a table of up to 40 loops: wrong loops first, if they are known, then by increasing probability."""
     if not result.loops:
-        return missing("No loops.")
+        return [missing("No loops.")]
     recording = result.sessions[0].recording
     wrong = set(_frame_pairs(wrong_loops(result)))
+    order = f"The {'wrong loops, then the ' if wrong else ''}least probable loops first."
+    if len(result.loops) > SHOWN_ROWS:
+        order += f" The table has {SHOWN_ROWS} of {len(result.loops)} loops, loops.csv has all."
     header = ("query", "match", "x [m]", "y [m]", "yaw [deg]", "probability", "overlap")
     if recording.positions is not None:
         header += ("true distance [m]",)
@@ -208,7 +211,7 @@ def _loop_table(result: LoopSearchResult) -> Text | TextTable:
             "" if loop.overlap is None else f"{loop.overlap:.2f}",
         )
         rows.append(cells if true_distance_m is None else (*cells, f"{true_distance_m:.1f}"))
-    return TextTable(header, rows[:SHOWN_ROWS], header[2:])
+    return [Text(order, "about"), TextTable(header, rows[:SHOWN_ROWS], header[2:])]
 
 
 def _transform_section(result: LoopSearchResult, names: list[str]) -> Section:

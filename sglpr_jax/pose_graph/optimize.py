@@ -53,12 +53,12 @@ class OptimizedTrajectory(NamedTuple):
 
     def __str__(self) -> str:
         if not self.inliers.any():
-            limit = f"{self.drift.max_deviation:g} sigmas of the stated drift ({self.drift})"
+            limit = f"{self.drift.max_deviation:g} sigmas of the drift ({self.drift})"
             reason = f"{len(self.inliers)} loops need more than {limit}" if len(self.inliers) else "no loops"
             return f"trajectory not corrected: {reason}"
         loops = f"{self.inliers.sum()} of {len(self.inliers)} loops"
         moved = f"{self.moved_m:.2f} m at most, {self.moved_rms_m:.2f} m RMS"
-        return f"trajectory corrected by {loops}: moved by {moved}, {self.deviation:.2f} sigmas of the stated drift"
+        return f"trajectory corrected by {loops}: moved by {moved}, {self.deviation:.2f} sigmas of the drift"
 
 
 def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:

@@ -10,6 +10,7 @@ import jax
 from sglpr_jax.data.readers import recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.method import Takes
 from sglpr_jax.methods.registry import method_with_weights
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
 from sglpr_jax.reproduce.reproduction import Reproduction, content_of
@@ -64,14 +65,24 @@ def _check_methods(reproduction: Reproduction) -> None:
     for name in reproduction.methods:
         if name not in HANDCRAFTED:
             raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
-    for name in (*reproduction.methods, *reproduction.weights):
-        needs = content_of(name)
-        for seq in reproduction.seqs:
-            recording = reproduction.recording(seq)
-            if needs != "images" and recording.has_images:
-                raise ValueError(f"{name} needs points, found images in sequence {seq}; leave it out")
-            if needs == "labelled points" and not recording.has_labels:
-                raise ValueError(f"{name} needs labels, found none in sequence {seq}; leave it out")
+    for flag, names in (("--method", reproduction.methods), ("--weights", reproduction.weights)):
+        missing = {name: needs for name in names if (needs := _missing_input(reproduction, content_of(name)))}
+        if missing:
+            usable = " ".join([flag, *(name for name in names if name not in missing)])
+            raise ValueError(
+                "; ".join([*(f"{name} needs {needs}" for name, needs in missing.items()), f"use {usable}"])
+            )
+
+
+def _missing_input(reproduction: Reproduction, takes: Takes) -> str:
+    """Return what a test recording lacks, or an empty text. `takes` is what a method needs."""
+    for seq in reproduction.seqs:
+        recording = reproduction.recording(seq)
+        if takes != "images" and recording.has_images:
+            return f"points, found images in sequence {seq}"
+        if takes == "labelled points" and not recording.has_labels:
+            return f"labels, found none in sequence {seq}"
+    return ""
 
 
 class Plan(NamedTuple):

@@ -149,7 +149,8 @@ def scan_image(
 ) -> Float[Array, "h w"]:
     """Compute the image of a scan that a model describes (see `ModelConfig.image`).
 
-    Images from other sources can be checked with `is_describable`.
+    The function checks the points, so it cannot run under `jit`. Images from other sources can be checked with
+    `is_describable`.
 
     Arguments:
       points: Points in metres: x forward, y left, z up.

@@ -75,7 +75,7 @@ class Callbacks(Callback):
 class ProgressBar(Callback):
     """Shows finished steps, remaining time and the latest measurements.
 
-    Without a terminal it prints a line for each call of `on_step`.
+    Without a terminal it prints a line at the start, and one for each call of `on_step`.
     """
 
     def __init__(self):
@@ -90,17 +90,19 @@ class ProgressBar(Callback):
     def on_start(self, step: int, steps: int) -> None:
         self._steps = steps
         self._open_once("train", steps)
-        self._show(step)
+        self._show_step(step, "compiling the first step")
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        text = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
-        self._show(step, text)
-        if not Console(stderr=True).is_terminal:
-            print(f"step {step} of {self._steps}: {text}", file=sys.stderr, flush=True)
+        self._show_step(step, "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values))
 
     def close(self) -> None:
         self._open_bar.close()
         self._title = ""
+
+    def _show_step(self, step: int, text: str) -> None:
+        self._show(step, text)
+        if not Console(stderr=True).is_terminal:
+            print(f"step {step} of {self._steps}: {text}", file=sys.stderr, flush=True)
 
     def _open_once(self, title: str, total: int) -> None:
         """Replace the bar by one with this title, unless it is open."""

@@ -40,6 +40,8 @@ ERRORS = {
     "relocalize scan.bin --map no.safetensors --submap-m 10": "scan.bin: expected --frame with --submap-m",
     "reproduce --data {town} --out {out}": "expected tables or figures",
     "reproduce table5 --data {images} --out {out}": "table5 is about semantics",
+    "reproduce table1 --data {images} --seq 06 --out {out} --method m2dp polar-fft": "use --method polar-fft",
+    "train --seq 06 --data {images} {images} --out {out}": "a second recording '00'",
     "reproduce table1 --data {town} --out {out} --method bow": "'bow'",
     "segment --weights segmented --data {images} --out {out}": "segmented: expected a folder",
     "simulate --out {out} --seq 11": "'11'",

@@ -32,11 +32,15 @@ def weights_of(folder) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def mixed(town, images, preset, tmp_path_factory):
-    """A run on images without labels, whose semantics come from simulated scans."""
-    out = tmp_path_factory.mktemp("runs") / "mixed"
+    """A run on two folders of images without labels, whose semantics come from simulated scans."""
+    root = tmp_path_factory.mktemp("runs")
+    out, monday, friday = (root / name for name in ("mixed", "monday", "friday"))
+    for folder, name in ((monday, "00"), (friday, "06")):
+        folder.mkdir()
+        (folder / name).symlink_to(images / name)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(final_test, "final_test", lambda *_, **__: None)
-        options = ("--seq", "06", "--data", images, "--also", town, "--preset", preset, "--out", out)
+        options = ("--seq", "06", "--data", monday, friday, "--also", town, "--preset", preset, "--out", out)
         ended = run_command("train", *options, *RECIPE, *LABELLED, "--tensorboard")
     assert ended.status == 0, ended.error
     return out, options, ended
@@ -53,7 +57,8 @@ def test_a_run_on_two_datasets_learns_places_and_semantics(mixed, town):
     assert all(line["score"] == line["recall_neighbours"] for line in scores)  # the images have no revisit
     assert sorted(path.name for path in (out / "mining").iterdir()) == ["0.npz", "3.npz"]
     settings = json.loads((out / "config.json").read_text())
-    assert settings["also"] == [str(town)] and settings["config"]["also_tuples"] == 1
+    assert settings["also"] == [str(town)] and len(settings["data"]) == 2
+    assert settings["config"]["also_tuples"] == 1
     assert json.loads((out / "weights" / "config.json").read_text())["compute"] == "bfloat16"
     (events,) = (out / "tensorboard").iterdir()
     assert b"gradient_norm" in events.read_bytes() and b"score" in events.read_bytes()

@@ -1,11 +1,11 @@
-"""A model's label images beside images that have no labels of their own, and nowhere else."""
+"""Leave-one-out over datasets. A model's label images beside images without labels of their own, nowhere else."""
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.data.training_recordings import with_pseudo_labels
+from sglpr_jax.data.training_recordings import leave_one_out, with_pseudo_labels
 
 
 def write_map(path, raw: int) -> None:
@@ -31,3 +31,17 @@ def test_recordings_with_labels_of_their_own_and_those_without_a_map_stay_as_the
         with_pseudo_labels([labelled, plain], tmp_path / "maps")
     with pytest.raises(FileNotFoundError, match=r"\(the data has no image recording without labels\)"):
         with_pseudo_labels([labelled], tmp_path / "maps")
+
+
+def test_leave_one_out_over_several_datasets_needs_names_that_differ(bev_root, kitti_root, tmp_path):
+    recordings, test = leave_one_out([kitti_root, bev_root], "08")
+    assert ([recording.name for recording in recordings], test.name) == (["06"], "08")
+    with pytest.raises(FileNotFoundError, match=f"{kitti_root}, {bev_root}: expected sequence '09', found 08, 06"):
+        leave_one_out([kitti_root, bev_root], "08", train=("09",))
+    (tmp_path / "again").symlink_to(bev_root)
+    with pytest.raises(
+        ValueError, match=f"again: expected a new name, found a second recording '06', as in {bev_root}"
+    ):
+        leave_one_out([bev_root, tmp_path / "again"], "06")
+    with pytest.raises(ValueError, match="expected training recordings other than '06', found none"):
+        leave_one_out([bev_root], "06")

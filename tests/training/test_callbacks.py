@@ -53,7 +53,7 @@ def test_a_progress_bar_can_be_used_for_a_second_training(capsys):
 def test_without_a_terminal_each_call_prints_a_line(capsys):
     bar = ProgressBar()
     bar.on_start(0, 4)
-    assert capsys.readouterr().err == ""
+    assert capsys.readouterr().err == "step 0 of 4: compiling the first step\n"
     for step in (2, 4):
         bar.on_step(step, {"loss": 0.5, "steps_per_second": 3.0})
         assert capsys.readouterr().err == f"step {step} of 4: loss 0.5  steps_per_second 3\n"
