@@ -124,7 +124,7 @@ def loops(
     print(f"{len(pairs)} pairs of recordings may overlap, {len(todo)} of them are searched now")
     if todo:
         for row in in_actors(PairSearch, todo, workers=workers, out=str(out), weights=weights):
-            print(row["said"])
+            print(f"{row['first']} and {row['second']}: {row['said']}")
 
 
 def proposed(places: str, index: str, *, where: str = "") -> list[dict[str, Any]]:
@@ -171,4 +171,5 @@ class PairSearch:
             found = sglpr_jax.find_loops(recordings, self.params)
             with replacing(Path(self.out) / row["pair"]) as folder:
                 write_loop_folder(found, folder)
-        return row | {"said": str(found).splitlines()[-1]}
+        _, _, said = str(found).splitlines()[-1].partition(": ")  # what follows the two names
+        return row | {"said": said}

@@ -32,7 +32,7 @@ class ConfigFlags:
     config: Path | None = None
     """JSON file with settings, as printed by --dump-config. The command line overrides the file."""
     dump_config: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print all settings as JSON and exit. Those with a dot are not listed here; set them as --NAME VALUE."""
+    """Print all settings as JSON and exit. Nested ones are listed only there; set them as --candidates.recent-m 60."""
 
 
 def flag_values(command: Any) -> dict[str, Any]:

@@ -26,6 +26,7 @@ class EvaluateCommand:
 
     Example:
       bin/evaluate 08.npz
+      bin/evaluate 08.npz --published                     beside the paper's numbers
       bin/evaluate mine.npy --poses poses/08.txt --pose-format kitti --times times.txt --distance cosine
       bin/evaluate mine.npy --data KITTI --seq 08 --protocol all --compare 08.npz
       bin/evaluate 2012-02-04.npz 2012-03-17.npz --database 2012-01-15.npz --published
@@ -52,7 +53,8 @@ class EvaluateCommand:
     distance: str | None = None
     """Distance between descriptors of a .npy file: l2 (None), cosine, ... Descriptor files define it themselves."""
     protocol: tuple[str, ...] = ()
-    """Names of protocols, or `all`. If omitted, top1-f1max, pairs-f1max and bevplace-recall-at-1."""
+    """Names of protocols (docs/concepts/protocols.md), or `all`. If omitted, top1-f1max (that of the
+    paper's table 1), pairs-f1max and bevplace-recall-at-1."""
     compare: tuple[Path, ...] = ()
     """Files of other methods on the same frames, to compare with FILE. Without poses or times of their own, they use
     those of FILE."""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class LiveCommand(LiveOptions, DetectorFlags):
+class LiveCommand(LiveOptions):
     """Find loop closures while the robot drives, and publish them at once.
 
     Sources: `folder:PATH` (a folder into which scans are written), `bag:PATH` (a bag at its own pace), `dds` or
@@ -45,10 +45,12 @@ class LiveCommand(LiveOptions, DetectorFlags):
     out: Path
     """Folder of the map and the results."""
     sinks: tuple[str, ...] = ("json",)
-    """Receivers of loops and of the status after each scan."""
+    """Receivers of loops and of the status after each scan. `dds` and `zenoh` publish /sglpr/loops, /sglpr/loop_markers
+    and, with the extra gtsam, map to odom on /tf (docs/guides/live-ros.md)."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     output: tyro.conf.OmitArgPrefixes[CloudOptions] = CloudOptions()
+    decision: tyro.conf.OmitArgPrefixes[DetectorFlags] = DetectorFlags()
 
     @property
     def expects_odometry(self) -> bool:
@@ -153,7 +155,7 @@ def _open_map(command: LiveCommand, report: "Report") -> "LiveMap":
     from sglpr_jax.loops.detector import LoopDetector
     from sglpr_jax.models.weights_file import load
 
-    params, config, odometry = load(command.weights), command.detector, command.expects_odometry
+    params, config, odometry = load(command.weights), command.decision.detector, command.expects_odometry
     options = {"sensor_height": command.sensor_height, "expects_odometry": odometry}
     live_map = LiveMap(LoopDetector(params, config=config), command.out, report=report, **options)
     warm_up(params, config, odometry=odometry)

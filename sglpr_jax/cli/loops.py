@@ -37,7 +37,7 @@ UNFINISHED = "unfinished"
 
 
 @dataclasses.dataclass(frozen=True)
-class LoopsCommand(DetectorFlags):
+class LoopsCommand:
     """Find the loop closures of a recording: pairs of scans of one place, their relative poses and probabilities.
 
     With several recordings, the command finds the loops within and between them, and the transforms between their
@@ -49,15 +49,14 @@ class LoopsCommand(DetectorFlags):
     was interrupted or killed.
 
     Example:
-      bin/loops my_scans
-      bin/loops my_scans --odometry odometry.tum --out found
-      bin/loops my_scans --odometry auto --optimize --out found
-      bin/loops drive.mcap --odometry drive.mcap --out found
-      bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found
-      bin/loops my_scans --odometry odometry.tum --optimize --out found
-      bin/loops my_scans --odometry auto --optimize --out found --cloud found/map.ply --grid found/map.yaml
-      bin/loops my_scans --odometry odometry.tum --submap-m 10 --out found
-      bin/loops monday tuesday --odometry monday.tum tuesday.tum --optimize --out found
+      bin/loops my_scans                                         by the scans alone
+      bin/loops my_scans --odometry auto --optimize              SLAM: also odometry and a corrected trajectory
+      bin/loops my_scans --odometry auto --optimize --cloud map.ply --grid map.yaml
+      bin/loops my_scans --odometry odometry.tum --optimize      corrects your odometry
+      bin/loops drive.mcap --odometry drive.mcap --pose-topic /odom --out found
+      bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti
+      bin/loops my_scans --odometry odometry.tum --submap-m 10   a sensor with few points
+      bin/loops monday tuesday --odometry auto --optimize        two drives in one frame
     """
 
     recording: Annotated[Path | tuple[Path, ...], tyro.conf.Positional]
@@ -90,6 +89,7 @@ class LoopsCommand(DetectorFlags):
     """Also write trajectories, scans, loops and image pairs of one recording to this .rrd file, for the rerun viewer
     (extra view)."""
     output: tyro.conf.OmitArgPrefixes[CloudOptions] = CloudOptions()
+    decision: tyro.conf.OmitArgPrefixes[DetectorFlags] = DetectorFlags()
     degenerate: Degenerate = "keep"
     """Loops whose position has a standard deviation of more than 1 m in one horizontal direction, for example between
     plain walls: `keep` writes these loops with that information matrix, and `drop` rejects them."""
@@ -173,7 +173,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     from sglpr_jax.pose_graph.optimize import describe_errors, optimize_trajectory, placements
 
     params, out, checkpoint = load(command.weights), command.folder, command.folder / UNFINISHED
-    detector = command.detector  # raises an error for invalid settings before the recordings are opened
+    detector = command.decision.detector  # raises an error for invalid settings before the recordings are opened
     odometry_checkpoints = [out / f"unfinished-{number}.odometry.log" for number in range(len(command.recordings))]
     effective, recordings, odometry = open_with_odometry(
         command,
@@ -207,6 +207,8 @@ def _search_and_write(command: LoopsCommand) -> int:
     if command.degenerate == "drop":
         result = result.without_degenerate()
     unused = [session.recording.name for session in result.sessions if session.odometry is None]
+    if command.optimize:
+        print("correcting the trajectory, writing the page", file=sys.stderr)
     optimized = optimize_trajectory(result) if command.optimize and not unused else None
     paths = write_loop_folder(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
     paths.append(record_command(effective, out))

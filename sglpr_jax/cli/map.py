@@ -39,7 +39,8 @@ ODOMETRY, ODOMETRY_CHECKPOINT = ".odometry.tum", ".odometry.log"
 
 @dataclasses.dataclass(frozen=True)
 class MapCommand:
-    """Store places along a recording in one file. Each place is a scan with its descriptor, image and pose.
+    """Make a map of places, in which bin/relocalize finds scans. Each place is a scan with its descriptor, image and
+    pose. --cloud and --grid also write a point cloud and an occupancy grid.
 
     Ctrl-C writes the places found until then. The same command continues a run that was interrupted or killed.
 
@@ -57,8 +58,8 @@ class MapCommand:
     .las, .laz), whose places are seen from the poses."""
     poses: Literal["auto"] | Path
     """File with a pose in the world frame for each scan, tum file with poses at other times, which are interpolated, or
-    the bag itself. Use a corrected trajectory, not raw odometry. For a point cloud map, the poses of its LiDAR. `auto`
-    computes odometry from the scans (extra odometry) and writes it beside the map, for a drive without revisits."""
+    the bag itself. Use a corrected trajectory, as bin/loops --optimize writes it. For a point cloud map, the poses of
+    its LiDAR. `auto` computes odometry from the scans (extra odometry), which suffices for a drive without revisits."""
     out: Path | None = None
     """Map to write (.safetensors). None: NAME.safetensors beside the recording NAME."""
     pose_format: OdometryFormat = "auto"

@@ -44,20 +44,22 @@ class RecordingOptions:
     """Selection of a recording in a folder, and options for reading it."""
 
     seq: str | None = None
-    """Sequence, or session of NCLT (2012-01-15). May be omitted if there is only one."""
+    """Sequence, session of NCLT (2012-01-15), or point cloud topic of a bag that has several. May be omitted if there
+    is only one."""
     pose_source: PoseChoice = "auto"
     """Pose files of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
     """Point format of .bin files. `auto` detects it from the names or the content of the files."""
     sensor_height: SensorHeight = "auto"
-    """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scans.
-    `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
+    """Height of an upright sensor above the ground, in metres. Rarely needed: `auto` estimates height and tilt from the
+    scans of plain folders and bags, and uses those that other datasets define. `estimate` always estimates them."""
     gravity: Gravity = dataclasses.field(default="auto", kw_only=True)
     """`recording`: one height and tilt for all scans. `scan`: height and tilt of each scan, for a sensor in a hand,
     from its ground and the IMU of a bag. `auto` chooses by the tilt of some scans, or `recording` if the layout or
     --sensor-height defines the mounting."""
     pose_topic: str | None = None
-    """Pose topic of a bag that has several, for example /odom."""
+    """Topic of the poses of a bag, for example /odom, also if the bag is the --odometry. By default, the one that
+    covers most scans is used."""
     imu_topic: str | None = dataclasses.field(default=None, kw_only=True)
     """IMU topic of a bag, for the gravity of each scan. By default, the one beside the topic of the LiDAR is used."""
     time_unit: TimeUnit = dataclasses.field(default="auto", kw_only=True)
@@ -137,12 +139,13 @@ class SubmapOptions:
 
 @dataclasses.dataclass(frozen=True)
 class CloudOptions:
-    """Point cloud and occupancy grid of the scans at their poses, without moving objects."""
+    """Point cloud and occupancy grid of the scans at their poses, without moving objects. bin/loops uses the corrected
+    poses."""
 
     cloud: Path | None = None
     """Also write the points of all scans in one frame (.ply, .pcd, .las, .laz)."""
     grid: Path | None = None
-    """Also write an occupancy grid for planners, NAME.yaml and NAME.pgm, as the map server of ROS 2 reads it."""
+    """Also write an occupancy grid for planners, NAME.yaml and NAME.pgm, as Nav2's map server reads it."""
     cloud_settings: CloudConfig = CloudConfig()
     grid_settings: OccupancyConfig = OccupancyConfig()
 
@@ -232,7 +235,7 @@ class DetectorFlags:
 
     drift_percent: float = DRIFT_PERCENT
     """Position drift of the odometry: one standard deviation, in percent of the travelled distance. Loops that need
-    more than four standard deviations are rejected."""
+    more than four standard deviations are rejected as contradicting the odometry: raise it then."""
     drift_deg_per_100m: float = DRIFT_DEG_PER_100M
     """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
     min_probability: float = MIN_PROBABILITY
@@ -271,6 +274,7 @@ def open_with_poses(
     odometry = read_stamped(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly
     whole_recording = source.open(root)
     recording, poses = match_to_scans(whole_recording, *odometry, path)
+    print(f"trajectory: {path}", file=sys.stderr)  # the description above may name other poses, of the dataset
     if recording is not whole_recording:  # its last message says how many scans were removed
         print(recording.found[-1], file=sys.stderr)
     return recording, poses

@@ -35,7 +35,7 @@ class TrainCommand:
       bin/train --seq 08                                  on the simulated recordings, preset sglpr
       bin/train --seq 08 --data KITTI --preset paper
       bin/train --seq 08 --data KITTI --resume            resumes a stopped run
-      bin/train --seq friday --data monday tuesday.bag friday    own scans with poses
+      bin/train --seq friday --data monday tuesday.bag friday    own scans, with poses beside them; no labels needed
       bin/train --seq 06 --data IMAGES --also SIMULATED --also-tuples 4     semantics from a second, labelled dataset
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
       bin/train --seq 08 --model.head.cbam False          an ablation; docs/guides/ablations.md lists all
@@ -106,7 +106,7 @@ def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with -
         check_still_there(folder / CONFIG_FILE)
         print(f"written to {out}")
     print(f"run: {folder}")
-    print(with_installed_names(f"next: bin/loops my_scans --weights {folder}"))
+    print(with_installed_names(f"next: bin/loops my_scans --weights {folder}"), file=sys.stderr)
 
 
 def run_folder(command: TrainCommand) -> Path:

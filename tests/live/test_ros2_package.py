@@ -163,7 +163,7 @@ def test_parameters_are_flags_of_bin_live(package):
     defaults, command_of = package.parameters.defaults(), package.parameters.command_of
     out = Path(package.parameters.OUT)
     assert command_of(defaults) == LiveCommand(source="ros2", sinks=("ros2",), out=out)
-    assert command_of({**defaults, "sensor_height": "1.7", "max_places": 9}).max_places == 9
+    assert command_of({**defaults, "sensor_height": "1.7", "max_places": 9}).decision.max_places == 9
     with pytest.raises(ValueError, match="sensor_height: expected metres or auto, found high"):
         command_of({**defaults, "sensor_height": "high"})
     written = yaml.safe_load((PACKAGE / "config" / "sglpr.yaml").read_text())["sglpr"]["ros__parameters"]

@@ -4,7 +4,10 @@ from pathlib import Path
 from typing import Any
 
 from sglpr_jax.cli.live import LiveCommand
+from sglpr_jax.cli.recording import DetectorFlags
 
+DECISION = ("drift_percent", "drift_deg_per_100m", "min_probability", "keyframe_m", "max_places")
+"""Flags of the loop detector that are parameters of the node."""
 FLAGS = (
     "topic",
     "odometry_topic",
@@ -14,11 +17,7 @@ FLAGS = (
     "topic_prefix",
     "map_frame",
     "odometry_frame",
-    "drift_percent",
-    "drift_deg_per_100m",
-    "min_probability",
-    "keyframe_m",
-    "max_places",
+    *DECISION,
 )
 """Flags of bin/live that are parameters of the node."""
 EMPTY = {"topic": "", "odometry_topic": "", "max_places": 0}
@@ -30,7 +29,8 @@ OUT = "sglpr_map"
 def defaults() -> dict[str, Any]:
     """Return names and default values of the parameters."""
     command = LiveCommand(source="ros2", sinks=("ros2",), out=Path(OUT))
-    return {"out": OUT, **{name: EMPTY.get(name, getattr(command, name)) for name in FLAGS}}
+    values = vars(command) | vars(command.decision)
+    return {"out": OUT, **{name: EMPTY.get(name, values[name]) for name in FLAGS}}
 
 
 def command_of(values: dict[str, Any]) -> LiveCommand:
@@ -42,6 +42,6 @@ def command_of(values: dict[str, Any]) -> LiveCommand:
         height = height if height == "auto" else float(height)
     except ValueError as error:
         raise ValueError(f"sensor_height: expected metres or auto, found {height}") from error
-    return LiveCommand(
-        source="ros2", sinks=("ros2",), out=Path(flags.pop("out")).expanduser(), sensor_height=height, **flags
-    )
+    decision = DetectorFlags(**{name: flags.pop(name) for name in DECISION if name in flags})
+    out = Path(flags.pop("out")).expanduser()
+    return LiveCommand(source="ros2", sinks=("ros2",), out=out, sensor_height=height, decision=decision, **flags)
