@@ -29,7 +29,7 @@ def leave_one_out(
         for name in recording_names(root):
             if name in root_of:
                 raise ValueError(
-                    f"{root}: expected a new name, found a second recording {name!r}, as in {root_of[name]}"
+                    f"{root}: expected recordings with new names, found {name!r}, as in {root_of[name]}; rename one"
                 )
             root_of[name] = root
     names = tuple(train) or tuple(name for name in root_of if name != test)

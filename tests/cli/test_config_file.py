@@ -75,8 +75,8 @@ def test_flags_override_the_file_and_the_file_overrides_the_defaults(file):
     path = file({"recording": "scans", "out": "found", "seq": "07", "register": True, "candidates.cohort": 5})
     found = parsed("loops", "drive", "--config", path, "--seq", "08", "--no-register", "--candidates.candidates", "7")
     assert (found.recording, found.out, found.source.seq) == (Path("drive"), Path("found"), "08")
-    assert (found.register, found.candidates.candidates, found.candidates.cohort) == (False, 7, 5)
-    assert found.candidates.further == 32
+    assert (found.register, found.decision.candidates.candidates, found.decision.candidates.cohort) == (False, 7, 5)
+    assert found.decision.candidates.further == 32
 
 
 @pytest.mark.parametrize("name", ["train", "reproduce"])

@@ -41,7 +41,7 @@ ERRORS = {
     "reproduce --data {town} --out {out}": "expected tables or figures",
     "reproduce table5 --data {images} --out {out}": "table5 is about semantics",
     "reproduce table1 --data {images} --seq 06 --out {out} --method m2dp polar-fft": "use --method polar-fft",
-    "train --seq 06 --data {images} {images} --out {out}": "a second recording '00'",
+    "train --seq 06 --data {images} {images} --out {out}": "found '00', as in",
     "reproduce table1 --data {town} --out {out} --method bow": "'bow'",
     "segment --weights segmented --data {images} --out {out}": "segmented: expected a folder",
     "simulate --out {out} --seq 11": "'11'",
