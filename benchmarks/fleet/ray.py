@@ -171,5 +171,4 @@ class PairSearch:
             found = sglpr_jax.find_loops(recordings, self.params)
             with replacing(Path(self.out) / row["pair"]) as folder:
                 write_loop_folder(found, folder)
-        _, _, said = str(found).splitlines()[-1].partition(": ")  # what follows the two names
-        return row | {"said": said}
+        return row | {"said": str(found).splitlines()[-1].partition(": ")[2]}  # without the names of the recordings

@@ -207,9 +207,10 @@ def _search_and_write(command: LoopsCommand) -> int:
     if command.degenerate == "drop":
         result = result.without_degenerate()
     unused = [session.recording.name for session in result.sessions if session.odometry is None]
-    if command.optimize:
+    optimized = None
+    if command.optimize and not unused:
         print("correcting the trajectory, writing the page", file=sys.stderr)
-    optimized = optimize_trajectory(result) if command.optimize and not unused else None
+        optimized = optimize_trajectory(result)
     paths = write_loop_folder(result, out, optimized=optimized, texts={PAGE: loops_page(result, optimized=optimized)})
     paths.append(record_command(effective, out))
     if command.rerun is not None:

@@ -186,14 +186,15 @@ def _rejection_blocks(rejected: Sequence[RejectedClosure]) -> list[Text | TextTa
 
 
 def _loop_table(result: LoopSearchResult) -> list[Text | TextTable]:
-    """Return a table of up to 40 loops: wrong loops first, if they are known, then by increasing probability."""
+    """Return the order of the loops in words and a table of up to 40: wrong loops first, if they are known, then by
+    increasing probability."""
     if not result.loops:
         return [missing("No loops.")]
     recording = result.sessions[0].recording
     wrong = set(_frame_pairs(wrong_loops(result)))
-    order = f"The {'wrong loops, then the ' if wrong else ''}least probable loops first."
+    order = f"Sorted{': wrong loops first, then' if wrong else ''} by increasing probability."
     if len(result.loops) > SHOWN_ROWS:
-        order += f" The table has {SHOWN_ROWS} of {len(result.loops)} loops, loops.csv has all."
+        order += f" The table has {SHOWN_ROWS} of {len(result.loops)} loops. The file loops.csv has all."
     header = ("query", "match", "x [m]", "y [m]", "yaw [deg]", "probability", "overlap")
     if recording.positions is not None:
         header += ("true distance [m]",)

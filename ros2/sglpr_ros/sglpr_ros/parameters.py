@@ -42,6 +42,6 @@ def command_of(values: dict[str, Any]) -> LiveCommand:
         height = height if height == "auto" else float(height)
     except ValueError as error:
         raise ValueError(f"sensor_height: expected metres or auto, found {height}") from error
-    decision = DetectorFlags(**{name: flags.pop(name) for name in DECISION if name in flags})
+    decision = DetectorFlags(**{name: flags.pop(name) for name in DECISION})
     out = Path(flags.pop("out")).expanduser()
     return LiveCommand(source="ros2", sinks=("ros2",), out=out, sensor_height=height, decision=decision, **flags)
