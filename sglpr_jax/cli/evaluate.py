@@ -53,8 +53,8 @@ class EvaluateCommand:
     distance: str | None = None
     """Distance between descriptors of a .npy file: l2 (None), cosine, ... Descriptor files define it themselves."""
     protocol: tuple[str, ...] = ()
-    """Names of protocols (docs/concepts/protocols.md), or `all`. If omitted, top1-f1max (that of the
-    paper's table 1), pairs-f1max and bevplace-recall-at-1."""
+    """Names of protocols (docs/concepts/protocols.md), or `all`. If omitted, top1-f1max (most likely SG-LPR's own,
+    which its paper does not state), pairs-f1max and bevplace-recall-at-1."""
     compare: tuple[Path, ...] = ()
     """Files of other methods on the same frames, to compare with FILE. Without poses or times of their own, they use
     those of FILE."""
